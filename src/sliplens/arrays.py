@@ -1,0 +1,45 @@
+"""Checks on arrays that several floors share."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from sliplens.errors import SaliencyError
+
+
+def require_saliency(
+    saliency: Float[np.ndarray, "height width"],
+    shape: Sequence[int],
+    *,
+    where: str = "the saliency map",
+) -> Float[np.ndarray, "height width"]:
+    """Return the map unchanged when it is finite and has the image's height and width.
+
+    Parameters
+    ----------
+    saliency
+        Map to check.
+    shape
+        Height and width of the image that the map explains, in pixels.
+    where
+        What the map is called in the message.
+
+    Raises
+    ------
+    SaliencyError
+        If the map has another shape, or holds NaN or infinity.
+    """
+    height, width = shape
+    if saliency.shape != (height, width):
+        raise SaliencyError(
+            f"{where} has shape {tuple(saliency.shape)} but its image is {height} x {width} pixels; "
+            "explain the same frames that are scored"
+        )
+    bad = int(np.size(saliency) - np.count_nonzero(np.isfinite(saliency)))
+    if bad:
+        raise SaliencyError(
+            f"{where} holds NaN or infinity in {bad} of {saliency.size} pixels; "
+            "explain the frame again, or drop it from the set"
+        )
+    return saliency

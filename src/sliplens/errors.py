@@ -1,0 +1,33 @@
+"""The exceptions sliplens raises for mistakes a user can mend; each message is one sentence with the cure."""
+
+
+class SliplensError(Exception):
+    """Base of every error that is the user's to mend; the command line prints it and exits with code 2."""
+
+
+class InputError(SliplensError):
+    """A file, folder or option that is missing or cannot be used."""
+
+
+class ImageError(InputError):
+    """An image that cannot be read, or has another size, channel count or bit depth than is needed."""
+
+
+class RecordingError(InputError):
+    """A recording or data set that breaks a law: empty, times not rising, a label outside [0, 1]."""
+
+
+class CheckpointError(InputError):
+    """A checkpoint that is incomplete, damaged, or does not fit the data it is asked about."""
+
+
+class ContactError(SliplensError):
+    """A physical parameter or load that cannot occur."""
+
+
+class ModelError(SliplensError):
+    """A network that cannot be built, trained or explained as asked."""
+
+
+class SaliencyError(SliplensError):
+    """A saliency map that does not fit its image or is not finite."""

@@ -1,0 +1,112 @@
+"""Images on disk: 8-bit RGB in, PNG out."""
+
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from sliplens.errors import ImageError, InputError
+from sliplens.provenance import require_folder
+
+IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"})
+
+_CURES = {
+    "L": "1 channel (grey); convert it to 8-bit RGB",
+    "1": "1 channel (black and white); convert it to 8-bit RGB",
+    "P": "a colour palette; convert it to 8-bit RGB",
+    "LA": "2 channels (grey and alpha); convert it to 8-bit RGB",
+    "RGBA": "4 channels (alpha); drop the alpha channel",
+    "CMYK": "4 channels (CMYK); convert it to 8-bit RGB",
+    "I;16": "16 bits a pixel; convert it to 8-bit RGB",
+    "I": "more than 8 bits a pixel; convert it to 8-bit RGB",
+    "F": "floating-point pixels; convert it to 8-bit RGB",
+}
+_BITS_PER_SAMPLE = 258  # TIFF tag
+
+
+def read_image(path: Path, *, size: tuple[int, int] | None = None) -> UInt8[np.ndarray, "height width 3"]:
+    """Read an 8-bit RGB image.
+
+    Parameters
+    ----------
+    path
+        PNG, TIFF, JPEG or BMP.
+    size
+        Height and width that the image must have, in pixels; any size if None.
+
+    Raises
+    ------
+    ImageError
+        If the file is missing, truncated or no image, is not 8-bit RGB, or has another size.
+    """
+    try:
+        with Image.open(path) as image:
+            bits = getattr(image, "tag_v2", {}).get(_BITS_PER_SAMPLE, (8,))
+            if image.mode != "RGB" or max(bits) > 8:
+                cure = _CURES.get(image.mode, f"mode {image.mode}; convert it to 8-bit RGB")
+                if max(bits) > 8:
+                    cure = f"{max(bits)} bits a pixel; convert it to 8-bit RGB"
+                raise ImageError(f"{path} has {cure}")
+            pixels = np.asarray(image)
+    except FileNotFoundError:
+        raise ImageError(f"{path} does not exist; check the path") from None
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise ImageError(f"{path} cannot be read as an image ({error}); copy or export it again") from None
+    if size is not None and pixels.shape[:2] != tuple(size):
+        raise ImageError(
+            f"{path} is {pixels.shape[0]} x {pixels.shape[1]} pixels, {size[0]} x {size[1]} are needed; "
+            "use frames of the sensor the network was trained for"
+        )
+    return pixels
+
+
+def write_png(path: Path, pixels: UInt8[np.ndarray, "height width *channels"]) -> None:
+    """Write an image as PNG, losslessly."""
+    Image.fromarray(pixels).save(path, format="PNG")
+
+
+def encode_png(pixels: UInt8[np.ndarray, "height width *channels"], *, compress_level: int = 1) -> bytes:
+    """Bytes of an image as PNG; noisy tactile frames hardly shrink above the lowest level."""
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=compress_level)
+    return buffer.getvalue()
+
+
+def decode_png(data: bytes, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    """Pixels of an RGB PNG held in memory.
+
+    Raises
+    ------
+    ImageError
+        If the bytes are damaged or no RGB image; the message begins with `where`.
+    """
+    try:
+        with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+            if image.mode != "RGB":
+                raise ImageError(f"{where} has {_CURES.get(image.mode, image.mode)}")
+            return np.asarray(image)
+    except (OSError, SyntaxError, ValueError) as error:
+        raise ImageError(f"{where} cannot be read as PNG ({error}); make the data set again") from None
+
+
+def list_images(folder: Path) -> list[Path]:
+    """Image files of a folder in natural order (frame 2 before frame 10).
+
+    Raises
+    ------
+    InputError
+        If the folder is missing, or holds no image.
+    """
+    require_folder(folder, what="the image folder")
+    found = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+    if not found:
+        raise InputError(f"{folder} holds no image (looked for {', '.join(sorted(IMAGE_SUFFIXES))}); check the path")
+    return sorted(found, key=lambda path: natural_key(path.name))
+
+
+def natural_key(text: str) -> list[tuple[int, int | str]]:
+    """Sort key that reads runs of digits as numbers."""
+    return [(0, int(part)) if part.isdigit() else (1, part.lower()) for part in re.split(r"(\d+)", text)]

@@ -1,0 +1,6 @@
+"""Recordings: trials of a tactile sensor with forces and slip labels, in memory and on disk."""
+
+from sliplens.recordings.dataset import Dataset, TrialInfo
+from sliplens.recordings.recording import ContactState, Recording
+
+__all__ = ["ContactState", "Dataset", "Recording", "TrialInfo"]

@@ -1,0 +1,103 @@
+"""One trial of a tactile sensor: frames, forces, labels, and who, when and what."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from sliplens.errors import RecordingError
+
+
+class ContactState(StrEnum):
+    """Phase of a grasp, as in Fig. 4 of the thesis."""
+
+    NO_CONTACT = "no contact"
+    CONTACT = "contact"
+    INCIPIENT_SLIP = "incipient slip"
+    FULL_SLIP = "full slip"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """One trial.
+
+    Forces are in newtons (normal force positive when pressing), times in seconds, images uint8 RGB. Labels are NaN
+    where there is none: without contact the safety margin has no meaning.
+
+    Raises
+    ------
+    RecordingError
+        If the trial is empty, lengths or sizes disagree, times do not rise, or a label lies outside [0, 1].
+    """
+
+    trial: str
+    sensor: str
+    day: int
+    condition: str
+    reference: UInt8[np.ndarray, "height width 3"]
+    frames: UInt8[np.ndarray, "frames height width 3"]
+    time_s: Float[np.ndarray, " frames"]
+    normal_force_n: Float[np.ndarray, " frames"]
+    tangential_force_n: Float[np.ndarray, " frames"]
+    friction_coefficient: Float[np.ndarray, " frames"]
+    safety_margin: Float[np.ndarray, " frames"]
+    stick_ratio: Float[np.ndarray, " frames"]
+    contact_state: tuple[ContactState, ...]
+
+    def __post_init__(self) -> None:
+        """Check the laws that every trial obeys."""
+        count = len(self.frames)
+        if count == 0:
+            raise RecordingError(f"trial {self.trial} has no frames; leave it out or record it again")
+        if self.frames.shape[1:] != self.reference.shape:
+            raise RecordingError(
+                f"trial {self.trial} has frames of {self.frames.shape[1:3]} pixels but a reference of "
+                f"{self.reference.shape[:2]}; record both with the same camera settings"
+            )
+        for name in (*SIGNALS, "contact_state"):
+            if len(getattr(self, name)) != count:
+                raise RecordingError(
+                    f"trial {self.trial} has {count} frames but {len(getattr(self, name))} values of {name}; "
+                    "give one value a frame"
+                )
+        if not np.all(np.diff(self.time_s) > 0):
+            at = int(np.argmax(~(np.diff(self.time_s) > 0))) + 1
+            raise RecordingError(
+                f"trial {self.trial}: time does not rise at frame {at} ({self.time_s[at - 1]:.6g} s, then "
+                f"{self.time_s[at]:.6g} s); sort the frames or mend their stamps"
+            )
+        for name in ("safety_margin", "stick_ratio"):
+            require_unit_interval(getattr(self, name), name=name, trial=self.trial)
+
+    def __len__(self) -> int:
+        """Count the frames."""
+        return len(self.frames)
+
+
+SIGNALS = (
+    "time_s",
+    "normal_force_n",
+    "tangential_force_n",
+    "friction_coefficient",
+    "safety_margin",
+    "stick_ratio",
+)
+"""The per-frame numbers of a `Recording`, in the order they are stored."""
+
+
+def require_unit_interval(values: Float[np.ndarray, " frames"], *, name: str, trial: str) -> None:
+    """Check that labels lie in [0, 1]; NaN (no label) passes.
+
+    Raises
+    ------
+    RecordingError
+        Naming the trial, the first offending frame and its value.
+    """
+    outside = (values < 0) | (values > 1)
+    if outside.any():
+        at = int(np.argmax(outside))
+        raise RecordingError(
+            f"trial {trial}: {name} of frame {at} is {values[at]:.4g}, outside [0, 1]; "
+            "give it as a fraction, not in percent"
+        )
