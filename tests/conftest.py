@@ -3,8 +3,20 @@
 import os
 from pathlib import Path
 
+# threads that spin while they wait take the cores from those that work; must be set before torch is imported
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 import numpy as np
 import pytest
+import torch
+
+from sliplens.images import absolute_difference, write_png
+from sliplens.models import Manifest, build_model, save_checkpoint
+from sliplens.recordings import ContactState, Dataset, Recording
+from sliplens.recordings.dataset import save_recording, trial_info, trial_path, write_dataset_table
+
+FRAME_SIZE = 48
+IMAGE_SIZE = 32
 
 
 @pytest.fixture(scope="session")
@@ -28,3 +40,94 @@ def chromatouch_folder(reference_folder: Path) -> Path:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20261121)
+
+
+def make_recording(trial: str, *, condition: str = "dry", day: int = 1, frames: int = 12, seed: int = 0) -> Recording:
+    """A square that wanders over a noisy background as the safety margin falls: enough for a network to learn."""
+    rng = np.random.default_rng(seed)
+    margin = np.linspace(1, 0, frames)
+    margin[0] = np.nan  # the first frame has no contact
+    reference = rng.integers(0, 20, (FRAME_SIZE, FRAME_SIZE, 3), dtype=np.uint8)
+    images = np.repeat(reference[None], frames, axis=0)
+    for index in range(1, frames):
+        row = 4 + round(24 * (1 - margin[index]))
+        images[index, row : row + 12, 16:32] += 120
+    state = [ContactState.NO_CONTACT] + [ContactState.INCIPIENT_SLIP] * (frames - 1)
+    force = np.full(frames, 1.0)
+    return Recording(
+        trial=trial,
+        sensor="test-sensor",
+        day=day,
+        condition=condition,
+        reference=reference,
+        frames=images,
+        time_s=np.arange(frames) / 30,
+        normal_force_n=force,
+        tangential_force_n=np.nan_to_num(0.5 * (1 - margin)),
+        friction_coefficient=0.5 * force,
+        safety_margin=margin,
+        stick_ratio=np.clip(margin ** (2 / 3), 0, 1),
+        contact_state=tuple(state),
+    )
+
+
+@pytest.fixture
+def recording() -> Recording:
+    return make_recording("trial")
+
+
+@pytest.fixture(scope="session")
+def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Eight small trials in all splits, dry and wet."""
+    folder = tmp_path_factory.mktemp("data")
+    plan = [("train", "dry")] * 4 + [("validation", "dry")] * 2 + [("test", "dry"), ("test", "wet")]
+    table = []
+    for index, (split, condition) in enumerate(plan):
+        recording = make_recording(f"{split}-{condition}-{index}", condition=condition, day=1 + index % 4, seed=index)
+        path = trial_path(folder, recording.trial)
+        save_recording(recording, path)
+        table.append(trial_info(recording, split=split, path=path))
+    write_dataset_table(folder, table, simulated=True)
+    return Dataset.open(folder)
+
+
+def save_untrained(folder: Path, *, kind: str = "difference", seed: int = 0, frame_size: int = FRAME_SIZE) -> Path:
+    """A checkpoint with random weights: enough to test everything around a network."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = build_model()
+    manifest = Manifest(
+        backbone="shufflenet_v2_x1_0",
+        input=kind,
+        image_size=IMAGE_SIZE,
+        frame_size=(frame_size, frame_size),
+        sensor="test-sensor",
+        data_hash="none",
+    )
+    save_checkpoint(folder, model.eval(), manifest)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def difference_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_untrained(tmp_path_factory.mktemp("difference-run"))
+
+
+@pytest.fixture(scope="session")
+def raw_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_untrained(tmp_path_factory.mktemp("raw-run"), kind="raw", seed=1)
+
+
+@pytest.fixture
+def difference_folder(tmp_path: Path, small_dataset: Dataset) -> Path:
+    """Difference images of a test trial as PNG, their labels in their names."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    recording = small_dataset.load(small_dataset.select(split="test", condition="dry")[0])
+    for index in (1, 6, 11):
+        percent = round(100 * recording.safety_margin[index])
+        write_png(
+            folder / f"frame{index}_{percent}.png", absolute_difference(recording.frames[index], recording.reference)
+        )
+    return folder

@@ -14,6 +14,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sliplens._version import __version__
 from sliplens.errors import InputError
 
@@ -52,7 +54,7 @@ def to_jsonable(value: Any) -> Any:
         return [to_jsonable(item) for item in value]
     if isinstance(value, Path):
         return str(value)
-    if hasattr(value, "item"):  # a NumPy scalar
+    if isinstance(value, np.generic):
         return value.item()
     return value
 

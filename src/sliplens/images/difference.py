@@ -1,13 +1,13 @@
 """Temporal difference images: the current frame against the untouched sensor."""
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from sliplens.errors import ImageError
 
 
 def absolute_difference(
-    frames: UInt8[np.ndarray, "*batch height width 3"], reference: UInt8[np.ndarray, "height width 3"]
+    frames: UInt8[np.ndarray, "*batch height width 3"], reference: UInt8[np.ndarray, "_ _ 3"]
 ) -> UInt8[np.ndarray, "*batch height width 3"]:
     """Absolute difference |T_n - T_0| of frames against the reference frame, in grey levels.
 
@@ -34,24 +34,6 @@ def absolute_difference(
         )
     # max - min instead of a subtraction: it stays in uint8 and cannot wrap
     return np.maximum(frames, reference) - np.minimum(frames, reference)
-
-
-def normalise_by_maximum(
-    images: Float[np.ndarray, "*batch channels height width"],
-) -> Float[np.ndarray, "*batch channels height width"]:
-    """Divide each image by its own largest value, so that it spans up to 1; an all-zero image stays zero.
-
-    Parameters
-    ----------
-    images
-        Non-negative images, channels first, any scale.
-
-    References
-    ----------
-    Polak, section 4 ("max normalization").
-    """
-    largest = images.max(axis=(-3, -2, -1), keepdims=True)
-    return images / np.where(largest > 0, largest, 1)
 
 
 def _size(image: np.ndarray) -> str:

@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.images.files import decode_png, encode_png
-from sliplens.provenance import hash_file, read_json, require_folder, write_json
+from sliplens.provenance import hash_file, hash_json, read_json, require_folder, write_json
 from sliplens.recordings.recording import SIGNALS, ContactState, Recording
 
 DATASET_FILE = "dataset.json"
@@ -41,6 +41,7 @@ class Dataset:
 
     folder: Path
     trials: tuple[TrialInfo, ...]
+    simulated: bool = False
 
     @classmethod
     def open(cls, folder: Path) -> "Dataset":
@@ -63,7 +64,12 @@ class Dataset:
             trials = tuple(TrialInfo(**row) for row in table["trials"])
         except TypeError as error:
             raise RecordingError(f"{folder / DATASET_FILE} has a malformed trial ({error})") from None
-        return cls(folder=folder, trials=trials)
+        return cls(folder=folder, trials=trials, simulated=bool(table.get("simulated")))
+
+    @property
+    def hash(self) -> str:
+        """Hash of the table, which holds the hash of every trial: the same data, the same hash."""
+        return hash_json([asdict(trial) for trial in self.trials])
 
     def select(self, *, split: str | None = None, condition: str | None = None) -> tuple[TrialInfo, ...]:
         """Trials of a split and a condition.
@@ -112,8 +118,8 @@ def save_recording(recording: Recording, path: Path) -> None:
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
-    # PNG bytes do not compress further, and dictionaries would only hash them
-    pq.write_table(table, part, compression={name: "zstd" for name in columns if name != "image"}, use_dictionary=False)
+    # PNG bytes, nearly all of the file, neither compress further nor repeat
+    pq.write_table(table, part, compression="none", use_dictionary=False)
     part.replace(path)
 
 
@@ -186,10 +192,15 @@ def trial_info(recording: Recording, *, split: str, path: Path) -> TrialInfo:
     )
 
 
-def write_dataset_table(folder: Path, trials: Sequence[TrialInfo]) -> None:
+def write_dataset_table(folder: Path, trials: Sequence[TrialInfo], *, simulated: bool = False) -> None:
     """Write `dataset.json`, the last file of a data set."""
     units = {"time_s": "s", "normal_force_n": "N", "tangential_force_n": "N"}
     write_json(
         folder / DATASET_FILE,
-        {"schema_version": SCHEMA_VERSION, "units": units, "trials": [asdict(trial) for trial in trials]},
+        {
+            "schema_version": SCHEMA_VERSION,
+            "simulated": simulated,
+            "units": units,
+            "trials": [asdict(trial) for trial in trials],
+        },
     )

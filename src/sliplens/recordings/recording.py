@@ -35,14 +35,15 @@ class Recording:
     sensor: str
     day: int
     condition: str
-    reference: UInt8[np.ndarray, "height width 3"]
-    frames: UInt8[np.ndarray, "frames height width 3"]
-    time_s: Float[np.ndarray, " frames"]
-    normal_force_n: Float[np.ndarray, " frames"]
-    tangential_force_n: Float[np.ndarray, " frames"]
-    friction_coefficient: Float[np.ndarray, " frames"]
-    safety_margin: Float[np.ndarray, " frames"]
-    stick_ratio: Float[np.ndarray, " frames"]
+    # sizes that must agree are left open here and checked below, in the user's words
+    reference: UInt8[np.ndarray, "_ _ 3"]
+    frames: UInt8[np.ndarray, "_ _ _ 3"]
+    time_s: Float[np.ndarray, " _"]
+    normal_force_n: Float[np.ndarray, " _"]
+    tangential_force_n: Float[np.ndarray, " _"]
+    friction_coefficient: Float[np.ndarray, " _"]
+    safety_margin: Float[np.ndarray, " _"]
+    stick_ratio: Float[np.ndarray, " _"]
     contact_state: tuple[ContactState, ...]
 
     def __post_init__(self) -> None:

@@ -1,0 +1,61 @@
+# The system's Python alone is enough: it makes .venv, and uv installs the pinned packages there.
+PYTHON ?= python3
+UV_VERSION := 0.13.8
+VENV := .venv
+BIN := $(VENV)/bin
+UV := $(BIN)/uv
+INSTALLED := $(VENV)/.installed
+BENCHMARKS := $(sort $(wildcard benchmarks/*.py))
+
+# idle threads that spin take the cores from those that work
+export OMP_WAIT_POLICY := passive
+# the real recordings, where they are at hand; tests and the demo do without them where they are not
+export SLIPLENS_REFERENCE ?= ../shared/reference
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test check format bench docs lock clean
+
+help: ## list these targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+install: $(INSTALLED) ## set up .venv with the pinned packages and sliplens itself
+
+demo: $(INSTALLED) ## run the whole path once, within 10 minutes: runs/demo/report.html
+	$(BIN)/sliplens demo runs/demo
+
+test: $(INSTALLED) ## run the tests
+	$(BIN)/pytest
+
+check: $(INSTALLED) ## lint, format, types, floors
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+format: $(INSTALLED) ## format the code and sort its imports
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+bench: $(INSTALLED) ## run every benchmark
+	@set -e; for script in $(BENCHMARKS); do echo "== $$script"; $(BIN)/python $$script --json; done
+
+docs: $(INSTALLED) ## build the documentation: docs/_build/index.html
+	$(BIN)/sphinx-build -W -q -b html docs docs/_build
+
+lock: $(UV) ## pin the newest packages that fit, for every supported Python
+	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --extra dev --extra docs \
+		--custom-compile-command "make lock" --output-file requirements.txt pyproject.toml
+
+clean: ## remove .venv and what the tools cache
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis .import_linter_cache docs/_build
+
+$(UV):
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if (3, 11) <= v <= (3, 13) else \
+		f"sliplens needs Python 3.11 to 3.13 and found {v[0]}.{v[1]}; name one with make PYTHON=python3.12")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
+
+$(INSTALLED): $(UV) requirements.txt pyproject.toml
+	$(UV) pip install --quiet --python $(BIN)/python -r requirements.txt
+	$(UV) pip install --quiet --python $(BIN)/python --no-build-isolation --no-deps -e .
+	@touch $@

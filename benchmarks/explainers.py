@@ -1,0 +1,100 @@
+"""Time the explainers on an untrained ShuffleNetV2 with one output.
+
+Two ratios say what an explainer adds to the passes it cannot do without: Grad-CAM against one forward and backward
+pass, Integrated Gradients at 50 steps against 50 of them. With `--json` the last line is one JSON object.
+"""
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+from torchvision import models
+
+from sliplens.explain import EXPLAINERS, GradCam, IntegratedGradients
+from sliplens.provenance import machine, versions
+
+STEPS = 50
+
+
+def median_seconds(work: Callable[[], object], *, repeats: int, device: torch.device) -> float:
+    """Median wall-clock seconds of a call, after one call that warms caches and allocators."""
+    seconds = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        work()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds[1:])
+
+
+def forward_and_backward(model: nn.Module, images: Tensor) -> Tensor:
+    """Gradient of the outputs with respect to the images."""
+    images = images.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(model(images).sum(), images)
+    return gradient
+
+
+def build(*, size: int, batch: int, device: torch.device) -> tuple[nn.Module, Tensor]:
+    """Make an untrained network in evaluation mode and images of `size` pixels."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = models.shufflenet_v2_x1_0(weights=None)
+        model.fc = nn.Linear(model.fc.in_features, 1)
+    for parameter in model.parameters():
+        parameter.requires_grad_(False)  # as while explaining: only the images take a gradient
+    generator = torch.Generator().manual_seed(0)
+    return model.eval().to(device), torch.rand(batch, 3, size, size, generator=generator).to(device)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the benchmark from the command line."""
+    parser = argparse.ArgumentParser(description="Time the explainers on an untrained ShuffleNetV2.")
+    parser.add_argument("--size", type=int, default=224, help="height and width of the images in pixels")
+    parser.add_argument("--batch", type=int, default=1, help="images in a call")
+    parser.add_argument("--repeats", type=int, default=5, help="timed calls after one warm-up; the median counts")
+    parser.add_argument("--methods", nargs="+", choices=EXPLAINERS, default=list(EXPLAINERS))
+    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
+    parser.add_argument("--json", action="store_true", help="end with one line of JSON")
+    options = parser.parse_args(arguments)
+    model, images = build(size=options.size, batch=options.batch, device=options.device)
+
+    def timed(work: Callable[[], object], repeats: int = options.repeats) -> float:
+        return median_seconds(work, repeats=repeats, device=options.device)
+
+    seconds = {}
+    for name in options.methods:
+        explain = EXPLAINERS[name]
+        # thousands of passes average out on their own; one call after the warm-up is enough
+        seconds[name] = timed(lambda e=explain: e(model, images), repeats=1 if name == "poly-cam" else options.repeats)
+        print(f"{name:<22} {seconds[name] / options.batch:9.4f} s an image, {options.size} px, batch {options.batch}")
+
+    one = timed(lambda: forward_and_backward(model, images))
+    many = timed(lambda: [forward_and_backward(model, images) for _ in range(STEPS)])
+    grad_cam = timed(lambda: GradCam()(model, images))
+    fifty = timed(lambda: IntegratedGradients(steps=STEPS, max_steps=STEPS)(model, images))
+    print(f"{'Grad-CAM':<22} {grad_cam / one:9.3f} x one forward and backward pass ({one:.4f} s)")
+    print(f"{'IG, 50 steps':<22} {fifty / many:9.3f} x 50 forward and backward passes ({many:.4f} s)")
+    if options.json:
+        result = {
+            "seconds": seconds,
+            "seconds_an_image": {name: value / options.batch for name, value in seconds.items()},
+            "forward_backward_seconds": one,
+            "grad_cam_ratio": grad_cam / one,
+            "ig_ratio": fifty / many,
+            "size": options.size,
+            "batch": options.batch,
+            "threads": torch.get_num_threads(),
+            "device": str(options.device),
+            "machine": machine(),
+            "versions": versions(),
+        }
+        print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

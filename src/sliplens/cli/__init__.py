@@ -1,0 +1,75 @@
+"""The command line: one frozen dataclass a subcommand."""
+
+import os
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+
+from sliplens._version import __version__
+from sliplens.cli.console import fail
+from sliplens.cli.demo import Demo
+from sliplens.cli.evaluate import Evaluate
+from sliplens.cli.explain import Explain
+from sliplens.cli.report import Report
+from sliplens.cli.score import Score
+from sliplens.cli.simulate import Simulate
+from sliplens.cli.train import Train
+from sliplens.errors import SliplensError
+
+Command = (
+    Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Simulate, tyro.conf.subcommand("simulate")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Explain, tyro.conf.subcommand("explain")]
+    | Annotated[Score, tyro.conf.subcommand("score")]
+    | Annotated[Report, tyro.conf.subcommand("report")]
+)
+
+_DESCRIPTION = """sliplens tells how close a soft robotic fingertip is to losing its grip, from the images of the camera
+inside it, and shows why the network says so. Start with `sliplens demo runs/demo`; every stage it runs is a command
+of its own: simulate, train, evaluate, explain, score, report."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    arguments
+        Words after the program's name; those of the process if None.
+
+    Returns
+    -------
+    int
+        0 on success, 2 for a mistake the user can mend, 130 when interrupted.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words == ["--version"]:
+        print(f"sliplens {__version__}")
+        return 0
+    # threads that spin while they wait take the cores from those that work; must be set before torch is imported
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    command = tyro.cli(
+        Command,  # pyright: ignore[reportArgumentType]
+        prog="sliplens",
+        description=_DESCRIPTION,
+        args=words or ["--help"],
+    )
+    try:
+        command.run()
+    except SliplensError as error:
+        fail(str(error))
+        return 2
+    except OSError as error:
+        fail(
+            f"{error.filename or 'a file'} could not be read or written ({error.strerror or error}); "
+            "check the path, its permissions and the space left"
+        )
+        return 2
+    except KeyboardInterrupt:
+        fail("interrupted; run the same command again and it goes on where it stopped")
+        return 130
+    return 0

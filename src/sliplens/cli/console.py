@@ -1,0 +1,62 @@
+"""What the command line shows: progress bars, results, errors."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+OUT = Console()
+ERR = Console(stderr=True)
+
+
+def fail(message: str) -> None:
+    """Print an error, in one line however narrow the terminal."""
+    ERR.print(f"[bold red]sliplens:[/] {escape(message)}", soft_wrap=True, highlight=False)
+
+
+def say(message: str) -> None:
+    """Print a line of plain text."""
+    OUT.print(escape(message), soft_wrap=True, highlight=False)
+
+
+def wrote(path: Path, what: str) -> None:
+    """Say what was written where."""
+    OUT.print(f"[green]wrote[/] {escape(str(path))}  [dim]{escape(what)}[/]", soft_wrap=True, highlight=False)
+
+
+def unchanged(path: Path) -> None:
+    """Say that a result is there already."""
+    OUT.print(
+        f"[green]kept[/] {escape(str(path))}  [dim]made before with the same settings; --overwrite makes it again[/]",
+        soft_wrap=True,
+        highlight=False,
+    )
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a progress bar; yields a function of how many are done and how many there are."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=30),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=OUT) as bar:
+        task = bar.add_task(title, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table, numbers to the right."""
+    table = Table(title=title, title_justify="left")
+    for index, name in enumerate(header):
+        table.add_column(name, justify="left" if index == 0 else "right")
+    for row in rows:
+        table.add_row(*row)
+    OUT.print(table)

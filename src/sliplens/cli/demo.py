@@ -1,0 +1,156 @@
+"""`sliplens demo`: the whole path, from a recording to a report."""
+
+import os
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from sliplens.cli.console import say, wrote
+from sliplens.cli.evaluate import Evaluate
+from sliplens.cli.explain import Explain
+from sliplens.cli.report import Report
+from sliplens.cli.score import Score
+from sliplens.cli.simulate import Simulate
+from sliplens.cli.train import Train
+from sliplens.errors import InputError
+from sliplens.provenance import read_json, require_folder, to_jsonable, write_json
+
+INPUTS = ("difference", "raw")
+_PLAN = "plan.json"
+_LEVELS = 6
+_POLY_CAM_PASSES = 3720  # two masks for each of the 1860 channels of ShuffleNetV2 x1.0
+_SHORTEST_TRAINING = 0.3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo:
+    """Run the whole path once: simulate, train, evaluate, explain, score, report.
+
+    Needs no network and no GPU. It measures how fast this machine is and trains for as long as the time allows. Run it
+    again after an interruption and it goes on where it stopped.
+    """
+
+    output: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """Folder to make; the page is report.html in it."""
+    max_minutes: float = 8.0
+    """Time to aim for, everything included."""
+    image_size: int = 112
+    """Height and width of the networks' input; the frames are 224 x 224 pixels."""
+    dry_trials: int = 32
+    """Simulated dry trials, over four days."""
+    wet_trials: int = 6
+    """Simulated wet trials."""
+    frames_per_trial: int = 120
+    """Frames of each trial."""
+    real_frames: Path | None = None
+    """Folder of real difference images named ..._GG.png with the safety margin in percent; found by itself where
+    SLIPLENS_REFERENCE (or ../shared/reference) holds the public ChromaTouch images."""
+    seed: int = 0
+    """Seed of the simulation and the networks."""
+
+    def run(self) -> None:
+        """Run every stage and print where the page is."""
+        started = time.perf_counter()
+        real = self._find_real_frames()
+        self._open_workspace(real)
+        data = self.output / "data"
+        Simulate(
+            output=data,
+            dry_trials=self.dry_trials,
+            wet_trials=self.wet_trials,
+            frames_per_trial=self.frames_per_trial,
+            seed=self.seed,
+        ).run()
+        minutes = self._plan_training(started, real)
+        for name in INPUTS:
+            Train(
+                data=data,
+                output=self.output / f"train-{name}",
+                input=name,
+                image_size=self.image_size,
+                epochs=60,
+                max_minutes=minutes,
+                seed=self.seed,
+            ).run()
+        for name in INPUTS:
+            run = self.output / f"train-{name}"
+            Evaluate(model=run, data=data, output=self.output / f"evaluate-{name}").run()
+            Explain(model=run, data=data, output=self.output / f"explain-{name}").run()
+            Score(
+                model=run,
+                explanations=self.output / f"explain-{name}",
+                output=self.output / f"score-{name}",
+                seed=self.seed,
+            ).run()
+        if real is not None:
+            run = self.output / "train-difference"
+            explanations = self.output / "explain-real"
+            Explain(model=run, frames=real, labels_in_names=True, output=explanations).run()
+            Score(model=run, explanations=explanations, output=self.output / "score-real", seed=self.seed).run()
+        Report(workspace=self.output).run()
+        page = (self.output / "report.html").resolve()
+        say(f"the demo took {(time.perf_counter() - started) / 60:.1f} minutes")
+        say(f"open {page}")
+
+    def _find_real_frames(self) -> Path | None:
+        if self.real_frames is not None:
+            return require_folder(self.real_frames, what="the folder of real frames")
+        reference = Path(os.environ.get("SLIPLENS_REFERENCE", "../shared/reference"))
+        folder = reference / "chromatouch" / "difference"
+        return folder if folder.is_dir() else None
+
+    def _open_workspace(self, real: Path | None) -> None:
+        """Make the workspace, or go on in one that was begun with the same settings."""
+        settings = to_jsonable({**asdict(self), "real_frames": real})
+        plan = self.output / _PLAN
+        if plan.is_file():
+            if read_json(plan)["settings"] != settings:
+                raise InputError(f"{self.output} holds a demo of other settings; choose another folder or delete it")
+            say(f"going on in {self.output}")
+            return
+        if self.output.exists() and (not self.output.is_dir() or any(self.output.iterdir())):
+            raise InputError(f"{self.output} exists and is no demo; choose another folder")
+        try:
+            self.output.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot make {self.output} ({error.strerror}); choose another folder") from None
+        write_json(plan, {"settings": settings})
+        if real is None:
+            say("no real frames found: the report will show simulated touch only (see --real-frames)")
+
+    def _plan_training(self, started: float, real: Path | None) -> float:
+        """Minutes to train each network; decided once, so that a second run goes on with the same."""
+        plan = read_json(self.output / _PLAN)
+        if "train_minutes" in plan:
+            return plan["train_minutes"]
+        rate = _forward_rate(self.image_size)
+        real_count = 0 if real is None else sum(1 for _ in real.iterdir())
+        explained = len(INPUTS) * _LEVELS + real_count
+        frames = len(INPUTS) * self.frames_per_trial * self.wet_trials * 3
+        passes = explained * (1.2 * _POLY_CAM_PASSES + 4 * self.image_size) + frames
+        left = 60 * self.max_minutes - (time.perf_counter() - started) - passes / rate - 45  # reading, drawing
+        minutes = max(_SHORTEST_TRAINING, round(left / 60 / len(INPUTS), 2))
+        say(f"this machine answers {rate:.0f} frames a second: {minutes:g} minutes of training for each network")
+        write_json(self.output / _PLAN, {**plan, "forward_rate": rate, "train_minutes": minutes})
+        wrote(self.output / _PLAN, "settings and training time, kept for a second run")
+        return minutes
+
+
+def _forward_rate(image_size: int, *, seconds: float = 3.0) -> float:
+    """Forward passes a second of the default network in batches of 64."""
+    import torch
+
+    from sliplens.models import build_model
+
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
+        model = build_model().to(memory_format=torch.channels_last).eval()
+        images = torch.zeros(64, 3, image_size, image_size)
+        model(images)
+        started, done = time.perf_counter(), 0
+        while time.perf_counter() - started < seconds:
+            model(images)
+            done += len(images)
+        return done / (time.perf_counter() - started)

@@ -1,0 +1,26 @@
+"""`sliplens report`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from sliplens.cli.console import wrote
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Draw one self-contained page from what the other commands wrote into a folder."""
+
+    workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="WORKSPACE")]
+    """Folder that holds the results, one subfolder a command."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None
+    """Page to write; report.html in the workspace if not given."""
+
+    def run(self) -> None:
+        """Draw and write the page."""
+        from sliplens.report import build_report
+
+        page = build_report(self.workspace, self.output or self.workspace / "report.html")
+        wrote(page, "open it in a browser")

@@ -1,0 +1,54 @@
+"""Augmentation of batches, on whatever device they lie."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+from torchvision.transforms.v2 import functional as transforms
+
+
+@dataclass(frozen=True, kw_only=True)
+class Augmentation:
+    """Slight rotations, Gaussian noise and Gaussian blur, drawn for each image.
+
+    Parameters
+    ----------
+    rotation_deg
+        Rotations are uniform within plus and minus this: the pull is never exactly along gravity.
+    noise_sd
+        Standard deviation of the noise is uniform in [0, noise_sd], in units of the image's maximum.
+    blur_probability, blur_sd_px
+        Share of batches that are blurred, and the largest standard deviation of the blur in pixels.
+
+    References
+    ----------
+    Polak, section 4 ("random image augmentations").
+    """
+
+    rotation_deg: float = 5.0
+    noise_sd: float = 0.03
+    blur_probability: float = 0.25
+    blur_sd_px: float = 0.8
+
+    def __call__(
+        self, images: Float[Tensor, "batch 3 size size"], *, generator: torch.Generator
+    ) -> Float[Tensor, "batch 3 size size"]:
+        """Augment a batch; the same generator state gives the same images."""
+        batch = len(images)
+        device = images.device
+
+        def uniform(*shape: int) -> Tensor:
+            return torch.rand(*shape, generator=generator, device=device)
+
+        angle = (2 * uniform(batch) - 1) * math.radians(self.rotation_deg)
+        zero = torch.zeros_like(angle)
+        turn = torch.stack([angle.cos(), -angle.sin(), zero, angle.sin(), angle.cos(), zero], dim=1).view(-1, 2, 3)
+        grid = functional.affine_grid(turn, list(images.shape), align_corners=False)
+        images = functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
+        if float(uniform(1)) < self.blur_probability:
+            images = transforms.gaussian_blur(images, [3, 3], [0.1 + (self.blur_sd_px - 0.1) * float(uniform(1))])
+        noise = torch.randn(images.shape, generator=generator, device=device)
+        return (images + uniform(batch, 1, 1, 1) * self.noise_sd * noise).clamp(0, 1)

@@ -1,0 +1,101 @@
+"""Encodings: from frames and a reference frame to the network's input."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+from sliplens.errors import InputError
+from sliplens.images import absolute_difference
+
+Frames = UInt8[np.ndarray, "batch height width 3"]
+Reference = UInt8[np.ndarray, "_ _ 3"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Encoding:
+    """How frames become a network's input.
+
+    `compare` sets the frames against the reference frame T_0, still in 8 bits; `resize` brings them to the network's
+    size, also in 8 bits, so that a data set can be held in memory; `normalise` makes the floats. A folder of images
+    that someone else has already compared enters at `resize`.
+    """
+
+    name: str
+    compare: Callable[[Frames, Reference], Frames]
+    empty_is_black: bool
+    """Whether an untouched sensor is a black image, so that no reference frame is needed to explain."""
+
+    def resize(self, compared: Frames, *, image_size: int) -> UInt8[Tensor, "batch 3 size size"]:
+        """Bring compared frames to the network's square size, in 8 bits.
+
+        Bilinear with antialiasing: the noise of neighbouring pixels averages out instead of aliasing.
+        """
+        images = torch.from_numpy(np.ascontiguousarray(compared)).permute(0, 3, 1, 2)
+        if images.shape[-2:] == (image_size, image_size):
+            return images.contiguous()
+        resized = functional.interpolate(
+            images.float(), size=(image_size, image_size), mode="bilinear", antialias=True, align_corners=False
+        )
+        return resized.round().clamp(0, 255).to(torch.uint8)
+
+    def normalise(self, images: UInt8[Tensor, "batch 3 size size"]) -> Float[Tensor, "batch 3 size size"]:
+        """Divide each image by its own maximum, as the thesis does; an all-black image stays black.
+
+        References
+        ----------
+        Polak, section 4 ("max normalization").
+        """
+        largest = images.amax(dim=(-3, -2, -1), keepdim=True).clamp(min=1)
+        return images.float() / largest
+
+    def encode(self, frames: Frames, reference: Reference, *, image_size: int) -> Float[Tensor, "batch 3 size size"]:
+        """Encode frames against their reference frame.
+
+        Parameters
+        ----------
+        frames
+            Frames T_n, uint8 RGB.
+        reference
+            The sensor untouched, T_0.
+        image_size
+            Height and width of the network's input, in pixels.
+
+        Raises
+        ------
+        ImageError
+            If frames and reference differ in size.
+        """
+        return self.normalise(self.resize(self.compare(frames, reference), image_size=image_size))
+
+    def empty(self, reference: Reference, *, image_size: int) -> Float[Tensor, "3 size size"]:
+        """Encode the untouched sensor itself: what an explanation is measured against."""
+        return self.encode(reference[None], reference, image_size=image_size)[0]
+
+
+def _keep(frames: Frames, reference: Reference) -> Frames:
+    absolute_difference(frames[:1], reference)  # the same check of sizes for every encoding
+    return frames
+
+
+ENCODINGS = {
+    "difference": Encoding(name="difference", compare=absolute_difference, empty_is_black=True),
+    "raw": Encoding(name="raw", compare=_keep, empty_is_black=False),
+}
+
+
+def get_encoding(name: str) -> Encoding:
+    """Look up an encoding by name.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name; the message lists those there are.
+    """
+    if name not in ENCODINGS:
+        raise InputError(f"there is no input named {name!r}; choose one of {', '.join(ENCODINGS)}")
+    return ENCODINGS[name]

@@ -1,0 +1,106 @@
+"""Labelled frames in memory, as a torch data set."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, UInt8
+from torch import Tensor
+from torch.utils.data import Dataset as TorchDataset
+
+from sliplens.datasets.encodings import Encoding
+from sliplens.errors import RecordingError
+from sliplens.recordings import Dataset, TrialInfo
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameSet(TorchDataset):
+    """Resized 8-bit inputs with their labels; a batch is indexed at once, not frame by frame.
+
+    Attributes
+    ----------
+    images
+        Compared and resized frames, uint8, as `Encoding.resize` returns them.
+    safety_margin
+        Labels in [0, 1].
+    trial, frame, condition, day, time_s
+        Where each row comes from, for tables by trial, condition and day.
+    """
+
+    encoding: Encoding
+    images: UInt8[Tensor, "frames 3 size size"]
+    safety_margin: Float32[Tensor, " frames"]
+    trial: tuple[str, ...]
+    frame: tuple[int, ...]
+    condition: tuple[str, ...]
+    day: tuple[int, ...]
+    time_s: Float[np.ndarray, " frames"]
+
+    def __len__(self) -> int:
+        """Count the frames."""
+        return len(self.images)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
+        """Return one input and its label."""
+        images, labels = self.__getitems__([index])
+        return images[0], labels[0]
+
+    def __getitems__(self, indices: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Return a batch of inputs and their labels; torch's loader asks for it by this name."""
+        rows = torch.as_tensor(indices)
+        return self.encoding.normalise(self.images[rows]), self.safety_margin[rows]
+
+
+def load_frames(
+    data: Dataset,
+    trials: Sequence[TrialInfo],
+    *,
+    encoding: Encoding,
+    image_size: int,
+    on_trial: Callable[[int, int], None] | None = None,
+) -> FrameSet:
+    """Read trials, encode them, and keep the frames that have a label.
+
+    Frames without contact have no safety margin and are left out, as in the thesis.
+
+    Parameters
+    ----------
+    data, trials
+        The data set and the trials of it to read.
+    encoding, image_size
+        Input of the network, and its height and width in pixels.
+    on_trial
+        Called with the number of trials read and the number of all.
+
+    Raises
+    ------
+    RecordingError
+        If no frame has a label, or the trials' frames differ in size.
+    """
+    sizes = {(info.height, info.width) for info in trials}
+    if len(sizes) > 1:
+        raise RecordingError(f"{data.folder} mixes frames of {sorted(sizes)} pixels; use one sensor at a time")
+    images, labels, times, rows = [], [], [], []
+    for done, recording in enumerate(data.load_all(trials), start=1):
+        labelled = np.flatnonzero(np.isfinite(recording.safety_margin))
+        compared = encoding.compare(recording.frames[labelled], recording.reference)
+        images.append(encoding.resize(compared, image_size=image_size))
+        labels.append(recording.safety_margin[labelled])
+        times.append(recording.time_s[labelled])
+        rows += [(recording.trial, int(frame), recording.condition, recording.day) for frame in labelled]
+        if on_trial is not None:
+            on_trial(done, len(trials))
+    if not rows:
+        raise RecordingError(f"{data.folder}: no frame of the {len(trials)} trials has a label; label them first")
+    trial, frame, condition, day = zip(*rows, strict=True)
+    return FrameSet(
+        encoding=encoding,
+        images=torch.cat(images),
+        safety_margin=torch.from_numpy(np.concatenate(labels)).float(),
+        trial=trial,
+        frame=frame,
+        condition=condition,
+        day=day,
+        time_s=np.concatenate(times),
+    )

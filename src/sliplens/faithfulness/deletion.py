@@ -1,0 +1,179 @@
+"""The deletion score of the thesis: remove the most salient pixels and watch the answer."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64, Int
+from torch import Tensor
+
+from sliplens.arrays import require_saliency
+from sliplens.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeletionCurves:
+    """Answers of a network while pixels are removed, for several images.
+
+    Attributes
+    ----------
+    pixels_removed
+        Pixels that are gone at each step.
+    base, predictions
+        Answer on the whole image, and at each step, in margin units.
+    """
+
+    pixels_removed: Int[np.ndarray, " steps"]
+    base: Float64[np.ndarray, " images"]
+    predictions: Float64[np.ndarray, "images steps"]
+
+    @property
+    def scores(self) -> Float64[np.ndarray, "images steps"]:
+        """Deletion score D at each step."""
+        return deletion_score(self.base[:, None], self.predictions)
+
+    @property
+    def auc(self) -> Float64[np.ndarray, " images"]:
+        """D_AUC of each image: the mean of D over the steps."""
+        return self.scores.mean(axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeletionSummary:
+    """Mean and population standard deviation of D_AUC over images, as in Table 2 of the thesis."""
+
+    mean: float
+    sd: float
+    images: int
+
+
+def deletion_score(
+    base: Float[np.ndarray, "*shape"], masked: Float[np.ndarray, "*shape2"]
+) -> Float[np.ndarray, "*shape3"]:
+    """Deletion score D = (1 - |y_base - y_mask|)^2 of answers in margin units; lower means more was destroyed.
+
+    References
+    ----------
+    Polak, eq. 2 (there in percent, hence divided by 100).
+    """
+    return (1 - np.abs(base - masked)) ** 2
+
+
+def summarise_deletion(auc: Float[np.ndarray, " images"]) -> DeletionSummary:
+    """Mean and population standard deviation of D_AUC over images.
+
+    Raises
+    ------
+    InputError
+        If there is no image.
+    """
+    if len(auc) == 0:
+        raise InputError("there is no deletion curve to summarise; explain and score some frames first")
+    return DeletionSummary(mean=float(np.mean(auc)), sd=float(np.std(auc)), images=len(auc))
+
+
+def deletion_order(saliency: Float[np.ndarray, "height width"]) -> Int[np.ndarray, " pixels"]:
+    """Flat pixel indices from most to least salient.
+
+    Ties go to the later pixel first: the order of an ascending stable sort read backwards, which is what the recorded
+    masks of the thesis show.
+    """
+    return np.argsort(saliency.ravel(), kind="stable")[::-1].copy()
+
+
+def random_order(shape: tuple[int, int], *, rng: np.random.Generator) -> Int[np.ndarray, " pixels"]:
+    """Flat pixel indices in random order: the control that every explanation has to beat."""
+    return rng.permutation(shape[0] * shape[1])
+
+
+def deletion_images(
+    image: Float[Tensor, "3 height width"],
+    fill: Float[Tensor, "3 height width"],
+    order: Int[np.ndarray, " pixels"],
+    *,
+    pixels_removed: Int[np.ndarray, " steps"],
+) -> Float[Tensor, "steps 3 height width"]:
+    """Images with the first pixels of an order replaced by the fill.
+
+    Parameters
+    ----------
+    image, fill
+        The network's input, and what a removed pixel becomes.
+    order
+        Flat pixel indices, first to be removed first.
+    pixels_removed
+        How many pixels are gone in each image returned.
+    """
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    gone = torch.from_numpy(rank.reshape(image.shape[1:]) < np.asarray(pixels_removed)[:, None, None])
+    return torch.where(gone[:, None].to(image.device), fill, image)
+
+
+def deletion_steps(shape: tuple[int, int], *, steps: int | None = None) -> Int[np.ndarray, " steps"]:
+    """Pixels removed at each step: as many steps as the image is high, the last of which removes all.
+
+    References
+    ----------
+    Polak, section 4 (n_masks = 224 for a 224 x 224 image: 224 steps of 224 pixels).
+    """
+    pixels = shape[0] * shape[1]
+    count = steps or shape[0]
+    if not 1 <= count <= pixels:
+        raise InputError(f"deletion in {count} steps is impossible with {pixels} pixels; choose 1 to {pixels}")
+    return np.round(np.linspace(0, pixels, count + 1)[1:]).astype(np.int64)
+
+
+def deletion_curves(
+    predict: Callable[[Tensor], Tensor],
+    images: Float[Tensor, "images 3 height width"],
+    orders: Int[np.ndarray, "images pixels"],
+    *,
+    fill: Callable[[Tensor], Tensor],
+    steps: int | None = None,
+    batch_size: int = 128,
+    on_image: Callable[[int, int], None] | None = None,
+) -> DeletionCurves:
+    """Answers of a network while pixels are removed in a given order.
+
+    Parameters
+    ----------
+    predict
+        From inputs (batch, 3, height, width) to answers (batch,), in margin units.
+    images
+        Inputs in [0, 1].
+    orders
+        Flat pixel indices for each image, first to be removed first (`deletion_order`, `random_order`).
+    fill
+        From inputs to what their removed pixels become (`get_fill`).
+    steps
+        Number of steps; the image's height if None, as in the thesis.
+    batch_size
+        Masked images that are made and answered at a time: bounds the memory.
+    on_image
+        Called with the number of images done and the number of all.
+    """
+    removed = deletion_steps((images.shape[-2], images.shape[-1]), steps=steps)
+    base = predict(images).double().cpu().numpy()
+    fills = fill(images)
+    curves = []
+    for index, (image, image_fill, order) in enumerate(zip(images, fills, orders, strict=True)):
+        answers = [
+            predict(deletion_images(image, image_fill, order, pixels_removed=chunk)).double().cpu().numpy()
+            for chunk in np.split(removed, range(batch_size, len(removed), batch_size))
+        ]
+        curves.append(np.concatenate(answers))
+        if on_image is not None:
+            on_image(index + 1, len(images))
+    return DeletionCurves(pixels_removed=removed, base=base, predictions=np.stack(curves))
+
+
+def saliency_orders(saliency: Float[np.ndarray, "images height width"], shape: tuple[int, int]) -> np.ndarray:
+    """Deletion orders of several maps, each checked against the image's shape and for NaN."""
+    return np.stack(
+        [
+            deletion_order(require_saliency(one, shape, where=f"saliency map {index}"))
+            for index, one in enumerate(saliency)
+        ]
+    )

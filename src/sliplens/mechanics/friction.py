@@ -1,0 +1,79 @@
+"""The friction cone: how much of the available friction is left."""
+
+import numpy as np
+from jaxtyping import Float
+
+from sliplens.errors import ContactError
+from sliplens.mechanics.hertz import Numbers, require_not_negative, require_positive
+
+
+def safety_margin(
+    normal_force_n: Numbers, tangential_force_n: Numbers, friction_coefficient: Numbers
+) -> Float[np.ndarray, "..."]:
+    """Safety margin Gamma = 1 - F_t / (mu F_n), clipped to [0, 1]; NaN where nothing presses.
+
+    1 is a contact without tangential load, 0 the onset of full slip. It is not the share of the contact that sticks;
+    see `stick_ratio`.
+
+    Parameters
+    ----------
+    normal_force_n
+        Normal force F_n in newtons, positive when pressing.
+    tangential_force_n
+        Magnitude F_t of the tangential force, in newtons.
+    friction_coefficient
+        Coefficient of friction mu.
+
+    Raises
+    ------
+    ContactError
+        If a force is negative or a coefficient is not positive.
+
+    References
+    ----------
+    Polak, *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning*, eq. 1 (right-hand side).
+    """
+    normal = np.asarray(require_not_negative(normal_force_n, name="normal force", unit="N"))
+    tangential = require_not_negative(tangential_force_n, name="tangential force", unit="N")
+    if not np.all(np.asarray(friction_coefficient) > 0):
+        raise ContactError(
+            f"the coefficient of friction must be positive, got {np.min(friction_coefficient):.3g}; "
+            "measure it at the onset of slip"
+        )
+    capacity = normal * friction_coefficient
+    pressing = capacity > 0
+    used = tangential / np.where(pressing, capacity, 1)
+    return np.where(pressing, np.clip(1 - used, 0, 1), np.nan)
+
+
+def stick_ratio(safety_margin: Numbers, *, profile_exponent: float = 2.0) -> Float[np.ndarray, "..."]:
+    """Share of the contact area that sticks, Gamma^(2 / (n + 1)); Gamma^(2/3) for a sphere on a flat.
+
+    Holds for a contact of revolution whose gap grows as r^n, pressed first and pulled after, with the same law of
+    friction everywhere (Cattaneo, Mindlin, Jaeger). A cone (n = 1) is the only profile for which the stick ratio is the
+    safety margin itself. A grip that grows in proportion with its load sticks fully and does not obey this law.
+
+    Parameters
+    ----------
+    safety_margin
+        Gamma, 0 to 1; NaN where nothing presses stays NaN.
+    profile_exponent
+        Exponent n of the gap; 2 for a sphere.
+
+    Raises
+    ------
+    ContactError
+        If a margin lies outside [0, 1] or the exponent is not positive.
+
+    References
+    ----------
+    Johnson (1985), section 7.2 (sphere: c/a = Gamma^(1/3)); Jaeger, *J. Tribol.* 120 (1998) 677 (other profiles).
+    """
+    require_positive(profile_exponent, name="profile exponent", unit="(no unit)")
+    margin = np.asarray(safety_margin, dtype=np.float64)
+    if np.any((margin < 0) | (margin > 1)):
+        raise ContactError(
+            f"safety margins must lie in [0, 1], got {np.nanmin(margin):.3g} to {np.nanmax(margin):.3g}; "
+            "give them as fractions, not in percent"
+        )
+    return np.asarray(margin ** (2 / (profile_exponent + 1)))

@@ -1,0 +1,142 @@
+"""Checkpoints: safetensors for the weights, a JSON manifest for what they are."""
+
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from sliplens.datasets import Encoding, get_encoding
+from sliplens.errors import CheckpointError, ImageError
+from sliplens.models.backbones import build_model
+from sliplens.provenance import hash_file, read_json, require_folder, write_json
+
+WEIGHTS_FILE = "model.safetensors"
+MANIFEST_FILE = "manifest.json"
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manifest:
+    """What a checkpoint is: enough to feed it right, and to tell where it comes from."""
+
+    backbone: str
+    input: str
+    image_size: int
+    frame_size: tuple[int, int]
+    sensor: str
+    data_hash: str
+    target: str = "safety_margin"
+    weights_sha256: str = ""
+    schema_version: int = SCHEMA_VERSION
+    metrics: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainedModel:
+    """A network with its manifest; in evaluation mode."""
+
+    model: nn.Module
+    manifest: Manifest
+
+    @property
+    def encoding(self) -> Encoding:
+        """The input the network was trained on."""
+        return get_encoding(self.manifest.input)
+
+    def encode(
+        self, frames: UInt8[np.ndarray, "batch height width 3"], reference: UInt8[np.ndarray, "_ _ 3"]
+    ) -> Float[Tensor, "batch 3 size size"]:
+        """Encode frames as the network was trained on them.
+
+        Raises
+        ------
+        ImageError
+            If the frames are not of the size the network's sensor has.
+        """
+        self.require_frame_size(frames.shape[1:3])
+        return self.encoding.encode(frames, reference, image_size=self.manifest.image_size)
+
+    def require_frame_size(self, size: tuple[int, ...]) -> None:
+        """Refuse frames of another sensor.
+
+        Raises
+        ------
+        ImageError
+            Naming both sizes.
+        """
+        if tuple(size) != tuple(self.manifest.frame_size):
+            raise ImageError(
+                f"frames are {size[0]} x {size[1]} pixels but the network was trained on "
+                f"{self.manifest.frame_size[0]} x {self.manifest.frame_size[1]}; use frames of the same sensor"
+            )
+
+    @torch.no_grad()
+    def predict(self, inputs: Float[Tensor, "batch 3 size size"], *, batch_size: int = 64) -> Float[Tensor, " batch"]:
+        """Safety margin of encoded frames; not clipped, so that an answer outside [0, 1] shows as what it is."""
+        answers = [self.model(batch).reshape(len(batch)) for batch in inputs.split(batch_size)]
+        return torch.cat(answers) if answers else torch.empty(0)
+
+
+def save_checkpoint(folder: Path, model: nn.Module, manifest: Manifest) -> None:
+    """Write weights and manifest into a folder; the manifest, which makes it a checkpoint, comes last."""
+    weights = folder / WEIGHTS_FILE
+    part = weights.with_name(weights.name + ".part")
+    save_file({name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}, part)
+    part.replace(weights)
+    write_json(folder / MANIFEST_FILE, asdict(manifest) | {"weights_sha256": hash_file(weights)})
+
+
+def load_checkpoint(folder: Path, *, device: str = "cpu") -> TrainedModel:
+    """Load a checkpoint written by `save_checkpoint`.
+
+    Raises
+    ------
+    InputError
+        If the folder or its manifest is missing.
+    CheckpointError
+        If the manifest is of another schema, the weights were changed or damaged, or they do not fit the backbone.
+    """
+    require_folder(folder, what="the run")
+    manifest = _read_manifest(folder / MANIFEST_FILE)
+    weights = folder / WEIGHTS_FILE
+    if not weights.is_file():
+        raise CheckpointError(f"{weights} is missing; train the network again or copy the whole folder")
+    if hash_file(weights) != manifest.weights_sha256:
+        raise CheckpointError(f"{weights} is not the file its manifest describes; copy the whole folder again")
+    model = build_model(manifest.backbone)
+    try:
+        model.load_state_dict(load_file(weights, device="cpu"))
+    except (SafetensorError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise CheckpointError(f"{weights} does not hold a {manifest.backbone} with one output ({reason})") from None
+    # channels last: depthwise convolutions run up to half as fast again on a CPU
+    model = model.to(device, memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
+    return TrainedModel(model=model, manifest=manifest)
+
+
+def _read_manifest(path: Path) -> Manifest:
+    values = read_json(path)
+    if not isinstance(values, dict) or values.get("schema_version") != SCHEMA_VERSION:
+        raise CheckpointError(f"{path} is not a sliplens manifest of schema {SCHEMA_VERSION}")
+    known = {item.name for item in fields(Manifest)}
+    missing = {"backbone", "input", "image_size", "frame_size", "weights_sha256"} - set(values)
+    if missing:
+        raise CheckpointError(f"{path} is incomplete (it lacks {', '.join(sorted(missing))}); train the network again")
+    size, frame = values["image_size"], values["frame_size"]
+    if not isinstance(size, int) or not isinstance(frame, list) or [type(side) for side in frame] != [int, int]:
+        raise CheckpointError(f"{path} gives no usable image_size or frame_size; train the network again")
+    try:
+        manifest = Manifest(
+            **{name: value for name, value in values.items() if name in known} | {"frame_size": tuple(frame)}
+        )
+    except TypeError as error:
+        raise CheckpointError(f"{path} is incomplete ({error}); train the network again") from None
+    get_encoding(manifest.input)
+    return manifest

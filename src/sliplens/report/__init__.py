@@ -1,0 +1,27 @@
+"""The report of a workspace: figures, tables and one page, from saved results only."""
+
+from sliplens.report.figures import (
+    plot_bins,
+    plot_faithfulness,
+    plot_learning_curves,
+    plot_margin_over_time,
+    plot_predictions,
+)
+from sliplens.report.overlay import overlay_saliency, plot_colour_bar, plot_overlay
+from sliplens.report.page import build_report
+from sliplens.report.records import Results
+from sliplens.report.results import load_results
+
+__all__ = [
+    "Results",
+    "build_report",
+    "load_results",
+    "overlay_saliency",
+    "plot_bins",
+    "plot_colour_bar",
+    "plot_faithfulness",
+    "plot_learning_curves",
+    "plot_margin_over_time",
+    "plot_overlay",
+    "plot_predictions",
+]

@@ -1,0 +1,122 @@
+"""Names, colours and drawing style that all figures and tables share."""
+
+from collections.abc import Iterable
+from contextlib import AbstractContextManager
+from typing import Any
+
+import matplotlib as mpl
+from cycler import cycler
+
+# Okabe and Ito's palette, told apart under every common colour blindness
+BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILLION, PURPLE = (
+    "#000000", "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
+)  # fmt: skip
+GREY = "#6B7280"
+
+INPUT_NAMES = {"raw": "Raw images", "difference": "Difference images"}
+INPUT_COLOURS = {"raw": ORANGE, "difference": BLUE}
+SOURCE_NAMES = {"simulated": "simulated touch", "real": "real touch"}
+
+CONTROL = "random"
+METHOD_NAMES = {
+    "grad-cam": "Grad-CAM",
+    "integrated-gradients": "Integrated Gradients",
+    "poly-cam": "Poly-CAM",
+    CONTROL: "Random order (control)",
+}
+METHOD_COLOURS = {"grad-cam": VERMILLION, "integrated-gradients": SKY, "poly-cam": GREEN, CONTROL: BLACK}
+METHOD_LINES = {"grad-cam": "-", "integrated-gradients": "--", "poly-cam": "-.", CONTROL: ":"}
+
+_STYLE: Any = {
+    # letters as outlines: the page looks the same wherever it is opened
+    "svg.fonttype": "path",
+    "svg.hashsalt": "sliplens",
+    "font.family": "DejaVu Sans",
+    "font.size": 10,
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelsize": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#9CA3AF",
+    "axes.labelcolor": "#1F2937",
+    "axes.titlecolor": "#1F2937",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.prop_cycle": cycler(color=[BLUE, ORANGE, GREEN, VERMILLION, PURPLE, SKY]),
+    "grid.color": "#E5E7EB",
+    "grid.linewidth": 0.8,
+    "xtick.color": "#4B5563",
+    "ytick.color": "#4B5563",
+    "xtick.labelsize": 9,
+    "ytick.labelsize": 9,
+    "legend.fontsize": 9,
+    "legend.frameon": False,
+    "legend.handlelength": 2.4,
+    "lines.linewidth": 1.8,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+}
+
+
+def drawing_style() -> AbstractContextManager[None]:
+    """Draw and save figures in the style of the report; matplotlib's own settings come back afterwards."""
+    return mpl.rc_context(_STYLE)
+
+
+def input_name(name: str) -> str:
+    """Name of an input as a reader sees it."""
+    return INPUT_NAMES.get(name, f"{name.capitalize()} images")
+
+
+def short_input_name(name: str) -> str:
+    """Name of an input for the legend of a picture that is about images anyway."""
+    return input_name(name).removesuffix(" images")
+
+
+def method_name(name: str) -> str:
+    """Name of a method as a reader sees it."""
+    return METHOD_NAMES.get(name, name)
+
+
+def source_name(name: str) -> str:
+    """Name of the frames' origin as a reader sees it."""
+    return SOURCE_NAMES.get(name, name)
+
+
+def in_order(names: Iterable[str], known: Iterable[str]) -> list[str]:
+    """Sort names: the known ones in their own order, then the others by the alphabet."""
+    rank = {name: index for index, name in enumerate(known)}
+    return sorted(names, key=lambda name: (rank.get(name, len(rank)), name))
+
+
+def inputs_in_order(names: Iterable[str]) -> list[str]:
+    """Raw before difference, as in the thesis."""
+    return in_order(set(names), INPUT_NAMES)
+
+
+def methods_in_order(names: Iterable[str]) -> list[str]:
+    """Methods as in the thesis, the control last."""
+    found = set(names)
+    return [*in_order(found - {CONTROL}, METHOD_NAMES), *(found & {CONTROL})]
+
+
+def conditions_in_order(names: Iterable[str]) -> list[str]:
+    """Dry before wet before any other."""
+    return in_order(set(names), ("dry", "wet"))
+
+
+def percent(value: float | None, *, digits: int = 0) -> str:
+    """Write a share as a percentage, or a dash where it is not known."""
+    return "–" if value is None else f"{100 * value:.{digits}f}\N{NO-BREAK SPACE}%"  # noqa: RUF001 (an en dash is meant)
+
+
+def signed(value: float, digits: int) -> str:
+    """Write a number with its sign."""
+    return f"{value:+.{digits}f}".replace("-", "\N{MINUS SIGN}")
+
+
+def decimals(value: float | None, digits: int) -> str:
+    """Write a number, or a dash where it is not known."""
+    return "–" if value is None else f"{value:.{digits}f}"  # noqa: RUF001 (an en dash is meant)

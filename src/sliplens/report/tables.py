@@ -1,0 +1,204 @@
+"""Tables of the page: cells as text, so that the template only lays them out."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sliplens.report.compare import Difference, compare_deletion
+from sliplens.report.records import Results, Scored
+from sliplens.report.style import (
+    CONTROL,
+    conditions_in_order,
+    decimals,
+    input_name,
+    inputs_in_order,
+    method_name,
+    methods_in_order,
+    percent,
+    short_input_name,
+    signed,
+)
+from sliplens.report.thesis import ACCURACY, DELETION, MARK, NETWORK_PIXELS, SECONDS
+
+Kind = Literal["name", "number", "best", "thesis"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """Text of a cell, and what it is: a name, a number, the best number of its group, or a figure of the thesis."""
+
+    text: str
+    kind: Kind = "number"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A table with its caption."""
+
+    caption: str
+    head: tuple[Cell, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+
+def table_accuracy(results: Results) -> Table:
+    """Tabulate MSE, R2 and MAE by condition and input (thesis, Table 1)."""
+    rows = []
+    for condition in conditions_in_order(name for one in results.evaluations.values() for name in one.conditions):
+        scores = {
+            name: results.evaluations[name].conditions[condition]
+            for name in inputs_in_order(results.evaluations)
+            if condition in results.evaluations[name].conditions
+        }
+        lowest = min(score.mse for score in scores.values())
+        for name, score in scores.items():
+            thesis = ACCURACY.get((name, condition), (None, None))
+            kind: Kind = "best" if score.mse == lowest and len(scores) > 1 else "number"
+            rows.append(
+                (
+                    Cell(text=condition.capitalize(), kind="name"),
+                    Cell(text=input_name(name), kind="name"),
+                    Cell(text=decimals(score.mse, 4), kind=kind),
+                    Cell(text=decimals(thesis[0], 4), kind="thesis"),
+                    Cell(text=decimals(score.r2, 3)),
+                    Cell(text=decimals(thesis[1], 2), kind="thesis"),
+                    Cell(text=decimals(100 * score.mae, 1)),
+                    Cell(text=f"{score.frames} / {score.trials}"),
+                )
+            )
+    return Table(
+        caption="How well each network reads the safety margin on test trials. MSE in squared margin units (Γ from 0 "
+        "to 1), MAE in percentage points of Γ; the lower MSE of each condition is bold. Grey columns: the "
+        f"{MARK}.",
+        head=_head("Objects", "Input", "MSE", "MSE, thesis", "R²", "R², thesis", "MAE (points)", "Frames / trials"),
+        rows=tuple(rows),
+    )
+
+
+def table_deletion(scores: dict[str, Scored], *, rng: np.random.Generator) -> Table:
+    """Tabulate the deletion score by input and method, with the random control (thesis, Table 2)."""
+    rows = []
+    for name in inputs_in_order(scores):
+        scored = scores[name]
+        lowest = min((score.mean for method, score in scored.methods.items() if method != CONTROL), default=None)
+        for method in methods_in_order(scored.methods):
+            score = scored.methods[method]
+            thesis = DELETION.get((name, method))
+            rows.append(
+                (
+                    Cell(text=input_name(name), kind="name"),
+                    Cell(text=method_name(method), kind="name"),
+                    Cell(text=_spread(score.mean, score.sd), kind="best" if score.mean == lowest else "number"),
+                    Cell(text=_gap(against_control(scored, method, rng=rng))),
+                    Cell(text=decimals(score.last_step_mean, 3)),
+                    Cell(text=_spread(*thesis) if thesis else decimals(None, 3), kind="thesis"),
+                    Cell(text=str(score.frames)),
+                )
+            )
+    sources = " and ".join(sorted({source_name(scored.source) for scored in scores.values()}))
+    return Table(
+        caption=f"Deletion score D on {sources}, averaged over all steps, mean ± standard deviation over frames; lower = more "
+        "faithful, and the lowest of each input is bold. “Against random”: mean difference from the random control "
+        "with a 95 % interval (frames resampled); below zero = better than chance. “Last step”: D once every pixel is "
+        f"filled, which no map has a part in. Grey column: the {MARK}.",
+        head=_head("Input", "Method", "Score D", "Against random", "Last step", "Score D, thesis", "Frames"),
+        rows=tuple(rows),
+    )
+
+
+def against_control(scored: Scored, method: str, *, rng: np.random.Generator) -> Difference | None:
+    """Difference of a method's D_AUC from the random control's; None for the control itself or without one."""
+    if method == CONTROL or not {method, CONTROL} <= set(scored.curves):
+        return None
+    return compare_deletion(scored.curves[method], scored.curves[CONTROL], rng=rng)
+
+
+def table_timing(results: Results) -> Table:
+    """Tabulate the seconds a frame of each method, one column for each input and origin of the frames."""
+    keys = sorted(results.explanations, key=lambda key: (key[1] == "real", key[0] != "raw", key))
+    explained = {key: results.explanations[key] for key in keys}
+    sides = sorted({one.image_size for one in explained.values()})
+    rows = [
+        (
+            Cell(text=method_name(method), kind="name"),
+            *(
+                Cell(text=decimals(one.methods[method].seconds_per_frame if method in one.methods else None, 3))
+                for one in explained.values()
+            ),
+            Cell(text=decimals(SECONDS.get(method), 3), kind="thesis"),
+        )
+        for method in methods_in_order(name for one in explained.values() for name in one.methods)
+    ]
+    return Table(
+        caption=f"Seconds to explain one frame, images of {' and '.join(map(str, sides))} px. The thesis timed images "
+        f"of {NETWORK_PIXELS} px on an RTX 3060 Ti and did not wait for the GPU to finish, so its seconds show the "
+        "order of magnitude only.",
+        head=_head("Method", *(f"{short_input_name(name)}, {source}" for name, source in keys), "Thesis"),
+        rows=tuple(rows),
+    )
+
+
+def table_real(results: Results) -> Table:
+    """Tabulate label and answers of each real frame."""
+    explained = {name: one for (name, source), one in results.explanations.items() if source == "real"}
+    names = inputs_in_order(explained)
+    found = {name: {frame.id: frame for frame in explained[name].frames} for name in names}
+    frames = {frame.id: frame for name in names for frame in explained[name].frames}
+    rows = []
+    for frame in sorted(frames.values(), key=lambda one: (-(one.safety_margin or 0), one.id)):
+        answers = [found[name].get(frame.id) for name in names]
+        rows.append(
+            (
+                Cell(text=frame.id, kind="name"),
+                Cell(text=frame.condition.capitalize(), kind="name"),
+                Cell(text=percent(frame.safety_margin)),
+                *(Cell(text=percent(None if answer is None else answer.prediction)) for answer in answers),
+            )
+        )
+    return Table(
+        caption=f"{len(rows)} real frames: the recorded safety margin, and what each network reads.",
+        head=_head("Frame", "Objects", "True Γ", *(f"Read from {input_name(name).lower()}" for name in names)),
+        rows=tuple(rows),
+    )
+
+
+def table_training(results: Results) -> Table:
+    """Tabulate how each network was trained."""
+    trainings = {name: results.trainings[name] for name in inputs_in_order(results.trainings)}
+    facts = {
+        "Backbone": lambda one: one.backbone,
+        "Image side (camera)": lambda one: f"{one.image_size} px ({' x '.join(map(str, one.frame_size)) or 'unknown'})",
+        "Frames: training / validation": lambda one: f"{_whole(one.train_frames)} / {_whole(one.validation_frames)}",
+        "Epochs": lambda one: decimals(one.epochs, 1),
+        "Minutes": lambda one: decimals(one.minutes, 1),
+        "Stopped by": lambda one: one.stopped_by,
+        "Best validation MSE": lambda one: decimals(one.best_validation_mse, 4),
+        "Parameters": lambda one: _whole(one.parameters),
+        "Seed": lambda one: _whole(one.seed),
+    }
+    return Table(
+        caption="How the networks were trained.",
+        head=_head("", *(input_name(name) for name in trainings)),
+        rows=tuple(
+            (Cell(text=fact, kind="name"), *(Cell(text=tell(one)) for one in trainings.values()))
+            for fact, tell in facts.items()
+        ),
+    )
+
+
+def _head(*texts: str) -> tuple[Cell, ...]:
+    return tuple(Cell(text=text, kind="thesis" if "thesis" in text.lower() else "name") for text in texts)
+
+
+def _spread(mean: float, sd: float) -> str:
+    return f"{mean:.3f} ± {sd:.3f}"
+
+
+def _gap(difference: Difference | None) -> str:
+    if difference is None:
+        return decimals(None, 3)
+    return f"{signed(difference.estimate, 3)} ({signed(difference.low, 3)} to {signed(difference.high, 3)})"
+
+
+def _whole(value: int | None) -> str:
+    return decimals(None, 0) if value is None else f"{value:,}".replace(",", " ")

@@ -1,0 +1,209 @@
+"""What differs between days, sensors, trials and frames, and how it is drawn."""
+
+from dataclasses import dataclass, fields
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+
+from sliplens.errors import ContactError
+
+Range: TypeAlias = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nuisances:
+    """Ranges of everything a network must not rely on, each (low, high) and drawn evenly.
+
+    The friction is drawn apart from the normal force: were they tied, the lens of contact alone would tell the safety
+    margin. Offsets and depths are in dome radii, angles in degrees, image lengths in pixels, brightness in grey levels.
+
+    Raises
+    ------
+    ContactError
+        If a range is not finite, runs downwards, or holds a value that cannot occur.
+    """
+
+    dry_friction: Range = (0.5, 1.2)
+    """By day; days are spread over the range."""
+    dry_friction_factor: Range = (0.9, 1.1)
+    """By trial, of the day's friction."""
+    wet_friction: Range = (0.15, 0.7)
+    wet_friction_drift: Range = (-0.15, 0.15)
+    """Relative change over a wet trial."""
+    kinetic_ratio: Range = (0.7, 0.9)
+    """Kinetic over static friction."""
+    normal_force_n: Range = (0.5, 2.0)
+    normal_force_drift: Range = (-0.05, 0.05)
+    modulus_factor: Range = (0.8, 1.2)
+    contact_offset: Range = (0.0, 0.12)
+    tilt_deg: Range = (-5.0, 5.0)
+    shear_direction_deg: Range = (75.0, 105.0)
+    """90 pulls down the image, as the thesis does."""
+    shear_exponent: Range = (0.5, 0.7)
+    creep: Range = (0.03, 0.08)
+    creep_time_s: Range = (0.5, 3.0)
+    white_balance: Range = (0.95, 1.05)
+    gain: Range = (0.9, 1.1)
+    illumination_gradient: Range = (0.0, 0.25)
+    """Brightness lost across the image, in a direction drawn by day."""
+    camera_shift_px: Range = (-3.0, 3.0)
+    camera_rotation_deg: Range = (-3.0, 3.0)
+    marker_jitter_px: float = 0.4
+    """Standard deviation of the markers' centres, by sensor."""
+    marker_radius: Range = (0.95, 1.05)
+    marker_contrast: Range = (0.85, 1.15)
+    blur_px: Range = (0.0, 1.0)
+    veil: Range = (2.0, 5.0)
+    """Grey levels by which the whole image brightens in contact."""
+    glow: Range = (2.0, 8.0)
+    """Grey levels by which the contact brightens beyond that."""
+
+    def __post_init__(self) -> None:
+        """Check that every range can be drawn from."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            low, high = value if isinstance(value, tuple) else (value, value)
+            if not (np.isfinite(low) and np.isfinite(high) and low <= high):
+                raise ContactError(f"the range of {field.name} is {value}; give a finite low, then a high")
+            if field.name in _POSITIVE and low <= 0:
+                raise ContactError(f"{field.name} must be positive, got {low:.3g}; raise its lower end")
+
+
+_POSITIVE = frozenset(
+    {"dry_friction", "dry_friction_factor", "wet_friction", "kinetic_ratio", "normal_force_n", "modulus_factor",
+     "shear_exponent", "creep_time_s", "white_balance", "gain", "marker_radius", "marker_contrast"}
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Day:
+    """What stays the same for a day: the friction of the dry object, the gel's stiffness, light and camera."""
+
+    friction: float = 0.775
+    modulus_factor: float = 1.0
+    gain: float = 1.0
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    gradient: float = 0.0
+    gradient_direction_rad: float = 0.0
+    camera_shift_px: tuple[float, float] = (0.0, 0.0)
+    camera_rotation_rad: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unit:
+    """What stays the same for one built sensor: where its markers came to lie, their size and dye."""
+
+    marker_jitter_px: Float[np.ndarray, "markers 2"]
+    radius_factor: Float[np.ndarray, " markers"]
+    contrast_factor: Float[np.ndarray, " markers"]
+    texture_seed: int
+    """Of the grain of its print."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grasp:
+    """What stays the same for one trial; the defaults are the trial of the real images, as far as they tell."""
+
+    friction: float = 0.775
+    """The images name none: the geometric mean of the dry range (assumed)."""
+    friction_drift: float = 0.0
+    kinetic_ratio: float = 1.0
+    normal_force_n: float = 1.86
+    """What gives the fitted radius of contact with the sensor's nominal modulus."""
+    normal_force_drift: float = 0.0
+    contact_offset: tuple[float, float] = (0.088, -0.015)
+    tilt_rad: tuple[float, float] = (0.0, 0.0)
+    shear_direction_rad: float = 1.551
+    shear_exponent: float = 0.514
+    creep: float = 0.0
+    creep_time_s: float = 1.0
+    blur_px: float = 0.0
+    veil: tuple[float, float, float] = (3.5, 3.3, 3.0)
+    glow: tuple[float, float, float] = (5.0, 4.5, 3.5)
+
+
+def nominal_unit(markers: int) -> Unit:
+    """Sensor built exactly as drawn, with so many markers."""
+    ones = np.ones(markers)
+    return Unit(marker_jitter_px=np.zeros((markers, 2)), radius_factor=ones, contrast_factor=ones, texture_seed=0)
+
+
+def draw_day(nuisances: Nuisances, *, quantile: float, rng: np.random.Generator) -> Day:
+    """Draw a day.
+
+    Parameters
+    ----------
+    nuisances
+        The ranges.
+    quantile
+        Where in its range the day's dry friction lies, 0 to 1; the caller spreads the days.
+    rng
+        Source of everything else.
+    """
+    low, high = nuisances.dry_friction
+    return Day(
+        friction=low + quantile * (high - low),
+        modulus_factor=rng.uniform(*nuisances.modulus_factor),
+        gain=rng.uniform(*nuisances.gain),
+        white_balance=_three(rng, nuisances.white_balance),
+        gradient=rng.uniform(*nuisances.illumination_gradient),
+        gradient_direction_rad=rng.uniform(-np.pi, np.pi),
+        camera_shift_px=(rng.uniform(*nuisances.camera_shift_px), rng.uniform(*nuisances.camera_shift_px)),
+        camera_rotation_rad=float(np.radians(rng.uniform(*nuisances.camera_rotation_deg))),
+    )
+
+
+def draw_unit(nuisances: Nuisances, *, markers: int, rng: np.random.Generator) -> Unit:
+    """Draw a built sensor with so many markers."""
+    return Unit(
+        marker_jitter_px=rng.normal(0, nuisances.marker_jitter_px, (markers, 2)),
+        # one factor for the whole print, and a little for each marker
+        radius_factor=rng.uniform(*nuisances.marker_radius) * rng.normal(1, 0.01, markers),
+        contrast_factor=rng.uniform(*nuisances.marker_contrast) * rng.normal(1, 0.03, markers),
+        texture_seed=int(rng.integers(2**32)),
+    )
+
+
+def draw_grasp(nuisances: Nuisances, *, day: Day, wet: bool, rng: np.random.Generator) -> Grasp:
+    """Draw a trial of a day.
+
+    Parameters
+    ----------
+    nuisances
+        The ranges.
+    day
+        The day, for its dry friction.
+    wet
+        Draw the friction of a wet object, with its drift.
+    rng
+        Source of the draws.
+    """
+    # every trial draws the same number of times, so that dry and wet twins differ in friction alone
+    dry_factor, wet_friction = rng.uniform(*nuisances.dry_friction_factor), rng.uniform(*nuisances.wet_friction)
+    drift = rng.uniform(*nuisances.wet_friction_drift)
+    reach, bearing = rng.uniform(*nuisances.contact_offset), rng.uniform(-np.pi, np.pi)
+    return Grasp(
+        friction=wet_friction if wet else day.friction * dry_factor,
+        friction_drift=drift if wet else 0.0,
+        kinetic_ratio=rng.uniform(*nuisances.kinetic_ratio),
+        normal_force_n=rng.uniform(*nuisances.normal_force_n),
+        normal_force_drift=rng.uniform(*nuisances.normal_force_drift),
+        contact_offset=(float(reach * np.cos(bearing)), float(reach * np.sin(bearing))),
+        tilt_rad=(
+            float(np.radians(rng.uniform(*nuisances.tilt_deg))),
+            float(np.radians(rng.uniform(*nuisances.tilt_deg))),
+        ),
+        shear_direction_rad=float(np.radians(rng.uniform(*nuisances.shear_direction_deg))),
+        shear_exponent=rng.uniform(*nuisances.shear_exponent),
+        creep=rng.uniform(*nuisances.creep),
+        creep_time_s=rng.uniform(*nuisances.creep_time_s),
+        blur_px=rng.uniform(*nuisances.blur_px),
+        veil=_three(rng, nuisances.veil),
+        glow=_three(rng, nuisances.glow),
+    )
+
+
+def _three(rng: np.random.Generator, limits: Range) -> tuple[float, float, float]:
+    first, second, third = rng.uniform(*limits, size=3)
+    return float(first), float(second), float(third)

@@ -1,0 +1,169 @@
+"""Which trials are simulated, on which day, and what they are for."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sliplens.errors import InputError
+from sliplens.simulation.loading import MINIMUM_FRAMES
+from sliplens.simulation.nuisances import Day, Nuisances, draw_day
+
+_VALIDATION_SHARE = 0.25
+# branches of the seed: what is drawn for one never moves what is drawn for another
+_DAYS, _UNITS, _TRIALS = range(3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationRecipe:
+    """All that shapes a simulated data set; the same recipe gives the same bytes on the same machine.
+
+    The days and splits follow the thesis: the first day and three quarters of the dry trials of the days between train,
+    the other quarter validates, the test day tests. Wet trials are all of the test day.
+
+    Raises
+    ------
+    InputError
+        If a number is out of range, or the trials cannot fill every split.
+    """
+
+    dry_trials: int = 40
+    wet_trials: int = 10
+    frames_per_trial: int = 200
+    days: int = 4
+    test_day: int | None = None
+    """The last day if None."""
+    sensors: int = 2
+    seed: int = 0
+    nuisances: Nuisances = field(default_factory=Nuisances)
+
+    def __post_init__(self) -> None:
+        """Check that the recipe can be followed."""
+        least = {
+            "dry_trials": (self.dry_trials, 3, "training, validation and test need one each"),
+            "wet_trials": (self.wet_trials, 0, "ask for none or more"),
+            "frames_per_trial": (self.frames_per_trial, MINIMUM_FRAMES, "every phase of the load needs a frame"),
+            "days": (self.days, 2, "the test needs a day of its own"),
+            "sensors": (self.sensors, 1, "ask for one or more"),
+            "seed": (self.seed, 0, "seeds are not negative"),
+        }
+        for name, (value, minimum, cure) in least.items():
+            if value < minimum:
+                raise InputError(f"{name} is {value}, at least {minimum} is needed: {cure}")
+        if not 2 <= self.resolved_test_day <= self.days:
+            raise InputError(
+                f"test_day is {self.test_day}, but the first of {self.days} days trains; "
+                f"name a day from 2 to {self.days}"
+            )
+
+    @property
+    def resolved_test_day(self) -> int:
+        """The day that tests."""
+        return self.days if self.test_day is None else self.test_day
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialPlan:
+    """All that `simulate_trial` needs to make one trial."""
+
+    trial: str
+    """Its name, such as day1-dry-003."""
+    day: int
+    condition: str
+    """dry or wet."""
+    split: str
+    """train, validation or test."""
+    frames: int
+    seed: int
+    """Of this trial alone: other trials come and go without changing it."""
+    unit: int
+    """Which built sensor, from 0."""
+    unit_seed: int
+    day_draw: Day
+    nuisances: Nuisances
+
+
+def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
+    """Lay out the trials of a recipe: names, days, splits and seeds.
+
+    Parameters
+    ----------
+    recipe
+        What to simulate.
+
+    Returns
+    -------
+    tuple of TrialPlan
+        Dry before wet within a day; the same for the same recipe.
+    """
+    test_day = recipe.resolved_test_day
+    days = _draw_days(recipe)
+    dry = _spread(recipe.dry_trials, days=recipe.days, test_day=test_day)
+    between = [(number, day) for day in dry if day not in (1, test_day) for number in range(1, dry[day] + 1)]
+    # without days between, the first day has to give up some of its own
+    candidates = sorted(between or [(number, 1) for number in range(1, dry[1] + 1)])
+    count = max(1, round(_VALIDATION_SHARE * len(candidates)))
+    validation = {(day, number) for number, day in _every_few(candidates, count)}
+
+    plans = []
+    for day in range(1, recipe.days + 1):
+        wet = recipe.wet_trials if day == test_day else 0
+        for condition, trials in (("dry", dry[day]), ("wet", wet)):
+            for number in range(1, trials + 1):
+                held_out = condition == "dry" and (day, number) in validation
+                split = "test" if day == test_day else "validation" if held_out else "train"
+                unit = (number - 1) % recipe.sensors
+                plans.append(
+                    TrialPlan(
+                        trial=f"day{day}-{condition}-{number:03d}",
+                        day=day,
+                        condition=condition,
+                        split=split,
+                        frames=recipe.frames_per_trial,
+                        seed=_seed(recipe.seed, _TRIALS, day, condition == "wet", number),
+                        unit=unit,
+                        unit_seed=_seed(recipe.seed, _UNITS, unit),
+                        day_draw=days[day],
+                        nuisances=recipe.nuisances,
+                    )
+                )
+    return tuple(plans)
+
+
+def _spread(trials: int, *, days: int, test_day: int) -> dict[int, int]:
+    """Deal dry trials to the days in turn, the first and the test day served first so that no split goes without."""
+    between = [day for day in range(2, days + 1) if day != test_day]
+    order = [1, test_day, *between]
+    dealt = dict.fromkeys(order, 0)
+    for index in range(trials):
+        dealt[order[index % len(order)]] += 1
+    if not between:
+        # the first day has to feed two splits
+        while dealt[1] < 2:
+            dealt[test_day] -= 1
+            dealt[1] += 1
+    return dealt
+
+
+def _every_few(candidates: Sequence[tuple[int, int]], count: int) -> list[tuple[int, int]]:
+    """Pick so many candidates, evenly spaced."""
+    return [candidates[int((index + 0.5) * len(candidates) / count)] for index in range(count)]
+
+
+def _draw_days(recipe: SimulationRecipe) -> dict[int, Day]:
+    """Draw the days, their dry friction spread over its range: four independent draws may all be alike."""
+    spread = np.random.default_rng(_seed(recipe.seed, _DAYS))
+    strata = spread.permutation(recipe.days)
+    return {
+        day: draw_day(
+            recipe.nuisances,
+            quantile=float((strata[day - 1] + spread.uniform()) / recipe.days),
+            rng=np.random.default_rng(_seed(recipe.seed, _DAYS, day)),
+        )
+        for day in range(1, recipe.days + 1)
+    }
+
+
+def _seed(seed: int, *branch: int) -> int:
+    state = np.random.SeedSequence(seed, spawn_key=tuple(int(step) for step in branch)).generate_state(2, np.uint64)
+    return int(state[0])

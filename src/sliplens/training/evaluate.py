@@ -1,0 +1,139 @@
+"""How well a network reads the safety margin: errors by condition and by bins of the margin."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Bool, Float
+
+from sliplens.datasets import FrameSet
+from sliplens.errors import RecordingError
+from sliplens.models import TrainedModel
+
+BIN_COUNT = 10
+
+
+@dataclass(frozen=True, kw_only=True)
+class BinScore:
+    """Mean squared error of the frames whose label lies in [low, high); the last bin holds 1 as well."""
+
+    low: float
+    high: float
+    frames: int
+    mse: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegressionScores:
+    """Errors of predictions against labels, in margin units (squared for `mse`).
+
+    `r2` is None where the labels do not vary, since there is no variance to explain.
+    """
+
+    frames: int
+    trials: int
+    mse: float
+    r2: float | None
+    mae: float
+    bins: tuple[BinScore, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """Scores by condition, and the predictions behind them."""
+
+    conditions: dict[str, RegressionScores]
+    predictions: pa.Table
+
+
+def regression_scores(
+    labels: Float[np.ndarray, " frames"], predictions: Float[np.ndarray, " frames"], *, trials: int = 1
+) -> RegressionScores:
+    """MSE, R2, MAE and the MSE in ten bins of the safety margin.
+
+    Raises
+    ------
+    RecordingError
+        If there is no frame, or a label lies outside [0, 1].
+
+    References
+    ----------
+    Polak, Table 1 and Fig. 7.
+    """
+    if len(labels) == 0:
+        raise RecordingError("there is no labelled frame to evaluate; check the split and the condition")
+    if not np.all((labels >= 0) & (labels <= 1)):
+        raise RecordingError("labels must lie in [0, 1]; give the safety margin as a fraction, not in percent")
+    squared = (predictions - labels) ** 2
+    spread = np.sum((labels - labels.mean()) ** 2)
+    return RegressionScores(
+        frames=len(labels),
+        trials=trials,
+        mse=float(squared.mean()),
+        r2=float(1 - squared.sum() / spread) if spread > 0 else None,
+        mae=float(np.abs(predictions - labels).mean()),
+        bins=tuple(_bin_scores(labels, squared)),
+    )
+
+
+def _bin_scores(labels: Float[np.ndarray, " frames"], squared: Float[np.ndarray, " frames"]) -> list[BinScore]:
+    # times ten, rounded: 0.3 * 10 must fall in bin 3 although 0.3 is not exact in binary
+    bins = np.minimum(np.floor(np.round(labels * BIN_COUNT, 9)), BIN_COUNT - 1)
+    scores = []
+    for index in range(BIN_COUNT):
+        inside: Bool[np.ndarray, " frames"] = bins == index
+        count = int(inside.sum())
+        scores.append(
+            BinScore(
+                low=index / BIN_COUNT,
+                high=(index + 1) / BIN_COUNT,
+                frames=count,
+                mse=float(squared[inside].mean()) if count else None,
+            )
+        )
+    return scores
+
+
+def evaluate(
+    trained: TrainedModel,
+    frames: FrameSet,
+    *,
+    batch_size: int = 64,
+    on_batch: Callable[[int, int], None] | None = None,
+) -> Evaluation:
+    """Predict every frame and score each condition by itself.
+
+    Parameters
+    ----------
+    trained
+        The network; `frames` must be in its encoding and size.
+    on_batch
+        Called with the number of frames done and the number of all.
+    """
+    count = len(frames)
+    answers = []
+    for start in range(0, count, batch_size):
+        rows = range(start, min(start + batch_size, count))
+        answers.append(trained.predict(frames.__getitems__(rows)[0], batch_size=batch_size).cpu().numpy())
+        if on_batch is not None:
+            on_batch(rows.stop, count)
+    predictions = np.concatenate(answers).astype(np.float64)
+    labels = frames.safety_margin.numpy().astype(np.float64)
+    condition, trial = np.array(frames.condition), np.array(frames.trial)
+    table = pa.table(
+        {
+            "trial": list(frames.trial),
+            "condition": list(frames.condition),
+            "day": list(frames.day),
+            "frame": list(frames.frame),
+            "time_s": frames.time_s,
+            "safety_margin": labels,
+            "prediction": predictions,
+        }
+    )
+    scores = {}
+    for name in sorted(set(frames.condition)):
+        rows = condition == name
+        scores[name] = regression_scores(labels[rows], predictions[rows], trials=len(set(trial[rows])))
+    return Evaluation(conditions=scores, predictions=table)

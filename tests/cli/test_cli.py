@@ -1,0 +1,141 @@
+"""The command line, run as a user would: every stage once, and what it says to mistakes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sliplens import __version__
+from sliplens.cli import main
+from sliplens.recordings import Dataset
+
+
+def run(*words: object) -> int:
+    return main([str(word) for word in words])
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    """Run a command that must fail with exit code 2 and one line; returns the line."""
+    assert run(*words) == 2
+    captured = capsys.readouterr()
+    assert "Traceback" not in captured.err + captured.out
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_version(capsys: pytest.CaptureFixture[str]):
+    assert run("--version") == 0
+    assert capsys.readouterr().out.strip() == f"sliplens {__version__}"
+
+
+def test_an_unknown_command_exits_with_2(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as exit_info:
+        run("predikt")
+    assert exit_info.value.code == 2
+
+
+@pytest.mark.parametrize("command", ["demo", "simulate", "train", "evaluate", "explain", "score", "report"])
+def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as exit_info:
+        run(command, "--help")
+    assert exit_info.value.code == 0
+    assert len(capsys.readouterr().out) > 300
+
+
+def test_the_stages_one_by_one(
+    tmp_path: Path, small_dataset: Dataset, difference_folder: Path, capsys: pytest.CaptureFixture[str]
+):
+    data, work = small_dataset.folder, tmp_path / "work"
+    train = ("train", data, "-o", work / "train", "--image-size", 32, "--epochs", 1, "--batch-size", 11)
+    assert run(*train) == 0
+    assert run("evaluate", work / "train", data, "-o", work / "evaluate") == 0
+    explain = ("explain", work / "train", data, "-o", work / "explain", "--levels", "1", "0", "--method", "grad-cam")
+    assert run(*explain) == 0
+    assert run("score", work / "train", work / "explain", "-o", work / "score", "--steps", "4") == 0
+    real = ("--frames", difference_folder, "--labels-in-names", "--method", "grad-cam")
+    assert run("explain", work / "train", *real, "-o", work / "explain-real") == 0
+    assert run("score", work / "train", work / "explain-real", "-o", work / "score-real", "--steps", "4") == 0
+    assert run("report", work) == 0
+    out = capsys.readouterr().out
+    for name in ("train", "evaluate", "explain", "score", "explain-real", "score-real", "report.html"):
+        assert (work / name).exists()
+        assert str(work / name) in out.replace("\n", "")
+    assert json.loads((work / "evaluate" / "result.json").read_text())["conditions"].keys() == {"dry", "wet"}
+    assert not [path for path in work.iterdir() if path.name.startswith(".")]
+    before = (work / "train" / "model.safetensors").stat().st_mtime_ns
+    assert run(*train) == 0  # nothing to do
+    assert (work / "train" / "model.safetensors").stat().st_mtime_ns == before
+    assert "refused" not in capsys.readouterr().out
+    assert "other settings" in refused(capsys, *train, "--seed", 1)
+
+
+def test_a_missing_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    line = refused(capsys, "train", tmp_path / "nothing", "-o", tmp_path / "out")
+    assert "the data set" in line
+    assert "does not exist; check the path" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_frames_and_data_at_once(
+    difference_run: Path, difference_folder: Path, small_dataset: Dataset, tmp_path: Path, capsys
+):
+    words = ("explain", difference_run, small_dataset.folder, "--frames", difference_folder, "-o", tmp_path / "out")
+    assert "name either a data set or --frames FOLDER" in refused(capsys, *words)
+
+
+@pytest.mark.parametrize(
+    ("name", "pixels", "message"),
+    [
+        ("a_20.png", np.zeros((50, 48, 3), np.uint8), "a_20.png is 50 x 48 pixels, 48 x 48 are needed"),
+        ("a_20.png", np.zeros((48, 48), np.uint8), "a_20.png has 1 channel (grey)"),
+        ("a_20.png", np.zeros((48, 48, 4), np.uint8), "a_20.png has 4 channels (alpha)"),
+        ("a_20.tiff", np.zeros((48, 48), np.uint16), "a_20.tiff has 16 bits a pixel"),
+    ],
+)
+def test_bad_frames(difference_run: Path, tmp_path: Path, capsys, *, name: str, pixels: np.ndarray, message: str):
+    (tmp_path / "frames").mkdir()
+    Image.fromarray(pixels).save(tmp_path / "frames" / name)
+    line = refused(capsys, "explain", difference_run, "--frames", tmp_path / "frames", "-o", tmp_path / "out")
+    assert message in line
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["frames"]
+
+
+def test_a_truncated_frame(difference_run: Path, difference_folder: Path, tmp_path: Path, capsys):
+    victim = difference_folder / "frame6_55.png"
+    assert victim.is_file()
+    victim.write_bytes(victim.read_bytes()[:300])
+    line = refused(capsys, "explain", difference_run, "--frames", difference_folder, "-o", tmp_path / "out")
+    assert "frame6_55.png cannot be read as an image" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_report_of_nothing(tmp_path: Path, capsys):
+    (tmp_path / "empty").mkdir()
+    assert "empty" in refused(capsys, "report", tmp_path / "empty")
+
+
+def test_a_demo_does_not_touch_a_folder_of_somebody_else(tmp_path: Path, capsys):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "holiday.jpg").touch()
+    assert "photos exists and is no demo; choose another folder" in refused(capsys, "demo", tmp_path / "photos")
+    assert [path.name for path in (tmp_path / "photos").iterdir()] == ["holiday.jpg"]
+
+
+def test_an_interruption_says_how_to_go_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys):
+    def interrupt(_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sliplens.cli.report.Report.run", interrupt)
+    assert run("report", tmp_path) == 130
+    assert "run the same command again and it goes on where it stopped" in capsys.readouterr().err
+
+
+def test_a_full_disk_is_one_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys):
+    def full(_: object) -> None:
+        raise OSError(28, "No space left on device", "maps.npz")
+
+    monkeypatch.setattr("sliplens.cli.report.Report.run", full)
+    assert "maps.npz could not be read or written (No space left on device)" in refused(capsys, "report", tmp_path)

@@ -1,0 +1,52 @@
+import numpy as np
+import pytest
+import torch
+
+from sliplens.datasets import ENCODINGS, get_encoding
+from sliplens.errors import ImageError, InputError
+
+
+@pytest.fixture
+def frames(rng: np.random.Generator) -> np.ndarray:
+    return rng.integers(0, 200, (3, 16, 16, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("name", ENCODINGS)
+def test_every_input_spans_up_to_one(name: str, frames: np.ndarray):
+    encoded = ENCODINGS[name].encode(frames, np.zeros_like(frames[0]), image_size=8)
+    assert encoded.shape == (3, 3, 8, 8)
+    torch.testing.assert_close(encoded.amax(dim=(1, 2, 3)), torch.ones(3))
+    assert encoded.min() >= 0
+
+
+def test_the_untouched_sensor_is_black_as_a_difference_and_itself_as_a_raw_frame(frames: np.ndarray):
+    assert not ENCODINGS["difference"].empty(frames[0], image_size=16).any()
+    expected = torch.from_numpy(frames[0]).permute(2, 0, 1) / frames[0].max()
+    torch.testing.assert_close(ENCODINGS["raw"].empty(frames[0], image_size=16), expected)
+
+
+def test_a_difference_forgets_its_amplitude(frames: np.ndarray):
+    black = np.zeros_like(frames[0])
+    halves = frames // 2 * 2  # even, so that half of it is exact
+    difference = ENCODINGS["difference"]
+    full, half = (difference.encode(images, black, image_size=16) for images in (halves, halves // 2))
+    torch.testing.assert_close(full, half)
+
+
+def test_halving_the_size_averages_neighbours_in_the_middle(frames: np.ndarray):
+    # a tent of half-width 2 on a ratio of 2: weights 1/8, 3/8, 3/8, 1/8 in each direction
+    resized = ENCODINGS["raw"].resize(frames, image_size=8)[0, 1, 3, 4].item()
+    weights = np.array([1, 3, 3, 1]) / 8
+    patch = frames[0, 5:9, 7:11, 1].astype(float)
+    assert abs(resized - weights @ patch @ weights) <= 0.5 + 1e-4  # rounded to whole levels
+
+
+def test_frames_of_another_size_than_the_reference_are_refused(frames: np.ndarray):
+    for encoding in ENCODINGS.values():
+        with pytest.raises(ImageError, match="against a reference of 8 x 16"):
+            encoding.encode(frames, frames[0, :8], image_size=8)
+
+
+def test_an_unknown_input_lists_those_there_are():
+    with pytest.raises(InputError, match="no input named 'depth'; choose one of difference, raw"):
+        get_encoding("depth")

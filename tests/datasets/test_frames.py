@@ -1,0 +1,38 @@
+import numpy as np
+import torch
+
+from sliplens.datasets import get_encoding, load_frames
+from sliplens.recordings import Dataset
+
+
+def test_frames_without_a_label_are_left_out(small_dataset: Dataset):
+    trials = small_dataset.select(split="train")
+    frames = load_frames(small_dataset, trials, encoding=get_encoding("difference"), image_size=32)
+    assert len(frames) == sum(trial.frames - 1 for trial in trials)
+    assert torch.isfinite(frames.safety_margin).all()
+
+
+def test_a_batch_is_what_encoding_the_frames_one_by_one_gives(small_dataset: Dataset):
+    trials = small_dataset.select(split="test")
+    encoding = get_encoding("difference")
+    frames = load_frames(small_dataset, trials, encoding=encoding, image_size=24)
+    recording = small_dataset.load(trials[1])
+    images, labels = frames.__getitems__([11, 15])
+    assert frames.trial[11] == recording.trial
+    expected = encoding.encode(recording.frames[[1, 5]], recording.reference, image_size=24)
+    assert torch.equal(images, expected)
+    np.testing.assert_allclose(labels.numpy(), recording.safety_margin[[1, 5]], rtol=1e-6)
+    assert torch.equal(frames[11][0], images[0])
+
+
+def test_progress_counts_trials(small_dataset: Dataset):
+    trials = small_dataset.select(split="train")
+    seen: list[tuple[int, int]] = []
+    load_frames(
+        small_dataset,
+        trials,
+        encoding=get_encoding("raw"),
+        image_size=32,
+        on_trial=lambda done, total: seen.append((done, total)),
+    )
+    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]

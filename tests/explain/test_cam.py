@@ -1,0 +1,101 @@
+import pytest
+import torch
+from torch import nn
+from torchcam.methods import GradCAM
+
+from sliplens.errors import InputError, ModelError
+from sliplens.explain import GradCam, capture
+from sliplens.explain.cam import grad_cam_map
+
+
+def captured(model: nn.Module, images, layer: str):
+    with capture(model, [layer], differentiable=True) as outputs:
+        prediction = model(images).flatten()
+    (gradients,) = torch.autograd.grad(prediction.sum(), outputs[layer])
+    return outputs[layer].detach(), gradients, prediction.detach()
+
+
+@pytest.mark.parametrize(("name", "layer"), [("shufflenet", "conv5"), ("gap", "second")])
+def test_a_pooled_linear_head_is_the_sum_of_the_map_and_its_bias(name, layer, network, images):
+    model = network(name)
+    activations, gradients, prediction = captured(model, images, layer)
+    total = grad_cam_map(activations, gradients).sum(dim=(1, 2)) + model.fc.bias
+    tolerance = 1e-4 * torch.maximum(prediction.abs(), torch.tensor(1.0))
+    assert bool(((total - prediction).abs() <= tolerance).all())
+
+
+@pytest.mark.parametrize("size", [64, 50])  # 50 px is no multiple of the map's 2 cells' stride
+def test_upsampling_keeps_that_sum(size, network, images):
+    model = network("shufflenet")
+    explanation = GradCam()(model, images[..., :size, :size])
+    total = explanation.relevance.sum(dim=(1, 2)) + model.fc.bias.detach().float()
+    torch.testing.assert_close(total, explanation.prediction, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(("name", "layer"), [("shufflenet", "conv5"), ("shufflenet", "stage3"), ("mobilenet", None)])
+def test_equals_torch_cam_after_the_same_relu_and_normalisation(name, layer, network, images):
+    model = network(name)
+    layer = layer or "features"
+    activations, gradients, _ = captured(model, images, layer)
+    ours = torch.relu(grad_cam_map(activations, gradients))
+    low, high = ours.amin(dim=(1, 2), keepdim=True), ours.amax(dim=(1, 2), keepdim=True)
+    with GradCAM(model, target_layer=layer) as extractor:
+        oracle = extractor(0, model(images.clone().requires_grad_()))[0]
+    torch.testing.assert_close((ours - low) / (high - low), oracle, atol=1e-6, rtol=0)
+
+
+def test_equals_torch_cam_on_the_image(network, images):
+    model = network("shufflenet")
+    explanation = GradCam(layer="stage3")(model, images)
+    with GradCAM(model, target_layer="stage3") as extractor:
+        oracle = extractor(0, model(images.clone().requires_grad_()), normalized=False)[0]
+    # torch-cam has applied its ReLU to the cells, so compare where the cells have one sign only
+    activations, gradients, _ = captured(model, images, "stage3")
+    cells = grad_cam_map(activations, gradients)
+    torch.testing.assert_close(torch.relu(cells), oracle, atol=1e-6, rtol=0)
+    upsampled = nn.functional.interpolate(cells[None], size=(64, 64), mode="bilinear", align_corners=False)[0]
+    torch.testing.assert_close(explanation.relevance, (upsampled / 16**2).float(), atol=1e-6, rtol=0)
+
+
+def test_last_layer_is_the_default(network, images):
+    model = network("shufflenet")
+    assert torch.equal(GradCam()(model, images).relevance, GradCam(layer="conv5")(model, images).relevance)
+
+
+def test_does_not_depend_on_the_reference(network, images, reference):
+    model = network("shufflenet")
+    one, other = GradCam()(model, images), GradCam()(model, images, reference=reference)
+    assert torch.equal(one.relevance, other.relevance)
+    assert not torch.equal(one.reference_prediction, other.reference_prediction)
+
+
+def test_moves_with_the_image_by_the_networks_stride(network):
+    def with_patch(at: int):
+        images = torch.zeros(1, 3, 384, 384, dtype=torch.float32)
+        patch = torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(5))
+        images[..., at : at + 64, at : at + 64] = patch
+        return images
+
+    model = network("shufflenet").float()
+    one = GradCam()(model, with_patch(128)).relevance[0, 96:256, 96:256]
+    other = GradCam()(model, with_patch(160)).relevance[0, 128:288, 128:288]
+    assert float(torch.corrcoef(torch.stack([one.flatten(), other.flatten()]))[0, 1]) >= 0.99
+
+
+def test_refuses_a_layer_that_the_output_ignores(images):
+    class Ignorant(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.maps = nn.Conv2d(3, 4, 1)
+
+        def forward(self, images):
+            self.maps(images)
+            return images.mean(dim=(1, 2, 3))
+
+    with pytest.raises(ModelError, match="the output does not depend on layer 'maps'; choose a layer on the path"):
+        GradCam()(Ignorant(), images.float())
+
+
+def test_rejects_a_batch_size_of_zero():
+    with pytest.raises(InputError, match="Grad-CAM's batch_size is 0; give at least 1"):
+        GradCam(batch_size=0)

@@ -1,0 +1,26 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis.extra.numpy import arrays
+
+from sliplens.errors import ImageError
+from sliplens.images import absolute_difference
+
+PIXELS = arrays(np.uint8, (4, 5, 3))
+
+
+@given(PIXELS, PIXELS)
+def test_difference_is_the_absolute_difference_of_integers(frame: np.ndarray, reference: np.ndarray):
+    expected = np.abs(frame.astype(int) - reference.astype(int))
+    np.testing.assert_array_equal(absolute_difference(frame, reference), expected)
+    np.testing.assert_array_equal(absolute_difference(reference, frame), expected)
+
+
+@given(PIXELS)
+def test_a_frame_does_not_differ_from_itself(frame: np.ndarray):
+    assert not absolute_difference(frame, frame).any()
+
+
+def test_a_reference_of_another_size_is_refused():
+    with pytest.raises(ImageError, match=r"frame of 4 x 4 pixels against a reference of 5 x 4"):
+        absolute_difference(np.zeros((4, 4, 3), np.uint8), np.zeros((5, 4, 3), np.uint8))

@@ -1,0 +1,82 @@
+import json
+import pickle
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sliplens.errors import CheckpointError, ImageError, InputError
+from sliplens.models import load_checkpoint
+from sliplens.provenance import hash_file
+
+
+@pytest.fixture
+def run(tmp_path: Path, difference_run: Path) -> Path:
+    shutil.copytree(difference_run, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def edit_manifest(run: Path, **changes: object) -> None:
+    manifest = json.loads((run / "manifest.json").read_text())
+    (run / "manifest.json").write_text(json.dumps(manifest | changes))
+
+
+def test_a_checkpoint_comes_back_bit_for_bit(run: Path):
+    inputs = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    first, second = load_checkpoint(run), load_checkpoint(run)
+    assert torch.equal(first.predict(inputs), second.predict(inputs))
+    assert not first.model.training
+
+
+def test_predictions_do_not_depend_on_the_batch_size(run: Path):
+    inputs = torch.rand(5, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    trained = load_checkpoint(run)
+    # float32 sums in another order
+    torch.testing.assert_close(trained.predict(inputs, batch_size=2), trained.predict(inputs), atol=1e-5, rtol=1e-5)
+
+
+def test_a_missing_run_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match=r"the run .*nothing does not exist"):
+        load_checkpoint(tmp_path / "nothing")
+
+
+def test_changed_weights_are_refused(run: Path):
+    weights = run / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-4])
+    with pytest.raises(CheckpointError, match=r"model\.safetensors is not the file its manifest describes"):
+        load_checkpoint(run)
+
+
+def test_a_pickle_in_place_of_weights_is_refused_unopened(run: Path):
+    class Bomb:
+        def __reduce__(self) -> tuple:
+            return (pytest.fail, ("the pickle was opened",))
+
+    weights = run / "model.safetensors"
+    weights.write_bytes(pickle.dumps(Bomb()))
+    edit_manifest(run, weights_sha256=hash_file(weights))
+    with pytest.raises(CheckpointError, match="does not hold a shufflenet_v2_x1_0 with one output"):
+        load_checkpoint(run)
+
+
+def test_a_manifest_of_another_backbone_is_refused(run: Path):
+    edit_manifest(run, backbone="resnet18")
+    with pytest.raises(CheckpointError, match="does not hold a resnet18 with one output"):
+        load_checkpoint(run)
+
+
+def test_an_incomplete_manifest_is_refused(run: Path):
+    manifest = json.loads((run / "manifest.json").read_text())
+    del manifest["frame_size"]
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(CheckpointError, match=r"manifest\.json is incomplete .*frame_size"):
+        load_checkpoint(run)
+
+
+def test_frames_of_another_sensor_are_refused(run: Path):
+    trained = load_checkpoint(run)
+    frames = np.zeros((1, 64, 64, 3), np.uint8)
+    with pytest.raises(ImageError, match="frames are 64 x 64 pixels but the network was trained on 48 x 48"):
+        trained.encode(frames, frames[0])

@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+
+from sliplens.report.compare import agreement, bootstrap_difference, compare_deletion, compare_errors
+from sliplens.report.records import DeletionCurve, Predictions
+
+
+def predictions(error: np.ndarray, *, order: np.ndarray | None = None) -> Predictions:
+    trials, frames = error.shape
+    rows = np.arange(error.size) if order is None else order
+    return Predictions(
+        trial=np.repeat([f"t{index}" for index in range(trials)], frames)[rows],
+        condition=np.full(error.size, "dry")[rows],
+        frame=np.tile(np.arange(frames), trials)[rows],
+        time_s=np.zeros(error.size),
+        safety_margin=np.full(error.size, 0.5),
+        prediction=(0.5 + error.ravel())[rows],
+    )
+
+
+def test_difference_is_that_of_the_means(rng):
+    first, second = rng.normal(size=(2, 8, 5))
+
+    gap = compare_errors(predictions(first), predictions(second), rng=rng)
+
+    assert gap is not None
+    assert gap.estimate == pytest.approx(np.mean(first**2) - np.mean(second**2))
+    assert gap.units == 8
+    assert gap.low <= gap.estimate <= gap.high
+
+
+def test_rows_are_matched_whatever_their_order(rng):
+    error = rng.normal(size=(8, 5))
+
+    gap = compare_errors(predictions(error), predictions(error, order=rng.permutation(40)), rng=rng)
+
+    assert gap is not None
+    assert (gap.low, gap.estimate, gap.high) == (0, 0, 0)
+
+
+def test_other_frames_are_not_compared(rng):
+    error = rng.normal(size=(8, 5))
+
+    assert compare_errors(predictions(error), predictions(error[:7]), rng=rng) is None
+
+
+def test_interval_has_the_width_of_the_standard_error(rng):
+    gap = rng.normal(0.3, 1.0, size=400)
+
+    found = bootstrap_difference(gap, np.zeros(400), np.ones(400), rng=rng)
+
+    assert found.high - found.low == pytest.approx(2 * 1.96 * gap.std() / 20, rel=0.1)
+    assert found.sure
+
+
+def test_few_units_are_never_sure(rng):
+    assert not bootstrap_difference(np.ones(3), np.zeros(3), np.ones(3), rng=rng).sure
+
+
+def test_curves_of_other_frames_are_not_compared(rng):
+    one, other = (
+        DeletionCurve(frame_ids=(name,), pixels_removed=np.array([1, 2]), scores=np.ones((1, 2))) for name in "ab"
+    )
+
+    assert compare_deletion(one, other, rng=rng) is None
+
+
+def test_agreement_of_perfect_answers():
+    labels = np.array([1.0, 0.8, 0.6, 0.4, 0.2, 0.0])
+
+    found = agreement(labels, labels)
+
+    assert (found.mae, found.pairs, found.ordered_pairs) == (0, 15, 15)
+    assert found.constant_mae == pytest.approx(0.3)
+
+
+def test_constant_and_reversed_answers_have_no_pair_in_order():
+    labels = np.array([1.0, 0.5, 0.5, 0.0])
+
+    assert agreement(labels, np.full(4, 0.5)).ordered_pairs == 0
+    assert agreement(labels, 1 - labels).ordered_pairs == 0
+    assert agreement(labels, labels).pairs == 5

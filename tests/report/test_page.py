@@ -1,0 +1,255 @@
+import json
+import re
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from sliplens.errors import InputError
+from sliplens.report import build_report, load_results
+from sliplens.report.panels import build_panel, choose_frames
+from sliplens.report.records import ExplainedFrame
+
+HOSTILE = "<script>alert(1)</script>"
+
+
+class Reader(HTMLParser):
+    """Tags with their attributes, and the text of the table cells."""
+
+    def __init__(self):
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.cells: list[str] = []
+        self._in_cell = False
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        self._in_cell = tag == "td"
+
+    def handle_endtag(self, tag):
+        self._in_cell = self._in_cell and tag != "td"
+
+    def handle_data(self, data):
+        if self._in_cell:
+            self.cells.append(data.strip())
+
+
+def parse(text: str) -> Reader:
+    reader = Reader()
+    reader.feed(text)
+    return reader
+
+
+@pytest.fixture(scope="module")
+def complete(pristine_workspace, tmp_path_factory):
+    """A complete workspace and its page, for the tests that only read."""
+    return pristine_workspace, build_report(pristine_workspace, tmp_path_factory.mktemp("out") / "report.html")
+
+
+@pytest.fixture
+def text(complete) -> str:
+    return complete[1].read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def reader(text) -> Reader:
+    return parse(text)
+
+
+@pytest.fixture
+def build(workspace, tmp_path):
+    """The page of a workspace of one's own, as it is when called."""
+    return lambda: build_report(workspace, tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def keep(workspace, *names):
+    for folder in workspace.iterdir():
+        if folder.name not in names:
+            shutil.rmtree(folder)
+
+
+def test_page_needs_nothing_but_itself(text, reader, complete):
+    loaded = [value for _, attributes in reader.tags for key in ("src", "href") if (value := attributes.get(key))]
+    assert loaded
+    assert all(value.startswith(("data:image/", "#")) for value in loaded)
+    assert not re.search(r"url\(|@import|<link|<script|http-equiv=\"refresh", text)
+    assert [path.name for path in complete[1].parent.iterdir()] == ["report.html"]
+
+
+def test_links_of_the_contents_lead_to_sections(reader):
+    targets = {attributes.get("id") for _, attributes in reader.tags}
+    links = [attributes["href"] for tag, attributes in reader.tags if tag == "a"]
+    assert len(links) == 6
+    assert all(link[1:] in targets for link in links)
+
+
+def test_page_speaks_to_those_who_cannot_see_it(text, reader):
+    images = [attributes for tag, attributes in reader.tags if tag == "img"]
+    assert len(images) > 90
+    assert all(attributes["alt"] for attributes in images)
+    assert '<html lang="en">' in text
+
+
+def test_tables_hold_the_numbers_of_the_results(reader, complete):
+    results = load_results(complete[0])
+    for evaluation in results.evaluations.values():
+        for score in evaluation.conditions.values():
+            assert score.r2 is not None
+            assert {f"{score.mse:.4f}", f"{score.r2:.3f}", f"{100 * score.mae:.1f}"} <= set(reader.cells)
+    for scored in results.scores.values():
+        for score in scored.methods.values():
+            assert f"{score.mean:.3f} ± {score.sd:.3f}" in reader.cells
+            assert f"{score.last_step_mean:.3f}" in reader.cells
+
+
+def test_the_thesis_stands_beside_and_is_marked(text, reader):
+    assert {"0.0187", "0.0507", "0.0144", "0.0402", "0.85", "0.57", "0.89", "0.66"} <= set(reader.cells)
+    assert {"0.325 ± 0.106", "0.272 ± 0.158", "0.200 ± 0.146", "0.539 ± 0.101"} <= set(reader.cells)
+    assert text.count("thesis (real touch, other data)") == 2
+
+
+def test_warnings_and_alarms_are_shown(text):
+    assert "on 3 frames the filled image is answered like the frame itself" in text
+    assert "completeness gap 1.8 % on 2 frames" in text
+
+
+def test_same_results_make_the_same_page(text, complete, tmp_path):
+    assert build_report(complete[0], tmp_path / "again.html").read_text(encoding="utf-8") == text
+
+
+def test_missing_stages_are_named(build, workspace):
+    keep(workspace, "test-difference", "maps-raw-simulated")
+
+    text = build()
+
+    assert {*re.findall(r'<p class="missing">([^<]*)</p>', text)} == {
+        "Simulation: not run yet; `sliplens simulate` makes it.",
+        "Raw images: not run yet; `sliplens train` makes it.",
+        "Difference images: not run yet; `sliplens train` makes it.",
+        "Raw images: not run yet; `sliplens evaluate` makes it.",
+        "Difference images: not run yet; `sliplens explain` makes it.",
+        "Real frames: not run yet; `sliplens explain` makes it.",
+        "Raw images: not run yet; `sliplens score` makes it.",
+        "Difference images: not run yet; `sliplens score` makes it.",
+    }
+
+
+def test_simulation_alone_makes_a_page(build, workspace):
+    keep(workspace, "data")
+
+    text = build()
+
+    assert "There is nothing to judge yet" in text
+    assert text.count("not run yet") == 9
+
+
+def test_scores_alone_make_a_page(build, workspace):
+    keep(workspace, "score-raw")
+
+    assert "Deletion score D on simulated touch while pixels become grey" in build()
+
+
+def test_training_that_wrote_no_epoch_makes_a_page(build, workspace):
+    keep(workspace, "network-raw")
+    (workspace / "network-raw" / "metrics.csv").write_text("epoch,train_mse,validation_mse,minutes\n")
+
+    assert "Learning curves" in build()
+
+
+def test_hostile_names_are_escaped(build, workspace):
+    keep(workspace, "data", "test-difference", "maps-raw-real")
+    path = workspace / "test-difference" / "predictions.parquet"
+    table = pq.read_table(path)
+    pq.write_table(table.set_column(0, "trial", pa.array([HOSTILE] * table.num_rows)), path)
+    folder = workspace / "maps-raw-real"
+    value = json.loads((folder / "result.json").read_text())
+    old, value["frames"][0]["id"] = value["frames"][0]["id"], '"><img src=x onerror=alert(1)>'
+    value["methods"]["grad-cam"]["warnings"] = [HOSTILE]
+    for frame in value["frames"]:
+        frame["condition"] = "<b>$dry$"
+    (folder / "result.json").write_text(json.dumps(value))
+    (folder / "frames" / f"{old}.png").rename(folder / "frames" / '"><img src=x onerror=alert(1)>.png')
+    run = json.loads((workspace / "data" / "run.json").read_text())
+    (workspace / "data" / "run.json").write_text(json.dumps(run | {"config": {HOSTILE: HOSTILE}, "finished": HOSTILE}))
+
+    text = build()
+
+    assert "<script" not in text
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+    assert not any("onerror" in attributes for _, attributes in parse(text).tags)
+    assert "<b>$dry$" not in text
+
+
+def test_condition_with_dollar_signs_is_drawn(build, workspace):
+    keep(workspace, "test-raw", "test-difference")
+    for name in ("raw", "difference"):
+        folder = workspace / f"test-{name}"
+        value = json.loads((folder / "result.json").read_text())
+        value["conditions"] = {"$\\bad$": value["conditions"]["dry"]}
+        (folder / "result.json").write_text(json.dumps(value))
+        table = pq.read_table(folder / "predictions.parquet")
+        named = table.set_column(1, "condition", pa.array(["$\\bad$"] * table.num_rows))
+        pq.write_table(named, folder / "predictions.parquet")
+
+    assert "$\\bad$" in build()
+
+
+def test_page_is_not_written_where_a_result_is_malformed(workspace, tmp_path):
+    (workspace / "score-raw" / "result.json").write_text("{}")
+
+    with pytest.raises(InputError):
+        build_report(workspace, tmp_path / "report.html")
+
+    assert not list(tmp_path.glob("*report.html*"))
+
+
+def test_output_that_is_a_folder_is_told(workspace, tmp_path):
+    with pytest.raises(InputError, match=r"is a folder; name the HTML file to write, such as .*report.html"):
+        build_report(workspace, tmp_path)
+
+
+def test_output_that_cannot_be_written_is_told(workspace, tmp_path):
+    keep(workspace, "data")
+    (tmp_path / "file").write_text("")
+
+    with pytest.raises(InputError, match=r"cannot write .*report.html"):
+        build_report(workspace, tmp_path / "file" / "report.html")
+
+
+def frame(name: str, margin: float | None, condition: str = "dry") -> ExplainedFrame:
+    return ExplainedFrame(id=name, condition=condition, safety_margin=margin, prediction=0.5, reference_prediction=None)
+
+
+def test_panel_takes_the_nearest_labels_of_one_condition():
+    frames = (frame("a", 0.97), frame("b", 1.0, "wet"), frame("c", 0.22), frame("d", 0.19), frame("e", 0.03))
+
+    condition, chosen = choose_frames(frames)
+
+    assert condition == "dry"
+    assert chosen == [(1.0, 0), (0.8, None), (0.6, None), (0.4, None), (0.2, 3), (0.0, 4)]
+
+
+def test_frames_without_labels_are_shown_in_their_order():
+    frames = tuple(frame(str(index), None) for index in range(9))
+
+    assert choose_frames(frames) == ("dry", [(None, index) for index in range(6)])
+
+
+def test_panel_pictures_have_one_size(workspace):
+    panel = build_panel(load_results(workspace).explanations["difference", "real"])
+
+    assert [row.name for row in panel.rows] == ["Input", "Grad-CAM", "Integrated Gradients", "Poly-CAM"]
+    assert {(cell.width, cell.height) for row in panel.rows for cell in row.cells if cell} == {(24, 24)}
+    assert [column.head for column in panel.columns][:2] == ["Γ 100\N{NO-BREAK SPACE}%", "Γ 80\N{NO-BREAK SPACE}%"]
+
+
+def test_report_needs_no_torch_and_no_pyplot():
+    code = "import sys, sliplens.report; print({'torch', 'matplotlib.pyplot'} & set(sys.modules))"
+
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    assert done.stdout.strip() == "set()"

@@ -1,0 +1,134 @@
+import json
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from sliplens.report import load_results
+from sliplens.report.verdict import judge
+
+
+@pytest.fixture
+def verdict(workspace, rng):
+    """The verdict of the workspace as it is when called: topic to statement."""
+    return lambda: {one.topic: one for one in judge(load_results(workspace), rng=rng)}
+
+
+def edit(path, change):
+    value = json.loads(path.read_text(encoding="utf-8"))
+    change(value)
+    path.write_text(json.dumps(value), encoding="utf-8")
+
+
+def replace(path, column, values):
+    table = pq.read_table(path)
+    pq.write_table(table.set_column(table.column_names.index(column), column, pa.array(values)), path)
+
+
+def test_accuracy_is_told_with_the_numbers(workspace, verdict):
+    scores = load_results(workspace).evaluations["difference"].conditions
+
+    text = verdict()["Accuracy on test trials"].text
+
+    assert f"R² {scores['dry'].r2:.2f} on dry and {scores['wet'].r2:.2f} on wet objects" in text
+    assert f"{100 * scores['dry'].mae:.1f} and {100 * scores['wet'].mae:.1f} percentage points" in text
+
+
+def test_a_network_that_reads_nothing_is_called_so(workspace, verdict):
+    edit(workspace / "test-raw" / "result.json", lambda value: value["conditions"]["wet"].update(r2=-0.1))
+
+    found = verdict()["Accuracy on test trials"]
+
+    assert found.tone == "caution"
+    assert "On wet objects that is no better than always answering the mean label." in found.text
+
+
+def test_a_clear_winner_is_named(workspace, verdict):
+    found = verdict()["Raw or difference, dry"]
+
+    assert found.tone == "good"
+    assert "On dry objects difference images have the lower error" in found.text
+    assert "holds when the 6 test trials are resampled" in found.text
+
+
+def test_a_lead_that_can_be_chance_is_called_so(workspace, verdict, rng):
+    # the same answers but for noise that favours neither
+    path = workspace / "test-raw" / "predictions.parquet"
+    answers = pq.read_table(workspace / "test-difference" / "predictions.parquet")["prediction"].to_numpy()
+    replace(path, "prediction", answers + rng.normal(0, 1e-4, len(answers)))
+
+    found = verdict()["Raw or difference, dry"]
+
+    assert found.tone == "caution"
+    assert "does not rule out chance" in found.text
+
+
+def test_the_best_method_is_named_with_its_control(workspace, verdict):
+    methods = load_results(workspace).scores["difference", "simulated"].methods
+
+    found = verdict()["Faithfulness, difference images"]
+
+    assert found.tone == "good"
+    assert f"Poly-CAM has the lowest deletion score, {methods['poly-cam'].mean:.3f}" in found.text
+    assert f"random order gives {methods['random'].mean:.3f}" in found.text
+    assert "It beats the control, as does every other method." in found.text
+
+
+def test_methods_that_lose_to_chance_are_called_so(workspace, verdict):
+    folder = workspace / "score-raw"
+    table = pq.read_table(folder / "deletion.parquet")
+    method, score = np.array(table["method"].to_pylist()), table["score"].to_numpy().copy()
+    score[method == "random"] = 0.1
+    replace(folder / "deletion.parquet", "score", score)
+    edit(folder / "result.json", lambda value: value["methods"]["random"].update(mean=0.1, sd=0.0))
+
+    found = verdict()["Faithfulness, raw images"]
+
+    assert found.tone == "caution"
+    assert "does not beat the control" in found.text
+
+
+def test_without_control_nothing_is_claimed(workspace, verdict):
+    edit(workspace / "score-raw" / "result.json", lambda value: value["methods"].pop("random"))
+
+    assert "no random control was scored" in verdict()["Faithfulness, raw images"].text
+
+
+def test_the_score_of_the_fill_alone_is_told(verdict):
+    found = verdict()["How far to trust D"]
+
+    assert found.tone == "caution"
+    assert "depends on what a removed pixel becomes" in found.text
+    assert "grey" in found.text
+
+
+def test_real_touch_is_held_against_a_constant_answer(workspace, verdict):
+    def constant(value):
+        for frame in value["frames"]:
+            frame["prediction"] = 0.9
+
+    edit(workspace / "maps-raw-real" / "result.json", constant)
+
+    found = verdict()["Real touch, raw images"]
+
+    assert found.tone == "caution"
+    assert "off by 43 percentage points on average; the best constant answer would be off by 30." in found.text
+    assert "0 of 15 pairs of frames in the right order" in found.text
+    assert "do not carry over to real touch" in found.text
+
+
+def test_real_frames_without_labels_carry_no_claim(workspace, verdict):
+    def unlabel(value):
+        for frame in value["frames"]:
+            frame["safety_margin"] = None
+
+    edit(workspace / "maps-raw-real" / "result.json", unlabel)
+
+    assert "have no label, so nothing can be said" in verdict()["Real touch, raw images"].text
+
+
+def test_the_reduced_image_is_told(verdict):
+    text = verdict()["What this run is"].text
+
+    assert "images of 24 px, shrunk from the camera's 224 x 224 (the thesis: 224 px)" in text

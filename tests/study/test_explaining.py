@@ -1,0 +1,162 @@
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from sliplens.errors import CheckpointError, InputError, SaliencyError
+from sliplens.models import TrainedModel, load_checkpoint
+from sliplens.provenance import output_folder
+from sliplens.recordings import Dataset
+from sliplens.study import Explained, explain_frames, frames_from_dataset, load_explained, score_explanations
+
+METHODS = ("grad-cam", "integrated-gradients")
+
+
+@pytest.fixture(scope="module")
+def trained(difference_run: Path) -> TrainedModel:
+    return load_checkpoint(difference_run)
+
+
+def explain(trained: TrainedModel, data: Dataset, target: Path, **more: object) -> Explained:
+    chosen = frames_from_dataset(trained, data, levels=(1.0, 0.0))
+    config = {"weights_sha256": trained.manifest.weights_sha256}
+    with output_folder(target, stage="explain", config=config) as out:
+        return explain_frames(trained, chosen, out.folder, methods=METHODS, **more)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.fixture(scope="module")
+def explanations(trained: TrainedModel, small_dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    target = tmp_path_factory.mktemp("explained") / "maps"
+    explain(trained, small_dataset, target)
+    return target
+
+
+def test_explanations_come_back_without_loss(
+    trained: TrainedModel, small_dataset: Dataset, explanations: Path, tmp_path: Path
+):
+    written = explain(trained, small_dataset, tmp_path / "maps")
+    back = load_explained(explanations)
+    assert back.frames == written.frames
+    assert torch.equal(back.images, written.images)
+    for method in METHODS:
+        np.testing.assert_array_equal(back.relevance[method], written.relevance[method])
+        np.testing.assert_array_equal(back.saliency[method], written.saliency[method])
+    assert {path.stem for path in (explanations / "frames").iterdir()} == {frame.id for frame in back.frames}
+
+
+def test_the_table_holds_the_networks_answers(trained: TrainedModel, explanations: Path):
+    back = load_explained(explanations)
+    answers = trained.predict(trained.encoding.normalise(back.images))
+    np.testing.assert_allclose([frame.prediction for frame in back.frames], answers.numpy(), atol=1e-6)
+
+
+def test_an_interrupted_explanation_goes_on_after_the_last_map(
+    trained: TrainedModel, small_dataset: Dataset, explanations: Path, tmp_path: Path
+):
+    def interrupt(done: int, total: int) -> None:
+        assert total == 4
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        explain(trained, small_dataset, tmp_path / "maps", on_map=interrupt)
+    parts = tmp_path / ".maps.partial" / "parts"
+    before = {path.name: path.stat().st_mtime_ns for path in parts.iterdir()}
+    assert len(before) == 3
+    seen: dict[str, int] = {}
+
+    def look(done: int, total: int) -> None:
+        seen.update({path.name: path.stat().st_mtime_ns for path in parts.iterdir()})
+
+    explain(trained, small_dataset, tmp_path / "maps", on_map=look)
+    assert before.items() <= seen.items()  # the three maps were not made again
+    first, second = (np.load(folder / "maps.npz") for folder in (explanations, tmp_path / "maps"))
+    for name in first.files:
+        np.testing.assert_array_equal(first[name], second[name])
+
+
+def test_an_unknown_method_lists_those_there_are(trained: TrainedModel, small_dataset: Dataset, tmp_path: Path):
+    chosen = frames_from_dataset(trained, small_dataset)
+    with pytest.raises(InputError, match="no explainer named 'lime'; choose from grad-cam, integrated-gradients, poly"):
+        explain_frames(trained, chosen, tmp_path, methods=("lime",))
+
+
+def change_maps(explanations: Path, tmp_path: Path, **changes: np.ndarray) -> Path:
+    folder = tmp_path / "changed"
+    shutil.copytree(explanations, folder)
+    maps = dict(np.load(folder / "maps.npz"))
+    np.savez(folder / "maps.npz", **(maps | changes))  # pyright: ignore[reportArgumentType]
+    return folder
+
+
+def test_a_map_of_another_shape_is_refused(explanations: Path, tmp_path: Path):
+    folder = change_maps(explanations, tmp_path, **{"grad-cam": np.zeros((2, 32, 31), np.float32)})
+    with pytest.raises(SaliencyError, match=r"the grad-cam map of .* has shape \(32, 31\) but its image is 32 x 32"):
+        load_explained(folder)
+
+
+def test_nan_in_a_map_is_refused(explanations: Path, tmp_path: Path):
+    maps = np.zeros((2, 32, 32), np.float32)
+    maps[1, 3, 3] = np.nan
+    folder = change_maps(explanations, tmp_path, **{"grad-cam.saliency": maps})
+    with pytest.raises(SaliencyError, match=r"the grad-cam\.saliency map of .* holds NaN or infinity in 1 of 1024"):
+        load_explained(folder)
+
+
+def test_a_missing_map_is_refused(explanations: Path, tmp_path: Path):
+    folder = change_maps(explanations, tmp_path, **{"grad-cam": np.zeros((1, 32, 32), np.float32)})
+    with pytest.raises(InputError, match=r"maps\.npz has 1 grad-cam maps for 2 frames; explain again"):
+        load_explained(folder)
+
+
+def test_truncated_maps_are_refused(explanations: Path, tmp_path: Path):
+    folder = change_maps(explanations, tmp_path)
+    (folder / "maps.npz").write_bytes((folder / "maps.npz").read_bytes()[:500])
+    with pytest.raises(InputError, match=r"maps\.npz is damaged .*; explain the frames again"):
+        load_explained(folder)
+
+
+def test_a_folder_of_another_stage_is_refused(tmp_path: Path):
+    with output_folder(tmp_path / "run", stage="train", config={}) as out:
+        (out.folder / "result.json").write_text("{}")
+    with pytest.raises(InputError, match="holds no explanations; make them with sliplens explain"):
+        load_explained(tmp_path / "run")
+
+
+def test_scores_follow_from_the_stored_curves(trained: TrainedModel, explanations: Path, tmp_path: Path):
+    result = score_explanations(trained, load_explained(explanations), tmp_path, steps=8)
+    assert set(result.methods) == {*METHODS, "random"}
+    rows = pq.read_table(tmp_path / "deletion.parquet").to_pylist()
+    written = json.loads((tmp_path / "result.json").read_text())
+    frames = {frame.id: frame.prediction for frame in load_explained(explanations).frames}
+    for method, score in result.methods.items():
+        auc = []
+        for name, base in frames.items():
+            answers = [row["prediction"] for row in rows if row["method"] == method and row["frame_id"] == name]
+            assert len(answers) == 8
+            auc.append(np.mean([(1 - abs(base - answer)) ** 2 for answer in answers]))
+        assert score.mean == pytest.approx(np.mean(auc), abs=1e-6)
+        assert score.sd == pytest.approx(np.std(auc), abs=1e-6)
+        assert written["methods"][method]["mean"] == score.mean
+
+
+def test_explanations_of_another_network_are_refused(raw_run: Path, explanations: Path, tmp_path: Path):
+    with pytest.raises(CheckpointError, match="made with another network; explain the frames again with this run"):
+        score_explanations(load_checkpoint(raw_run), load_explained(explanations), tmp_path)
+
+
+def test_alarms_say_when_the_fill_decides_and_when_no_method_beats_chance(
+    trained: TrainedModel, explanations: Path, tmp_path: Path
+):
+    class Stubborn(torch.nn.Module):
+        def forward(self, images: torch.Tensor) -> torch.Tensor:
+            return torch.full((len(images), 1), 0.7)
+
+    result = score_explanations(replace(trained, model=Stubborn()), load_explained(explanations), tmp_path, steps=4)
+    assert "the fill decides in 2 of 2 frames" in result.alarms[0]
+    assert "grad-cam does not beat a random order (1.000 against 1.000)" in result.alarms

@@ -1,0 +1,121 @@
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from sliplens.datasets import FrameSet, get_encoding, load_frames
+from sliplens.errors import InputError, ModelError
+from sliplens.models import load_checkpoint
+from sliplens.recordings import Dataset
+from sliplens.training import TrainConfig, TrainProgress, evaluate, fit
+from sliplens.training.fit import EpochShuffle, TrainResult
+
+CONFIG = TrainConfig(image_size=32, epochs=3, batch_size=11, seed=3)
+
+
+@pytest.fixture(scope="module")
+def frames(small_dataset: Dataset) -> tuple[FrameSet, FrameSet]:
+    encoding = get_encoding("difference")
+    train, validation = (
+        load_frames(small_dataset, small_dataset.select(split=split), encoding=encoding, image_size=32)
+        for split in ("train", "validation")
+    )
+    return train, validation
+
+
+def run(folder: Path, frames: tuple[FrameSet, FrameSet], config: TrainConfig = CONFIG, **more: object) -> TrainResult:
+    folder.mkdir(exist_ok=True)
+    return fit(config, *frames, folder, frame_size=(48, 48), sensor="test", data_hash="none", **more)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.fixture(scope="module")
+def trained_run(tmp_path_factory: pytest.TempPathFactory, frames: tuple[FrameSet, FrameSet]) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    run(folder, frames)
+    return folder
+
+
+def test_a_network_learns(tmp_path: Path, frames: tuple[FrameSet, FrameSet]):
+    result = run(tmp_path / "run", frames, replace(CONFIG, epochs=25))
+    # labels are spread evenly over [0, 1): their variance, the error of the best constant, is 0.08
+    assert result.best_validation_mse < 0.03
+    scores = evaluate(load_checkpoint(tmp_path / "run"), frames[1]).conditions["dry"]
+    assert scores.mse == pytest.approx(result.best_validation_mse, abs=1e-5)  # the best weights were kept
+
+
+def test_the_same_seed_gives_the_same_weights(tmp_path: Path, frames: tuple[FrameSet, FrameSet], trained_run: Path):
+    run(tmp_path / "run", frames)
+    first, second = ((folder / "model.safetensors").read_bytes() for folder in (trained_run, tmp_path / "run"))
+    assert first == second
+
+
+def test_an_interrupted_training_resumes_to_the_same_weights(
+    tmp_path: Path, frames: tuple[FrameSet, FrameSet], trained_run: Path
+):
+    def interrupt(now: TrainProgress) -> None:
+        if now.epoch == 1 and now.fraction > 0.4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "run", frames, on_progress=interrupt)
+    assert not (tmp_path / "run" / "model.safetensors").exists()
+    assert (tmp_path / "run" / "checkpoints" / "last.ckpt").exists()
+    run(tmp_path / "run", frames)
+    assert (tmp_path / "run" / "model.safetensors").read_bytes() == (trained_run / "model.safetensors").read_bytes()
+    metrics = (tmp_path / "run" / "metrics.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in metrics] == ["epoch", "1.000", "2.000", "3.000"]
+    assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+def test_training_leaves_the_callers_random_state_alone(tmp_path: Path, frames: tuple[FrameSet, FrameSet]):
+    before = torch.get_rng_state()
+    run(tmp_path / "run", frames, replace(CONFIG, epochs=1))
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_the_time_limit_stops_a_training_and_leaves_a_whole_run(tmp_path: Path, frames: tuple[FrameSet, FrameSet]):
+    result = run(tmp_path / "run", frames, replace(CONFIG, epochs=10_000, max_minutes=0.02))
+    assert result.stopped_by == "time limit"
+    assert 0 < result.epochs < 10_000
+    load_checkpoint(tmp_path / "run")
+
+
+def test_a_loss_that_is_not_finite_stops_with_a_sentence(tmp_path: Path, frames: tuple[FrameSet, FrameSet]):
+    with pytest.raises(ModelError, match="the training loss is nan at step 0; lower the learning rate"):
+        run(tmp_path / "run", (replace(frames[0], safety_margin=frames[0].safety_margin * torch.nan), frames[1]))
+
+
+def test_a_trial_in_both_sets_is_refused(tmp_path: Path, frames: tuple[FrameSet, FrameSet]):
+    with pytest.raises(InputError, match="trial train-dry-0 is in both training and validation; split by trial"):
+        run(tmp_path / "run", (frames[0], frames[0]))
+
+
+def test_fewer_frames_than_a_batch_are_refused(tmp_path: Path, frames: tuple[FrameSet, FrameSet]):
+    with pytest.raises(InputError, match="44 training frames do not fill a batch of 64; lower batch_size"):
+        run(tmp_path / "run", frames, replace(CONFIG, batch_size=64))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"epochs": 0}, "epochs must be positive, got 0"),
+        ({"image_size": 16}, "image_size must be at least 32 pixels, got 16"),
+        ({"batch_size": 1}, "batch_size must be at least 2"),
+        ({"max_minutes": 0.0}, "max_minutes must be positive, got 0"),
+    ],
+)
+def test_impossible_recipes_are_refused(change: dict, message: str):
+    with pytest.raises(InputError, match=message):
+        replace(CONFIG, **change)
+
+
+def test_each_epoch_has_an_order_of_its_own_that_repeats():
+    shuffle = EpochShuffle(20, seed=1)
+    first = list(shuffle)
+    shuffle.set_epoch(1)
+    second = list(shuffle)
+    shuffle.set_epoch(0)
+    assert sorted(first) == sorted(second) == list(range(20))
+    assert first != second
+    assert list(shuffle) == first
