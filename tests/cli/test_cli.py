@@ -104,11 +104,11 @@ def test_bad_frames(difference_run: Path, tmp_path: Path, capsys, *, name: str, 
 
 
 def test_a_truncated_frame(difference_run: Path, difference_folder: Path, tmp_path: Path, capsys):
-    victim = difference_folder / "frame6_55.png"
-    assert victim.is_file()
-    victim.write_bytes(victim.read_bytes()[:300])
+    victim = next(difference_folder.glob("frame6_*.png"))
+    whole = victim.read_bytes()
+    victim.write_bytes(whole[: len(whole) // 2])
     line = refused(capsys, "explain", difference_run, "--frames", difference_folder, "-o", tmp_path / "out")
-    assert "frame6_55.png cannot be read as an image" in line
+    assert f"{victim.name} cannot be read as an image" in line
     assert not (tmp_path / "out").exists()
 
 

@@ -71,14 +71,14 @@ def test_does_not_depend_on_the_reference(network, images, reference):
 
 def test_moves_with_the_image_by_the_networks_stride(network):
     def with_patch(at: int):
-        images = torch.zeros(1, 3, 384, 384, dtype=torch.float32)
+        images = torch.zeros(1, 3, 512, 512)  # large, so that the padding of the border is out of sight
         patch = torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(5))
         images[..., at : at + 64, at : at + 64] = patch
         return images
 
     model = network("shufflenet").float()
-    one = GradCam()(model, with_patch(128)).relevance[0, 96:256, 96:256]
-    other = GradCam()(model, with_patch(160)).relevance[0, 128:288, 128:288]
+    one = GradCam()(model, with_patch(224)).relevance[0, 192:320, 192:320]
+    other = GradCam()(model, with_patch(256)).relevance[0, 224:352, 224:352]
     assert float(torch.corrcoef(torch.stack([one.flatten(), other.flatten()]))[0, 1]) >= 0.99
 
 

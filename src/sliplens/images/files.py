@@ -50,7 +50,7 @@ def read_image(path: Path, *, size: tuple[int, int] | None = None) -> UInt8[np.n
                 if max(bits) > 8:
                     cure = f"{max(bits)} bits a pixel; convert it to 8-bit RGB"
                 raise ImageError(f"{path} has {cure}")
-            pixels = np.asarray(image)
+            pixels = np.array(image)
     except FileNotFoundError:
         raise ImageError(f"{path} does not exist; check the path") from None
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
@@ -87,7 +87,7 @@ def decode_png(data: bytes, *, where: str) -> UInt8[np.ndarray, "height width 3"
         with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
             if image.mode != "RGB":
                 raise ImageError(f"{where} has {_CURES.get(image.mode, image.mode)}")
-            return np.asarray(image)
+            return np.array(image)
     except (OSError, SyntaxError, ValueError) as error:
         raise ImageError(f"{where} cannot be read as PNG ({error}); make the data set again") from None
 

@@ -18,6 +18,7 @@ from sliplens.report.style import (
     percent,
     short_input_name,
     signed,
+    source_name,
 )
 from sliplens.report.thesis import ACCURACY, DELETION, MARK, NETWORK_PIXELS, SECONDS
 
@@ -97,10 +98,10 @@ def table_deletion(scores: dict[str, Scored], *, rng: np.random.Generator) -> Ta
             )
     sources = " and ".join(sorted({source_name(scored.source) for scored in scores.values()}))
     return Table(
-        caption=f"Deletion score D on {sources}, averaged over all steps, mean ± standard deviation over frames; lower = more "
-        "faithful, and the lowest of each input is bold. “Against random”: mean difference from the random control "
-        "with a 95 % interval (frames resampled); below zero = better than chance. “Last step”: D once every pixel is "
-        f"filled, which no map has a part in. Grey column: the {MARK}.",
+        caption=f"Deletion score D on {sources}, averaged over all steps, mean ± standard deviation over frames; "
+        "lower = more faithful, and the lowest of each input is bold. “Against random”: mean difference from the "
+        "random control with a 95 % interval (frames resampled); below zero = better than chance. “Last step”: D once "
+        f"every pixel is filled, which no map has a part in. Grey column: the {MARK}.",
         head=_head("Input", "Method", "Score D", "Against random", "Last step", "Score D, thesis", "Frames"),
         rows=tuple(rows),
     )

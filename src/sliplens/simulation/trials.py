@@ -104,5 +104,5 @@ def simulate_dataset(
         table.append(trial_info(recording, split=plan.split, path=path))
         if on_trial is not None:
             on_trial(index + 1, len(plans))
-    write_dataset_table(folder, table)
+    write_dataset_table(folder, table, simulated=True)
     return Dataset.open(folder)
