@@ -2,6 +2,7 @@ import numpy as np
 import torch
 
 from sliplens.datasets import get_encoding, load_frames
+from sliplens.datasets.frames import UNTOUCHED
 from sliplens.recordings import Dataset
 
 
@@ -36,3 +37,17 @@ def test_progress_counts_trials(small_dataset: Dataset):
         on_trial=lambda done, total: seen.append((done, total)),
     )
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+def test_the_untouched_sensor_is_added_as_full_stick_only_when_asked_for(small_dataset: Dataset):
+    trials = small_dataset.select(split="train")
+    plain, more = (
+        load_frames(small_dataset, trials, encoding=get_encoding("difference"), image_size=32, untouched_share=share)
+        for share in (0.0, 0.2)
+    )
+    added = [row for row, frame in enumerate(more.frame) if frame == UNTOUCHED]
+    assert len(more) == len(plain) + len(added)
+    assert len(added) == 4 * 2  # a fifth of 11 labelled frames, rounded, in each of four trials
+    assert not more.images[added].any()
+    assert more.safety_margin[added].eq(1).all()
+    assert UNTOUCHED not in plain.frame

@@ -37,7 +37,7 @@ def test_is_exact_on_a_linear_model(images, reference):
     torch.testing.assert_close(explanation.relevance, expected, atol=0, rtol=1e-5)
 
 
-def test_steps_are_doubled_until_the_sum_is_complete(network, images, reference):
+def test_steps_grow_until_the_sum_is_complete(network, images, reference):
     model = network("gap")
     fixed = IntegratedGradients(steps=2, max_steps=2)(model, images, reference=reference)
     adaptive = IntegratedGradients(steps=2)(model, images, reference=reference)
@@ -72,7 +72,7 @@ def test_stops_at_the_most_steps_and_says_so():
     assert explanation.completeness_gap is not None
     assert explanation.completeness_gap.tolist() == [1]
     assert any("leaves 1 of f(x) - f(reference) = 1 unexplained" in sentence for sentence in explanation.warnings)
-    assert sum(counted.batches) == 2 + 4 + 8 + 10  # the predictions, then the doublings
+    assert sum(counted.batches) == 2 + 4 + 10  # the predictions, then fourfold up to the most
 
 
 def test_one_pass_is_bounded(network, images):

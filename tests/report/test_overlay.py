@@ -4,6 +4,7 @@ from matplotlib.figure import Figure
 
 from sliplens.errors import SaliencyError
 from sliplens.report import overlay_saliency, plot_colour_bar, plot_overlay
+from sliplens.report.overlay import stretch_saliency
 
 
 def test_overlay_has_the_size_of_its_picture(rng):
@@ -55,5 +56,19 @@ def test_plot_overlay_draws_one_image_that_fills_the_picture(rng):
 def test_colour_bar_says_what_its_ends_mean():
     ax = plot_colour_bar(ax=Figure().subplots())
 
-    assert "relative" in ax.get_xlabel()
+    assert "99.5th percentile" in ax.get_xlabel()
     assert ax.images[0].get_extent() == [0, 1, 0, 1]
+
+
+def test_stretching_gives_the_upper_half_percent_full_colour_and_keeps_the_order():
+    saliency = np.linspace(0, 0.5, 1000).reshape(20, 50)
+    stretched = stretch_saliency(saliency)
+    assert np.count_nonzero(stretched == 1) == 5
+    assert (np.diff(stretched.ravel()) >= 0).all()
+
+
+def test_stretching_leaves_an_empty_map_empty_and_shows_a_single_pixel():
+    assert not stretch_saliency(np.zeros((20, 50))).any()
+    dot = np.zeros((20, 50))
+    dot[3, 4] = 0.1
+    assert stretch_saliency(dot)[3, 4] == 1

@@ -39,12 +39,14 @@ class Demo:
     """Time to aim for, everything included."""
     image_size: int = 112
     """Height and width of the networks' input; the frames are 224 x 224 pixels."""
-    dry_trials: int = 32
-    """Simulated dry trials, over four days."""
-    wet_trials: int = 6
+    dry_trials: int = 96
+    """Simulated dry trials, dealt to all days."""
+    wet_trials: int = 8
     """Simulated wet trials."""
-    frames_per_trial: int = 120
+    frames_per_trial: int = 48
     """Frames of each trial."""
+    days: int = 12
+    """Simulated days, each with its own friction, stiffness, light and camera; the last one tests."""
     real_frames: Path | None = None
     """Folder of real difference images named ..._GG.png with the safety margin in percent; found by itself where
     SLIPLENS_REFERENCE (or ../shared/reference) holds the public ChromaTouch images."""
@@ -62,6 +64,7 @@ class Demo:
             dry_trials=self.dry_trials,
             wet_trials=self.wet_trials,
             frames_per_trial=self.frames_per_trial,
+            days=self.days,
             seed=self.seed,
         ).run()
         minutes = self._plan_training(started, real)
@@ -130,7 +133,8 @@ class Demo:
         real_count = 0 if real is None else sum(1 for _ in real.iterdir())
         explained = len(INPUTS) * _LEVELS + real_count
         frames = len(INPUTS) * self.frames_per_trial * self.wet_trials * 3
-        passes = explained * (1.2 * _POLY_CAM_PASSES + 4 * self.image_size) + frames
+        # masks, gradients of Integrated Gradients, deletion with four orders: in forward passes, as measured
+        passes = explained * (1.8 * _POLY_CAM_PASSES + 4 * self.image_size) + frames
         left = 60 * self.max_minutes - (time.perf_counter() - started) - passes / rate - 45  # reading, drawing
         minutes = max(_SHORTEST_TRAINING, round(left / 60 / len(INPUTS), 2))
         say(f"this machine answers {rate:.0f} frames a second: {minutes:g} minutes of training for each network")

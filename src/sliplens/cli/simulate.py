@@ -14,18 +14,21 @@ from sliplens.provenance import output_folder, write_json
 class Simulate:
     """Simulate trials of a ChromaTouch-like dome, with known safety margin.
 
-    Each trial presses the dome on a flat object, holds, and pulls until it slips. Four days: days 1 to 3 are dry and
-    make the training and validation sets, day 4 is the test set, dry and wet. A trial is never split.
+    Each trial presses the dome on a flat object, holds, and pulls until it slips. The last day is the test set, dry and
+    wet; the days before are dry and make the training set and, a quarter of all but the first, the validation set. A
+    trial is never split. The thesis has four days; a network that saw three cannot tell a day from a friction.
     """
 
     output: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Folder to make."""
-    dry_trials: int = 32
-    """Trials on the dry object, over all four days."""
-    wet_trials: int = 6
-    """Trials on the wet object, all on day 4."""
-    frames_per_trial: int = 120
+    dry_trials: int = 96
+    """Trials on the dry object, dealt to all days."""
+    wet_trials: int = 8
+    """Trials on the wet object, all on the last day."""
+    frames_per_trial: int = 48
     """Frames of each trial; the thesis has about 800."""
+    days: int = 12
+    """Days, each with its own friction, stiffness, light and camera; the last one tests."""
     seed: int = 0
     """Seed: the same seed gives the same bytes."""
     overwrite: bool = False
@@ -39,6 +42,7 @@ class Simulate:
             dry_trials=self.dry_trials,
             wet_trials=self.wet_trials,
             frames_per_trial=self.frames_per_trial,
+            days=self.days,
             seed=self.seed,
         )
         with output_folder(self.output, stage="simulate", config={"recipe": recipe}, overwrite=self.overwrite) as out:

@@ -8,6 +8,7 @@ import tyro
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from sliplens.cli.console import OUT, progress_bar, unchanged, wrote
+from sliplens.errors import InputError
 from sliplens.provenance import output_folder, write_json
 
 
@@ -36,6 +37,8 @@ class Train:
     """Images a step."""
     learning_rate: float = 2e-3
     """Peak learning rate."""
+    untouched_share: float = 0.05
+    """Share of images that show the untouched sensor as full stick: what explanations are measured against."""
     augment: bool = True
     """Slight rotations, noise and blur."""
     seed: int = 0
@@ -61,7 +64,14 @@ class Train:
         )
         data = Dataset.open(self.data)
         train_trials, validation_trials = data.select(split="train"), data.select(split="validation")
-        recipe = {"input": self.input, "training": config, "data_hash": data.hash}
+        if not 0 <= self.untouched_share <= 1:
+            raise InputError(f"--untouched-share must lie in [0, 1], got {self.untouched_share:g}")
+        recipe = {
+            "input": self.input,
+            "training": config,
+            "untouched_share": self.untouched_share,
+            "data_hash": data.hash,
+        }
         with output_folder(self.output, stage="train", config=recipe, overwrite=self.overwrite) as out:
             if out.complete:
                 unchanged(self.output)
@@ -74,6 +84,7 @@ class Train:
                     train_trials,
                     encoding=encoding,
                     image_size=self.image_size,
+                    untouched_share=self.untouched_share,
                     on_trial=lambda done, _: bar(done, total),
                 )
                 validation = load_frames(

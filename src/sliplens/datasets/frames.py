@@ -13,6 +13,9 @@ from sliplens.datasets.encodings import Encoding
 from sliplens.errors import RecordingError
 from sliplens.recordings import Dataset, TrialInfo
 
+UNTOUCHED = -1
+"""Frame number of the reference frame, which is no frame of the trial."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class FrameSet(TorchDataset):
@@ -58,6 +61,7 @@ def load_frames(
     *,
     encoding: Encoding,
     image_size: int,
+    untouched_share: float = 0.0,
     on_trial: Callable[[int, int], None] | None = None,
 ) -> FrameSet:
     """Read trials, encode them, and keep the frames that have a label.
@@ -70,6 +74,11 @@ def load_frames(
         The data set and the trials of it to read.
     encoding, image_size
         Input of the network, and its height and width in pixels.
+    untouched_share
+        For training: add the untouched sensor itself, with the label 1, this often for each labelled frame and at least
+        once a trial. Without a pull the safety margin is 1 however light the touch, so 1 is its limit; and a network
+        that was shown the untouched sensor gives explanations a reference that means something: "why 20 % rather than
+        100 %?". Never for an evaluation.
     on_trial
         Called with the number of trials read and the number of all.
 
@@ -89,6 +98,13 @@ def load_frames(
         labels.append(recording.safety_margin[labelled])
         times.append(recording.time_s[labelled])
         rows += [(recording.trial, int(frame), recording.condition, recording.day) for frame in labelled]
+        if untouched_share > 0:
+            copies = max(1, round(untouched_share * len(labelled)))
+            compared = encoding.compare(recording.reference[None], recording.reference)
+            images.append(encoding.resize(compared, image_size=image_size).expand(copies, -1, -1, -1))
+            labels.append(np.ones(copies))
+            times.append(np.full(copies, recording.time_s[0]))
+            rows += [(recording.trial, UNTOUCHED, recording.condition, recording.day)] * copies
         if on_trial is not None:
             on_trial(done, len(trials))
     if not rows:

@@ -13,6 +13,7 @@ from sliplens.explain.explanation import Explanation, Progress
 from sliplens.explain.health import check_maps
 from sliplens.explain.subject import Subject, explaining
 
+_GROWTH = 4  # nodes are not shared between grids: fourfold, the tries before the last cost a third more, not twice
 _ROUNDING = 1e-6  # of |f|: a gap that float32 predictions cannot resolve is no gap
 
 
@@ -21,8 +22,8 @@ class IntegratedGradients:
     """Integrated Gradients along the straight line from the reference, with as many steps as completeness needs.
 
     Relevance is (x - b) times the integral over t in [0, 1] of df/dx at b + t (x - b), summed over the channels; it
-    adds up to f(x) - f(b) when the integral is exact. The number of steps is doubled for each image on its own until
-    the sum is within `tolerance` of that, so a batch gives what its images alone would give.
+    adds up to f(x) - f(b) when the integral is exact. The number of steps is raised fourfold for each image on its
+    own until the sum is within `tolerance` of that, so a batch gives what its images alone would give.
 
     Parameters
     ----------
@@ -105,4 +106,4 @@ class IntegratedGradients:
             relevance = contributions.detach().sum(dim=1)[0]
             if abs(float(relevance.sum()) - change) <= allowed or steps == self.max_steps:
                 return relevance
-            steps = min(2 * steps, self.max_steps)
+            steps = min(_GROWTH * steps, self.max_steps)

@@ -1,6 +1,7 @@
 """A data set on disk: one Parquet file a trial, frames as lossless PNG beside their labels."""
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -111,7 +112,8 @@ def save_recording(recording: Recording, path: Path) -> None:
     columns: dict[str, Any] = {"frame": np.arange(len(recording))}
     columns |= {name: getattr(recording, name) for name in SIGNALS}
     columns["contact_state"] = [str(state) for state in recording.contact_state]
-    columns["image"] = pa.array([encode_png(frame) for frame in recording.frames], type=pa.binary())
+    with ThreadPoolExecutor() as pool:  # zlib lets go of the interpreter's lock
+        columns["image"] = pa.array(list(pool.map(encode_png, recording.frames)), type=pa.binary())
     description = {name: str(getattr(recording, name)) for name in _DESCRIPTION}
     table = pa.table(columns).replace_schema_metadata(
         {**description, b"reference": encode_png(recording.reference), b"schema_version": str(SCHEMA_VERSION)}
@@ -165,8 +167,13 @@ def _decode_frames(
     images: pa.ChunkedArray, reference: UInt8[np.ndarray, "height width 3"], path: Path
 ) -> UInt8[np.ndarray, "frames height width 3"]:
     frames = np.empty((len(images), *reference.shape), dtype=np.uint8)
-    for index, data in enumerate(images):
-        frame = decode_png(data.as_py(), where=f"frame {index} of {path}")
+
+    def decode(index: int) -> UInt8[np.ndarray, "height width 3"]:
+        return decode_png(images[index].as_py(), where=f"frame {index} of {path}")
+
+    with ThreadPoolExecutor() as pool:
+        decoded = list(pool.map(decode, range(len(images))))
+    for index, frame in enumerate(decoded):
         if frame.shape != reference.shape:
             raise RecordingError(
                 f"frame {index} of {path} is {frame.shape[:2]} pixels but the reference is {reference.shape[:2]}; "

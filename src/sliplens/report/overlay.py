@@ -11,6 +11,8 @@ from sliplens.arrays import require_saliency
 COLORMAP = "inferno"
 _DIM = 0.55  # of the picture's lightness: leaves the bright end of the colours to the saliency
 _OPAQUE_FROM = 0.4  # saliency from which the picture no longer shines through
+FULL_COLOUR_PERCENTILE = 99.5
+"""Percentile of a map that gets the brightest colour: a few outlying pixels would leave the rest of the map black."""
 
 
 def overlay_saliency(
@@ -37,6 +39,12 @@ def overlay_saliency(
     return np.round(255 * _blend(_DIM * _lightness(picture), value)).astype(np.uint8)
 
 
+def stretch_saliency(saliency: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
+    """Stretch a map for viewing, so that its 99.5th percentile and all above are 1; a zero map stays zero."""
+    top = np.percentile(saliency, FULL_COLOUR_PERCENTILE) or saliency.max()
+    return np.clip(saliency / top, 0, 1) if top > 0 else saliency
+
+
 def plot_overlay(
     picture: UInt8[np.ndarray, "height width 3"], saliency: Float[np.ndarray, "rows columns"], *, ax: Axes
 ) -> Axes:
@@ -50,7 +58,7 @@ def plot_colour_bar(*, ax: Axes) -> Axes:
     """Draw the colours of `overlay_saliency` from least to most important, over a mid-grey picture."""
     value = np.linspace(0, 1, 256)[None]
     ax.imshow(_blend(np.full_like(value, _DIM / 2), value), extent=(0, 1, 0, 1), aspect="auto")
-    ax.set(xlabel="Saliency (relative to the largest of its own picture)", yticks=[], xticks=[0, 0.25, 0.5, 0.75, 1])
+    ax.set(xlabel="Saliency (share of its own picture's 99.5th percentile)", yticks=[], xticks=[0, 0.25, 0.5, 0.75, 1])
     ax.grid(visible=False)
     return ax
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sliplens.report.drawing import Picture, png_picture
-from sliplens.report.overlay import overlay_saliency
+from sliplens.report.overlay import overlay_saliency, stretch_saliency
 from sliplens.report.records import Explained, ExplainedFrame
 from sliplens.report.style import in_order, input_name, method_name, methods_in_order, percent, source_name
 
@@ -59,8 +59,9 @@ def build_panel(explained: Explained) -> Panel:
         columns=columns,
         rows=tuple(rows),
         caption=f"{input_name(explained.input)}, {source_name(explained.source)}, {condition}: what the network saw, "
-        "and what each method holds to be important for its answer. Colours are relative to the largest saliency of "
-        f"each picture, so brightness does not compare between pictures.{gap} Frames: {ids}.",
+        "and what each method holds to speak for the answer, rather than for that of the untouched sensor. Colours are "
+        f"relative to each picture's own saliency, so brightness does not compare between pictures.{gap}"
+        f"{_tell_blank(explained, chosen)} Frames: {ids}.",
     )
 
 
@@ -101,8 +102,17 @@ def _input_picture(explained: Explained, index: int | None) -> Picture | None:
 def _overlay_picture(explained: Explained, method: str, index: int | None) -> Picture | None:
     if index is None:
         return None
-    pixels = overlay_saliency(explained.pictures[index], explained.saliency[method][index])
+    pixels = overlay_saliency(explained.pictures[index], stretch_saliency(explained.saliency[method][index]))
     return png_picture(pixels, alt=f"{method_name(method)} over frame {_told(explained.frames[index])}")
+
+
+def _tell_blank(explained: Explained, chosen: list[tuple[float | None, int | None]]) -> str:
+    rows = [index for _, index in chosen if index is not None]
+    blank = sum(not explained.saliency[method][index].any() for method in explained.methods for index in rows)
+    if not blank:
+        return ""
+    pictures = "1 picture has" if blank == 1 else f"{blank} pictures have"
+    return f" {pictures} no colour: there the method finds nothing that speaks for the answer."
 
 
 def _told(frame: ExplainedFrame) -> str:

@@ -129,7 +129,8 @@ def _notes(pieces: list[dict[str, np.ndarray]], ids: Sequence[str]) -> dict[str,
     warnings: dict[str, list[str]] = {}
     for name, piece in zip(ids, pieces, strict=True):
         for warning in piece["warnings"]:
-            warnings.setdefault(str(warning), []).append(name)
+            # each frame was explained by itself: its place in that batch of one tells nothing
+            warnings.setdefault(str(warning).removeprefix("image 0: "), []).append(name)
     return {
         "seconds_per_frame": float(np.mean([piece["seconds"] for piece in pieces])),
         "warnings": [f"{', '.join(names)}: {warning}" for warning, names in warnings.items()],

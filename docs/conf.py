@@ -1,0 +1,21 @@
+"""Sphinx configuration."""
+
+from sliplens import __version__
+
+project = "sliplens"
+author = "The sliplens developers"
+copyright = "2026, the sliplens developers"  # noqa: A001
+release = version = __version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+exclude_patterns = ["_build"]
+html_theme = "alabaster"
+html_theme_options = {"description": "How close a fingertip is to losing its grip, and why.", "page_width": "1080px"}
+
+autodoc_typehints = "description"
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+napoleon_numpy_docstring = True
+napoleon_google_docstring = False
+# Attributes sections repeat what the fields' own lines say
+napoleon_use_ivar = True
