@@ -4,7 +4,7 @@ from sliplens import __version__
 
 project = "sliplens"
 author = "The sliplens developers"
-copyright = "2026, the sliplens developers"  # noqa: A001
+copyright = "2026, the sliplens developers"
 release = version = __version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]

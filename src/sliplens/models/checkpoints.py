@@ -132,10 +132,10 @@ def _read_manifest(path: Path) -> Manifest:
     size, frame = values["image_size"], values["frame_size"]
     if not isinstance(size, int) or not isinstance(frame, list) or [type(side) for side in frame] != [int, int]:
         raise CheckpointError(f"{path} gives no usable image_size or frame_size; train the network again")
+    given: dict[str, Any] = {name: value for name, value in values.items() if name in known}
+    given["frame_size"] = (frame[0], frame[1])
     try:
-        manifest = Manifest(
-            **{name: value for name, value in values.items() if name in known} | {"frame_size": tuple(frame)}
-        )
+        manifest = Manifest(**given)
     except TypeError as error:
         raise CheckpointError(f"{path} is incomplete ({error}); train the network again") from None
     get_encoding(manifest.input)

@@ -57,7 +57,7 @@ class Regressor(lightning.LightningModule):
         """Predict the safety margin."""
         return self.model(images).reshape(len(images))
 
-    def training_step(self, batch: tuple[Tensor, Tensor], batch_index: int) -> Tensor:  # noqa: ARG002
+    def training_step(self, batch: tuple[Tensor, Tensor], batch_idx: int) -> Tensor:
         """One step; a loss that is not finite stops the training."""
         images, labels = batch
         if self.augmentation is not None:
@@ -72,13 +72,13 @@ class Regressor(lightning.LightningModule):
         self.log("train_mse", loss, on_step=False, on_epoch=True, batch_size=len(images))
         return loss
 
-    def validation_step(self, batch: tuple[Tensor, Tensor], batch_index: int) -> None:  # noqa: ARG002
+    def validation_step(self, batch: tuple[Tensor, Tensor], batch_idx: int) -> None:
         """Log the validation error."""
         images, labels = batch
         loss = functional.mse_loss(self(images), labels)
         self.log("validation_mse", loss, on_epoch=True, batch_size=len(images))
 
-    def on_train_batch_start(self, *_: Any) -> None:
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         """Set the learning rate for the share of the training that is done."""
         warm_up, done = 0.1, self.fraction_done()
         descent = 0.5 * (1 + math.cos(math.pi * min(1.0, max(0.0, (done - warm_up) / (1 - warm_up)))))
@@ -138,12 +138,19 @@ class Clock(Callback):
         """Go on from a checkpoint."""
         self.seconds_before, self.rows = state_dict["seconds"], state_dict["rows"]
 
-    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:  # noqa: ARG002
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Start the clock."""
         self._started = time.perf_counter()
         self.step = trainer.global_step
 
-    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
+    def on_train_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
         """Stop when the time is up."""
         self.step = trainer.global_step
         if self.max_seconds is not None and self.seconds >= self.max_seconds and self.step < self.steps:
@@ -151,7 +158,7 @@ class Clock(Callback):
             trainer.should_stop = True
         self._report(trainer)
 
-    def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:  # noqa: ARG002
+    def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Write the epoch's row; the validation has run by now."""
         metrics = trainer.callback_metrics
         epoch = self.step / self.steps * (trainer.max_epochs or 1)
