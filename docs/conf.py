@@ -1,5 +1,7 @@
 """Sphinx configuration."""
 
+from sphinx.application import Sphinx
+
 from sliplens import __version__
 
 project = "sliplens"
@@ -19,3 +21,12 @@ napoleon_numpy_docstring = True
 napoleon_google_docstring = False
 # Attributes sections repeat what the fields' own lines say
 napoleon_use_ivar = True
+
+
+def setup(app: Sphinx) -> None:
+    """Read bars in docstrings as absolute values, |T_n - T_0|, not as substitutions of reStructuredText."""
+
+    def escape(_app: Sphinx, _what: str, _name: str, _obj: object, _options: object, lines: list[str]) -> None:
+        lines[:] = [line.replace("|", r"\|") for line in lines]
+
+    app.connect("autodoc-process-docstring", escape)

@@ -27,7 +27,7 @@ def test_a_pooled_linear_head_is_the_sum_of_the_map_and_its_bias(name, layer, ne
 @pytest.mark.parametrize("size", [64, 50])  # 50 px is no multiple of the map's 2 cells' stride
 def test_upsampling_keeps_that_sum(size, network, images):
     model = network("shufflenet")
-    explanation = GradCam()(model, images[..., :size, :size])
+    explanation = GradCam(contrast=False)(model, images[..., :size, :size])
     total = explanation.relevance.sum(dim=(1, 2)) + model.fc.bias.detach().float()
     torch.testing.assert_close(total, explanation.prediction, atol=1e-4, rtol=0)
 
@@ -46,7 +46,7 @@ def test_equals_torch_cam_after_the_same_relu_and_normalisation(name, layer, net
 
 def test_equals_torch_cam_on_the_image(network, images):
     model = network("shufflenet")
-    explanation = GradCam(layer="stage3")(model, images)
+    explanation = GradCam(layer="stage3", contrast=False)(model, images)
     with GradCAM(model, target_layer="stage3") as extractor:
         oracle = extractor(0, model(images.clone().requires_grad_()), normalized=False)[0]
     # torch-cam has applied its ReLU to the cells, so compare where the cells have one sign only
@@ -62,11 +62,37 @@ def test_last_layer_is_the_default(network, images):
     assert torch.equal(GradCam()(model, images).relevance, GradCam(layer="conv5")(model, images).relevance)
 
 
-def test_does_not_depend_on_the_reference(network, images, reference):
+def test_the_published_map_does_not_depend_on_the_reference(network, images, reference):
     model = network("shufflenet")
-    one, other = GradCam()(model, images), GradCam()(model, images, reference=reference)
+    published = GradCam(contrast=False)
+    one, other = published(model, images), published(model, images, reference=reference)
     assert torch.equal(one.relevance, other.relevance)
     assert not torch.equal(one.reference_prediction, other.reference_prediction)
+    assert one.completeness_gap is None
+
+
+@pytest.mark.parametrize(("name", "size"), [("shufflenet", 64), ("shufflenet", 50), ("gap", 64)])
+def test_the_contrast_adds_up_to_the_difference_for_a_pooled_linear_head(name, size, network, images, reference):
+    explanation = GradCam()(network(name), images[..., :size, :size], reference=reference[..., :size, :size])
+    total = explanation.relevance.sum(dim=(1, 2))
+    # a float32 sum over the pixels of the image
+    torch.testing.assert_close(total, explanation.change, atol=1e-4, rtol=1e-4)
+    assert explanation.completeness_gap is not None
+    assert float(explanation.completeness_gap.max()) <= 1e-5
+
+
+def test_the_contrast_is_the_published_map_less_that_of_the_references_activations(network, images, reference):
+    model = network("shufflenet")
+    activations, gradients, _ = captured(model, images, "stage3")
+    references, _, _ = captured(model, reference.expand_as(images), "stage3")
+    cells = grad_cam_map(activations, gradients) - grad_cam_map(references, gradients)
+    upsampled = nn.functional.interpolate(cells[None], size=(64, 64), mode="bilinear", align_corners=False)[0]
+    relevance = GradCam(layer="stage3")(model, images, reference=reference).relevance
+    torch.testing.assert_close(relevance, (upsampled / 16**2).float(), atol=1e-6, rtol=0)
+
+
+def test_an_image_that_is_its_own_reference_has_an_empty_map(network, images):
+    assert not GradCam()(network("shufflenet"), images, reference=images).relevance.any()
 
 
 def test_moves_with_the_image_by_the_networks_stride(network):

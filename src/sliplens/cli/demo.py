@@ -42,8 +42,8 @@ class Demo:
     max_minutes: float = 8.0
     """Time to aim for, everything included."""
     image_size: int | None = None
-    """Height and width of the networks' input; the frames are 224 x 224 pixels. If not given, the largest of 112, 96, 80
-    and 64 that leaves time to train."""
+    """Height and width of the networks' input; the frames are 224 x 224 pixels. If not given, the largest of 112, 96,
+    80 and 64 that leaves time to train."""
     dry_trials: int = 96
     """Simulated dry trials, dealt to all days."""
     wet_trials: int = 8
@@ -112,7 +112,8 @@ class Demo:
 
     def _open_workspace(self, real: Path | None) -> None:
         """Make the workspace, or go on in one that was begun with the same settings."""
-        settings = to_jsonable({**asdict(self), "real_frames": real})
+        settings = to_jsonable({**asdict(self), "real_frames": None if real is None else real.resolve()})
+        del settings["output"]  # the same folder, named from elsewhere
         plan = self.output / _PLAN
         if plan.is_file():
             if read_json(plan)["settings"] != settings:
@@ -139,16 +140,16 @@ class Demo:
         real_count = 0 if real is None else sum(1 for _ in real.iterdir())
         explained = len(INPUTS) * _LEVELS + real_count
         left = 60 * self.max_minutes - (time.perf_counter() - started) - _OTHER_SECONDS
+        plans = []
         for size in sizes:
             # masks, gradients of Integrated Gradients, deletion in four orders: in forward passes, as measured
             seconds = explained * (1.8 * _POLY_CAM_PASSES + 4 * size) / rate * (size / sizes[0]) ** 2
-            minutes = round((left - seconds) / 60 / len(INPUTS), 2)
-            if minutes >= _SHORTEST_TRAINING:
-                break
-        minutes = max(_SHORTEST_TRAINING, minutes)
+            plans.append((size, round((left - seconds) / 60 / len(INPUTS), 2)))
+        smallest = (sizes[-1], _SHORTEST_TRAINING)
+        size, minutes = next((plan for plan in plans if plan[1] >= _SHORTEST_TRAINING), smallest)
         say(
-            f"this machine answers {rate:.0f} images of {sizes[0]} px a second: images of {size} px, {minutes:g} minutes of "
-            "training for each network"
+            f"this machine answers {rate:.0f} images of {sizes[0]} px a second: "
+            f"images of {size} px, {minutes:g} minutes of training for each network"
         )
         write_json(self.output / _PLAN, {**plan, "forward_rate": rate, "image_size": size, "train_minutes": minutes})
         wrote(self.output / _PLAN, "settings and training time, kept for a second run")

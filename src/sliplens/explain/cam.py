@@ -41,21 +41,29 @@ def grad_cam_map(
 
 @dataclass(frozen=True, kw_only=True)
 class GradCam:
-    """Grad-CAM of one layer, signed, in margin units.
+    """Grad-CAM of one layer against the reference, signed, in margin units.
 
-    The map is bilinear between the layer's cells and keeps their total. It follows the gradient at x and does not
-    depend on the reference, which only decides what `saliency` shows. With a head linear in the mean over space it adds
-    up to f(x) less the head's bias, not to f(x) - f(reference), so no completeness gap is given.
+    The published map, sum over c of alpha_c A_c(x), adds up to f(x) less the head's bias: for a classifier's logit that
+    is evidence, for a regressor it is mostly the level that every image has. What sets x apart is the contrast
+
+        sum over c of alpha_c (A_c(x) - A_c(b)),   alpha_c at x,
+
+    which for a head linear in the mean over space adds up to f(x) - f(b) exactly, whatever the bias.
+    The map is bilinear between the layer's cells and keeps their total.
 
     Parameters
     ----------
     layer
         Name of the layer; by default the last one with a map, as `find_layers` finds it.
+    contrast
+        Take the reference's activations off. False gives the published map, which does not depend on the reference and
+        has no completeness gap; the reference then only decides what `saliency` shows.
     batch_size
         Images in one pass.
     """
 
     layer: str | None = None
+    contrast: bool = True
     batch_size: int = 32
 
     def __post_init__(self) -> None:
@@ -77,32 +85,41 @@ class GradCam:
             layer = find_layers(model, subject.images[:1], names=names)[-1].name
             parts = []
             done = 0
-            for part in subject.images.split(self.batch_size):
-                parts.append(self._explain(subject, part, layer=layer))
+            pairs = zip(subject.images.split(self.batch_size), subject.reference.split(self.batch_size), strict=True)
+            for part, references in pairs:
+                parts.append(self._explain(subject, part, references, layer=layer))
                 done += len(part)
                 if on_progress is not None:
                     on_progress(done, len(subject.images))
-            relevance = torch.cat(parts).float()
+            exact = torch.cat(parts)
+            gap = (exact.sum(dim=(1, 2)) - subject.change).abs().float() if self.contrast else None
+            relevance = exact.float()
         return Explanation(
             relevance=relevance,
             method="grad-cam",
-            target=f"f(x), by its gradient with respect to layer {layer}",
+            target=f"{'f(x) - f(reference)' if self.contrast else 'f(x)'}, through layer {layer}",
             prediction=subject.prediction.float(),
             reference_prediction=subject.reference_prediction.float(),
+            completeness_gap=gap,
             seconds=clock.seconds(relevance),
             warnings=check_maps(
                 relevance,
                 prediction=subject.prediction,
                 reference_prediction=subject.reference_prediction,
-                completeness_gap=None,
+                completeness_gap=gap,
             ),
         )
 
-    def _explain(self, subject: Subject, images: Tensor, *, layer: str) -> Tensor:
+    def _explain(self, subject: Subject, images: Tensor, references: Tensor, *, layer: str) -> Tensor:
         with capture(subject.model, [layer], differentiable=True) as outputs:
             prediction = subject.predict(images)
         if not prediction.requires_grad:
             raise ModelError(f"the output does not depend on layer {layer!r}; choose a layer on the path to the output")
         (gradients,) = torch.autograd.grad(prediction.sum(), outputs[layer])
-        cells = grad_cam_map(outputs[layer].detach(), gradients)
+        activations = outputs[layer].detach()
+        if self.contrast:
+            with capture(subject.model, [layer]) as outputs, torch.no_grad():
+                subject.predict(references)
+            activations = activations - outputs[layer]
+        cells = grad_cam_map(activations, gradients)
         return spread(cells, (images.shape[-2], images.shape[-1]))

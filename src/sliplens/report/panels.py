@@ -40,8 +40,8 @@ class Panel:
 def build_panel(explained: Explained) -> Panel:
     """Lay out frames by safety margin (thesis, Figs. 8, 11 and 12).
 
-    The frames are the nearest to 100, 80, 60, 40, 20 and 0 %, of the condition with the most frames; without labels,
-    the first ones.
+    Where there are few frames, all of them; otherwise those nearest to 100, 80, 60, 40, 20 and 0 %, of the condition
+    with the most frames; without labels, the first ones.
     """
     condition, chosen = choose_frames(explained.frames)
     columns = tuple(_column(nominal, explained.frames, index) for nominal, index in chosen)
@@ -76,6 +76,8 @@ def choose_frames(frames: tuple[ExplainedFrame, ...]) -> tuple[str, list[tuple[f
     labels = {index: margin for index in rows if (margin := frames[index].safety_margin) is not None}
     if not labels:
         return condition, [(None, index) for index in rows[: len(NOMINAL_MARGINS)]]
+    if len(labels) == len(rows) <= len(NOMINAL_MARGINS):
+        return condition, [(labels[index], index) for index in sorted(rows, key=lambda index: -labels[index])]
     chosen = []
     for nominal in NOMINAL_MARGINS:
         nearest = min(labels, key=lambda index: abs(labels[index] - nominal))
