@@ -17,7 +17,7 @@ def draw(workspace: Path) -> Figure:
     explained = load_results(workspace).explanations["difference", "simulated"]
     columns = [index for _, index in choose_frames(explained.frames)[1] if index is not None]
     methods = methods_in_order(explained.methods)
-    figure = Figure(figsize=(2 * len(columns) + 1.6, 2 * (len(methods) + 1) + 1.1), dpi=100, layout="constrained")
+    figure = Figure(figsize=(2 * len(columns) + 0.4, 2 * (len(methods) + 1) + 1.1), dpi=100, layout="constrained")
     grid = GridSpec(len(methods) + 2, len(columns), figure=figure, height_ratios=[1] * (len(methods) + 1) + [0.06])
     for column, index in enumerate(columns):
         frame, picture = explained.frames[index], explained.pictures[index]
@@ -30,9 +30,9 @@ def draw(workspace: Path) -> Figure:
             if column == 0:
                 ax.set_ylabel(name, fontsize=13)
             if row == 0:
-                title = f"true {percent(frame.safety_margin)}\nread {percent(frame.prediction)}"
+                title = f"Γ {percent(frame.safety_margin)}\nread {percent(frame.prediction)}"
                 ax.set_title(title, fontsize=13)
-    plot_colour_bar(ax=figure.add_subplot(grid[-1, 1:-1]))
+    plot_colour_bar(ax=figure.add_subplot(grid[-1, :]))
     return figure
 
 

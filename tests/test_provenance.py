@@ -42,6 +42,12 @@ def test_an_interrupted_folder_keeps_its_pieces_for_the_same_recipe_only(tmp_pat
     assert interrupted({"seed": 2}) == []
 
 
+def test_a_mistake_before_the_first_piece_leaves_nothing_behind(tmp_path: Path):
+    with pytest.raises(InputError), output_folder(tmp_path / "result", stage="test", config={}):
+        raise InputError("the data are broken")
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_same_recipe_finds_its_result_and_makes_nothing(tmp_path: Path):
     assert make(tmp_path / "result", {"seed": 1}) is False
     assert make(tmp_path / "result", {"seed": 1}, text="y") is True

@@ -169,7 +169,13 @@ def output_folder(target: Path, *, stage: str, config: Mapping[str, Any], overwr
     except OSError as error:
         raise InputError(f"cannot write to {target.parent} ({error.strerror}); choose another output folder") from None
     state.write_text(config_hash)
-    yield Output(target=target, folder=partial, complete=False)
+    try:
+        yield Output(target=target, folder=partial, complete=False)
+    except BaseException:
+        # what is finished stays for the next try; where nothing is, nothing is left behind
+        if not any(path != state for path in partial.iterdir()):
+            shutil.rmtree(partial)
+        raise
     write_json(
         partial / RUN_FILE,
         {

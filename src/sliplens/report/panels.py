@@ -88,9 +88,12 @@ def choose_frames(frames: tuple[ExplainedFrame, ...]) -> tuple[str, list[tuple[f
 
 def _column(nominal: float | None, frames: tuple[ExplainedFrame, ...], index: int | None) -> PanelColumn:
     frame = None if index is None else frames[index]
+    head = "Γ not known" if nominal is None else f"Γ {percent(nominal)}"
+    told = frame is not None and head == f"Γ {percent(frame.safety_margin)}"
     return PanelColumn(
-        head="Γ not known" if nominal is None else f"Γ {percent(nominal)}",
-        label="no frame" if frame is None else f"true {percent(frame.safety_margin)}",
+        head=head,
+        # a label that the head gives already is not given twice
+        label="no frame" if frame is None else "" if told else f"true {percent(frame.safety_margin)}",
         prediction="" if frame is None else f"read {percent(frame.prediction)}",
     )
 
