@@ -13,6 +13,8 @@ from sliplens.mechanics.hertz import Numbers, require_not_negative
 
 Field: TypeAlias = tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]
 
+_POINT = 1e-30
+"""Contacts no larger than this move nothing, and squares and cubes of distances over them stay finite."""
 _FAR = 100.0
 """Beyond this many contact radii the closed form loses digits to cancellation and its expansion is used."""
 
@@ -44,7 +46,7 @@ def shear_displacement(
     """
     nu = poisson_ratio
     a = np.asarray(require_not_negative(contact_radius_m, name="contact radius", unit="m"))
-    loaded = a > 0
+    loaded = a > _POINT
     unit = np.where(loaded, a, 1)
     x, y = x_m / unit, y_m / unit
     s = np.hypot(x, y)
