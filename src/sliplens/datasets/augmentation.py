@@ -12,12 +12,17 @@ from torchvision.transforms.v2 import functional as transforms
 
 @dataclass(frozen=True, kw_only=True)
 class Augmentation:
-    """Slight rotations, Gaussian noise and Gaussian blur, drawn for each image.
+    """Slight rotations and shifts, colour, Gaussian noise and Gaussian blur, drawn for each image.
 
     Parameters
     ----------
     rotation_deg
         Rotations are uniform within plus and minus this: the pull is never exactly along gravity.
+    shift
+        Shifts along x and y are uniform within plus and minus this share of the image: a camera never sits twice alike,
+        and a network must not know a day by its place.
+    colour
+        Each channel is scaled by 1 plus or minus up to this: white balance.
     noise_sd
         Standard deviation of the noise is uniform in [0, noise_sd], in units of the image's maximum.
     blur_probability, blur_sd_px
@@ -25,10 +30,12 @@ class Augmentation:
 
     References
     ----------
-    Polak, section 4 ("random image augmentations").
+    Polak, section 4 ("random image augmentations": rotation, noise and blur; shift and colour are ours).
     """
 
     rotation_deg: float = 5.0
+    shift: float = 0.015
+    colour: float = 0.05
     noise_sd: float = 0.03
     blur_probability: float = 0.25
     blur_sd_px: float = 0.8
@@ -44,11 +51,13 @@ class Augmentation:
             return torch.rand(*shape, generator=generator, device=device)
 
         angle = (2 * uniform(batch) - 1) * math.radians(self.rotation_deg)
-        zero = torch.zeros_like(angle)
-        turn = torch.stack([angle.cos(), -angle.sin(), zero, angle.sin(), angle.cos(), zero], dim=1).view(-1, 2, 3)
+        # the grid spans 2, from -1 to 1
+        along, down = 2 * self.shift * (2 * uniform(2, batch) - 1)
+        turn = torch.stack([angle.cos(), -angle.sin(), along, angle.sin(), angle.cos(), down], dim=1).view(-1, 2, 3)
         grid = functional.affine_grid(turn, list(images.shape), align_corners=False)
         images = functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
         if float(uniform(1)) < self.blur_probability:
             images = transforms.gaussian_blur(images, [3, 3], [0.1 + (self.blur_sd_px - 0.1) * float(uniform(1))])
+        images = images * (1 + self.colour * (2 * uniform(batch, 3, 1, 1) - 1))
         noise = torch.randn(images.shape, generator=generator, device=device)
         return (images + uniform(batch, 1, 1, 1) * self.noise_sd * noise).clamp(0, 1)
