@@ -38,10 +38,12 @@ class Score:
         from sliplens.faithfulness import get_fill
         from sliplens.models import load_checkpoint
         from sliplens.study import load_explained, score_explanations
+        from sliplens.study.scoring import require_same_network
 
         get_fill(self.fill)
         trained = load_checkpoint(self.model)
         explained = load_explained(self.explanations)
+        require_same_network(trained, explained)
         recipe = {
             "weights_sha256": trained.manifest.weights_sha256,
             "maps_sha256": hash_file(self.explanations / "maps.npz"),

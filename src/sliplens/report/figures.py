@@ -68,7 +68,7 @@ def plot_predictions(predictions: Predictions, *, colour: str, ax: Axes) -> Axes
     )
     low, high = _limits(predictions.prediction)
     ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103), ylim=(low, high))
-    ax.legend(loc="upper left")
+    ax.legend(loc="best")
     return ax
 
 

@@ -43,6 +43,20 @@ class ScoreResult:
     alarms: tuple[str, ...]
 
 
+def require_same_network(trained: TrainedModel, explained: Explained) -> None:
+    """Refuse explanations of another network.
+
+    Raises
+    ------
+    CheckpointError
+        If the weights' hashes differ.
+    """
+    if explained.weights_sha256 != trained.manifest.weights_sha256:
+        raise CheckpointError(
+            "these explanations were made with another network; explain the frames again with this run"
+        )
+
+
 def score_explanations(
     trained: TrainedModel,
     explained: Explained,
@@ -75,10 +89,7 @@ def score_explanations(
     CheckpointError
         If the explanations are of another network.
     """
-    if explained.weights_sha256 != trained.manifest.weights_sha256:
-        raise CheckpointError(
-            "these explanations were made with another network; explain the frames again with this run"
-        )
+    require_same_network(trained, explained)
     inputs = trained.encoding.normalise(explained.images)
     shape = (inputs.shape[-2], inputs.shape[-1])
     rng = np.random.default_rng(seed)
