@@ -34,7 +34,7 @@ class ChosenFrames:
     safety_margin
         Labels; NaN where a frame has none.
     source
-        "simulated" or "real" (a folder of images).
+        "simulated", or "real": a recorded data set or a folder of images.
     """
 
     ids: tuple[str, ...]
@@ -100,7 +100,7 @@ def frames_from_dataset(
         safety_margin=np.concatenate(labels).astype(np.float32),
         images=torch.cat(images),
         references=torch.cat(references),
-        source="simulated" if data.simulated else "recorded",
+        source="simulated" if data.simulated else "real",
     )
 
 
