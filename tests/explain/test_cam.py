@@ -59,14 +59,16 @@ def test_equals_torch_cam_on_the_image(network, images):
 
 def test_last_layer_is_the_default(network, images):
     model = network("shufflenet")
-    assert torch.equal(GradCam()(model, images).relevance, GradCam(layer="conv5")(model, images).relevance)
+    by_name = GradCam(layer="conv5")(model, images).relevance
+    # two runs may differ in the last bit
+    torch.testing.assert_close(GradCam()(model, images).relevance, by_name, atol=1e-9, rtol=1e-6)
 
 
 def test_the_published_map_does_not_depend_on_the_reference(network, images, reference):
     model = network("shufflenet")
     published = GradCam(contrast=False)
     one, other = published(model, images), published(model, images, reference=reference)
-    assert torch.equal(one.relevance, other.relevance)
+    torch.testing.assert_close(one.relevance, other.relevance, atol=1e-9, rtol=1e-6)
     assert not torch.equal(one.reference_prediction, other.reference_prediction)
     assert one.completeness_gap is None
 
@@ -92,7 +94,8 @@ def test_the_contrast_is_the_published_map_less_that_of_the_references_activatio
 
 
 def test_an_image_that_is_its_own_reference_has_an_empty_map(network, images):
-    assert not GradCam()(network("shufflenet"), images, reference=images).relevance.any()
+    # two runs of a float64 network may differ in the last bit
+    assert float(GradCam()(network("shufflenet"), images, reference=images).relevance.abs().max()) < 1e-12
 
 
 def test_moves_with_the_image_by_the_networks_stride(network):
