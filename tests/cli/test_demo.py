@@ -31,7 +31,6 @@ def test_the_demo_runs_every_stage_and_ends_in_a_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], no_real_frames: None
 ):
     monkeypatch.setattr(demo, "_SHORTEST_TRAINING", 0.02)
-    monkeypatch.setattr(demo, "_LEVELS", 6)
     out = tmp_path / "demo"
     words = ("demo", str(out), *SMALL, "--max-minutes", "0.1")
     assert main(words) == 0

@@ -16,7 +16,7 @@ class Simulate:
 
     Each trial presses the dome on a flat object, holds, and pulls until it slips. The last day is the test set, dry and
     wet; the days before are dry and make the training set and, a quarter of all but the first, the validation set. A
-    trial is never split. The thesis has four days; a network that saw three cannot tell a day from a friction.
+    trial is never split. The thesis has four days.
     """
 
     output: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
