@@ -12,11 +12,11 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from sliplens.images import absolute_difference, read_image, write_png
-from sliplens.simulation.filming import film
+from sliplens.simulation.filming import prepare_film
 from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.motion import move_markers
+from sliplens.simulation.noise import Noise
 from sliplens.simulation.nuisances import Day, Grasp, nominal_unit
-from sliplens.simulation.rendering import Noise
 from sliplens.simulation.sensor import CHROMATOUCH
 
 IMAGES = {51: np.nan, 80: 1.0, 357: 0.6, 433: 0.2, 547: 0.0}
@@ -40,16 +40,16 @@ def read_real(folder: Path) -> np.ndarray:
 def simulate(seed: int = 0) -> np.ndarray:
     """Difference images of the same trial, simulated."""
     grasp = Grasp()
-    reference, frames = film(
+    film = prepare_film(
         CHROMATOUCH,
         loading=load_at_margins(np.array(list(IMAGES.values())), grasp=grasp),
         grasp=grasp,
         day=Day(),
-        unit=nominal_unit(sum(CHROMATOUCH.ring_counts)),
+        unit=nominal_unit(CHROMATOUCH.geometry.markers),
         rng=np.random.default_rng(seed),
         noise=Noise(),
     )
-    return absolute_difference(frames, reference)
+    return absolute_difference(film.draw(slice(0, len(IMAGES))).numpy(), film.draw_reference().numpy())
 
 
 def blurred(images: np.ndarray) -> np.ndarray:
@@ -75,12 +75,14 @@ def marker_errors(real: np.ndarray) -> np.ndarray:
     Each real marker is located by fitting two blurred discs, at rest and displaced, to its crescents in green.
     """
     sensor, grasp = CHROMATOUCH, Grasp()
-    rest = sensor.project(sensor.marker_positions())
     loading = load_at_margins(np.array(list(IMAGES.values()))[1:], grasp=grasp)
     moved = move_markers(sensor, loading=loading, grasp=grasp)
+    rest = moved.rest_px
     # two radii and the motion fit inside
-    kept = np.all((rest > 20) & (rest < 204), axis=-1) & (sensor.marker_rings() < 4)
-    radius = sensor.marker_radius_px[1] * sensor.marker_scale()
+    kept = np.all((rest > 20) & (rest < 204), axis=-1) & (
+        np.linalg.norm(rest - sensor.geometry.centre_px, axis=-1) < 110
+    )
+    radius = sensor.marker_radius_px[1] * sensor.geometry.marker_scale()
     errors = []
     for image, centres, scale in zip(real[1:], moved.centres_px, moved.scale, strict=True):
         for index in np.flatnonzero(kept):

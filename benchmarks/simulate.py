@@ -19,7 +19,7 @@ from sliplens.simulation import SimulationRecipe, plan_trials, simulate_dataset,
 
 def frames_per_second(frames: int, device: str) -> float:
     """Frames drawn in a second, the first batch (which warms up) left out."""
-    warm, timed = (plan_trials(SimulationRecipe(frames_per_trial=count))[0] for count in (20, frames))
+    warm, timed = (plan_trials(SimulationRecipe(frames_per_trial=count))[0] for count in (40, frames))
     simulate_trial(warm, device=device)
     start = time.perf_counter()
     simulate_trial(timed, device=device)

@@ -14,7 +14,8 @@ from hypothesis import settings
 from sliplens.images import absolute_difference, write_png
 from sliplens.models import Manifest, build_model, save_checkpoint
 from sliplens.recordings import ContactState, Dataset, Recording
-from sliplens.recordings.dataset import save_recording, trial_info, trial_path, write_dataset_table
+from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.store import save_recording
 
 # the same examples every time: a change is judged by its own doing, and a failure can be looked at again
 settings.register_profile("sliplens", derandomize=True, deadline=None)
@@ -91,7 +92,7 @@ def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
         recording = make_recording(f"{split}-{condition}-{index}", condition=condition, day=1 + index % 4, seed=index)
         path = trial_path(folder, recording.trial)
         save_recording(recording, path)
-        table.append(trial_info(recording, split=split, path=path))
+        table.append(trial_info(path, split=split))
     write_dataset_table(folder, table, simulated=True)
     return Dataset.open(folder)
 

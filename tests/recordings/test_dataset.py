@@ -8,7 +8,8 @@ import pytest
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.recordings import Dataset, Recording
-from sliplens.recordings.dataset import load_recording, save_recording, write_dataset_table
+from sliplens.recordings.dataset import write_dataset_table
+from sliplens.recordings.store import load_recording, save_recording
 
 
 def test_a_trial_comes_back_without_loss(tmp_path: Path, recording: Recording):

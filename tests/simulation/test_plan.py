@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sliplens.errors import ContactError, InputError
-from sliplens.simulation import Nuisances, SimulationRecipe, plan_trials
+from sliplens.simulation import FLAT_GEL, PRESETS, FrameTotals, Nuisances, SimulationRecipe, plan_trials
 from sliplens.simulation.nuisances import draw_grasp
 
 
@@ -38,7 +38,8 @@ def test_names_say_day_condition_and_number():
 
 def test_more_trials_leave_the_others_as_they_were():
     few, many = ({plan.trial: plan for plan in plan_trials(SimulationRecipe(dry_trials=count))} for count in (8, 20))
-    assert all(replace(many[name], split=plan.split) == plan for name, plan in few.items())
+    for name, plan in few.items():
+        assert replace(many[name], split=plan.split, recipe=plan.recipe, recipe_hash=plan.recipe_hash) == plan
 
 
 def test_every_trial_has_its_own_seed():
@@ -54,7 +55,7 @@ def test_another_seed_gives_other_trials():
 def test_friction_does_not_depend_on_the_normal_force():
     plans = plan_trials(SimulationRecipe(dry_trials=3, wet_trials=1500))
     grasps = [
-        draw_grasp(plan.nuisances, day=plan.day_draw, wet=True, rng=np.random.default_rng(plan.seed))
+        draw_grasp(plan.recipe.nuisances, day=plan.day_draw, wet=True, rng=np.random.default_rng(plan.seed))
         for plan in plans
         if plan.condition == "wet"
     ]
@@ -67,6 +68,69 @@ def test_friction_does_not_depend_on_the_normal_force():
     assert drawn[:, 1].max() <= 2.0
 
 
+@pytest.mark.parametrize("preset", PRESETS)
+def test_in_every_preset_the_margin_cannot_be_read_from_the_normal_force(preset):
+    # the recipe as it is, with more days and trials: correlations of a few would say little
+    recipe = replace(PRESETS[preset], days=40, dry_trials=800, wet_trials=400, frame_totals=None)
+    grasps = [
+        draw_grasp(
+            recipe.nuisances, day=plan.day_draw, wet=plan.condition == "wet", rng=np.random.default_rng(plan.seed)
+        )
+        for plan in plan_trials(recipe)
+    ]
+    force, friction = np.array([(grasp.normal_force_n, grasp.friction) for grasp in grasps]).T
+    # 1200 independent pairs correlate by 0.029 (one standard deviation); 4 of them happen once in 16,000 draws
+    assert abs(np.corrcoef(force, friction)[0, 1]) < 4 / np.sqrt(len(grasps))
+    # nor do the mean and the spread of the friction change from light to firm grasps
+    light, firm = friction[force < np.median(force)], friction[force >= np.median(force)]
+    deviation = friction.std() * np.sqrt(2 / len(light))
+    assert abs(light.mean() - firm.mean()) < 4 * deviation
+    assert abs(light.std() - firm.std()) < 4 * deviation
+
+
+def test_thesis_preset_has_the_frames_of_the_thesis():
+    plans = plan_trials(PRESETS["thesis"])
+    frames = {
+        split: sum(plan.frames for plan in plans if plan.split == split) for split in ("train", "validation", "test")
+    }
+    assert frames == {"train": 128_043, "validation": 15_839, "test": 16_875}
+    between = [plan for plan in plans if plan.day in (2, 3)]
+    assert {plan.day for plan in plans} == {1, 2, 3, 4}
+    assert {plan.split for plan in plans if plan.day == 1} == {"train"}
+    assert sum(plan.split == "validation" for plan in between) == len(between) / 4
+    assert {(plan.split, plan.condition) for plan in plans if plan.day == 4} == {("test", "dry"), ("test", "wet")}
+    assert {plan.condition for plan in plans if plan.day != 4} == {"dry"}
+    lengths = np.array([plan.frames for plan in plans])
+    assert abs(lengths.mean() - 800) < 10
+    assert lengths.min() >= 650
+    assert lengths.max() <= 950
+
+
+def test_grasps_of_the_thesis_preset_are_within_its_forces():
+    recipe = PRESETS["thesis"]
+    assert recipe.nuisances.normal_force_n == (0.5, 2.0)
+
+
+def test_totals_that_trials_cannot_hold_are_refused():
+    with pytest.raises(InputError, match="30 frames cannot fill 2 test trials of at least 20; change the frame totals"):
+        plan_trials(
+            SimulationRecipe(dry_trials=4, wet_trials=1, frame_totals=FrameTotals(train=100, validation=100, test=30))
+        )
+
+
+def test_recipes_have_the_same_hash_only_if_they_are_the_same():
+    recipe = SimulationRecipe()
+    assert recipe.hash == SimulationRecipe().hash
+    others = (
+        replace(recipe, seed=1),
+        replace(recipe, release=True),
+        replace(recipe, displacement="half-space"),
+        replace(recipe, sensor=FLAT_GEL),
+        replace(recipe, nuisances=Nuisances(gain=(1.0, 1.0))),
+    )
+    assert len({recipe.hash, *(other.hash for other in others)}) == 6
+
+
 def test_days_are_spread_over_the_range_of_friction():
     plans = plan_trials(SimulationRecipe(dry_trials=8, days=4))
     quarters = sorted(int((plan.day_draw.friction - 0.5) / 0.7 * 4) for plan in plans if plan.trial.endswith("dry-001"))
@@ -76,6 +140,11 @@ def test_days_are_spread_over_the_range_of_friction():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"dry_trials": (2, 2)}, "dry_trials names 2 days but there are 4; give one a day"),
+        ({"dry_trials": (0, 2, 2, 2)}, "but the first day trains; give it more trials"),
+        ({"dry_trials": (3, 0, 0, -1)}, "no day has fewer than 0 trials"),
+        ({"displacement": "magic"}, "displacement is 'magic', which sensor chromatouch does not have; choose calib"),
+        ({"sensor": FLAT_GEL, "displacement": "calibrated"}, "sensor flat-gel does not have; choose half-space"),
         ({"dry_trials": 2}, "dry_trials is 2, at least 3 is needed: training, validation and test need one each"),
         ({"wet_trials": -1}, "wet_trials is -1, at least 0"),
         ({"frames_per_trial": 5}, "frames_per_trial is 5, at least 20 is needed"),
@@ -97,6 +166,8 @@ def test_impossible_recipes_are_refused(change, message):
             r"the range of normal_force_n is \(2.0, 0.5\); give a finite low, then a high",
         ),
         ({"dry_friction": (0.0, 1.0)}, "dry_friction must be positive, got 0; raise its lower end"),
+        ({"marker_depth": (-0.1, 0.1)}, "marker_depth must not be negative, got -0.1; raise its lower end"),
+        ({"kinetic_ratio": (0.8, 1.2)}, "kinetic_ratio must be at most 1, got 1.2; lower its upper end"),
     ],
 )
 def test_impossible_ranges_are_refused(change, message):

@@ -7,11 +7,11 @@ import pytest
 
 from sliplens.images import absolute_difference, read_image
 from sliplens.simulation import CHROMATOUCH
-from sliplens.simulation.filming import film
+from sliplens.simulation.filming import prepare_film
 from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.motion import move_markers
+from sliplens.simulation.noise import Noise
 from sliplens.simulation.nuisances import Day, Grasp, nominal_unit
-from sliplens.simulation.rendering import Noise
 
 pytestmark = pytest.mark.real
 
@@ -26,16 +26,16 @@ def real(chromatouch_folder):
 
 @pytest.fixture(scope="module")
 def simulated():
-    reference, frames = film(
+    film = prepare_film(
         CHROMATOUCH,
         loading=load_at_margins(MARGINS, grasp=Grasp()),
         grasp=Grasp(),
         day=Day(),
-        unit=nominal_unit(sum(CHROMATOUCH.ring_counts)),
+        unit=nominal_unit(CHROMATOUCH.geometry.markers),
         rng=np.random.default_rng(0),
         noise=Noise(),
     )
-    return absolute_difference(frames, reference)
+    return absolute_difference(film.draw(slice(0, len(MARGINS))).numpy(), film.draw_reference().numpy())
 
 
 def halves(images):
@@ -73,7 +73,7 @@ def test_shear_of_the_markers_is_the_measured_one(chromatouch_folder):
     measured = np.array([[(float(row[f"dx_{x}"]), float(row[f"dy_{x}"])) for row in rows] for x in labels])
     grasp = Grasp()
     moved = move_markers(CHROMATOUCH, loading=load_at_margins(np.array(labels) / 100, grasp=grasp), grasp=grasp)
-    rest = CHROMATOUCH.project(CHROMATOUCH.marker_positions())
+    rest = moved.rest_px
     match = np.argmin(np.linalg.norm(rest[None] - places[:, None], axis=-1), axis=1)
     model = moved.centres_px[:, match] - rest[match]
     shear, expected = model - model[0], measured - measured[0]

@@ -75,17 +75,17 @@ def encode_png(pixels: UInt8[np.ndarray, "height width *channels"], *, compress_
     return buffer.getvalue()
 
 
-def decode_png(data: bytes, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Pixels of an RGB PNG held in memory.
+def decode_png(data: bytes, *, where: str, mode: str = "RGB") -> UInt8[np.ndarray, "height width *channels"]:
+    """Pixels of a PNG held in memory: three channels, or none with mode "L" (grey).
 
     Raises
     ------
     ImageError
-        If the bytes are damaged or no RGB image; the message begins with `where`.
+        If the bytes are damaged or no image of this mode; the message begins with `where`.
     """
     try:
         with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
-            if image.mode != "RGB":
+            if image.mode != mode:
                 raise ImageError(f"{where} has {_CURES.get(image.mode, image.mode)}")
             return np.array(image)
     except (OSError, SyntaxError, ValueError) as error:

@@ -5,6 +5,7 @@ from sliplens.mechanics.hertz import (
     contact_radius,
     indentation,
     normal_displacement,
+    normal_slope,
     peak_pressure,
     radial_displacement,
     reduced_modulus,
@@ -15,11 +16,20 @@ from sliplens.mechanics.partial_slip import (
     stick_displacement,
     stick_radius,
 )
+from sliplens.mechanics.subsurface import (
+    buried_hertz_displacement,
+    buried_partial_slip_displacement,
+    buried_shear_displacement,
+)
 
 __all__ = [
+    "buried_hertz_displacement",
+    "buried_partial_slip_displacement",
+    "buried_shear_displacement",
     "contact_radius",
     "indentation",
     "normal_displacement",
+    "normal_slope",
     "partial_slip_displacement",
     "peak_pressure",
     "radial_displacement",

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sliplens.errors import ContactError
-from sliplens.mechanics.hertz import Numbers, require_not_negative, require_positive
+from sliplens.mechanics.checks import Numbers, require_not_negative, require_positive
 
 
 def safety_margin(

@@ -4,14 +4,9 @@ All formulas are Johnson, *Contact Mechanics* (Cambridge, 1985), chapters 3 and 
 surface; numbers and arrays broadcast, so that frames can run down and markers across.
 """
 
-from typing import TypeAlias
-
 import numpy as np
-from jaxtyping import Float
 
-from sliplens.errors import ContactError
-
-Numbers: TypeAlias = float | Float[np.ndarray, "..."]
+from sliplens.mechanics.checks import Numbers, require_not_negative, require_poisson_ratio, require_positive
 
 
 def reduced_modulus(*, youngs_modulus_pa: float, poisson_ratio: float) -> float:
@@ -34,8 +29,7 @@ def reduced_modulus(*, youngs_modulus_pa: float, poisson_ratio: float) -> float:
     Johnson (1985), section 4.2.
     """
     require_positive(youngs_modulus_pa, name="Young's modulus", unit="Pa")
-    if not 0 <= poisson_ratio <= 0.5:
-        raise ContactError(f"Poisson's ratio must lie in [0, 0.5], got {poisson_ratio:.3g}; rubber is near 0.5")
+    require_poisson_ratio(poisson_ratio)
     return youngs_modulus_pa / (1 - poisson_ratio**2)
 
 
@@ -153,6 +147,39 @@ def normal_displacement(distance_m: Numbers, *, contact_radius_m: Numbers, spher
     return depth * shape
 
 
+def normal_slope(distance_m: Numbers, *, contact_radius_m: Numbers, sphere_radius_m: float) -> Numbers:
+    """Slope -du_z/dr of the surface under Hertz's pressure: how steeply the dent rises away from its centre.
+
+    Inside the contact r / R; outside (2 a / (pi R)) [s asin(1/s) - sqrt(s^2 - 1) / s] with s = r/a.
+
+    Parameters
+    ----------
+    distance_m
+        Distance r from the contact's centre, along the surface, in metres.
+    contact_radius_m
+        Contact radius a, in metres; where it is 0 the slope is 0.
+    sphere_radius_m
+        Radius R of the sphere, in metres.
+
+    Raises
+    ------
+    ContactError
+        If a distance or a contact radius is negative, or the sphere's radius is not positive.
+
+    References
+    ----------
+    The derivative of Johnson (1985), eqs. 3.41a and 3.42a with p0 of eq. 4.24.
+    """
+    require_positive(sphere_radius_m, name="sphere radius", unit="m")
+    a = require_not_negative(contact_radius_m, name="contact radius", unit="m")
+    s = _relative_distance(distance_m, a)
+    # far away the two terms cancel to 2 / (3 s^2)
+    near = np.clip(s, 1, 1e3)
+    outside = 2 / np.pi * (near * np.arcsin(1 / near) - np.sqrt(near**2 - 1) / near)
+    shape = np.where(s <= 1, np.minimum(s, 1), np.where(s > 1e3, 4 / (3 * np.pi * np.maximum(s, 1) ** 2), outside))
+    return a / sphere_radius_m * shape
+
+
 def radial_displacement(
     distance_m: Numbers, *, contact_radius_m: Numbers, sphere_radius_m: float, poisson_ratio: float
 ) -> Numbers:
@@ -188,31 +215,6 @@ def radial_displacement(
     profile = np.where(s < 1e-6, 1.5 * s, bracket / np.where(s < 1e-6, 1, s))
     factor = -2 * (1 - 2 * poisson_ratio) / (3 * np.pi * (1 - poisson_ratio))
     return factor * depth * np.where(np.isinf(s), 0, profile)
-
-
-def require_positive(value: Numbers, *, name: str, unit: str) -> None:
-    """Check that a parameter is finite and positive.
-
-    Raises
-    ------
-    ContactError
-        Naming the parameter and its value.
-    """
-    if not np.all((np.asarray(value) > 0) & np.isfinite(value)):
-        raise ContactError(f"{name} must be positive and finite, got {np.min(value):.3g} {unit}; give it in {unit}")
-
-
-def require_not_negative(value: Numbers, *, name: str, unit: str) -> Numbers:
-    """Return a quantity unchanged when it is nowhere negative or NaN.
-
-    Raises
-    ------
-    ContactError
-        Naming the quantity and its smallest value.
-    """
-    if not np.all(np.asarray(value) >= 0):
-        raise ContactError(f"{name} must not be negative, got {np.min(value):.3g} {unit}; flip its sign on import")
-    return value
 
 
 def _relative_distance(distance_m: Numbers, contact_radius_m: Numbers) -> Numbers:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sliplens.errors import ContactError
-from sliplens.mechanics.hertz import Numbers, require_not_negative
+from sliplens.mechanics.checks import Numbers, require_not_negative
 
 Field: TypeAlias = tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]
 

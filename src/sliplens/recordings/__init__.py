@@ -2,5 +2,6 @@
 
 from sliplens.recordings.dataset import Dataset, TrialInfo
 from sliplens.recordings.recording import ContactState, Recording
+from sliplens.recordings.truth import GroundTruth
 
-__all__ = ["ContactState", "Dataset", "Recording", "TrialInfo"]
+__all__ = ["ContactState", "Dataset", "GroundTruth", "Recording", "TrialInfo"]

@@ -1,24 +1,15 @@
 """A data set on disk: one Parquet file a trial, frames as lossless PNG beside their labels."""
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
-from jaxtyping import UInt8
 
 from sliplens.errors import RecordingError
-from sliplens.images.files import decode_png, encode_png
 from sliplens.provenance import hash_file, hash_json, read_json, require_folder, write_json
-from sliplens.recordings.recording import SIGNALS, ContactState, Recording
+from sliplens.recordings.recording import Recording
+from sliplens.recordings.store import SCHEMA_VERSION, load_recording, read_header
 
 DATASET_FILE = "dataset.json"
-SCHEMA_VERSION = 1
-_DESCRIPTION = ("trial", "sensor", "day", "condition")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,13 +84,13 @@ class Dataset:
             )
         return chosen
 
-    def load(self, info: TrialInfo) -> Recording:
-        """Read one trial, frames included."""
-        return load_recording(trial_path(self.folder, info.trial))
+    def load(self, info: TrialInfo, *, truth: bool = True) -> Recording:
+        """Read one trial, frames included; without the ground truth of a simulated one where that is not needed."""
+        return load_recording(trial_path(self.folder, info.trial), truth=truth)
 
-    def load_all(self, trials: Sequence[TrialInfo]) -> Iterator[Recording]:
+    def load_all(self, trials: Sequence[TrialInfo], *, truth: bool = True) -> Iterator[Recording]:
         """Read trials one after another."""
-        return (self.load(info) for info in trials)
+        return (self.load(info, truth=truth) for info in trials)
 
 
 def trial_path(folder: Path, trial: str) -> Path:
@@ -107,96 +98,17 @@ def trial_path(folder: Path, trial: str) -> Path:
     return folder / "trials" / f"{trial}.parquet"
 
 
-def save_recording(recording: Recording, path: Path) -> None:
-    """Write a trial as one Parquet file: a row a frame, its image a lossless PNG; whole or not at all."""
-    columns: dict[str, Any] = {"frame": np.arange(len(recording))}
-    columns |= {name: getattr(recording, name) for name in SIGNALS}
-    columns["contact_state"] = [str(state) for state in recording.contact_state]
-    with ThreadPoolExecutor() as pool:  # zlib lets go of the interpreter's lock
-        columns["image"] = pa.array(list(pool.map(encode_png, recording.frames)), type=pa.binary())
-    description = {name: str(getattr(recording, name)) for name in _DESCRIPTION}
-    table = pa.table(columns).replace_schema_metadata(
-        {**description, b"reference": encode_png(recording.reference), b"schema_version": str(SCHEMA_VERSION)}
-    )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    # PNG bytes, nearly all of the file, neither compress further nor repeat
-    pq.write_table(table, part, compression="none", use_dictionary=False)
-    part.replace(path)
-
-
-def load_recording(path: Path) -> Recording:
-    """Read a trial written by `save_recording`.
+def trial_info(path: Path, *, split: str) -> TrialInfo:
+    """Row of the data set's table for a trial saved at `path`.
 
     Raises
     ------
     RecordingError
-        If the file is missing, damaged or empty, or its labels break a law.
-    ImageError
-        If an image inside is damaged.
+        If the file is missing or damaged, or no trial.
     """
-    try:
-        table = pq.read_table(path)
-    except FileNotFoundError:
-        raise RecordingError(f"{path} does not exist; make the data set again") from None
-    except (pa.ArrowInvalid, OSError) as error:
-        raise RecordingError(f"{path} is not a readable Parquet file ({error}); make the data set again") from None
-    metadata = {key.decode(): value for key, value in (table.schema.metadata or {}).items()}
-    missing = ({"reference", *_DESCRIPTION} - set(metadata)) | (
-        {"image", "contact_state", *SIGNALS} - set(table.column_names)
-    )
-    if missing:
-        raise RecordingError(f"{path} lacks {', '.join(sorted(missing))}; write it with save_recording")
-    reference = decode_png(metadata["reference"], where=f"the reference frame of {path}")
-    trial = metadata["trial"].decode()
-    if table.num_rows == 0:
-        raise RecordingError(f"trial {trial} has no frames; leave it out or record it again")
-    return Recording(
-        trial=trial,
-        sensor=metadata["sensor"].decode(),
-        day=int(metadata["day"]),
-        condition=metadata["condition"].decode(),
-        reference=reference,
-        frames=_decode_frames(table.column("image"), reference, path),
-        contact_state=tuple(ContactState(state) for state in table.column("contact_state").to_pylist()),
-        **{name: table.column(name).to_numpy().astype(np.float64) for name in SIGNALS},
-    )
-
-
-def _decode_frames(
-    images: pa.ChunkedArray, reference: UInt8[np.ndarray, "height width 3"], path: Path
-) -> UInt8[np.ndarray, "frames height width 3"]:
-    frames = np.empty((len(images), *reference.shape), dtype=np.uint8)
-
-    def decode(index: int) -> UInt8[np.ndarray, "height width 3"]:
-        return decode_png(images[index].as_py(), where=f"frame {index} of {path}")
-
-    with ThreadPoolExecutor() as pool:
-        decoded = list(pool.map(decode, range(len(images))))
-    for index, frame in enumerate(decoded):
-        if frame.shape != reference.shape:
-            raise RecordingError(
-                f"frame {index} of {path} is {frame.shape[:2]} pixels but the reference is {reference.shape[:2]}; "
-                "record both with the same camera settings"
-            )
-        frames[index] = frame
-    return frames
-
-
-def trial_info(recording: Recording, *, split: str, path: Path) -> TrialInfo:
-    """Row of the data set's table for a trial saved at `path`."""
-    height, width = recording.reference.shape[:2]
-    return TrialInfo(
-        trial=recording.trial,
-        sensor=recording.sensor,
-        day=recording.day,
-        condition=recording.condition,
-        split=split,
-        frames=len(recording),
-        height=height,
-        width=width,
-        sha256=hash_file(path),
-    )
+    header = asdict(read_header(path))
+    del header["recipe"]
+    return TrialInfo(**header, split=split, sha256=hash_file(path))
 
 
 def write_dataset_table(folder: Path, trials: Sequence[TrialInfo], *, simulated: bool = False) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from sliplens.errors import RecordingError
+from sliplens.recordings.truth import GroundTruth
 
 
 class ContactState(StrEnum):
@@ -45,6 +46,8 @@ class Recording:
     safety_margin: Float[np.ndarray, " _"]
     stick_ratio: Float[np.ndarray, " _"]
     contact_state: tuple[ContactState, ...]
+    truth: GroundTruth | None = None
+    """What a simulator knows beyond the labels; None for a real trial."""
 
     def __post_init__(self) -> None:
         """Check the laws that every trial obeys."""
@@ -62,6 +65,11 @@ class Recording:
                     f"trial {self.trial} has {count} frames but {len(getattr(self, name))} values of {name}; "
                     "give one value a frame"
                 )
+        if self.truth is not None and len(self.truth.marker_px) != count:
+            raise RecordingError(
+                f"trial {self.trial} has {count} frames but the truth of {len(self.truth.marker_px)}; "
+                "give the truth of every frame"
+            )
         if not np.all(np.diff(self.time_s) > 0):
             at = int(np.argmax(~(np.diff(self.time_s) > 0))) + 1
             raise RecordingError(

@@ -1,5 +1,6 @@
 """The report of a workspace: figures, tables and one page, from saved results only."""
 
+from sliplens.report.contact_sheet import draw_contact_sheet, write_contact_sheet
 from sliplens.report.figures import (
     plot_bins,
     plot_faithfulness,
@@ -15,6 +16,7 @@ from sliplens.report.results import load_results
 __all__ = [
     "Results",
     "build_report",
+    "draw_contact_sheet",
     "load_results",
     "overlay_saliency",
     "plot_bins",
@@ -24,4 +26,5 @@ __all__ = [
     "plot_margin_over_time",
     "plot_overlay",
     "plot_predictions",
+    "write_contact_sheet",
 ]

@@ -1,14 +1,22 @@
 """Simulated trials of a marker-based fingertip, with exact labels."""
 
 from sliplens.simulation.nuisances import Nuisances
-from sliplens.simulation.plan import SimulationRecipe, TrialPlan, plan_trials
-from sliplens.simulation.sensor import CHROMATOUCH, Sensor
+from sliplens.simulation.plan import FrameTotals, SimulationRecipe, TrialPlan, plan_trials
+from sliplens.simulation.presets import PRESETS
+from sliplens.simulation.sensor import CHROMATOUCH, FLAT_GEL, SENSORS, Sensor
+from sliplens.simulation.stream import SimulatedFrame, SimulatedFrames
 from sliplens.simulation.trials import simulate_dataset, simulate_trial
 
 __all__ = [
     "CHROMATOUCH",
+    "FLAT_GEL",
+    "PRESETS",
+    "SENSORS",
+    "FrameTotals",
     "Nuisances",
     "Sensor",
+    "SimulatedFrame",
+    "SimulatedFrames",
     "SimulationRecipe",
     "TrialPlan",
     "plan_trials",

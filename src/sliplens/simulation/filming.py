@@ -1,28 +1,165 @@
 """A loaded fingertip filmed: the reference frame and the frames of a trial."""
 
-from collections.abc import Callable
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
+from torch import Tensor
 
+from sliplens.mechanics import indentation, normal_slope
+from sliplens.simulation.geometry import pixel_grid
+from sliplens.simulation.lighting import brightness, haze, relief
 from sliplens.simulation.loading import Loading
-from sliplens.simulation.motion import move_markers
+from sliplens.simulation.motion import Motion, move_markers
+from sliplens.simulation.noise import Noise, NoisePicks, pick_noise
 from sliplens.simulation.nuisances import Day, Grasp, Unit
-from sliplens.simulation.rendering import Noise, Scene, draw_texture, render
+from sliplens.simulation.rendering import Scene, draw_texture, render
 from sliplens.simulation.sensor import Sensor
 
-_BATCH = 16
-"""Frames drawn at once: enough to keep two cores busy, few enough for their caches."""
+_BATCHES = {"cpu": 4, "cuda": 512}
+"""Frames drawn at once: few enough for a processor's caches, many enough for a GPU."""
 
 _FADE = 0.05
 """Contrast that markers lose in contact."""
 
-_GLOW_RADIUS_PX = 58.0
-"""Where the glow of the contact fades."""
+
+@dataclass(frozen=True, kw_only=True)
+class Film:
+    """A trial ready to be drawn, any of its frames in any order; made by `prepare_film`."""
+
+    sensor: Sensor
+    unit: Unit
+    motion: Motion
+    noise: Noise | None
+    marker_rest_px: Float[np.ndarray, "markers 2"]
+    """Where the camera sees the untouched markers, the jitter of the print and the seat of the camera included."""
+    marker_px: Float[np.ndarray, "frames markers 2"]
+    blur_px: Float[np.ndarray, " frames_and_reference"]
+    """The untouched sensor first, as in the picks."""
+    noise_picks: NoisePicks
+    texture: Float32[np.ndarray, "3 markers side side"]
+    light: Float32[np.ndarray, "3 height width"]
+    haze: Float32[np.ndarray, "3 height width"]
+    relief: Float32[np.ndarray, "3 height width"] | None
+    rays: Float[np.ndarray, "height width 2"]
+
+    def __len__(self) -> int:
+        """Count the frames."""
+        return len(self.marker_px)
+
+    def draw_reference(self, *, device: str | torch.device = "cpu") -> UInt8[Tensor, "height width 3"]:
+        """Draw the untouched sensor."""
+        return self._draw(
+            self.marker_rest_px[None],
+            scale=np.ones((1, len(self.marker_rest_px))),
+            touch=np.zeros(1),
+            slope=None if self.relief is None else np.zeros((1, *self.rays.shape[:2]), dtype=np.float32),
+            taken=slice(0, 1),
+            device=device,
+        )[0]
+
+    def draw(self, frames: slice, *, device: str | torch.device = "cpu") -> UInt8[Tensor, "frames height width 3"]:
+        """Draw some of the frames.
+
+        Parameters
+        ----------
+        frames
+            Which ones, from start to stop.
+        device
+            Where to draw; the frames stay there.
+        """
+        motion = self.motion
+        slope = None
+        if self.relief is not None:
+            slope = np.asarray(
+                normal_slope(
+                    np.sqrt(self._face_distance_squared(frames)),
+                    contact_radius_m=motion.contact_radius_m[frames, None, None],
+                    sphere_radius_m=self.sensor.geometry.sphere_radius_m,
+                ),
+                dtype=np.float32,
+            )
+        return self._draw(
+            self.marker_px[frames],
+            scale=motion.scale[frames],
+            touch=motion.touch[frames],
+            slope=slope,
+            taken=slice(frames.start + 1, frames.stop + 1),
+            device=device,
+        )
+
+    def contact_map(self, frames: slice) -> UInt8[np.ndarray, "frames height width"]:
+        """Where the camera sees the skin touch the object: 0 nowhere, 1 slipping, 2 sticking.
+
+        The contact of a dome is seen as the flat lens that it is, displaced and enlarged by its indentation.
+        """
+        square = self._face_distance_squared(frames)
+        touching = square < (self.motion.contact_radius_m[frames, None, None] ** 2).astype(np.float32)
+        sticking = square < (self.motion.stick_radius_m[frames, None, None] ** 2).astype(np.float32)
+        return touching.view(np.uint8) + sticking.view(np.uint8)
+
+    def _face_distance_squared(self, frames: slice) -> Float32[np.ndarray, "frames height width"]:
+        geometry = self.sensor.geometry
+        depth = indentation(self.motion.contact_radius_m[frames], sphere_radius_m=geometry.sphere_radius_m)
+        return geometry.face_distance_squared(
+            self.rays, contact_centre_m=self.motion.contact_centre_m, indentation_m=np.asarray(depth)
+        )
+
+    def _draw(
+        self,
+        centres_px: Float[np.ndarray, "frames markers 2"],
+        *,
+        scale: Float[np.ndarray, "frames markers"],
+        touch: Float[np.ndarray, " frames"],
+        slope: Float32[np.ndarray, "frames height width"] | None,
+        taken: slice,
+        device: str | torch.device,
+    ) -> UInt8[Tensor, "frames height width 3"]:
+        scene = Scene(
+            centres_px=centres_px,
+            size=self.sensor.geometry.marker_scale() * self.unit.radius_factor * scale,
+            contrast=self.unit.contrast_factor * (1 - _FADE * touch[:, None]),
+            texture=self.texture,
+            blur_px=self.blur_px[taken],
+            light=self.light,
+            haze=self.haze,
+            touch=touch,
+            relief=self.relief,
+            slope=slope,
+            noise=self.noise_picks.at(taken),
+        )
+        return render(scene, sensor=self.sensor, noise=self.noise, device=device)
 
 
-def film(
+@dataclass(frozen=True, kw_only=True)
+class _Seat:
+    """How the camera is seated that day: turned about the image of the skin's middle, and shifted."""
+
+    day: Day
+    middle: Float[np.ndarray, "2"]
+
+    def see(self, points_px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Where points are seen that a camera seated as drawn would see at `points_px`."""
+        return (points_px - self.middle) @ self._turn() + self.middle + np.asarray(self.day.camera_shift_px)
+
+    def unsee(self, points_px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Where a camera seated as drawn would see what is seen at `points_px`: the inverse of `see`."""
+        return (points_px - self.middle - np.asarray(self.day.camera_shift_px)) @ self._turn().T + self.middle
+
+    def _turn(self) -> Float[np.ndarray, "2 2"]:
+        cos, sin = np.cos(self.day.camera_rotation_rad), np.sin(self.day.camera_rotation_rad)
+        return np.array([[cos, sin], [-sin, cos]])
+
+
+def batches(frames: int, *, device: str | torch.device) -> Iterator[slice]:
+    """Cut a trial into batches that suit a device; the frames do not depend on it."""
+    step = _BATCHES.get(torch.device(device).type, 64)
+    return (slice(start, min(start + step, frames)) for start in range(0, frames, step))
+
+
+def prepare_film(
     sensor: Sensor,
     *,
     loading: Loading,
@@ -31,10 +168,9 @@ def film(
     unit: Unit,
     rng: np.random.Generator,
     noise: Noise | None,
-    device: str | torch.device = "cpu",
-    on_frames: Callable[[int, int], None] | None = None,
-) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "frames height width 3"]]:
-    """Film a loaded fingertip.
+    displacement: str | None = None,
+) -> Film:
+    """Move the markers, set the light and draw all that is random: what is left is drawing.
 
     Parameters
     ----------
@@ -48,73 +184,39 @@ def film(
         Source of noise and of the focus' wander.
     noise
         The camera's noise; None films without it.
-    device
-        Where to draw.
-    on_frames
-        Called with the frames done and the frames in all, after each batch.
+    displacement
+        How the markers move; see `move_markers`.
 
-    Returns
-    -------
-    reference, frames
-        The untouched sensor, and the trial.
+    Raises
+    ------
+    ContactError
+        If the sensor cannot be moved so, or its markers would lie outside it.
     """
-    motion = move_markers(sensor, loading=loading, grasp=grasp, modulus_factor=day.modulus_factor)
-    rest = sensor.project(sensor.marker_positions())
-    # drawn before the noise, so that a clean film differs in its noise alone
-    blur = grasp.blur_px * rng.uniform(0.8, 1.2, len(loading.time_s) + 1)
-    light = _light(sensor, day=day)
-    haze = _haze(sensor, grasp=grasp)
-    texture = draw_texture(len(rest), rng=np.random.default_rng(unit.texture_seed))
-
-    def view(centres: np.ndarray, scale: np.ndarray, depth: np.ndarray, blur_px: np.ndarray) -> np.ndarray:
-        scene = Scene(
-            centres_px=_through_camera(centres + unit.marker_jitter_px, day=day, sensor=sensor),
-            size=sensor.marker_scale() * unit.radius_factor * scale,
-            contrast=unit.contrast_factor * (1 - _FADE * depth[:, None]),
-            texture=texture,
-            blur_px=blur_px,
-            light=light,
-            haze=haze,
-            depth=depth,
-        )
-        return render(scene, sensor=sensor, noise=noise, rng=rng, device=device)
-
-    reference = view(rest[None], np.ones((1, len(rest))), np.zeros(1), blur[:1])[0]
-    count = len(loading.time_s)
-    frames = np.empty((count, *reference.shape), dtype=np.uint8)
-    for start in range(0, count, _BATCH):
-        part = slice(start, min(start + _BATCH, count))
-        frames[part] = view(motion.centres_px[part], motion.scale[part], motion.depth[part], blur[1:][part])
-        if on_frames is not None:
-            on_frames(part.stop, count)
-    return reference, frames
-
-
-def _through_camera(
-    centres_px: Float[np.ndarray, "frames markers 2"], *, day: Day, sensor: Sensor
-) -> Float[np.ndarray, "frames markers 2"]:
-    """Turn and shift the image as the camera was seated that day."""
-    cos, sin = np.cos(day.camera_rotation_rad), np.sin(day.camera_rotation_rad)
-    middle = np.asarray(sensor.centre_px)
-    return (centres_px - middle) @ np.array([[cos, sin], [-sin, cos]]) + middle + np.asarray(day.camera_shift_px)
-
-
-def _light(sensor: Sensor, *, day: Day) -> Float[np.ndarray, "height width 3"]:
-    """Gain, white balance, vignette, and a linear fall of brightness across the image."""
-    across = np.linspace(-0.5, 0.5, sensor.image_size_px)
-    cos, sin = np.cos(day.gradient_direction_rad), np.sin(day.gradient_direction_rad)
-    # the brightest corner keeps its level
-    ramp = across[None, :] * cos + across[:, None] * sin
-    fall = 1 - day.gradient * (0.5 - ramp / (abs(cos) + abs(sin)))
-    corner = 1 - sensor.vignette * 2 * (across[None, :] ** 2 + across[:, None] ** 2)
-    return day.gain * (fall * corner)[..., None] * np.asarray(day.white_balance)
-
-
-def _haze(sensor: Sensor, *, grasp: Grasp) -> Float[np.ndarray, "height width 3"]:
-    """Grey levels that full contact adds: a veil over all, and a glow where the object reflects the light."""
-    pixels = np.arange(sensor.image_size_px)
-    spread = sensor.focal_px_per_rad / (1 + sensor.camera_offset)
-    x = pixels[None, :] - sensor.centre_px[0] - spread * grasp.contact_offset[0]
-    y = pixels[:, None] - sensor.centre_px[1] - spread * grasp.contact_offset[1]
-    disc = np.exp(-(((x**2 + y**2) / _GLOW_RADIUS_PX**2) ** 2))
-    return np.asarray(grasp.veil) + disc[..., None] * np.asarray(grasp.glow)
+    motion = move_markers(
+        sensor,
+        loading=loading,
+        grasp=grasp,
+        displacement=displacement,
+        modulus_factor=day.modulus_factor,
+        marker_depth=unit.marker_depth,
+    )
+    geometry, frames = sensor.geometry, len(loading.time_s)
+    seat = _Seat(day=day, middle=np.asarray(geometry.centre_px))
+    contact_px = seat.see(geometry.project(geometry.skin_point(motion.contact_centre_m)))
+    edge, apex = (geometry.project(geometry.skin_point(np.array([x, 0.0]))) for x in (motion.nominal_radius_m, 0.0))
+    return Film(
+        sensor=sensor,
+        unit=unit,
+        motion=motion,
+        noise=noise,
+        marker_rest_px=seat.see(motion.rest_px + unit.marker_jitter_px),
+        marker_px=seat.see(motion.centres_px + unit.marker_jitter_px),
+        # drawn before the noise, so that a clean film differs in its noise alone
+        blur_px=grasp.blur_px * rng.uniform(0.8, 1.2, frames + 1),
+        noise_picks=pick_noise(frames + 1, rng=rng),
+        texture=draw_texture(geometry.markers, rng=np.random.default_rng(unit.texture_seed)),
+        light=brightness(sensor, day=day),
+        haze=haze(sensor, grasp=grasp, contact_px=contact_px, radius_px=float(edge[0] - apex[0])),
+        relief=relief(sensor, contact_px=contact_px),
+        rays=geometry.rays(seat.unsee(pixel_grid(sensor.image_size_px))),
+    )

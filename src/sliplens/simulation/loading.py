@@ -1,20 +1,23 @@
-"""The load on the fingertip through a trial: touch, press, hold, pull until it slips, slide on."""
+"""The load on the fingertip through a trial: touch, press, hold, pull until it slips, slide on, let go."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from sliplens.errors import ContactError
 from sliplens.mechanics import safety_margin, stick_ratio
 from sliplens.recordings import ContactState
 from sliplens.simulation.nuisances import Grasp
+from sliplens.simulation.sliding import slide
 
 TRIAL_S = 8.0
 """Length of a trial in seconds."""
 
 _PHASES = (0.06, 0.07, 0.07, 0.72, 0.08)
 """Shares of a trial: no contact, press, hold, pull, slide; the pull gets most, for its margins are what is learnt."""
+_RELEASE = (0.05, 0.04)
+"""Shares taken from the pull in a trial that ends with a release: letting go, and no contact after."""
 
 MINIMUM_FRAMES = 20
 """Fewer frames leave a phase empty."""
@@ -24,8 +27,13 @@ MINIMUM_FRAMES = 20
 class Loading:
     """Forces and labels of every frame of a trial.
 
-    The friction coefficient is the one that holds: static until the contact slips, kinetic after, so that the margin
-    of a sliding contact is 0 and every margin is 1 - F_t / (mu F_n). Without contact the margin is NaN.
+    The friction coefficient is the one that holds: static until the contact slips, kinetic while it slides, and what
+    the contact has regained where it sticks again. So the margin of a sliding contact is 0 and every margin is
+    1 - F_t / (mu F_n). Without contact the margin is NaN.
+
+    The traction is that of `carried_friction` times the pressure everywhere, from sliding, and on top of it that of a
+    Cattaneo-Mindlin contact with the friction that is left and `stick_margin` (Ciavarella and Jaeger's superposition).
+    Before the first slip nothing is carried, and the stick margin is the safety margin.
     """
 
     time_s: Float[np.ndarray, " frames"]
@@ -34,13 +42,18 @@ class Loading:
     friction_coefficient: Float[np.ndarray, " frames"]
     safety_margin: Float[np.ndarray, " frames"]
     stick_ratio: Float[np.ndarray, " frames"]
+    carried_friction: Float[np.ndarray, " frames"]
+    stick_margin: Float[np.ndarray, " frames"]
+    """NaN without contact, as the safety margin."""
     held_s: Float[np.ndarray, " frames"]
     """Time since the object was touched; 0 before."""
     contact_state: tuple[ContactState, ...]
 
 
-def load_grasp(grasp: Grasp, *, frames: int, rng: np.random.Generator) -> Loading:
+def load_grasp(grasp: Grasp, *, frames: int, rng: np.random.Generator, release: bool = False) -> Loading:
     """Load a grasp: press to its force, hold, pull with an evenly falling margin, then slide.
+
+    Sliding begins with a fall from static to kinetic friction; a spring-slider makes it stick and slip (`slide`).
 
     Parameters
     ----------
@@ -50,6 +63,9 @@ def load_grasp(grasp: Grasp, *, frames: int, rng: np.random.Generator) -> Loadin
         Frames in the trial.
     rng
         Source of the pull's small unevenness.
+    release
+        Let go at the end: the normal force falls to nothing while the object slides, and the last frames have no
+        contact.
 
     Raises
     ------
@@ -58,28 +74,30 @@ def load_grasp(grasp: Grasp, *, frames: int, rng: np.random.Generator) -> Loadin
     """
     if frames < MINIMUM_FRAMES:
         raise ContactError(f"a trial of {frames} frames cannot hold all phases; ask for {MINIMUM_FRAMES} or more")
-    touch, pressed, pull, slide = _phase_ends(frames, rng)
+    touch, pressed, pull, slip, let_go, gone = _phase_ends(frames, rng, release=release)
     index = np.arange(frames)
     progress = index / (frames - 1)
     time_s = index * (TRIAL_S / frames)
 
-    ramp = np.clip((index - touch + 1) / (pressed - touch), 0, 1)
-    # a smooth start and stop of the press, as a servo makes it
-    normal = grasp.normal_force_n * ramp**2 * (3 - 2 * ramp) * (1 + grasp.normal_force_drift * (progress - 0.5) * 2)
-    normal[index < touch] = 0
-    friction = grasp.friction * (1 + grasp.friction_drift * (progress - 0.5) * 2)
-    friction[index >= slide] *= grasp.kinetic_ratio
+    normal = grasp.normal_force_n * _smooth((index - touch + 1) / (pressed - touch))
+    normal *= 1 + grasp.normal_force_drift * (progress - 0.5) * 2
+    if release:
+        normal *= 1 - _smooth((index - let_go + 1) / (gone - let_go))
+    normal[(index < touch) | (index >= gone)] = 0
+    static = grasp.friction * (1 + grasp.friction_drift * (progress - 0.5) * 2)
 
-    pulled = np.clip((index - pull) / (slide - pull), 0, 1)
+    pulled = np.clip((index - pull) / (slip - pull), 0, 1)
     # a slow swing of the puller, small enough that the margin never rises
     swing = rng.uniform(-0.5, 0.5) * np.sin(2 * np.pi * pulled) / (2 * np.pi)
-    tangential = np.clip(pulled + swing, 0, 1) * friction * normal
+    used = np.clip(pulled + swing, 0, 1)
+    sliding = slide(time_s - time_s[slip], static_friction=static, grasp=grasp, stuck_until=let_go - slip)
     return _label(
         time_s,
         normal=normal,
-        # while sliding, rounding alone would leave a margin of 1e-16
-        tangential=np.where(index >= slide, np.nextafter(tangential, np.inf), tangential),
-        friction=friction,
+        used=np.where(index < slip, used, sliding.used),
+        friction=np.where(index < slip, static, sliding.friction),
+        carried=np.where(index < slip, 0.0, sliding.carried),
+        slips=(index >= slip) & sliding.slips,
         held_s=np.where(index < touch, 0, time_s - time_s[touch]),
     )
 
@@ -101,41 +119,64 @@ def load_at_margins(margins: Float[np.ndarray, " frames"], *, grasp: Grasp) -> L
     """
     if np.any((margins < 0) | (margins > 1)):
         raise ContactError("safety margins must lie in [0, 1]; give them as fractions, not in percent")
-    normal = np.where(np.isnan(margins), 0.0, grasp.normal_force_n)
-    friction = np.full(len(margins), grasp.friction)
-    tangential = (1 - np.nan_to_num(margins, nan=1.0)) * friction * normal
-    seconds = np.arange(len(margins), dtype=np.float64)
-    return _label(seconds, normal=normal, tangential=tangential, friction=friction, held_s=np.zeros(len(margins)))
+    nothing = np.zeros(len(margins))
+    return _label(
+        np.arange(len(margins), dtype=np.float64),
+        normal=np.where(np.isnan(margins), 0.0, grasp.normal_force_n),
+        used=1 - np.nan_to_num(margins, nan=1.0),
+        friction=np.full(len(margins), grasp.friction),
+        carried=nothing,
+        slips=margins == 0,
+        held_s=nothing,
+    )
 
 
 def _label(
     time_s: Float[np.ndarray, " frames"],
     *,
     normal: Float[np.ndarray, " frames"],
-    tangential: Float[np.ndarray, " frames"],
+    used: Float[np.ndarray, " frames"],
     friction: Float[np.ndarray, " frames"],
+    carried: Float[np.ndarray, " frames"],
+    slips: Bool[np.ndarray, " frames"],
     held_s: Float[np.ndarray, " frames"],
 ) -> Loading:
-    margin = safety_margin(normal, tangential, friction)
+    """Label frames of which is known how much of the friction they use."""
+    tangential = used * friction * normal
+    # rounding alone would leave a sliding contact a margin of 1e-16
+    margin = np.where(slips & (normal > 0), 0.0, safety_margin(normal, tangential, friction))
+    left = friction - carried
+    on_top = np.clip((used * friction - carried) / np.where(left > 0, left, 1), 0, 1)
+    again = ~np.isnan(margin) & ~slips & (carried > 0)
+    stick_margin = np.where(again, 1 - on_top, margin)
     return Loading(
         time_s=time_s,
         normal_force_n=normal,
         tangential_force_n=tangential,
         friction_coefficient=friction,
         safety_margin=margin,
-        stick_ratio=stick_ratio(margin),
+        stick_ratio=stick_ratio(stick_margin),
+        carried_friction=carried,
+        stick_margin=stick_margin,
         held_s=held_s,
         contact_state=tuple(_state(value) for value in margin),
     )
 
 
-def _phase_ends(frames: int, rng: np.random.Generator) -> tuple[int, int, int, int]:
-    """First frame after each phase but the last, the lengths varied by a fifth; the pull takes what is left."""
-    shares = np.asarray(_PHASES)
-    lengths = np.maximum(1, np.round(frames * shares * rng.uniform(0.8, 1.2, len(shares)))).astype(int)
-    lengths[3] = frames - lengths[:3].sum() - lengths[4]
-    ends = np.cumsum(lengths)
-    return int(ends[0]), int(ends[1]), int(ends[2]), int(ends[3])
+def _phase_ends(frames: int, rng: np.random.Generator, *, release: bool) -> tuple[int, int, int, int, int, int]:
+    """First frame after each phase, the lengths varied by a fifth; the pull takes what is left."""
+    shares = np.array((*_PHASES, *(_RELEASE if release else (0.0, 0.0))))
+    lengths = np.round(frames * shares * rng.uniform(0.8, 1.2, len(shares))).astype(int)
+    lengths[shares > 0] = np.maximum(1, lengths[shares > 0])
+    lengths[3] += frames - lengths.sum()
+    touch, pressed, pull, slip, let_go, gone, _ = (int(end) for end in np.cumsum(lengths))
+    return touch, pressed, pull, slip, let_go, gone
+
+
+def _smooth(progress: Float[np.ndarray, " frames"]) -> Float[np.ndarray, " frames"]:
+    """Rise from 0 to 1 with a soft start and stop, as a servo makes it."""
+    inside = np.clip(progress, 0, 1)
+    return inside**2 * (3 - 2 * inside)
 
 
 def _state(margin: float) -> ContactState:

@@ -1,52 +1,78 @@
-"""Where the markers go under load: the calibrated model, fitted to the markers of the real ChromaTouch."""
+"""Where the markers go under load: a calibrated model and the exact half-space."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
+from sliplens.errors import ContactError
 from sliplens.mechanics import (
+    buried_hertz_displacement,
+    buried_partial_slip_displacement,
     contact_radius,
-    normal_displacement,
-    partial_slip_displacement,
     reduced_modulus,
+    stick_radius,
 )
 from sliplens.simulation.loading import Loading
 from sliplens.simulation.nuisances import Grasp
 from sliplens.simulation.sensor import Sensor
 
-_SHEAR = 0.0322
-"""Shear of the whole skin at full slip in the fitted trial, in dome radii."""
-_LOCAL_FRICTION = 0.049
-"""Friction whose Cattaneo-Mindlin field the fitted trial shows on top of that shear."""
-_CLAMP_EXPONENT = 0.41
-"""The base holds the gel: displacements fade with the cosine of the polar angle to this power."""
 _FITTED_FRICTION = 0.775
-"""Friction ascribed to the fitted trial, which names none: the geometric mean of the dry range (assumed)."""
-_FITTED_CONTACT = 0.451
-"""Contact radius of the fitted trial, in dome radii."""
+"""Ascribed to the trial of the real images, which names none: the geometric mean of the dry range (assumed)."""
 _TURN = 0.15
 """Far from the apex markers turn away from the camera as the dome flattens: size lost at the equator."""
-# the six above and the defaults of `Grasp` were fitted to 35 markers x 4 frames of the published difference images,
-# each located by fitting two blurred discs to its crescents: rms 0.48 px a coordinate, of a motion of 4.1 px
+
+
+@dataclass(frozen=True, kw_only=True)
+class Displacement:
+    """How a fingertip gives way: an elastic half-space held by its base, and a shear of the whole skin."""
+
+    local_friction: float
+    """Share of the friction that shows as Cattaneo and Mindlin's local field."""
+    clamp_exponent: float
+    """The base holds the gel: local displacements fade with the cosine of the polar angle to this power."""
+    skin_shear: float
+    """Shear of the whole skin at full slip in the fitted trial, in radii; as Mindlin's it grows with mu P / a, that is
+    with mu times the indentation, and with the pull as 1 - Gamma^p."""
+
+
+DISPLACEMENTS = {
+    # fitted to 35 markers x 4 frames of the published difference images, each located by fitting two blurred discs to
+    # its crescents: rms 0.48 px a coordinate, of a motion of 4.1 px
+    "calibrated": Displacement(local_friction=0.049 / _FITTED_FRICTION, clamp_exponent=0.41, skin_shear=0.0322),
+    # the exponent where a half-space alone was fitted to those markers
+    "half-space": Displacement(local_friction=1.0, clamp_exponent=1.6, skin_shear=0.0),
+}
+"""`calibrated` moves as the real ChromaTouch did, and its stick zone is nominal; `half-space` is exact mechanics."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """Markers through a trial, as the camera sees them."""
+    """Markers and contact through a trial; pixels are those of a camera that sits as drawn."""
 
+    rest_px: Float[np.ndarray, "markers 2"]
     centres_px: Float[np.ndarray, "frames markers 2"]
     scale: Float[np.ndarray, "frames markers"]
     """Size over the size at rest: what comes nearer looks larger."""
-    depth: Float[np.ndarray, " frames"]
-    """Indentation over that of the fitted trial; 0 without contact."""
+    touch: Float[np.ndarray, " frames"]
+    """Indentation over that of the nominal grasp; 0 without contact."""
+    nominal_radius_m: float
+    """Contact radius of the nominal grasp."""
+    contact_centre_m: Float[np.ndarray, "2"]
+    contact_radius_m: Float[np.ndarray, " frames"]
+    stick_radius_m: Float[np.ndarray, " frames"]
 
 
-def move_markers(sensor: Sensor, *, loading: Loading, grasp: Grasp, modulus_factor: float = 1.0) -> Motion:
+def move_markers(
+    sensor: Sensor,
+    *,
+    loading: Loading,
+    grasp: Grasp,
+    displacement: str | None = None,
+    modulus_factor: float = 1.0,
+    marker_depth: float = 0.0,
+) -> Motion:
     """Displace a sensor's markers by a loading.
-
-    Hertz's normal field and a weak Cattaneo-Mindlin field, both faded towards the base, and a shear of the whole skin
-    that grows as 1 - Gamma^p. The shear is calibrated, not derived: its stick zone is nominal.
 
     Parameters
     ----------
@@ -56,65 +82,92 @@ def move_markers(sensor: Sensor, *, loading: Loading, grasp: Grasp, modulus_fact
         Forces and margins of every frame.
     grasp
         Contact offset, tilt, direction and exponent of the shear, creep.
+    displacement
+        `calibrated` gives the motion of the real ChromaTouch, whose stick zone is nominal; `half-space` gives exact
+        contact mechanics. The sensor's default if None.
     modulus_factor
         Stiffness of the gel over the sensor's nominal one.
+    marker_depth
+        Depth of the markers under the skin, in radii of the contact's sphere.
+
+    Raises
+    ------
+    ContactError
+        If the sensor does not have that displacement, or the markers would lie outside it.
     """
-    rest = sensor.marker_positions()
-    modulus = reduced_modulus(
-        youngs_modulus_pa=sensor.youngs_modulus_pa * modulus_factor, poisson_ratio=sensor.poisson_ratio
-    )
+    name = sensor.displacements[0] if displacement is None else displacement
+    if name not in sensor.displacements:
+        raise ContactError(
+            f"sensor {sensor.name} cannot be moved by {name!r}; choose {' or '.join(sensor.displacements)}"
+        )
+    model = DISPLACEMENTS[name]
+    modulus_pa = sensor.youngs_modulus_pa
+    if name == "calibrated" and sensor.effective_modulus_pa is not None:
+        modulus_pa = sensor.effective_modulus_pa
+    geometry = sensor.geometry
+    sphere_m, depth_m = geometry.sphere_radius_m, marker_depth * geometry.sphere_radius_m
+    rest = geometry.marker_positions(depth_m)
     creep = 1 + grasp.creep * (1 - np.exp(-loading.held_s / grasp.creep_time_s))
-    radius = contact_radius(
-        loading.normal_force_n * creep, sphere_radius_m=sensor.dome_radius_m, reduced_modulus_pa=modulus
-    )
-    a = np.asarray(radius)[:, None] / sensor.dome_radius_m
-    x = rest[:, 0] - grasp.contact_offset[0]
-    y = rest[:, 1] - grasp.contact_offset[1]
-    cosine = np.clip(rest[:, 2], 0, 1)
-    clamp = cosine**_CLAMP_EXPONENT
 
-    inward = normal_displacement(np.hypot(x, y), contact_radius_m=a, sphere_radius_m=1.0) * clamp
-    along, across = _shear(x, y, a=a, cosine=cosine, clamp=clamp, loading=loading, grasp=grasp, sensor=sensor)
-    cos, sin = np.cos(grasp.shear_direction_rad), np.sin(grasp.shear_direction_rad)
-    depth = (a[:, 0] / _FITTED_CONTACT) ** 2
-    # a tilted object pushes a little sideways
-    push_x, push_y = np.tan(grasp.tilt_rad[0]), np.tan(grasp.tilt_rad[1])
-    moved = rest + np.stack(
-        [along * cos - across * sin + push_x * inward, along * sin + across * cos + push_y * inward, -inward], axis=-1
-    )
-    return Motion(
-        centres_px=sensor.project(moved),
-        scale=sensor.camera_distance(rest)
-        / sensor.camera_distance(moved)
-        * (1 - _TURN * depth[:, None] * (1 - cosine**2)),
-        depth=depth,
-    )
+    def radius(force_n: np.ndarray, factor: float) -> np.ndarray:
+        modulus = reduced_modulus(youngs_modulus_pa=modulus_pa * factor, poisson_ratio=sensor.poisson_ratio)
+        return np.asarray(contact_radius(force_n, sphere_radius_m=sphere_m, reduced_modulus_pa=modulus))
 
-
-def _shear(
-    x: Float[np.ndarray, " markers"],
-    y: Float[np.ndarray, " markers"],
-    *,
-    a: Float[np.ndarray, "frames 1"],
-    cosine: Float[np.ndarray, " markers"],
-    clamp: Float[np.ndarray, " markers"],
-    loading: Loading,
-    grasp: Grasp,
-    sensor: Sensor,
-) -> tuple[Float[np.ndarray, "frames markers"], Float[np.ndarray, "frames markers"]]:
-    """Give the displacement along and across the pull, in dome radii."""
-    margin = np.nan_to_num(loading.safety_margin, nan=1.0)[:, None]
-    friction = loading.friction_coefficient[:, None] / _FITTED_FRICTION
-    cos, sin = np.cos(grasp.shear_direction_rad), np.sin(grasp.shear_direction_rad)
-    local_along, local_across = partial_slip_displacement(
-        x * cos + y * sin,
-        y * cos - x * sin,
-        contact_radius_m=a,
-        sphere_radius_m=1.0,
-        friction_coefficient=_LOCAL_FRICTION * friction,
-        safety_margin=margin,
+    contact_m = radius(loading.normal_force_n * creep, modulus_factor)
+    nominal_m = radius(np.array([Grasp().normal_force_n]), 1.0)
+    touch = (contact_m / nominal_m) ** 2
+    cosine = geometry.slope_cosine(rest)
+    clamp = cosine**model.clamp_exponent
+    centre_m = np.asarray(grasp.contact_offset) * sphere_m
+    from_centre = rest[:, :2] - centre_m
+    distance = np.linalg.norm(from_centre, axis=-1)
+    outward, inward = buried_hertz_displacement(
+        distance,
+        depth_m,
+        contact_radius_m=contact_m[:, None],
+        sphere_radius_m=sphere_m,
         poisson_ratio=sensor.poisson_ratio,
     )
-    # as Mindlin's, the whole shear at slip is proportional to mu P / a, that is to mu a^2
-    whole = _SHEAR * friction * (a / _FITTED_CONTACT) ** 2 * (1 - margin**grasp.shear_exponent)
-    return whole * cosine + local_along * clamp, local_across * clamp
+    outward, inward = outward * clamp / np.where(distance > 0, distance, 1), inward * clamp
+    pull = np.array([np.cos(grasp.shear_direction_rad), np.sin(grasp.shear_direction_rad)])
+    athwart = np.array([-pull[1], pull[0]])
+    # a tilted object pushes a little sideways
+    moved = rest + outward[..., None] * np.append(from_centre, np.zeros((len(rest), 1)), axis=1)
+    moved += inward[..., None] * np.append(np.tan(grasp.tilt_rad), -1)
+    for friction, margin in _tractions(loading):
+        along, across, sunk = buried_partial_slip_displacement(
+            from_centre @ pull,
+            from_centre @ athwart,
+            depth_m,
+            friction_coefficient=friction * model.local_friction,
+            safety_margin=margin,
+            contact_radius_m=contact_m[:, None],
+            sphere_radius_m=sphere_m,
+            poisson_ratio=sensor.poisson_ratio,
+        )
+        skin = model.skin_shear * sphere_m * friction / _FITTED_FRICTION * touch[:, None]
+        along = along * clamp + skin * cosine * (1 - margin**grasp.shear_exponent)
+        moved[..., :2] += along[..., None] * pull + (across * clamp)[..., None] * athwart
+        moved[..., 2] -= sunk * clamp
+    return Motion(
+        rest_px=geometry.project(rest),
+        centres_px=geometry.project(moved),
+        scale=geometry.camera_distance(rest)
+        / geometry.camera_distance(moved)
+        * (1 - _TURN * touch[:, None] * (1 - cosine**2)),
+        touch=touch,
+        nominal_radius_m=float(nominal_m[0]),
+        contact_centre_m=centre_m,
+        contact_radius_m=contact_m,
+        stick_radius_m=np.asarray(stick_radius(contact_m, np.nan_to_num(loading.stick_margin, nan=0.0))),
+    )
+
+
+def _tractions(loading: Loading) -> list[tuple[Float[np.ndarray, "frames 1"], Float[np.ndarray, "frames 1"]]]:
+    """Friction and margin of each Cattaneo-Mindlin contact whose sum the traction is."""
+    margin = np.nan_to_num(loading.stick_margin, nan=1.0)[:, None]
+    carried = loading.carried_friction[:, None]
+    tractions = [(loading.friction_coefficient[:, None] - carried, margin)]
+    if carried.any():
+        tractions.append((carried, np.zeros_like(carried)))
+    return tractions

@@ -16,7 +16,8 @@ class Nuisances:
     """Ranges of everything a network must not rely on, each (low, high) and drawn evenly.
 
     The friction is drawn apart from the normal force: were they tied, the lens of contact alone would tell the safety
-    margin. Offsets and depths are in dome radii, angles in degrees, image lengths in pixels, brightness in grey levels.
+    margin. Offsets and depths are in radii of the contact's sphere, angles in degrees, image lengths in pixels,
+    brightness in grey levels.
 
     Raises
     ------
@@ -33,6 +34,9 @@ class Nuisances:
     """Relative change over a wet trial."""
     kinetic_ratio: Range = (0.7, 0.9)
     """Kinetic over static friction."""
+    stick_slip_share: Range = (0.0, 0.5)
+    """Share of static less kinetic friction that a sliding contact regains before it slips again."""
+    stick_slip_hz: Range = (2.0, 8.0)
     normal_force_n: Range = (0.5, 2.0)
     normal_force_drift: Range = (-0.05, 0.05)
     modulus_factor: Range = (0.8, 1.2)
@@ -51,6 +55,8 @@ class Nuisances:
     camera_rotation_deg: Range = (-3.0, 3.0)
     marker_jitter_px: float = 0.4
     """Standard deviation of the markers' centres, by sensor."""
+    marker_depth: Range = (0.0, 0.1)
+    """Under the skin, by sensor."""
     marker_radius: Range = (0.95, 1.05)
     marker_contrast: Range = (0.85, 1.15)
     blur_px: Range = (0.0, 1.0)
@@ -68,11 +74,22 @@ class Nuisances:
                 raise ContactError(f"the range of {field.name} is {value}; give a finite low, then a high")
             if field.name in _POSITIVE and low <= 0:
                 raise ContactError(f"{field.name} must be positive, got {low:.3g}; raise its lower end")
+            if field.name in _NOT_NEGATIVE and low < 0:
+                raise ContactError(f"{field.name} must not be negative, got {low:.3g}; raise its lower end")
+            if high > _UPPER.get(field.name, np.inf):
+                limit = _UPPER[field.name]
+                raise ContactError(f"{field.name} must be at most {limit:g}, got {high:.3g}; lower its upper end")
 
 
 _POSITIVE = frozenset(
     {"dry_friction", "dry_friction_factor", "wet_friction", "kinetic_ratio", "normal_force_n", "modulus_factor",
-     "shear_exponent", "creep_time_s", "white_balance", "gain", "marker_radius", "marker_contrast"}
+     "shear_exponent", "creep_time_s", "stick_slip_hz", "white_balance", "gain", "marker_radius", "marker_contrast"}
+)  # fmt: skip
+_UPPER = {"kinetic_ratio": 1.0, "stick_slip_share": 1.0, "contact_offset": 0.5, "marker_depth": 0.5,
+          "illumination_gradient": 1.0, "normal_force_drift": 0.5, "wet_friction_drift": 0.5}  # fmt: skip
+_NOT_NEGATIVE = frozenset(
+    {"contact_offset", "marker_depth", "stick_slip_share", "creep", "illumination_gradient", "marker_jitter_px",
+     "blur_px"}
 )  # fmt: skip
 
 
@@ -95,6 +112,8 @@ class Unit:
     """What stays the same for one built sensor: where its markers came to lie, their size and dye."""
 
     marker_jitter_px: Float[np.ndarray, "markers 2"]
+    marker_depth: float
+    """Under the skin, in radii of the contact's sphere."""
     radius_factor: Float[np.ndarray, " markers"]
     contrast_factor: Float[np.ndarray, " markers"]
     texture_seed: int
@@ -109,8 +128,10 @@ class Grasp:
     """The images name none: the geometric mean of the dry range (assumed)."""
     friction_drift: float = 0.0
     kinetic_ratio: float = 1.0
+    stick_slip_share: float = 0.0
+    stick_slip_hz: float = 4.0
     normal_force_n: float = 1.86
-    """What gives the fitted radius of contact with the sensor's nominal modulus."""
+    """What gives the fitted radius of contact with the sensor's effective modulus."""
     normal_force_drift: float = 0.0
     contact_offset: tuple[float, float] = (0.088, -0.015)
     tilt_rad: tuple[float, float] = (0.0, 0.0)
@@ -126,7 +147,13 @@ class Grasp:
 def nominal_unit(markers: int) -> Unit:
     """Sensor built exactly as drawn, with so many markers."""
     ones = np.ones(markers)
-    return Unit(marker_jitter_px=np.zeros((markers, 2)), radius_factor=ones, contrast_factor=ones, texture_seed=0)
+    return Unit(
+        marker_jitter_px=np.zeros((markers, 2)),
+        marker_depth=0.0,
+        radius_factor=ones,
+        contrast_factor=ones,
+        texture_seed=0,
+    )
 
 
 def draw_day(nuisances: Nuisances, *, quantile: float, rng: np.random.Generator) -> Day:
@@ -158,6 +185,7 @@ def draw_unit(nuisances: Nuisances, *, markers: int, rng: np.random.Generator) -
     """Draw a built sensor with so many markers."""
     return Unit(
         marker_jitter_px=rng.normal(0, nuisances.marker_jitter_px, (markers, 2)),
+        marker_depth=rng.uniform(*nuisances.marker_depth),
         # one factor for the whole print, and a little for each marker
         radius_factor=rng.uniform(*nuisances.marker_radius) * rng.normal(1, 0.01, markers),
         contrast_factor=rng.uniform(*nuisances.marker_contrast) * rng.normal(1, 0.03, markers),
@@ -187,6 +215,8 @@ def draw_grasp(nuisances: Nuisances, *, day: Day, wet: bool, rng: np.random.Gene
         friction=wet_friction if wet else day.friction * dry_factor,
         friction_drift=drift if wet else 0.0,
         kinetic_ratio=rng.uniform(*nuisances.kinetic_ratio),
+        stick_slip_share=rng.uniform(*nuisances.stick_slip_share),
+        stick_slip_hz=rng.uniform(*nuisances.stick_slip_hz),
         normal_force_n=rng.uniform(*nuisances.normal_force_n),
         normal_force_drift=rng.uniform(*nuisances.normal_force_drift),
         contact_offset=(float(reach * np.cos(bearing)), float(reach * np.sin(bearing))),

@@ -1,17 +1,29 @@
 """Which trials are simulated, on which day, and what they are for."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
+from sliplens._version import __version__
 from sliplens.errors import InputError
+from sliplens.provenance import hash_json
 from sliplens.simulation.loading import MINIMUM_FRAMES
 from sliplens.simulation.nuisances import Day, Nuisances, draw_day
+from sliplens.simulation.sensor import CHROMATOUCH, Sensor
 
 _VALIDATION_SHARE = 0.25
 # branches of the seed: what is drawn for one never moves what is drawn for another
 _DAYS, _UNITS, _TRIALS = range(3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameTotals:
+    """Frames of each split."""
+
+    train: int
+    validation: int
+    test: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,20 +39,31 @@ class SimulationRecipe:
         If a number is out of range, or the trials cannot fill every split.
     """
 
-    dry_trials: int = 40
+    dry_trials: int | tuple[int, ...] = 40
+    """Dealt to the days in turn, or one number for each day."""
     wet_trials: int = 10
     frames_per_trial: int = 200
+    frame_totals: FrameTotals | None = None
+    """If given, trials differ in length by a tenth so that each split has exactly so many frames."""
+    release: bool = False
+    """Let go of the object at the end of each trial."""
     days: int = 4
     test_day: int | None = None
     """The last day if None."""
+    sensor: Sensor = CHROMATOUCH
+    displacement: str | None = None
+    """How the markers move; see `move_markers`. The sensor's default if None."""
     sensors: int = 2
+    """How many were built: their markers differ a little."""
     seed: int = 0
     nuisances: Nuisances = field(default_factory=Nuisances)
 
     def __post_init__(self) -> None:
         """Check that the recipe can be followed."""
+        if isinstance(self.dry_trials, tuple):
+            self._check_days(self.dry_trials)
         least = {
-            "dry_trials": (self.dry_trials, 3, "training, validation and test need one each"),
+            "dry_trials": (np.sum(self.dry_trials), 3, "training, validation and test need one each"),
             "wet_trials": (self.wet_trials, 0, "ask for none or more"),
             "frames_per_trial": (self.frames_per_trial, MINIMUM_FRAMES, "every phase of the load needs a frame"),
             "days": (self.days, 2, "the test needs a day of its own"),
@@ -55,11 +78,36 @@ class SimulationRecipe:
                 f"test_day is {self.test_day}, but the first of {self.days} days trains; "
                 f"name a day from 2 to {self.days}"
             )
+        if self.displacement is not None and self.displacement not in self.sensor.displacements:
+            raise InputError(
+                f"displacement is {self.displacement!r}, which sensor {self.sensor.name} does not have; "
+                f"choose {' or '.join(self.sensor.displacements)}"
+            )
+
+    def _check_days(self, dry_trials: tuple[int, ...]) -> None:
+        if len(dry_trials) != self.days:
+            raise InputError(f"dry_trials names {len(dry_trials)} days but there are {self.days}; give one a day")
+        if min(dry_trials) < 0:
+            raise InputError(f"dry_trials is {dry_trials}, but no day has fewer than 0 trials")
+        test_day = self.resolved_test_day
+        others = sum(dry_trials) - dry_trials[0] - (dry_trials[test_day - 1] if 1 < test_day <= self.days else 0)
+        if dry_trials[0] < (1 if others else 2):
+            raise InputError(f"dry_trials is {dry_trials}, but the first day trains; give it more trials")
 
     @property
     def resolved_test_day(self) -> int:
         """The day that tests."""
         return self.days if self.test_day is None else self.test_day
+
+    @property
+    def resolved_displacement(self) -> str:
+        """How the markers move."""
+        return self.sensor.displacements[0] if self.displacement is None else self.displacement
+
+    @property
+    def hash(self) -> str:
+        """Hash of the recipe and of the version of sliplens that follows it."""
+        return hash_json({"recipe": self, "sliplens": __version__})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +128,9 @@ class TrialPlan:
     """Which built sensor, from 0."""
     unit_seed: int
     day_draw: Day
-    nuisances: Nuisances
+    recipe: SimulationRecipe
+    """For what all trials have in common."""
+    recipe_hash: str
 
 
 def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
@@ -96,9 +146,12 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
     tuple of TrialPlan
         Dry before wet within a day; the same for the same recipe.
     """
-    test_day = recipe.resolved_test_day
+    test_day, recipe_hash = recipe.resolved_test_day, recipe.hash
     days = _draw_days(recipe)
-    dry = _spread(recipe.dry_trials, days=recipe.days, test_day=test_day)
+    if isinstance(recipe.dry_trials, tuple):
+        dry = dict(enumerate(recipe.dry_trials, start=1))
+    else:
+        dry = _spread(recipe.dry_trials, days=recipe.days, test_day=test_day)
     between = [(number, day) for day in dry if day not in (1, test_day) for number in range(1, dry[day] + 1)]
     # without days between, the first day has to give up some of its own
     candidates = sorted(between or [(number, 1) for number in range(1, dry[1] + 1)])
@@ -124,10 +177,28 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
                         unit=unit,
                         unit_seed=_seed(recipe.seed, _UNITS, unit),
                         day_draw=days[day],
-                        nuisances=recipe.nuisances,
+                        recipe=recipe,
+                        recipe_hash=recipe_hash,
                     )
                 )
-    return tuple(plans)
+    return tuple(plans) if recipe.frame_totals is None else _with_totals(plans, recipe.frame_totals)
+
+
+def _with_totals(plans: Sequence[TrialPlan], totals: FrameTotals) -> tuple[TrialPlan, ...]:
+    """Give each trial a length of its own, so that the lengths of a split sum to its total."""
+    lengths: dict[str, int] = {}
+    for split, total in asdict(totals).items():
+        chosen = [plan for plan in plans if plan.split == split]
+        if total < MINIMUM_FRAMES * len(chosen) or not chosen:
+            raise InputError(
+                f"{total} frames cannot fill {len(chosen)} {split} trials of at least {MINIMUM_FRAMES}; "
+                "change the frame totals or the trials"
+            )
+        # one way to draw for each trial: others come and go without changing its share much
+        shares = np.array([np.random.default_rng((plan.seed, 0)).uniform(0.9, 1.1) for plan in chosen])
+        ends = np.round(np.cumsum(shares) / shares.sum() * total).astype(int)
+        lengths |= {plan.trial: int(count) for plan, count in zip(chosen, np.diff(ends, prepend=0), strict=True)}
+    return tuple(replace(plan, frames=lengths[plan.trial]) for plan in plans)
 
 
 def _spread(trials: int, *, days: int, test_day: int) -> dict[int, int]:

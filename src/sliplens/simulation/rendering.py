@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
 
+from sliplens.simulation.noise import Noise, NoisePicks, mix_noise
 from sliplens.simulation.sensor import Sensor
 
 _PATCH = 32
@@ -22,137 +23,138 @@ class Scene:
     """Marker size over the sensor's `marker_radius_px`."""
     contrast: Float[np.ndarray, "frames markers"]
     """Marker contrast over the sensor's."""
-    texture: Float32[np.ndarray, "markers side side 3"]
+    texture: Float32[np.ndarray, "3 markers side side"]
     """From `draw_texture`."""
     blur_px: Float[np.ndarray, " frames"]
-    light: Float[np.ndarray, "height width 3"]
+    light: Float32[np.ndarray, "3 height width"]
     """Brightness over the sensor's, the same for all frames."""
-    haze: Float[np.ndarray, "height width 3"]
+    haze: Float32[np.ndarray, "3 height width"]
     """Grey levels that full contact adds."""
-    depth: Float[np.ndarray, " frames"]
+    touch: Float[np.ndarray, " frames"]
     """How much of the haze each frame has."""
+    relief: Float32[np.ndarray, "3 height width"] | None
+    """Relative change of brightness where the skin slopes by 1; None where slopes do not show."""
+    slope: Float32[np.ndarray, "frames height width"] | None
+    """Slope of the skin, downwards away from the contact's centre."""
+    noise: NoisePicks
 
 
-@dataclass(frozen=True, kw_only=True)
-class Noise:
-    """Standard deviation of one frame's noise by channel, in grey levels, and its smoothness."""
-
-    background: tuple[float, float, float] = (2.2, 2.1, 2.0)
-    marker: tuple[float, float, float] = (9.2, 9.0, 3.0)
-    smoothness: float = 0.4
-    """Weight of the neighbour's noise in a pixel; 0.4 gives a lag-1 correlation of 0.34."""
-    red_in_green: float = 0.5
-    """Correlation of red and green, which the camera's debayering ties together."""
-    grain: tuple[float, float, float] = (0.13, 0.06, 0.07)
-    """Unevenness of the print, which moves with a marker, over its contrast."""
-    ragged_px: tuple[float, float, float] = (0.5, 0.35, 0.35)
-    """Unevenness of a marker's edge."""
-
-
-def draw_texture(markers: int, *, rng: np.random.Generator) -> Float32[np.ndarray, "markers side side 3"]:
+def draw_texture(markers: int, *, rng: np.random.Generator) -> Float32[np.ndarray, "3 markers side side"]:
     """Grain of the markers' print, of unit strength, red and green alike in half."""
-    grain = rng.standard_normal((markers, _PATCH, _PATCH, 3), dtype=np.float32)
-    grain[..., 1] = 0.5 * grain[..., 0] + 0.75**0.5 * grain[..., 1]
+    grain = rng.standard_normal((3, markers, _PATCH, _PATCH), dtype=np.float32)
+    grain[1] = 0.5 * grain[0] + 0.75**0.5 * grain[1]
     return grain
 
 
 def render(
-    scene: Scene, *, sensor: Sensor, noise: Noise | None, rng: np.random.Generator, device: str | torch.device = "cpu"
-) -> UInt8[np.ndarray, "frames height width 3"]:
-    """Draw a batch of frames.
+    scene: Scene, *, sensor: Sensor, noise: Noise | None, device: str | torch.device = "cpu"
+) -> UInt8[Tensor, "frames height width 3"]:
+    """Draw a batch of frames; nothing in it depends on which frames are drawn together.
 
     Each marker is drawn in a patch of its own and added to the frame, so that a frame costs little more than its noise.
-    The noise comes from NumPy and is drawn frame by frame: the frames do not depend on how they are batched.
+    Devices agree within one grey level: they round sums of four terms in another order.
 
     Parameters
     ----------
     scene
-        Markers, light and blur.
+        Markers, light, blur and noise picks.
     sensor
         Colours, marker sizes and image size.
     noise
-        The noise; None for a clean image.
-    rng
-        Source of the noise.
+        How strong the noise is; None for a clean image.
     device
-        Where to compute.
+        Where to compute; the frames stay there.
     """
+    # one plane a channel: a channel's constant then meets whole rows of pixels, which vectorises
     shade = _shade(scene, sensor=sensor, noise=noise, device=device)
-    contrast = torch.tensor(sensor.marker_contrast, dtype=torch.float32, device=device)
-    background = torch.tensor(sensor.background, dtype=torch.float32, device=device)
-    light = torch.as_tensor(scene.light, dtype=torch.float32, device=device)
-    haze = torch.as_tensor(scene.haze, dtype=torch.float32, device=device)
-    depth = torch.as_tensor(scene.depth, dtype=torch.float32, device=device)[:, None, None, None]
-    frames = torch.addcmul(background * light, shade, contrast * light, value=-1).addcmul_(depth, haze)
+    light = _tensor(scene.light, device)[:, None]
+    frames = torch.addcmul(
+        light * _channels(sensor.background, device),
+        shade,
+        light * _channels(sensor.marker_contrast, device),
+        value=-1,
+    )
+    if scene.relief is not None and scene.slope is not None:
+        frames *= 1 + _tensor(scene.slope, device) * _tensor(scene.relief, device)[:, None]
+    frames.addcmul_(_tensor(scene.touch, device)[:, None, None], _tensor(scene.haze, device)[:, None])
     if noise is not None:
-        frames += _noise(shade, noise=noise, rng=rng)
-    return frames.add_(0.5).clamp_(0, 255).to(torch.uint8).cpu().numpy()
+        background = _channels(noise.background, device)
+        strength = shade.clamp_(0, 1).mul_(_channels(noise.marker, device) - background).add_(background)
+        frames.addcmul_(
+            strength, mix_noise(scene.noise, noise=noise, image_size_px=sensor.image_size_px, device=device)
+        )
+    frames.add_(0.5).clamp_(0, 255)
+    pixels = torch.empty((*frames.shape[1:], 3), dtype=torch.uint8, device=device)
+    for channel, plane in enumerate(frames):  # converts and interleaves in one go
+        pixels[..., channel].copy_(plane)
+    return pixels
 
 
 def _shade(
     scene: Scene, *, sensor: Sensor, noise: Noise | None, device: str | torch.device
-) -> Float[Tensor, "frames height width 3"]:
+) -> Float[Tensor, "3 frames height width"]:
     """Share of the markers' contrast in each pixel: 0 in the background, about 1 in a marker."""
     size, frames = sensor.image_size_px, len(scene.centres_px)
     # markers that no pixel of the frame can see are left out; the padding takes the rest of those that stick out
     seen = np.all((scene.centres_px > -_PATCH / 2) & (scene.centres_px < size - 1 + _PATCH / 2), axis=-1)
     frame_index, marker_index = np.nonzero(seen)
-    centres = torch.as_tensor(scene.centres_px[seen], dtype=torch.float32, device=device)
-    radius = _column(scene.size[seen], device) * torch.tensor(sensor.marker_radius_px, device=device)
+    centres = _tensor(scene.centres_px[seen], device)
+    radius = _channels(sensor.marker_radius_px, device) * _items(scene.size[seen], device)
     # blur widens the logistic edge: its standard deviation is 1.81 widths
-    edge = (
-        torch.tensor(sensor.marker_edge_px, device=device).square()
-        + (_column(scene.blur_px[frame_index], device) / 1.81).square()
-    )
+    edge = _channels(sensor.marker_edge_px, device).square() + _items((scene.blur_px[frame_index] / 1.81) ** 2, device)
     corner = torch.floor(centres).to(torch.int64) - _PATCH // 2 + 1
 
     steps = torch.arange(_PATCH, device=device)
     dx = (corner[:, :1] + steps) - centres[:, :1]
     dy = (corner[:, 1:] + steps) - centres[:, 1:]
     distance = torch.sqrt(dy.square()[:, :, None] + dx.square()[:, None, :])
-    slope = edge.rsqrt()[:, None, None, :]
-    inward = radius[:, None, None, :] - distance[..., None]
     texture = None
-    if noise is not None:
-        texture = torch.as_tensor(scene.texture, device=device)[torch.as_tensor(marker_index, device=device)]
-        inward.addcmul_(texture, torch.tensor(noise.ragged_px, device=device))
-    patch = inward.mul_(slope).sigmoid_()
+    if noise is None:
+        patch = radius - distance
+    else:
+        texture = _tensor(scene.texture, device)[:, torch.as_tensor(marker_index, device=device)]
+        patch = texture * _channels(noise.ragged_px, device)
+        patch.add_(radius).sub_(distance)
+    patch.mul_(edge.rsqrt()).sigmoid_()
     if noise is not None and texture is not None:
-        patch.mul_(texture.mul_(torch.tensor(noise.grain, device=device)).add_(1))
-    patch *= torch.as_tensor(scene.contrast[seen], dtype=torch.float32, device=device)[:, None, None, None]
+        patch.mul_(texture.mul_(_channels(noise.grain, device)).add_(1))
+    patch.mul_(_items(scene.contrast[seen], device))
 
-    side = size + 2 * _PATCH
-    row = (corner[:, 1:] + steps + _PATCH) + side * torch.as_tensor(frame_index, device=device)[:, None]
-    column = corner[:, :1] + steps + _PATCH
-    target = row[:, :, None] * side + column[:, None, :]
-    canvas = torch.zeros((frames * side * side, 3), dtype=torch.float32, device=device)
-    canvas.index_add_(0, target.reshape(-1), patch.reshape(-1, 3))
-    return canvas.reshape(frames, side, side, 3)[:, _PATCH:-_PATCH, _PATCH:-_PATCH]
+    return _place(patch, corner=corner, frame=frame_index, frames=frames, size_px=size)
 
 
-def _noise(
-    shade: Float[Tensor, "frames height width 3"], *, noise: Noise, rng: np.random.Generator
-) -> Float[Tensor, "frames height width 3"]:
-    """Noise as strong as a pixel's share of marker says, smoothed over neighbours.
+def _place(
+    patch: Float[Tensor, "3 items side side"],
+    *,
+    corner: Int[Tensor, "items 2"],
+    frame: Int[np.ndarray, " items"],
+    frames: int,
+    size_px: int,
+) -> Float[Tensor, "3 frames height width"]:
+    """Add each patch to its frame, its first pixel at a corner (x, y); what sticks out is cut off."""
+    side = size_px + 2 * _PATCH
+    canvas = torch.zeros((3, frames, side, side), dtype=torch.float32, device=patch.device)
+    corner = corner + _PATCH
+    if patch.device.type == "cpu":
+        # slices are several times faster here than scattering, and add in the same order
+        target, source = canvas.numpy(), patch.numpy()
+        for item, (index, (column, row)) in enumerate(zip(frame.tolist(), corner.tolist(), strict=True)):
+            target[:, index, row : row + _PATCH, column : column + _PATCH] += source[:, item]
+    else:
+        steps = torch.arange(_PATCH, device=patch.device)
+        row = corner[:, 1:] + steps + side * torch.as_tensor(frame, device=patch.device)[:, None]
+        pixel = row[:, :, None] * side + (corner[:, :1] + steps)[:, None, :]
+        canvas.view(3, -1).index_add_(1, pixel.reshape(-1), patch.reshape(3, -1))
+    return canvas[:, :, _PATCH:-_PATCH, _PATCH:-_PATCH]
 
-    Four neighbours of two bytes each sum to what is close enough to normal (excess kurtosis -0.3), and much faster.
-    """
-    frames, height, width, _ = shade.shape
-    count = (height + 1) * (width + 1) * 3
-    # whole frames of bytes one after another, so that the batch size does not matter
-    pairs = np.frombuffer(b"".join(rng.bytes(2 * count) for _ in range(frames)), dtype=np.uint8)
-    pairs = torch.from_numpy(pairs.reshape(frames, 2, height + 1, width + 1, 3).copy()).to(shade.device)
-    white = pairs[:, 0].to(torch.float32) + pairs[:, 1]
-    rows = torch.add(white[:, :-1], white[:, 1:], alpha=noise.smoothness)
-    smooth = torch.add(rows[:, :, :-1], rows[:, :, 1:], alpha=noise.smoothness)
-    # a byte has mean 127.5 and variance (256^2 - 1) / 12
-    smooth.sub_(2 * 127.5 * (1 + noise.smoothness) ** 2)
-    smooth[..., 1].mul_((1 - noise.red_in_green**2) ** 0.5).add_(smooth[..., 0], alpha=noise.red_in_green)
-    unit = (1 + noise.smoothness**2) * (2 * (256**2 - 1) / 12) ** 0.5
-    background = torch.tensor(noise.background, device=shade.device) / unit
-    marker = torch.tensor(noise.marker, device=shade.device) / unit
-    return smooth.mul_(shade.clamp(0, 1).mul_(marker - background).add_(background))
+
+def _tensor(values: np.ndarray, device: str | torch.device) -> Tensor:
+    return torch.as_tensor(values, dtype=torch.float32, device=device)
 
 
-def _column(values: Float[np.ndarray, " items"], device: str | torch.device) -> Float[Tensor, "items 1"]:
-    return torch.as_tensor(values, dtype=torch.float32, device=device)[:, None]
+def _channels(values: tuple[float, float, float], device: str | torch.device) -> Float[Tensor, "3 1 1 1"]:
+    return torch.tensor(values, dtype=torch.float32, device=device).reshape(3, 1, 1, 1)
+
+
+def _items(values: Float[np.ndarray, " items"], device: str | torch.device) -> Float[Tensor, "items 1 1"]:
+    return _tensor(values, device)[:, None, None]

@@ -7,20 +7,46 @@ import numpy as np
 import torch
 
 from sliplens.errors import InputError
-from sliplens.recordings import Dataset, Recording
-from sliplens.recordings.dataset import load_recording, save_recording, trial_info, trial_path, write_dataset_table
-from sliplens.simulation.filming import film
-from sliplens.simulation.loading import load_grasp
+from sliplens.recordings import Dataset, GroundTruth, Recording
+from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.store import read_header, save_recording
+from sliplens.simulation.filming import Film, batches, prepare_film
+from sliplens.simulation.loading import Loading, load_grasp
+from sliplens.simulation.noise import Noise
 from sliplens.simulation.nuisances import draw_grasp, draw_unit
 from sliplens.simulation.plan import SimulationRecipe, TrialPlan, plan_trials
-from sliplens.simulation.rendering import Noise
-from sliplens.simulation.sensor import CHROMATOUCH, Sensor
+
+
+def prepare_trial(plan: TrialPlan) -> tuple[Loading, Film]:
+    """Load a trial and make it ready to be drawn.
+
+    Parameters
+    ----------
+    plan
+        The trial, as `plan_trials` laid it out.
+    """
+    recipe = plan.recipe
+    grasp_rng, load_rng, film_rng = np.random.default_rng(plan.seed).spawn(3)
+    grasp = draw_grasp(recipe.nuisances, day=plan.day_draw, wet=plan.condition == "wet", rng=grasp_rng)
+    loading = load_grasp(grasp, frames=plan.frames, rng=load_rng, release=recipe.release)
+    film = prepare_film(
+        recipe.sensor,
+        loading=loading,
+        grasp=grasp,
+        day=plan.day_draw,
+        unit=draw_unit(
+            recipe.nuisances, markers=recipe.sensor.geometry.markers, rng=np.random.default_rng(plan.unit_seed)
+        ),
+        rng=film_rng,
+        noise=Noise(),
+        displacement=recipe.resolved_displacement,
+    )
+    return loading, film
 
 
 def simulate_trial(
     plan: TrialPlan,
     *,
-    sensor: Sensor = CHROMATOUCH,
     device: str | torch.device = "cpu",
     on_frames: Callable[[int, int], None] | None = None,
 ) -> Recording:
@@ -30,31 +56,23 @@ def simulate_trial(
     ----------
     plan
         The trial, as `plan_trials` laid it out.
-    sensor
-        The fingertip.
     device
         Where to draw the frames.
     on_frames
         Called with the frames done and the frames in all, after each batch.
     """
-    grasp_rng, load_rng, film_rng = np.random.default_rng(plan.seed).spawn(3)
-    grasp = draw_grasp(plan.nuisances, day=plan.day_draw, wet=plan.condition == "wet", rng=grasp_rng)
-    loading = load_grasp(grasp, frames=plan.frames, rng=load_rng)
-    markers = sum(sensor.ring_counts)
-    reference, frames = film(
-        sensor,
-        loading=loading,
-        grasp=grasp,
-        day=plan.day_draw,
-        unit=draw_unit(plan.nuisances, markers=markers, rng=np.random.default_rng(plan.unit_seed)),
-        rng=film_rng,
-        noise=Noise(),
-        device=device,
-        on_frames=on_frames,
-    )
+    loading, film = prepare_trial(plan)
+    reference = film.draw_reference(device=device).cpu().numpy()
+    frames = np.empty((plan.frames, *reference.shape), dtype=np.uint8)
+    contact_map = np.empty(frames.shape[:3], dtype=np.uint8)
+    for part in batches(plan.frames, device=device):
+        frames[part] = film.draw(part, device=device).cpu().numpy()
+        contact_map[part] = film.contact_map(part)
+        if on_frames is not None:
+            on_frames(part.stop, plan.frames)
     return Recording(
         trial=plan.trial,
-        sensor=f"{sensor.name}-{plan.unit + 1}",
+        sensor=f"{plan.recipe.sensor.name}-{plan.unit + 1}",
         day=plan.day,
         condition=plan.condition,
         reference=reference,
@@ -66,43 +84,60 @@ def simulate_trial(
         safety_margin=loading.safety_margin,
         stick_ratio=loading.stick_ratio,
         contact_state=loading.contact_state,
+        truth=GroundTruth(
+            recipe=plan.recipe_hash,
+            displacement=plan.recipe.resolved_displacement,
+            marker_rest_px=film.marker_rest_px.astype(np.float32),
+            marker_px=film.marker_px.astype(np.float32),
+            contact_radius_m=film.motion.contact_radius_m,
+            stick_radius_m=film.motion.stick_radius_m,
+            contact_map=contact_map,
+        ),
     )
 
 
 def simulate_dataset(
-    folder: Path, recipe: SimulationRecipe, *, on_trial: Callable[[int, int], None] | None = None
+    folder: Path,
+    recipe: SimulationRecipe,
+    *,
+    device: str | torch.device = "cpu",
+    on_frames: Callable[[int, int], None] | None = None,
 ) -> Dataset:
     """Simulate a data set into a folder; trials that are already there are kept.
 
     Parameters
     ----------
     folder
-        Where to write `trials/*.parquet` and, last, `dataset.json`. It must hold trials of the same recipe, if any.
+        Where to write `trials/*.parquet` and, last, `dataset.json`.
     recipe
         What to simulate.
-    on_trial
-        Called with the trials done and the trials in all, after each.
+    device
+        Where to draw the frames.
+    on_frames
+        Called with the frames done and the frames in all, after each batch.
 
     Raises
     ------
     InputError
-        If a trial that is there has another number of frames than the recipe asks for.
+        If a trial that is there was made by another recipe.
     """
     plans = plan_trials(recipe)
-    table = []
-    for index, plan in enumerate(plans):
+    total = sum(plan.frames for plan in plans)
+    table, done = [], 0
+
+    def report(drawn: int, _: int) -> None:
+        if on_frames is not None:
+            on_frames(done + drawn, total)
+
+    for plan in plans:
         path = trial_path(folder, plan.trial)
         if path.is_file():
-            recording = load_recording(path)
-            if len(recording) != plan.frames:
-                raise InputError(
-                    f"{path} has {len(recording)} frames but the recipe asks for {plan.frames}; choose another folder"
-                )
+            if read_header(path).recipe != plan.recipe_hash:
+                raise InputError(f"{path} was made by another recipe; choose another folder")
         else:
-            recording = simulate_trial(plan)
-            save_recording(recording, path)
-        table.append(trial_info(recording, split=plan.split, path=path))
-        if on_trial is not None:
-            on_trial(index + 1, len(plans))
+            save_recording(simulate_trial(plan, device=device, on_frames=report), path)
+        table.append(trial_info(path, split=plan.split))
+        done += plan.frames
+        report(0, 0)
     write_dataset_table(folder, table, simulated=True)
     return Dataset.open(folder)

@@ -1,0 +1,166 @@
+"""Laws of the load: forces, friction, labels."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sliplens.errors import ContactError
+from sliplens.mechanics import stick_ratio
+from sliplens.recordings import ContactState
+from sliplens.simulation.loading import load_at_margins, load_grasp
+from sliplens.simulation.nuisances import Grasp, Nuisances, draw_day, draw_grasp
+from sliplens.simulation.sliding import slide
+
+FRAMES = 800
+FEW = settings(max_examples=25)
+
+
+def drawn(seed, **changes):
+    rng = np.random.default_rng(seed)
+    nuisances = Nuisances()
+    day = draw_day(nuisances, quantile=rng.uniform(), rng=rng)
+    return replace(draw_grasp(nuisances, day=day, wet=bool(seed % 2), rng=rng), **changes)
+
+
+def loaded(seed, *, release=False, frames=FRAMES, **changes):
+    return load_grasp(drawn(seed, **changes), frames=frames, rng=np.random.default_rng(seed), release=release)
+
+
+def first_slip(loading):
+    return int(np.argmax(loading.safety_margin == 0))
+
+
+seeds = st.integers(0, 10_000)
+
+
+@FEW
+@given(seeds, st.booleans())
+def test_margin_is_one_minus_the_used_share_of_the_friction_that_holds(seed, release):
+    loading = loaded(seed, release=release)
+    pressing = loading.normal_force_n > 0
+    capacity = loading.friction_coefficient[pressing] * loading.normal_force_n[pressing]
+    np.testing.assert_allclose(
+        loading.safety_margin[pressing], 1 - loading.tangential_force_n[pressing] / capacity, atol=1e-12
+    )
+    assert np.all(np.isnan(loading.safety_margin[~pressing]))
+    assert np.all(loading.tangential_force_n[~pressing] == 0)
+
+
+@FEW
+@given(seeds)
+def test_margin_falls_from_one_to_zero_while_the_pull_grows(seed):
+    loading = loaded(seed, normal_force_drift=0.0, friction_drift=0.0)
+    touch, slip = int(np.argmin(np.isnan(loading.safety_margin))), first_slip(loading)
+    margin, pull = loading.safety_margin[touch : slip + 1], loading.tangential_force_n[touch : slip + 1]
+    assert margin[0] == 1
+    assert np.all(np.diff(margin) <= 1e-12)
+    assert np.all(np.diff(pull) >= -1e-12)
+    # full slip begins exactly where the friction is used up
+    assert margin[-1] == 0
+    assert pull[-1] == pytest.approx(loading.friction_coefficient[slip] * loading.normal_force_n[slip], rel=1e-12)
+    assert np.all(margin[:-1] > 0)
+
+
+@FEW
+@given(seeds)
+def test_before_the_first_slip_the_stick_ratio_is_that_of_a_sphere(seed):
+    loading = loaded(seed)
+    before = slice(0, first_slip(loading))
+    np.testing.assert_array_equal(loading.stick_ratio[before], stick_ratio(loading.safety_margin[before]))
+    assert np.all(loading.carried_friction[before] == 0)
+
+
+@FEW
+@given(seeds)
+def test_margins_are_evenly_spread_over_the_pull(seed):
+    margin = loaded(seed).safety_margin
+    counts, _ = np.histogram(margin[: np.argmax(margin == 0)], bins=5, range=(1e-9, 1 - 1e-9))
+    assert counts.min() > 0.1 * counts.sum()
+    assert counts.max() < 0.4 * counts.sum()
+
+
+@FEW
+@given(seeds)
+def test_sliding_friction_stays_between_kinetic_and_what_was_regained(seed):
+    grasp = drawn(seed)
+    loading = load_grasp(grasp, frames=FRAMES, rng=np.random.default_rng(seed))
+    slip = first_slip(loading)
+    # the fall from static to kinetic friction takes a few frames
+    later = slice(slip + 10, None)
+    used = loading.tangential_force_n[later] / loading.normal_force_n[later]
+    static = grasp.friction * (1 + grasp.friction_drift * (2 * np.arange(FRAMES) / (FRAMES - 1) - 1))[later]
+    kinetic = grasp.kinetic_ratio * static
+    regained = kinetic + grasp.stick_slip_share * (static - kinetic)
+    assert np.all(used >= kinetic * (1 - 1e-9))
+    assert np.all(used <= regained * (1 + 1e-9))
+
+
+def test_stick_slip_is_a_sawtooth_with_its_frequency():
+    grasp = Grasp(friction=0.8, kinetic_ratio=0.75, stick_slip_share=0.5, stick_slip_hz=4.0)
+    time_s = np.arange(0, 3, 0.001)
+    sliding = slide(time_s, static_friction=np.full(len(time_s), 0.8), grasp=grasp, stuck_until=10**6)
+    assert sliding.friction[0] == 0.8
+    assert sliding.slips[0]
+    begins = np.flatnonzero(np.diff(sliding.slips.astype(int)) == -1)
+    np.testing.assert_allclose(np.diff(time_s[begins]), 0.25, atol=0.0011)
+    pull = sliding.used * sliding.friction
+    stuck = ~sliding.slips
+    # stuck, the spring reloads: force from kinetic friction to what was regained, and the margin falls with it
+    assert pull[stuck].min() == pytest.approx(0.6, abs=1e-3)
+    assert pull[stuck].max() == pytest.approx(0.7, abs=1e-3)
+    assert np.all(sliding.used[sliding.slips] == 1)
+
+
+def test_without_stick_slip_the_contact_slides_evenly():
+    loading = load_grasp(Grasp(kinetic_ratio=0.8), frames=FRAMES, rng=np.random.default_rng(0))
+    slip = first_slip(loading)
+    assert np.all(loading.safety_margin[slip:] == 0)
+    np.testing.assert_allclose(loading.friction_coefficient[-20:], 0.8 * 0.775)
+
+
+def test_a_contact_that_sticks_again_sticks_wholly_before_it_creeps():
+    grasp = Grasp(kinetic_ratio=0.7, stick_slip_share=0.5, stick_slip_hz=2.0)
+    loading = load_grasp(grasp, frames=4 * FRAMES, rng=np.random.default_rng(0))
+    again = (loading.carried_friction > 0) & (loading.safety_margin > 0)
+    assert again.any()
+    # its margin is small, yet all of it sticks at first: margin and stick ratio are two things
+    at = np.flatnonzero(again)[0]
+    assert loading.stick_ratio[at] > 0.95
+    assert loading.safety_margin[at] < 0.3
+    assert np.all(loading.stick_ratio[loading.safety_margin == 0] == 0)
+
+
+@FEW
+@given(seeds)
+def test_a_release_ends_without_contact_and_slides_on_the_way(seed):
+    loading = loaded(seed, release=True)
+    assert np.isnan(loading.safety_margin[-1])
+    assert loading.contact_state[-1] is ContactState.NO_CONTACT
+    falling = np.flatnonzero(np.diff(loading.normal_force_n) < -1e-3 * loading.normal_force_n.max())
+    assert falling.size
+    assert np.all(np.nan_to_num(loading.safety_margin[falling + 1], nan=0.0) == 0)
+
+
+@FEW
+@given(st.integers(20, 2000), seeds, st.booleans())
+def test_every_trial_has_every_state(frames, seed, release):
+    loading = loaded(seed, frames=frames, release=release)
+    assert set(loading.contact_state) == set(ContactState)
+    assert len(loading.time_s) == frames
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: load_at_margins(np.array([80.0]), grasp=Grasp()), "give them as fractions, not in percent"),
+        (lambda: load_grasp(Grasp(), frames=5, rng=np.random.default_rng(0)), "a trial of 5 frames cannot hold all"),
+        (lambda: load_at_margins(np.array([0.5]), grasp=Grasp(friction=0.0)), "coefficient of friction must be pos"),
+        (lambda: load_at_margins(np.array([0.5]), grasp=Grasp(normal_force_n=-1.0)), "normal force must not be neg"),
+    ],
+)
+def test_impossible_loads_are_refused(call, message):
+    with pytest.raises(ContactError, match=message):
+        call()

@@ -1,0 +1,151 @@
+"""Where the markers go: symmetries, limits, and the mechanics behind."""
+
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from sliplens.errors import ContactError
+from sliplens.mechanics import contact_radius, reduced_modulus, stick_displacement, stick_ratio
+from sliplens.simulation import CHROMATOUCH, FLAT_GEL
+from sliplens.simulation.flat_pad import FlatPad
+from sliplens.simulation.loading import load_at_margins, load_grasp
+from sliplens.simulation.motion import move_markers
+from sliplens.simulation.nuisances import Grasp
+
+WAYS = [(CHROMATOUCH, "calibrated"), (CHROMATOUCH, "half-space"), (FLAT_GEL, "half-space")]
+CENTRED = Grasp(contact_offset=(0.0, 0.0), shear_direction_rad=0.0)
+MARGINS = np.array([1.0, 0.8, 0.6, 0.4, 0.2, 0.0])
+PAD = cast("FlatPad", FLAT_GEL.geometry)
+
+
+def moved(sensor, displacement, margins=(1.0, 0.8, 0.6, 0.4, 0.2, 0.0), grasp=CENTRED, **more):
+    loading = load_at_margins(np.array(margins), grasp=grasp)
+    return move_markers(sensor, loading=loading, grasp=grasp, displacement=displacement, **more)
+
+
+@pytest.mark.parametrize(("sensor", "displacement"), WAYS)
+def test_without_load_no_marker_moves(sensor, displacement):
+    motion = moved(sensor, displacement, margins=[np.nan])
+    np.testing.assert_array_equal(motion.centres_px[0], motion.rest_px)
+    np.testing.assert_array_equal(motion.scale[0], 1)
+    assert motion.contact_radius_m[0] == motion.stick_radius_m[0] == motion.touch[0] == 0
+
+
+@pytest.mark.parametrize(("sensor", "displacement"), WAYS)
+@pytest.mark.parametrize("depth", [0.0, 0.05])
+def test_opposite_pulls_give_opposite_motions(sensor, displacement, depth):
+    right = moved(sensor, displacement, marker_depth=depth)
+    left = moved(sensor, displacement, grasp=replace(CENTRED, shear_direction_rad=np.pi), marker_depth=depth)
+    middle = np.asarray(sensor.geometry.centre_px)
+    # the grid of a sensor is its own mirror image: each marker has a twin on the other side
+    mirror = (right.rest_px - middle) * [-1, 1] + middle
+    twin = np.argmin(np.linalg.norm(right.rest_px[None] - mirror[:, None], axis=-1), axis=1)
+    np.testing.assert_allclose(right.rest_px[twin], mirror, atol=1e-9)
+    np.testing.assert_allclose((left.centres_px - middle) * [-1, 1] + middle, right.centres_px[:, twin], atol=1e-9)
+
+
+@pytest.mark.parametrize(("sensor", "displacement"), WAYS)
+def test_markers_follow_the_pull_the_further_the_smaller_the_margin(sensor, displacement):
+    motion = moved(sensor, displacement)
+    near = np.linalg.norm(motion.rest_px - np.asarray(sensor.geometry.centre_px), axis=-1) < 40
+    along = (motion.centres_px - motion.centres_px[0])[:, near, 0].mean(axis=1)
+    assert along[0] == 0
+    assert np.all(np.diff(along) > 0)
+
+
+@pytest.mark.parametrize(("sensor", "displacement"), WAYS)
+def test_stick_zone_is_the_share_of_the_contact_that_cattaneo_and_mindlin_give(sensor, displacement):
+    motion = moved(sensor, displacement)
+    np.testing.assert_allclose((motion.stick_radius_m / motion.contact_radius_m) ** 2, stick_ratio(MARGINS), atol=1e-12)
+
+
+def test_on_the_half_space_the_stick_zone_moves_as_one_piece():
+    margin, grasp = 0.8, replace(CENTRED, normal_force_n=2.0)
+    # a gel at nu = 0.5 does not tip: what is seen of the motion is along the pull alone
+    sensor = replace(FLAT_GEL, poisson_ratio=0.5)
+    motion = moved(sensor, "half-space", margins=[1.0, margin], grasp=grasp)
+    radius = PAD.ball_radius_m
+    distance = np.linalg.norm(PAD.marker_positions()[:, :2], axis=-1)
+    inside = distance < motion.stick_radius_m[1]
+    assert inside.sum() == 9
+    depth = (motion.contact_radius_m[1] ** 2 - distance[inside] ** 2 / 2) / radius
+    shift_px = (motion.centres_px[1] - motion.centres_px[0])[inside]
+    # a pinhole of focal length f shows a shift dx at distance D - depth as f dx / (D - depth)
+    shift_m = shift_px * ((PAD.camera_distance_m - depth) / PAD.focal_px)[:, None]
+    expected_m = stick_displacement(
+        contact_radius_m=motion.contact_radius_m[1],
+        sphere_radius_m=radius,
+        friction_coefficient=grasp.friction,
+        safety_margin=margin,
+        poisson_ratio=0.5,
+    )
+    np.testing.assert_allclose(shift_m[:, 0], expected_m, rtol=1e-9)
+    np.testing.assert_allclose(shift_m[:, 1], 0, atol=1e-9 * float(expected_m))
+
+
+@pytest.mark.parametrize(("sensor", "modulus_pa"), [(CHROMATOUCH, 400e3), (FLAT_GEL, 500e3)])
+def test_contact_radius_of_the_half_space_is_hertzs(sensor, modulus_pa):
+    motion = moved(sensor, "half-space")
+    expected = contact_radius(
+        CENTRED.normal_force_n,
+        sphere_radius_m=sensor.geometry.sphere_radius_m,
+        reduced_modulus_pa=reduced_modulus(youngs_modulus_pa=modulus_pa, poisson_ratio=sensor.poisson_ratio),
+    )
+    np.testing.assert_allclose(motion.contact_radius_m, expected)
+
+
+@pytest.mark.parametrize("displacement", ["calibrated", "half-space"])
+def test_a_little_depth_changes_little(displacement):
+    surface, buried = (moved(CHROMATOUCH, displacement, marker_depth=depth) for depth in (0.0, 1e-6))
+    np.testing.assert_allclose(buried.centres_px - buried.rest_px, surface.centres_px - surface.rest_px, atol=1e-3)
+
+
+def test_a_pressed_gel_pushes_buried_markers_outwards():
+    surface, buried = (moved(CHROMATOUCH, "calibrated", margins=[1.0], marker_depth=depth) for depth in (0.0, 0.1))
+    ring = slice(1, 7)
+
+    def spread(motion):
+        middle = np.asarray(CHROMATOUCH.geometry.centre_px)
+        at_rest, now = (
+            np.linalg.norm(points[ring] - middle, axis=-1) for points in (motion.rest_px, motion.centres_px[0])
+        )
+        return (now / at_rest).mean()
+
+    # incompressible gel under the contact has to go somewhere
+    assert spread(buried) > spread(surface) + 0.05
+
+
+def test_kinetic_friction_lets_the_skin_spring_back():
+    grasp = replace(CENTRED, kinetic_ratio=0.7)
+    loading = load_grasp(grasp, frames=400, rng=np.random.default_rng(0))
+    motion = move_markers(FLAT_GEL, loading=loading, grasp=grasp)
+    centre = np.argmin(np.linalg.norm(FLAT_GEL.geometry.marker_positions(), axis=-1))
+    shift = motion.centres_px[:, centre, 0] - motion.rest_px[centre, 0]
+    slip = int(np.argmax(loading.safety_margin == 0))
+    # the field of full slip is linear in the friction
+    assert shift[-1] / shift[slip] == pytest.approx(0.7, abs=0.01)
+
+
+def test_restuck_skin_carries_on_from_where_it_slid():
+    grasp = replace(CENTRED, kinetic_ratio=0.7, stick_slip_share=0.5, stick_slip_hz=2.0)
+    loading = load_grasp(grasp, frames=8000, rng=np.random.default_rng(0))
+    motion = move_markers(FLAT_GEL, loading=loading, grasp=grasp)
+    slip = int(np.argmax(loading.safety_margin == 0))
+    step = np.abs(np.diff(motion.centres_px[slip:], axis=0)).max()
+    # at 1000 frames/s nothing jumps: slip phases of 0.1 s carry the skin over by at most 0.15 of its full shift
+    assert step < 0.01 * np.abs(motion.centres_px[slip] - motion.rest_px).max()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: moved(FLAT_GEL, "calibrated"), "sensor flat-gel cannot be moved by 'calibrated'; choose half-space"),
+        (lambda: moved(CHROMATOUCH, None, marker_depth=1.5), "lie outside a dome of radius 0.02 m"),
+        (lambda: moved(FLAT_GEL, None, marker_depth=-0.1), "do not lie between it and the camera"),
+    ],
+)
+def test_impossible_motions_are_refused(call, message):
+    with pytest.raises(ContactError, match=message):
+        call()

@@ -1,0 +1,86 @@
+"""Fingertips: where their markers and cameras are, and what cannot be."""
+
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sliplens.errors import ContactError
+from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SENSORS
+from sliplens.simulation.dome import Dome
+from sliplens.simulation.flat_pad import FlatPad
+from sliplens.simulation.geometry import pixel_grid
+
+DOME, PAD = cast("Dome", CHROMATOUCH.geometry), cast("FlatPad", FLAT_GEL.geometry)
+
+
+@pytest.mark.parametrize("geometry", [DOME, PAD])
+def test_rays_look_back_to_where_points_were_seen(geometry):
+    points = geometry.marker_positions()
+    rays = geometry.rays(geometry.project(points))
+    camera = np.array([0, 0, -geometry.camera_offset * geometry.radius_m if geometry is DOME else -0.020])
+    ahead = points - camera
+    looked_at = ahead[:, 2] > 0.3 * np.linalg.norm(ahead, axis=-1)
+    np.testing.assert_allclose(rays[looked_at], (ahead[:, :2] / ahead[:, 2:])[looked_at], atol=1e-9)
+
+
+@settings(max_examples=40)
+@given(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(0.0, 0.3), st.floats(0, 2 * np.pi), st.floats(0, 1))
+def test_skin_in_contact_is_seen_where_the_contact_map_says(cx, cy, contact, bearing, reach):
+    """A point of the dome inside the contact, displaced as Hertz says, is seen at its distance from the centre."""
+    radius = DOME.radius_m
+    centre, a = np.array([cx, cy]) * radius, contact * radius
+    sideways = centre + reach * a * np.array([np.cos(bearing), np.sin(bearing)])
+    lift = a**2 / radius - np.sum((sideways - centre) ** 2) / (2 * radius)
+    # the sphere as Hertz sees it, a paraboloid
+    point = np.append(sideways, radius - sideways @ sideways / (2 * radius) - lift)
+    rays = DOME.rays(DOME.project(point[None, None]))
+    square = DOME.face_distance_squared(rays, contact_centre_m=centre, indentation_m=np.array([a**2 / radius]))
+    # the map is computed in single precision, from lengths of the dome's radius
+    assert np.sqrt(square[0, 0, 0]) == pytest.approx(reach * a, abs=2e-3 * radius)
+
+
+def test_rings_are_where_they_were_measured():
+    rest = DOME.project(DOME.marker_positions())
+    from_apex = np.linalg.norm(rest - np.asarray(DOME.centre_px), axis=-1)
+    # measured at 30.9, 62.1 and 93.6 px; markers scatter round their rings by 0.38 px rms: two of that
+    for ring, radius in ((1, 30.9), (2, 62.1), (3, 93.6)):
+        np.testing.assert_allclose(from_apex[DOME.marker_rings() == ring], radius, atol=0.76)
+    assert sum(DOME.ring_counts) == 82
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_every_marker_has_a_size_and_a_place(name):
+    geometry = SENSORS[name].geometry
+    assert geometry.marker_positions().shape == (geometry.markers, 3)
+    assert geometry.marker_scale().shape == (geometry.markers,)
+
+
+def test_the_grid_of_pixels_is_x_then_y():
+    grid = pixel_grid(5)
+    assert grid[2, 4].tolist() == [4, 2]
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: replace(DOME, camera_offset=1.5), "the camera lies 1.5 dome radii behind the centre"),
+        (lambda: replace(DOME, focal_px_per_rad=0.0), "focal length must be positive, got 0"),
+        (lambda: replace(DOME, ring_scale=(1.0,)), "has 6 rings but 1 marker sizes"),
+        (lambda: replace(DOME, ring_spacing_deg=20.0), "the outermost ring would lie 100 degrees from the apex"),
+        (lambda: replace(PAD, spacing_m=0.0), "dot spacing must be positive, got 0"),
+        (
+            lambda: replace(CHROMATOUCH, poisson_ratio=0.6),
+            r"sensor chromatouch: Poisson's ratio must lie in \[0, 0.5\]",
+        ),
+        (lambda: replace(CHROMATOUCH, youngs_modulus_pa=-1.0), "sensor chromatouch: Young's modulus must be positive"),
+        (lambda: replace(CHROMATOUCH, image_size_px=0), "sensor chromatouch: image size must be positive, got 0"),
+        (lambda: replace(CHROMATOUCH, effective_modulus_pa=0.0), "effective modulus must be positive, got 0"),
+    ],
+)
+def test_impossible_sensors_are_refused(call, message):
+    with pytest.raises(ContactError, match=message):
+        call()
