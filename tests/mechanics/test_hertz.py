@@ -9,6 +9,7 @@ from sliplens.mechanics import (
     contact_radius,
     indentation,
     normal_displacement,
+    normal_slope,
     peak_pressure,
     radial_displacement,
     reduced_modulus,
@@ -91,6 +92,24 @@ def test_radial_displacement_is_inwards_and_vanishes_for_rubber():
     np.testing.assert_array_equal(
         radial_displacement(r, contact_radius_m=0.008, sphere_radius_m=R, poisson_ratio=0.5), 0
     )
+
+
+@FEW
+@given(st.floats(0.0, 0.05), st.floats(0.001, 0.01))
+def test_slope_is_the_derivative_of_the_displacement(r, a):
+    step = 1e-6 * a
+    ends = np.abs(np.array([r - step, r + step]))
+    low, high = np.asarray(normal_displacement(ends, contact_radius_m=a, sphere_radius_m=R))
+    slope = float(normal_slope(r, contact_radius_m=a, sphere_radius_m=R))
+    # central differences err by rounding, 1e-16 / 1e-6, and at the kink of the curvature by the step
+    assert slope == pytest.approx(-(high - low) / (2 * step) if r > step else r / R, abs=2e-3 * a / R)
+
+
+def test_slope_falls_as_that_of_a_point_force_far_away():
+    a = 0.008
+    for s in (999.0, 1001.0, 1e5):
+        slope = float(normal_slope(s * a, contact_radius_m=a, sphere_radius_m=R))
+        assert slope == pytest.approx(a / R * 4 / (3 * np.pi * s**2), rel=1e-5)
 
 
 def test_negative_force_is_refused():

@@ -2,6 +2,7 @@
 
 import io
 import re
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -68,10 +69,23 @@ def write_png(path: Path, pixels: UInt8[np.ndarray, "height width *channels"]) -
     Image.fromarray(pixels).save(path, format="PNG")
 
 
-def encode_png(pixels: UInt8[np.ndarray, "height width *channels"], *, compress_level: int = 1) -> bytes:
-    """Bytes of an image as PNG; noisy tactile frames hardly shrink above the lowest level."""
+def encode_png(
+    pixels: UInt8[np.ndarray, "height width *channels"], *, compress_level: int = 1, huffman_only: bool = False
+) -> bytes:
+    """Bytes of an image as PNG; noisy tactile frames hardly shrink above the lowest level.
+
+    Parameters
+    ----------
+    pixels
+        The image.
+    compress_level
+        Effort of zlib, 0 to 9.
+    huffman_only
+        Do not look for what repeats: faster, and smaller too where camera noise leaves nothing to find.
+    """
     buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=compress_level)
+    strategy = zlib.Z_HUFFMAN_ONLY if huffman_only else zlib.Z_DEFAULT_STRATEGY
+    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=compress_level, compress_type=strategy)
     return buffer.getvalue()
 
 

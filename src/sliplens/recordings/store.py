@@ -3,6 +3,7 @@
 import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,10 @@ def save_recording(recording: Recording, path: Path) -> None:
     columns["contact_state"] = [str(state) for state in recording.contact_state]
     description: dict[str, Any] = {name: str(getattr(recording, name)) for name in _DESCRIPTION}
     with ThreadPoolExecutor() as pool:  # zlib lets go of the interpreter's lock
-        columns["image"] = pa.array(list(pool.map(encode_png, recording.frames)), type=pa.binary())
+        first = recording.frames[0]
+        noisy = len(encode_png(first, huffman_only=True)) < len(encode_png(first))
+        encode = partial(encode_png, huffman_only=noisy)
+        columns["image"] = pa.array(list(pool.map(encode, recording.frames)), type=pa.binary())
         if recording.truth is not None:
             truth = recording.truth
             columns |= {name: getattr(truth, name) for name in _TRUTH_SIGNALS}
