@@ -21,6 +21,7 @@ def truth(recording: Recording, rng: np.random.Generator) -> GroundTruth:
         displacement="half-space",
         marker_rest_px=rng.uniform(0, 48, (7, 2)).astype(np.float32),
         marker_px=rng.uniform(0, 48, (frames, 7, 2)).astype(np.float32),
+        static_friction=rng.uniform(0.2, 1.0, frames),
         contact_radius_m=radius,
         stick_radius_m=radius * rng.uniform(0, 1, frames),
         contact_map=rng.integers(0, 3, (frames, height, width), dtype=np.uint8),
@@ -81,6 +82,7 @@ def test_truth_that_contradicts_itself_is_refused(recording: Recording, truth: G
     shorter = replace(
         truth,
         marker_px=truth.marker_px[1:],
+        static_friction=truth.static_friction[1:],
         contact_radius_m=truth.contact_radius_m[1:],
         stick_radius_m=truth.stick_radius_m[1:],
         contact_map=truth.contact_map[1:],

@@ -209,6 +209,7 @@ def test_outlines_are_in_the_clip_where_the_truth_is_known(trial, written, tmp_p
         displacement="half-space",
         marker_rest_px=rest,
         marker_px=np.repeat(rest[None], len(trial), axis=0),
+        static_friction=np.ones(len(trial)),
         contact_radius_m=np.ones(len(trial)),
         stick_radius_m=np.zeros(len(trial)),
         contact_map=contact,

@@ -62,6 +62,7 @@ def with_truth(trial: Recording, *, displacement: str = "half-space") -> Recordi
         displacement=displacement,
         marker_rest_px=rest,
         marker_px=np.repeat(rest[None], count, axis=0),
+        static_friction=np.ones(count),
         contact_radius_m=np.ones(count),
         stick_radius_m=np.zeros(count),
         contact_map=contact,

@@ -60,6 +60,7 @@ def test_margin_falls_from_one_to_zero_while_the_pull_grows(seed):
     assert np.all(np.diff(pull) >= -1e-12)
     # full slip begins exactly where the friction is used up
     assert margin[-1] == 0
+    np.testing.assert_array_equal(loading.static_friction[: slip + 1], loading.friction_coefficient[: slip + 1])
     assert pull[-1] == pytest.approx(loading.friction_coefficient[slip] * loading.normal_force_n[slip], rel=1e-12)
     assert np.all(margin[:-1] > 0)
 

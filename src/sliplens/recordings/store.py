@@ -19,7 +19,7 @@ from sliplens.recordings.truth import GroundTruth
 
 SCHEMA_VERSION = 1
 _DESCRIPTION = ("trial", "sensor", "day", "condition")
-_TRUTH_SIGNALS = ("contact_radius_m", "stick_radius_m")
+_TRUTH_SIGNALS = ("static_friction", "contact_radius_m", "stick_radius_m")
 _TRUTH_COLUMNS = frozenset({*_TRUTH_SIGNALS, "marker_px", "contact_map"})
 
 

@@ -30,6 +30,8 @@ class GroundTruth:
     """Markers of the untouched sensor."""
     marker_px: Float32[np.ndarray, "_ _ 2"]
     """The same markers in every frame."""
+    static_friction: Float[np.ndarray, " _"]
+    """mu_s, whether or not the contact slips; `Recording.friction_coefficient` is the one that holds."""
     contact_radius_m: Float[np.ndarray, " _"]
     """0 without contact."""
     stick_radius_m: Float[np.ndarray, " _"]
@@ -39,7 +41,7 @@ class GroundTruth:
     def __post_init__(self) -> None:
         """Check that all speaks of the same frames and markers."""
         count = len(self.marker_px)
-        for name in ("contact_radius_m", "stick_radius_m", "contact_map"):
+        for name in ("static_friction", "contact_radius_m", "stick_radius_m", "contact_map"):
             if len(getattr(self, name)) != count:
                 raise RecordingError(
                     f"the truth has {count} frames of markers but {len(getattr(self, name))} of {name}; "

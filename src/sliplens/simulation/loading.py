@@ -40,6 +40,7 @@ class Loading:
     normal_force_n: Float[np.ndarray, " frames"]
     tangential_force_n: Float[np.ndarray, " frames"]
     friction_coefficient: Float[np.ndarray, " frames"]
+    static_friction: Float[np.ndarray, " frames"]
     safety_margin: Float[np.ndarray, " frames"]
     stick_ratio: Float[np.ndarray, " frames"]
     carried_friction: Float[np.ndarray, " frames"]
@@ -96,6 +97,7 @@ def load_grasp(grasp: Grasp, *, frames: int, rng: np.random.Generator, release: 
         normal=normal,
         used=np.where(index < slip, used, sliding.used),
         friction=np.where(index < slip, static, sliding.friction),
+        static=static,
         carried=np.where(index < slip, 0.0, sliding.carried),
         slips=(index >= slip) & sliding.slips,
         held_s=np.where(index < touch, 0, time_s - time_s[touch]),
@@ -125,6 +127,7 @@ def load_at_margins(margins: Float[np.ndarray, " frames"], *, grasp: Grasp) -> L
         normal=np.where(np.isnan(margins), 0.0, grasp.normal_force_n),
         used=1 - np.nan_to_num(margins, nan=1.0),
         friction=np.full(len(margins), grasp.friction),
+        static=np.full(len(margins), grasp.friction),
         carried=nothing,
         slips=margins == 0,
         held_s=nothing,
@@ -137,6 +140,7 @@ def _label(
     normal: Float[np.ndarray, " frames"],
     used: Float[np.ndarray, " frames"],
     friction: Float[np.ndarray, " frames"],
+    static: Float[np.ndarray, " frames"],
     carried: Float[np.ndarray, " frames"],
     slips: Bool[np.ndarray, " frames"],
     held_s: Float[np.ndarray, " frames"],
@@ -154,6 +158,7 @@ def _label(
         normal_force_n=normal,
         tangential_force_n=tangential,
         friction_coefficient=friction,
+        static_friction=static,
         safety_margin=margin,
         stick_ratio=stick_ratio(stick_margin),
         carried_friction=carried,

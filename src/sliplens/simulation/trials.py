@@ -89,6 +89,7 @@ def simulate_trial(
             displacement=plan.recipe.resolved_displacement,
             marker_rest_px=film.marker_rest_px.astype(np.float32),
             marker_px=film.marker_px.astype(np.float32),
+            static_friction=loading.static_friction,
             contact_radius_m=film.motion.contact_radius_m,
             stick_radius_m=film.motion.stick_radius_m,
             contact_map=contact_map,
