@@ -13,6 +13,8 @@ from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SENSORS
 from sliplens.simulation.dome import Dome
 from sliplens.simulation.flat_pad import FlatPad
 from sliplens.simulation.geometry import pixel_grid
+from sliplens.simulation.look import MarkerLook, draw_look
+from sliplens.simulation.nuisances import nominal_unit
 
 DOME, PAD = cast("Dome", CHROMATOUCH.geometry), cast("FlatPad", FLAT_GEL.geometry)
 
@@ -59,6 +61,39 @@ def test_every_marker_has_a_size_and_a_place(name):
     assert geometry.marker_scale().shape == (geometry.markers,)
 
 
+def drawn(look, *, touch=(0.0, 1.0), pressure=0.0, blur_px=0.0):
+    still = (len(touch), DOME.markers)
+    return draw_look(
+        look,
+        geometry=DOME,
+        unit=nominal_unit(DOME.markers),
+        scale=np.ones(still),
+        pressure=np.full(still, pressure),
+        touch=np.array(touch),
+        blur_px=np.full(len(touch), blur_px),
+    )
+
+
+def test_pressing_makes_markers_sharper_and_paler():
+    look = drawn(CHROMATOUCH.look)
+    assert np.all(look.contrast[1] < look.contrast[0])
+    assert np.all(look.edge_px[1] <= look.edge_px[0])
+    sharp = drawn(replace(CHROMATOUCH.look, defocus_px=(0.0, 0.0, 0.0)))
+    np.testing.assert_array_equal(sharp.edge_px[0], look.edge_px[1])
+
+
+def test_blur_adds_to_the_edge_in_quadrature():
+    look = drawn(FLAT_GEL.look, blur_px=1.0)
+    # the variance of a logistic distribution of width w is (pi w)^2 / 3
+    np.testing.assert_allclose((np.pi * look.edge_px) ** 2 / 3, (np.pi * 0.9) ** 2 / 3 + 1, rtol=0.01)
+
+
+def test_pressure_widens_red_most():
+    look = drawn(CHROMATOUCH.look, pressure=1.0)
+    growth = (look.radius_px / drawn(CHROMATOUCH.look).radius_px)[0, 0]
+    assert growth[0] > growth[1] > 1 > growth[2]
+
+
 def test_the_grid_of_pixels_is_x_then_y():
     grid = pixel_grid(5)
     assert grid[2, 4].tolist() == [4, 2]
@@ -77,6 +112,10 @@ def test_the_grid_of_pixels_is_x_then_y():
             r"sensor chromatouch: Poisson's ratio must lie in \[0, 0.5\]",
         ),
         (lambda: replace(CHROMATOUCH, youngs_modulus_pa=-1.0), "sensor chromatouch: Young's modulus must be positive"),
+        (
+            lambda: MarkerLook(radius_px=(1.0, 0.0, 1.0), edge_px=(1.0, 1.0, 1.0), contrast=(1.0, 1.0, 1.0)),
+            "marker radius in green must be positive, got 0",
+        ),
         (lambda: replace(CHROMATOUCH, image_size_px=0), "sensor chromatouch: image size must be positive, got 0"),
         (lambda: replace(CHROMATOUCH, effective_modulus_pa=0.0), "effective modulus must be positive, got 0"),
     ],

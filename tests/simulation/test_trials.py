@@ -20,7 +20,6 @@ from sliplens.simulation import (
 from sliplens.simulation.filming import prepare_film
 from sliplens.simulation.flat_pad import FlatPad
 from sliplens.simulation.loading import load_at_margins
-from sliplens.simulation.noise import Noise
 from sliplens.simulation.nuisances import Day, Grasp, nominal_unit
 
 RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=30, seed=5)
@@ -62,7 +61,14 @@ def test_without_load_a_frame_is_the_reference_frame(sensor):
 
 def centred(sensor):
     lamps = tuple(replace(lamp, direction_deg=90.0) for lamp in sensor.lights)
-    return replace(sensor, geometry=replace(sensor.geometry, centre_px=(111.5, 111.5)), lights=lamps)
+    return replace(
+        sensor,
+        geometry=replace(sensor.geometry, centre_px=(111.5, 111.5)),
+        # focus, lamps and their reflections know left from right
+        look=replace(sensor.look, focus_tilt=(0.0, 0.0)),
+        lights=lamps,
+        glare=None,
+    )
 
 
 @pytest.mark.parametrize(
@@ -70,8 +76,8 @@ def centred(sensor):
     [(CHROMATOUCH, "calibrated"), (CHROMATOUCH, "half-space"), (FLAT_GEL, "half-space")],
 )
 def test_a_mirrored_pull_gives_the_mirrored_image(sensor, displacement):
-    left = Grasp(shear_direction_rad=np.radians(70), contact_offset=(0.05, 0.02))
-    right = Grasp(shear_direction_rad=np.radians(110), contact_offset=(-0.05, 0.02))
+    left = Grasp(shear_direction_rad=np.radians(70), contact_offset=(0.05, 0.02), skin_grain=0.0)
+    right = Grasp(shear_direction_rad=np.radians(110), contact_offset=(-0.05, 0.02), skin_grain=0.0)
     margins = [1.0, 0.5, 0.0]
     one, other = (
         film(margins, grasp=grasp, sensor=centred(sensor), displacement=displacement) for grasp in (left, right)
@@ -86,7 +92,7 @@ def test_a_mirrored_pull_gives_the_mirrored_image(sensor, displacement):
 
 
 def test_frames_do_not_depend_on_which_are_drawn_together():
-    prepared = film(np.linspace(1, 0, 23), grasp=Grasp(blur_px=0.5), noise=Noise())
+    prepared = film(np.linspace(1, 0, 23), grasp=Grasp(blur_px=0.5), noise=CHROMATOUCH.noise)
     together = prepared.draw(slice(0, 23)).numpy()
     for start, stop in ((0, 1), (5, 6), (22, 23), (3, 10)):
         np.testing.assert_array_equal(prepared.draw(slice(start, stop)).numpy(), together[start:stop])
@@ -94,7 +100,7 @@ def test_frames_do_not_depend_on_which_are_drawn_together():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here to compare with the processor")
 def test_a_gpu_draws_the_same_frames_within_one_grey_level():
-    prepared = film(np.linspace(1, 0, 20), grasp=Grasp(blur_px=0.5), noise=Noise())
+    prepared = film(np.linspace(1, 0, 20), grasp=Grasp(blur_px=0.5), noise=CHROMATOUCH.noise)
     host, gpu = (prepared.draw(slice(0, 20), device=device).cpu().numpy().astype(int) for device in ("cpu", "cuda"))
     assert np.abs(host - gpu).max() <= 1
     # a value has to lie within some 1e-4 of a half to be rounded the other way
@@ -118,7 +124,7 @@ def test_contact_map_has_the_areas_of_contact_and_stick_zone():
 
 def test_a_flank_that_leans_towards_a_lamp_brightens():
     lamp = replace(FLAT_GEL.lights[0], direction_deg=0.0, share=(1.0, 1.0, 1.0))
-    sensor = replace(FLAT_GEL, lights=(lamp,), marker_contrast=(0.0, 0.0, 0.0), vignette=0.0)
+    sensor = replace(FLAT_GEL, lights=(lamp,), look=replace(FLAT_GEL.look, contrast=(0.0, 0.0, 0.0)), vignette=0.0)
     reference, frames = clean_frames([1.0], grasp=Grasp(contact_offset=(0.0, 0.0)), sensor=sensor)
     change = frames[0].astype(int) - reference
     edge = round(prepared_radius_px(sensor))

@@ -8,10 +8,11 @@ import torch
 from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
-from sliplens.mechanics import indentation, normal_slope
+from sliplens.mechanics import normal_slope
 from sliplens.simulation.geometry import pixel_grid
-from sliplens.simulation.lighting import brightness, haze, relief
+from sliplens.simulation.lighting import brightness, empty_view, haze, relief
 from sliplens.simulation.loading import Loading
+from sliplens.simulation.look import draw_look
 from sliplens.simulation.motion import Motion, move_markers
 from sliplens.simulation.noise import Noise, NoisePicks, pick_noise
 from sliplens.simulation.nuisances import Day, Grasp, Unit
@@ -20,9 +21,6 @@ from sliplens.simulation.sensor import Sensor
 
 _BATCHES = {"cpu": 4, "cuda": 512}
 """Frames drawn at once: few enough for a processor's caches, many enough for a GPU."""
-
-_FADE = 0.05
-"""Contrast that markers lose in contact."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +39,7 @@ class Film:
     noise_picks: NoisePicks
     texture: Float32[np.ndarray, "3 markers side side"]
     light: Float32[np.ndarray, "3 height width"]
+    empty: Float32[np.ndarray, "3 height width"]
     haze: Float32[np.ndarray, "3 height width"]
     relief: Float32[np.ndarray, "3 height width"] | None
     rays: Float[np.ndarray, "height width 2"]
@@ -54,6 +53,7 @@ class Film:
         return self._draw(
             self.marker_rest_px[None],
             scale=np.ones((1, len(self.marker_rest_px))),
+            pressure=np.zeros((1, len(self.marker_rest_px))),
             touch=np.zeros(1),
             slope=None if self.relief is None else np.zeros((1, *self.rays.shape[:2]), dtype=np.float32),
             taken=slice(0, 1),
@@ -84,6 +84,7 @@ class Film:
         return self._draw(
             self.marker_px[frames],
             scale=motion.scale[frames],
+            pressure=motion.pressure[frames],
             touch=motion.touch[frames],
             slope=slope,
             taken=slice(frames.start + 1, frames.stop + 1),
@@ -101,10 +102,10 @@ class Film:
         return touching.view(np.uint8) + sticking.view(np.uint8)
 
     def _face_distance_squared(self, frames: slice) -> Float32[np.ndarray, "frames height width"]:
-        geometry = self.sensor.geometry
-        depth = indentation(self.motion.contact_radius_m[frames], sphere_radius_m=geometry.sphere_radius_m)
-        return geometry.face_distance_squared(
-            self.rays, contact_centre_m=self.motion.contact_centre_m, indentation_m=np.asarray(depth)
+        return self.sensor.geometry.face_distance_squared(
+            self.rays,
+            contact_centre_m=self.motion.contact_centre_m,
+            indentation_m=self.motion.indentation_m[frames],
         )
 
     def _draw(
@@ -112,18 +113,27 @@ class Film:
         centres_px: Float[np.ndarray, "frames markers 2"],
         *,
         scale: Float[np.ndarray, "frames markers"],
+        pressure: Float[np.ndarray, "frames markers"],
         touch: Float[np.ndarray, " frames"],
         slope: Float32[np.ndarray, "frames height width"] | None,
         taken: slice,
         device: str | torch.device,
     ) -> UInt8[Tensor, "frames height width 3"]:
+        markers = draw_look(
+            self.sensor.look,
+            geometry=self.sensor.geometry,
+            unit=self.unit,
+            scale=scale,
+            pressure=pressure,
+            touch=touch,
+            blur_px=self.blur_px[taken],
+        )
         scene = Scene(
             centres_px=centres_px,
-            size=self.sensor.geometry.marker_scale() * self.unit.radius_factor * scale,
-            contrast=self.unit.contrast_factor * (1 - _FADE * touch[:, None]),
+            markers=markers,
             texture=self.texture,
-            blur_px=self.blur_px[taken],
             light=self.light,
+            empty=self.empty,
             haze=self.haze,
             touch=touch,
             relief=self.relief,
@@ -204,6 +214,7 @@ def prepare_film(
     seat = _Seat(day=day, middle=np.asarray(geometry.centre_px))
     contact_px = seat.see(geometry.project(geometry.skin_point(motion.contact_centre_m)))
     edge, apex = (geometry.project(geometry.skin_point(np.array([x, 0.0]))) for x in (motion.nominal_radius_m, 0.0))
+    light = brightness(sensor, day=day)
     return Film(
         sensor=sensor,
         unit=unit,
@@ -215,8 +226,15 @@ def prepare_film(
         blur_px=grasp.blur_px * rng.uniform(0.8, 1.2, frames + 1),
         noise_picks=pick_noise(frames + 1, rng=rng),
         texture=draw_texture(geometry.markers, rng=np.random.default_rng(unit.texture_seed)),
-        light=brightness(sensor, day=day),
-        haze=haze(sensor, grasp=grasp, contact_px=contact_px, radius_px=float(edge[0] - apex[0])),
+        light=light,
+        empty=empty_view(sensor, light=light),
+        haze=haze(
+            sensor,
+            grasp=grasp,
+            contact_px=contact_px,
+            radius_px=float(edge[0] - apex[0]),
+            rng=np.random.default_rng((unit.texture_seed, 1)),
+        ),
         relief=relief(sensor, contact_px=contact_px),
         rays=geometry.rays(seat.unsee(pixel_grid(sensor.image_size_px))),
     )

@@ -7,7 +7,11 @@ from sliplens.simulation.geometry import pixel_grid
 from sliplens.simulation.nuisances import Day, Grasp
 from sliplens.simulation.sensor import Sensor
 
-_GLOW_RADIUS = 0.89
+_WHITE = 258.0
+"""Glare ends a little above white: the markers in it are seen, the noise is not."""
+_GRAIN_PX = 2.2
+"""Size of the pressed skin's grain."""
+_GLOW_RADIUS = 0.935
 """Where the glow of the contact fades, over the radius of a nominal contact."""
 
 
@@ -28,6 +32,21 @@ def brightness(sensor: Sensor, *, day: Day) -> Float32[np.ndarray, "3 height wid
     return _planes(even)
 
 
+def empty_view(
+    sensor: Sensor, *, light: Float32[np.ndarray, "3 height width"]
+) -> Float32[np.ndarray, "3 height width"]:
+    """Untouched sensor without its markers, the lamps' glare included, in grey levels."""
+    skin = np.asarray(sensor.background, dtype=np.float32)[:, None, None] * light
+    glare = sensor.glare
+    if glare is None:
+        return skin
+    bearings = np.radians(glare.bearing_deg) + 2 * np.pi * np.arange(glare.lamps) / glare.lamps
+    lamps = np.asarray(glare.centre_px) + glare.radius_px * np.stack([np.cos(bearings), np.sin(bearings)], axis=-1)
+    away = ((pixel_grid(sensor.image_size_px)[:, :, None] - lamps) ** 2).sum(axis=-1)
+    spots = np.exp(-away / (2 * glare.width_px**2)).sum(axis=-1)
+    return np.minimum(skin + _planes(spots[..., None] * np.asarray(glare.colour)), np.float32(_WHITE))
+
+
 def relief(sensor: Sensor, *, contact_px: Float[np.ndarray, "2"]) -> Float32[np.ndarray, "3 height width"] | None:
     """Relative change of brightness where the skin slopes by 1 away from a contact; None for a sensor without lamps.
 
@@ -45,9 +64,14 @@ def relief(sensor: Sensor, *, contact_px: Float[np.ndarray, "2"]) -> Float32[np.
 
 
 def haze(
-    sensor: Sensor, *, grasp: Grasp, contact_px: Float[np.ndarray, "2"], radius_px: float
+    sensor: Sensor,
+    *,
+    grasp: Grasp,
+    contact_px: Float[np.ndarray, "2"],
+    radius_px: float,
+    rng: np.random.Generator,
 ) -> Float32[np.ndarray, "3 height width"]:
-    """Grey levels that full contact adds: a veil over all, and a glow where the object reflects the light.
+    """Grey levels that full contact adds: a veil, a glow where the object reflects the light, the grain of the skin.
 
     Parameters
     ----------
@@ -55,12 +79,25 @@ def haze(
         The fingertip, and the strength of veil and glow.
     contact_px, radius_px
         Where the camera sees the contact's centre, and how large its radius in a nominal grasp.
+    rng
+        Source of the grain.
     """
     if not sensor.sees_contact:
         return np.zeros((3, sensor.image_size_px, sensor.image_size_px), dtype=np.float32)
     square = ((pixel_grid(sensor.image_size_px) - contact_px) ** 2).sum(axis=-1)
     disc = np.exp(-((square / (_GLOW_RADIUS * radius_px) ** 2) ** 2))
-    return _planes(np.asarray(grasp.veil) + disc[..., None] * np.asarray(grasp.glow))
+    grain = grasp.skin_grain * _smooth_noise(sensor.image_size_px, rng=rng)
+    return _planes(np.asarray(grasp.veil) + disc[..., None] * np.asarray(grasp.glow) + grain[..., None])
+
+
+def _smooth_noise(size: int, *, rng: np.random.Generator) -> Float[np.ndarray, "size size"]:
+    """Noise of unit variance that keeps its sign over a few pixels."""
+    steps = np.arange(-8, 9)
+    kernel = np.exp(-(steps**2) / (2 * _GRAIN_PX**2))
+    kernel /= np.linalg.norm(kernel)
+    windows = np.lib.stride_tricks.sliding_window_view
+    rows = windows(rng.standard_normal((size + 16, size + 16)), len(kernel), axis=1) @ kernel
+    return windows(rows, len(kernel), axis=0) @ kernel
 
 
 def _planes(image: Float[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "3 height width"]:

@@ -10,6 +10,7 @@ from sliplens.mechanics import (
     buried_hertz_displacement,
     buried_partial_slip_displacement,
     contact_radius,
+    indentation,
     reduced_modulus,
     stick_radius,
 )
@@ -19,14 +20,14 @@ from sliplens.simulation.sensor import Sensor
 
 _FITTED_FRICTION = 0.775
 """Ascribed to the trial of the real images, which names none: the geometric mean of the dry range (assumed)."""
-_TURN = 0.15
-"""Far from the apex markers turn away from the camera as the dome flattens: size lost at the equator."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Displacement:
     """How a fingertip gives way: an elastic half-space held by its base, and a shear of the whole skin."""
 
+    layer: float
+    """Indentation over Hertz's for the same contact: on a hard core the gel is a layer; a thin one has half of it."""
     local_friction: float
     """Share of the friction that shows as Cattaneo and Mindlin's local field."""
     clamp_exponent: float
@@ -37,11 +38,13 @@ class Displacement:
 
 
 DISPLACEMENTS = {
-    # fitted to 35 markers x 4 frames of the published difference images, each located by fitting two blurred discs to
-    # its crescents: rms 0.48 px a coordinate, of a motion of 4.1 px
-    "calibrated": Displacement(local_friction=0.049 / _FITTED_FRICTION, clamp_exponent=0.41, skin_shear=0.0322),
+    # fitted, with the defaults of `Grasp`, to 34 markers x 4 frames of the published difference images;
+    # `benchmarks/sim_vs_real.py` prints how well
+    "calibrated": Displacement(
+        layer=0.69, local_friction=0.042 / _FITTED_FRICTION, clamp_exponent=0.76, skin_shear=0.0307
+    ),
     # the exponent where a half-space alone was fitted to those markers
-    "half-space": Displacement(local_friction=1.0, clamp_exponent=1.6, skin_shear=0.0),
+    "half-space": Displacement(layer=1.0, local_friction=1.0, clamp_exponent=1.6, skin_shear=0.0),
 }
 """`calibrated` moves as the real ChromaTouch did, and its stick zone is nominal; `half-space` is exact mechanics."""
 
@@ -59,6 +62,9 @@ class Motion:
     nominal_radius_m: float
     """Contact radius of the nominal grasp."""
     contact_centre_m: Float[np.ndarray, "2"]
+    pressure: Float[np.ndarray, "frames markers"]
+    """Hertz's pressure on each marker over the peak of the nominal grasp's."""
+    indentation_m: Float[np.ndarray, " frames"]
     contact_radius_m: Float[np.ndarray, " frames"]
     stick_radius_m: Float[np.ndarray, " frames"]
 
@@ -116,8 +122,7 @@ def move_markers(
     contact_m = radius(loading.normal_force_n * creep, modulus_factor)
     nominal_m = radius(np.array([Grasp().normal_force_n]), 1.0)
     touch = (contact_m / nominal_m) ** 2
-    cosine = geometry.slope_cosine(rest)
-    clamp = cosine**model.clamp_exponent
+    clamp = geometry.slope_cosine(rest) ** model.clamp_exponent
     centre_m = np.asarray(grasp.contact_offset) * sphere_m
     from_centre = rest[:, :2] - centre_m
     distance = np.linalg.norm(from_centre, axis=-1)
@@ -128,7 +133,8 @@ def move_markers(
         sphere_radius_m=sphere_m,
         poisson_ratio=sensor.poisson_ratio,
     )
-    outward, inward = outward * clamp / np.where(distance > 0, distance, 1), inward * clamp
+    yielding = model.layer * clamp
+    outward, inward = outward * yielding / np.where(distance > 0, distance, 1), inward * yielding
     pull = np.array([np.cos(grasp.shear_direction_rad), np.sin(grasp.shear_direction_rad)])
     athwart = np.array([-pull[1], pull[0]])
     # a tilted object pushes a little sideways
@@ -146,16 +152,16 @@ def move_markers(
             poisson_ratio=sensor.poisson_ratio,
         )
         skin = model.skin_shear * sphere_m * friction / _FITTED_FRICTION * touch[:, None]
-        along = along * clamp + skin * cosine * (1 - margin**grasp.shear_exponent)
+        along = (along + skin * (1 - margin**grasp.shear_exponent)) * clamp
         moved[..., :2] += along[..., None] * pull + (across * clamp)[..., None] * athwart
         moved[..., 2] -= sunk * clamp
     return Motion(
         rest_px=geometry.project(rest),
         centres_px=geometry.project(moved),
-        scale=geometry.camera_distance(rest)
-        / geometry.camera_distance(moved)
-        * (1 - _TURN * touch[:, None] * (1 - cosine**2)),
+        scale=geometry.camera_distance(rest) / geometry.camera_distance(moved),
         touch=touch,
+        pressure=np.sqrt(np.maximum(contact_m[:, None] ** 2 - distance**2, 0)) / nominal_m,
+        indentation_m=model.layer * np.asarray(indentation(contact_m, sphere_radius_m=sphere_m)),
         nominal_radius_m=float(nominal_m[0]),
         contact_centre_m=centre_m,
         contact_radius_m=contact_m,

@@ -17,15 +17,18 @@ _PLAY_PX = 64
 class Noise:
     """Standard deviation of one frame's noise by channel, in grey levels, and its smoothness."""
 
-    background: tuple[float, float, float] = (2.2, 2.1, 2.0)
-    marker: tuple[float, float, float] = (9.2, 9.0, 3.0)
-    smoothness: float = 0.4
-    """Weight of the neighbour's noise in a pixel; 0.4 gives a lag-1 correlation of 0.34."""
-    red_in_green: float = 0.5
+    background: tuple[float, float, float]
+    marker: tuple[float, float, float]
+    edge: float
+    """How far the noise of a marker's edge, where the video's compression rings, exceeds that inside: at a share s of
+    marker in the pixel the noise has s (1 + edge (1 - s)) of the marker's excess over the background's."""
+    smoothness: float
+    """Weight w of the neighbour's noise in a pixel; the lag-1 correlation is w / (1 + w^2)."""
+    red_in_green: float
     """Correlation of red and green, which the camera's debayering ties together."""
-    grain: tuple[float, float, float] = (0.13, 0.06, 0.07)
+    grain: tuple[float, float, float]
     """Unevenness of the print, which moves with a marker, over its contrast."""
-    ragged_px: tuple[float, float, float] = (0.5, 0.35, 0.35)
+    ragged_px: tuple[float, float, float]
     """Unevenness of a marker's edge."""
 
 

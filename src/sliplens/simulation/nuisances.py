@@ -60,10 +60,12 @@ class Nuisances:
     marker_radius: Range = (0.95, 1.05)
     marker_contrast: Range = (0.85, 1.15)
     blur_px: Range = (0.0, 1.0)
-    veil: Range = (2.0, 5.0)
+    veil: Range = (2.5, 6.0)
     """Grey levels by which the whole image brightens in contact."""
     glow: Range = (2.0, 8.0)
     """Grey levels by which the contact brightens beyond that."""
+    skin_grain: Range = (0.8, 2.4)
+    """Standard deviation of the grey levels by which pressed skin shows its grain."""
 
     def __post_init__(self) -> None:
         """Check that every range can be drawn from."""
@@ -133,15 +135,16 @@ class Grasp:
     normal_force_n: float = 1.86
     """What gives the fitted radius of contact with the sensor's effective modulus."""
     normal_force_drift: float = 0.0
-    contact_offset: tuple[float, float] = (0.088, -0.015)
+    contact_offset: tuple[float, float] = (0.092, -0.033)
     tilt_rad: tuple[float, float] = (0.0, 0.0)
-    shear_direction_rad: float = 1.551
-    shear_exponent: float = 0.514
+    shear_direction_rad: float = 1.512
+    shear_exponent: float = 0.495
     creep: float = 0.0
     creep_time_s: float = 1.0
     blur_px: float = 0.0
-    veil: tuple[float, float, float] = (3.5, 3.3, 3.0)
-    glow: tuple[float, float, float] = (5.0, 4.5, 3.5)
+    veil: tuple[float, float, float] = (5.3, 4.8, 4.2)
+    glow: tuple[float, float, float] = (4.0, 3.8, 2.6)
+    skin_grain: float = 1.5
 
 
 def nominal_unit(markers: int) -> Unit:
@@ -231,6 +234,7 @@ def draw_grasp(nuisances: Nuisances, *, day: Day, wet: bool, rng: np.random.Gene
         blur_px=rng.uniform(*nuisances.blur_px),
         veil=_three(rng, nuisances.veil),
         glow=_three(rng, nuisances.glow),
+        skin_grain=rng.uniform(*nuisances.skin_grain),
     )
 
 

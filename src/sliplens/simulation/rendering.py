@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
 
+from sliplens.simulation.look import DrawnMarkers
 from sliplens.simulation.noise import Noise, NoisePicks, mix_noise
 from sliplens.simulation.sensor import Sensor
 
@@ -19,15 +20,13 @@ class Scene:
     """What the camera sees in a batch of frames, before noise."""
 
     centres_px: Float[np.ndarray, "frames markers 2"]
-    size: Float[np.ndarray, "frames markers"]
-    """Marker size over the sensor's `marker_radius_px`."""
-    contrast: Float[np.ndarray, "frames markers"]
-    """Marker contrast over the sensor's."""
+    markers: DrawnMarkers
     texture: Float32[np.ndarray, "3 markers side side"]
     """From `draw_texture`."""
-    blur_px: Float[np.ndarray, " frames"]
     light: Float32[np.ndarray, "3 height width"]
     """Brightness over the sensor's, the same for all frames."""
+    empty: Float32[np.ndarray, "3 height width"]
+    """The untouched sensor without its markers, in grey levels."""
     haze: Float32[np.ndarray, "3 height width"]
     """Grey levels that full contact adds."""
     touch: Float[np.ndarray, " frames"]
@@ -66,20 +65,17 @@ def render(
         Where to compute; the frames stay there.
     """
     # one plane a channel: a channel's constant then meets whole rows of pixels, which vectorises
-    shade = _shade(scene, sensor=sensor, noise=noise, device=device)
-    light = _tensor(scene.light, device)[:, None]
-    frames = torch.addcmul(
-        light * _channels(sensor.background, device),
-        shade,
-        light * _channels(sensor.marker_contrast, device),
-        value=-1,
-    )
+    shade = _shade(scene, size_px=sensor.image_size_px, noise=noise, device=device)
+    contrast = _tensor(scene.light, device)[:, None] * _channels(sensor.look.contrast, device)
+    frames = torch.addcmul(_tensor(scene.empty, device)[:, None], shade, contrast, value=-1)
     if scene.relief is not None and scene.slope is not None:
         frames *= 1 + _tensor(scene.slope, device) * _tensor(scene.relief, device)[:, None]
     frames.addcmul_(_tensor(scene.touch, device)[:, None, None], _tensor(scene.haze, device)[:, None])
     if noise is not None:
         background = _channels(noise.background, device)
-        strength = shade.clamp_(0, 1).mul_(_channels(noise.marker, device) - background).add_(background)
+        excess, share = _channels(noise.marker, device) - background, shade.clamp_(0, 1)
+        strength = torch.addcmul((1 + noise.edge) * excess, share, noise.edge * excess, value=-1)
+        strength.mul_(share).add_(background)
         frames.addcmul_(
             strength, mix_noise(scene.noise, noise=noise, image_size_px=sensor.image_size_px, device=device)
         )
@@ -91,17 +87,18 @@ def render(
 
 
 def _shade(
-    scene: Scene, *, sensor: Sensor, noise: Noise | None, device: str | torch.device
+    scene: Scene, *, size_px: int, noise: Noise | None, device: str | torch.device
 ) -> Float[Tensor, "3 frames height width"]:
     """Share of the markers' contrast in each pixel: 0 in the background, about 1 in a marker."""
-    size, frames = sensor.image_size_px, len(scene.centres_px)
+    frames = len(scene.centres_px)
     # markers that no pixel of the frame can see are left out; the padding takes the rest of those that stick out
-    seen = np.all((scene.centres_px > -_PATCH / 2) & (scene.centres_px < size - 1 + _PATCH / 2), axis=-1)
+    seen = np.all((scene.centres_px > -_PATCH / 2) & (scene.centres_px < size_px - 1 + _PATCH / 2), axis=-1)
     frame_index, marker_index = np.nonzero(seen)
     centres = _tensor(scene.centres_px[seen], device)
-    radius = _channels(sensor.marker_radius_px, device) * _items(scene.size[seen], device)
-    # blur widens the logistic edge: its standard deviation is 1.81 widths
-    edge = _channels(sensor.marker_edge_px, device).square() + _items((scene.blur_px[frame_index] / 1.81) ** 2, device)
+    drawn = scene.markers
+    radius, edge, contrast = (
+        _items(values[seen], device) for values in (drawn.radius_px, drawn.edge_px, drawn.contrast)
+    )
     corner = torch.floor(centres).to(torch.int64) - _PATCH // 2 + 1
 
     steps = torch.arange(_PATCH, device=device)
@@ -115,12 +112,12 @@ def _shade(
         texture = _tensor(scene.texture, device)[:, torch.as_tensor(marker_index, device=device)]
         patch = texture * _channels(noise.ragged_px, device)
         patch.add_(radius).sub_(distance)
-    patch.mul_(edge.rsqrt()).sigmoid_()
+    patch.div_(edge).sigmoid_()
     if noise is not None and texture is not None:
         patch.mul_(texture.mul_(_channels(noise.grain, device)).add_(1))
-    patch.mul_(_items(scene.contrast[seen], device))
+    patch.mul_(contrast)
 
-    return _place(patch, corner=corner, frame=frame_index, frames=frames, size_px=size)
+    return _place(patch, corner=corner, frame=frame_index, frames=frames, size_px=size_px)
 
 
 def _place(
@@ -156,5 +153,5 @@ def _channels(values: tuple[float, float, float], device: str | torch.device) ->
     return torch.tensor(values, dtype=torch.float32, device=device).reshape(3, 1, 1, 1)
 
 
-def _items(values: Float[np.ndarray, " items"], device: str | torch.device) -> Float[Tensor, "items 1 1"]:
-    return _tensor(values, device)[:, None, None]
+def _items(values: Float[np.ndarray, "items 3"], device: str | torch.device) -> Float[Tensor, "3 items 1 1"]:
+    return _tensor(values, device).T[:, :, None, None].contiguous()

@@ -12,7 +12,6 @@ from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_ta
 from sliplens.recordings.store import read_header, save_recording
 from sliplens.simulation.filming import Film, batches, prepare_film
 from sliplens.simulation.loading import Loading, load_grasp
-from sliplens.simulation.noise import Noise
 from sliplens.simulation.nuisances import draw_grasp, draw_unit
 from sliplens.simulation.plan import SimulationRecipe, TrialPlan, plan_trials
 
@@ -38,7 +37,7 @@ def prepare_trial(plan: TrialPlan) -> tuple[Loading, Film]:
             recipe.nuisances, markers=recipe.sensor.geometry.markers, rng=np.random.default_rng(plan.unit_seed)
         ),
         rng=film_rng,
-        noise=Noise(),
+        noise=recipe.sensor.noise,
         displacement=recipe.resolved_displacement,
     )
     return loading, film
