@@ -227,7 +227,7 @@ def prepare_film(
         noise_picks=pick_noise(frames + 1, rng=rng),
         texture=draw_texture(geometry.markers, rng=np.random.default_rng(unit.texture_seed)),
         light=light,
-        empty=empty_view(sensor, light=light),
+        empty=empty_view(sensor, day=day, light=light),
         haze=haze(
             sensor,
             grasp=grasp,

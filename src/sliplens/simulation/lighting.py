@@ -33,7 +33,7 @@ def brightness(sensor: Sensor, *, day: Day) -> Float32[np.ndarray, "3 height wid
 
 
 def empty_view(
-    sensor: Sensor, *, light: Float32[np.ndarray, "3 height width"]
+    sensor: Sensor, *, day: Day, light: Float32[np.ndarray, "3 height width"]
 ) -> Float32[np.ndarray, "3 height width"]:
     """Untouched sensor without its markers, the lamps' glare included, in grey levels."""
     skin = np.asarray(sensor.background, dtype=np.float32)[:, None, None] * light
@@ -44,7 +44,7 @@ def empty_view(
     lamps = np.asarray(glare.centre_px) + glare.radius_px * np.stack([np.cos(bearings), np.sin(bearings)], axis=-1)
     away = ((pixel_grid(sensor.image_size_px)[:, :, None] - lamps) ** 2).sum(axis=-1)
     spots = np.exp(-away / (2 * glare.width_px**2)).sum(axis=-1)
-    return np.minimum(skin + _planes(spots[..., None] * np.asarray(glare.colour)), np.float32(_WHITE))
+    return np.minimum(skin + _planes(day.glare * spots[..., None] * np.asarray(glare.colour)), np.float32(_WHITE))
 
 
 def relief(sensor: Sensor, *, contact_px: Float[np.ndarray, "2"]) -> Float32[np.ndarray, "3 height width"] | None:

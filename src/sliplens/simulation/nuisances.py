@@ -44,13 +44,15 @@ class Nuisances:
     tilt_deg: Range = (-5.0, 5.0)
     shear_direction_deg: Range = (75.0, 105.0)
     """90 pulls down the image, as the thesis does."""
-    shear_exponent: Range = (0.5, 0.7)
+    shear_exponent: Range = (0.45, 0.7)
     creep: Range = (0.03, 0.08)
     creep_time_s: Range = (0.5, 3.0)
     white_balance: Range = (0.95, 1.05)
     gain: Range = (0.9, 1.1)
     illumination_gradient: Range = (0.0, 0.25)
     """Brightness lost across the image, in a direction drawn by day."""
+    glare: Range = (0.5, 1.1)
+    """Of the lamps' reflections, over the sensor's."""
     camera_shift_px: Range = (-3.0, 3.0)
     camera_rotation_deg: Range = (-3.0, 3.0)
     marker_jitter_px: float = 0.4
@@ -90,8 +92,8 @@ _POSITIVE = frozenset(
 _UPPER = {"kinetic_ratio": 1.0, "stick_slip_share": 1.0, "contact_offset": 0.5, "marker_depth": 0.5,
           "illumination_gradient": 1.0, "normal_force_drift": 0.5, "wet_friction_drift": 0.5}  # fmt: skip
 _NOT_NEGATIVE = frozenset(
-    {"contact_offset", "marker_depth", "stick_slip_share", "creep", "illumination_gradient", "marker_jitter_px",
-     "blur_px"}
+    {"contact_offset", "marker_depth", "stick_slip_share", "creep", "illumination_gradient", "glare", "skin_grain",
+     "marker_jitter_px", "blur_px"}
 )  # fmt: skip
 
 
@@ -105,6 +107,7 @@ class Day:
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
     gradient: float = 0.0
     gradient_direction_rad: float = 0.0
+    glare: float = 1.0
     camera_shift_px: tuple[float, float] = (0.0, 0.0)
     camera_rotation_rad: float = 0.0
 
@@ -179,6 +182,7 @@ def draw_day(nuisances: Nuisances, *, quantile: float, rng: np.random.Generator)
         white_balance=_three(rng, nuisances.white_balance),
         gradient=rng.uniform(*nuisances.illumination_gradient),
         gradient_direction_rad=rng.uniform(-np.pi, np.pi),
+        glare=rng.uniform(*nuisances.glare),
         camera_shift_px=(rng.uniform(*nuisances.camera_shift_px), rng.uniform(*nuisances.camera_shift_px)),
         camera_rotation_rad=float(np.radians(rng.uniform(*nuisances.camera_rotation_deg))),
     )

@@ -131,18 +131,36 @@ def _place(
     """Add each patch to its frame, its first pixel at a corner (x, y); what sticks out is cut off."""
     side = size_px + 2 * _PATCH
     canvas = torch.zeros((3, frames, side, side), dtype=torch.float32, device=patch.device)
-    corner = corner + _PATCH
-    if patch.device.type == "cpu":
-        # slices are several times faster here than scattering, and add in the same order
-        target, source = canvas.numpy(), patch.numpy()
-        for item, (index, (column, row)) in enumerate(zip(frame.tolist(), corner.tolist(), strict=True)):
-            target[:, index, row : row + _PATCH, column : column + _PATCH] += source[:, item]
-    else:
-        steps = torch.arange(_PATCH, device=patch.device)
-        row = corner[:, 1:] + steps + side * torch.as_tensor(frame, device=patch.device)[:, None]
-        pixel = row[:, :, None] * side + (corner[:, :1] + steps)[:, None, :]
-        canvas.view(3, -1).index_add_(1, pixel.reshape(-1), patch.reshape(3, -1))
+    add = add_slices if patch.device.type == "cpu" else scatter
+    add(canvas, patch, corner=corner + _PATCH, frame=frame)
     return canvas[:, :, _PATCH:-_PATCH, _PATCH:-_PATCH]
+
+
+def add_slices(
+    canvas: Float[Tensor, "3 frames height width"],
+    patch: Float[Tensor, "3 items side side"],
+    *,
+    corner: Int[Tensor, "items 2"],
+    frame: Int[np.ndarray, " items"],
+) -> None:
+    """Add patches to a canvas in place, one after another: several times faster than `scatter` on a processor."""
+    target, source, side = canvas.numpy(), patch.numpy(), patch.shape[-1]
+    for item, (index, (column, row)) in enumerate(zip(frame.tolist(), corner.tolist(), strict=True)):
+        target[:, index, row : row + side, column : column + side] += source[:, item]
+
+
+def scatter(
+    canvas: Float[Tensor, "3 frames height width"],
+    patch: Float[Tensor, "3 items side side"],
+    *,
+    corner: Int[Tensor, "items 2"],
+    frame: Int[np.ndarray, " items"],
+) -> None:
+    """Add patches to a canvas in place, all at once: for a GPU."""
+    steps = torch.arange(patch.shape[-1], device=patch.device)
+    row = corner[:, 1:] + steps + canvas.shape[2] * torch.as_tensor(frame, device=patch.device)[:, None]
+    pixel = row[:, :, None] * canvas.shape[3] + (corner[:, :1] + steps)[:, None, :]
+    canvas.view(3, -1).index_add_(1, pixel.reshape(-1), patch.reshape(3, -1))
 
 
 def _tensor(values: np.ndarray, device: str | torch.device) -> Tensor:

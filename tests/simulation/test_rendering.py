@@ -1,0 +1,73 @@
+"""Drawing: how patches meet the frame, and what the noise is like."""
+
+import numpy as np
+import pytest
+import torch
+
+from sliplens.simulation import CHROMATOUCH, FLAT_GEL
+from sliplens.simulation.noise import mix_noise, pick_noise
+from sliplens.simulation.rendering import add_slices, scatter
+
+FRAMES, SIZE = 400, 64
+
+
+@pytest.fixture
+def patches():
+    generator = torch.Generator().manual_seed(3)
+    patch = torch.rand((3, 40, 5, 5), generator=generator)
+    corner = torch.randint(0, 20 - 5 + 1, (40, 2), generator=generator)
+    return patch, corner, np.repeat(np.arange(4), 10)
+
+
+def test_a_processor_and_a_gpu_add_patches_to_the_same_places(patches):
+    patch, corner, frame = patches
+    slow, fast, naive = (torch.zeros((3, 4, 20, 20)) for _ in range(3))
+    scatter(slow, patch, corner=corner, frame=frame)
+    add_slices(fast, patch, corner=corner, frame=frame)
+    for item, (column, row) in enumerate(corner.tolist()):
+        for y in range(5):
+            for x in range(5):
+                naive[:, frame[item], row + y, column + x] += patch[:, item, y, x]
+    # ten patches a frame overlap: sums of a few numbers below 1 in another order
+    torch.testing.assert_close(slow, naive, atol=1e-5, rtol=0)
+    torch.testing.assert_close(fast, naive, atol=1e-5, rtol=0)
+
+
+@pytest.fixture(scope="module", params=[CHROMATOUCH.noise, FLAT_GEL.noise], ids=["chromatouch", "flat-gel"])
+def noise(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def mixed(noise):
+    picks = pick_noise(FRAMES, rng=np.random.default_rng(0))
+    return mix_noise(picks, noise=noise, image_size_px=SIZE, device="cpu").numpy()
+
+
+def test_noise_has_unit_variance_and_no_mean(mixed):
+    # 400 frames are mixed from 32 fields of 128 x 128 pixels: some 500,000 independent numbers a channel
+    assert np.abs(mixed.mean(axis=(1, 2, 3))).max() < 5 / np.sqrt(500_000)
+    np.testing.assert_allclose(mixed.var(axis=(1, 2, 3)), 1, atol=5 * np.sqrt(2 / 500_000))
+
+
+def test_neighbours_and_colours_share_the_noise_they_should(noise, mixed):
+    def correlation(one, other):
+        return float(np.mean(one * other))
+
+    weight = noise.smoothness
+    for axis in (2, 3):
+        ahead, behind = (np.take(mixed, range(*ends), axis=axis) for ends in ((1, SIZE), (0, SIZE - 1)))
+        # the moving average 1, w has this correlation at lag 1, and none beyond
+        assert correlation(ahead[2], behind[2]) == pytest.approx(weight / (1 + weight**2), abs=0.01)
+    assert correlation(mixed[2, :, 2:], mixed[2, :, :-2]) == pytest.approx(0, abs=0.01)
+    assert correlation(mixed[0], mixed[1]) == pytest.approx(noise.red_in_green, abs=0.01)
+    assert correlation(mixed[0], mixed[2]) == pytest.approx(0, abs=0.01)
+
+
+def test_noise_of_different_frames_is_independent(mixed):
+    flat = mixed[1].reshape(FRAMES, -1)
+    correlations = np.corrcoef(flat)[np.triu_indices(FRAMES, k=1)]
+    # 4096 neighbouring pixels: one standard deviation is about 1 / sqrt(4096 / 2)
+    assert np.abs(correlations).mean() < 0.03
+    # two frames may share one field of the bank in nearly the same window: rare, and then half their noise
+    assert np.mean(np.abs(correlations) > 0.15) < 1e-3
