@@ -80,7 +80,7 @@ def frames_from_dataset(
         raise InputError(f"levels must lie in [0, 1], got {', '.join(f'{level:g}' for level in levels)}")
     images, references, labels, names = [], [], [], []
     for info in data.select(split=split, condition=condition)[:trials]:
-        recording = data.load(info)
+        recording = data.load(info, truth=False)
         trained.require_frame_size(recording.reference.shape[:2])
         margin = recording.safety_margin
         if not np.isfinite(margin).any():
