@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from sliplens._version import __version__
+from sliplens.cli.check import Check
 from sliplens.cli.console import fail
 from sliplens.cli.demo import Demo
 from sliplens.cli.evaluate import Evaluate
@@ -21,6 +22,7 @@ from sliplens.errors import SliplensError
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
+    | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Explain, tyro.conf.subcommand("explain")]

@@ -30,7 +30,7 @@ class Simulate:
     """Folder to make. Not needed for --preview and --video alone."""
     preset: Literal["small", "thesis"] = "small"
     """small: 104 short trials on 12 days, for a laptop. thesis: the days, splits and 160,757 frames of the thesis, some
-    15 GB. The options below change it."""
+    14 GB. The options below change it."""
     sensor: Literal["chromatouch", "flat-gel"] = "chromatouch"
     """chromatouch: a dome with a fisheye inside, fitted to real images. flat-gel: a flat gel with dots, lit from three
     sides, like a GelSight; not fitted to one device."""

@@ -1,0 +1,38 @@
+"""`sliplens check`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from sliplens.cli.console import print_table, progress_bar, say
+from sliplens.errors import RecordingError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """Check a data set: every hash, every image, and the laws of its labels.
+
+    Exit code 0 when all is well, 2 when something is not; then every finding is listed.
+    """
+
+    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
+    """Data set to read."""
+
+    def run(self) -> None:
+        """Check and say what is wrong, and where."""
+        from sliplens.recordings import Dataset
+        from sliplens.recordings.checking import check_dataset
+
+        data = Dataset.open(self.data)
+        with progress_bar("Checking trials") as bar:
+            findings = check_dataset(self.data, on_trial=bar)
+        if findings:
+            print_table("Found", ("where", "what"), [(one.where, one.what) for one in findings])
+            raise RecordingError(
+                f"{self.data} has {len(findings)} thing{'s' if len(findings) > 1 else ''} wrong, listed above; "
+                "mend or make these trials again"
+            )
+        frames = sum(info.frames for info in data.trials)
+        say(f"{self.data} is sound: {len(data.trials)} trials, {frames:,} frames, every hash and law holds")

@@ -1,0 +1,108 @@
+"""A data set is sound, or it is told what is wrong with it and where."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sliplens.cli import main
+from sliplens.recordings import ContactState, Dataset, Recording
+from sliplens.recordings.checking import check_dataset
+from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.store import save_recording
+from sliplens.simulation import FLAT_GEL, SimulationRecipe, simulate_dataset
+
+
+def write(folder: Path, *recordings: Recording) -> Path:
+    table = []
+    for recording in recordings:
+        path = trial_path(folder, recording.trial)
+        save_recording(recording, path)
+        table.append(trial_info(path, split="train"))
+    write_dataset_table(folder, table)
+    return folder
+
+
+def whats(folder: Path) -> list[str]:
+    return [f"{one.where}: {one.what}" for one in check_dataset(folder)]
+
+
+@pytest.mark.parametrize("release", [False, True])
+def test_simulated_data_are_sound(tmp_path: Path, release: bool):
+    recipe = SimulationRecipe(dry_trials=3, wet_trials=1, days=2, frames_per_trial=20, sensor=FLAT_GEL, release=release)
+    simulate_dataset(tmp_path, recipe)
+    assert whats(tmp_path) == []
+
+
+def test_a_changed_file_and_a_missing_one_are_found(tmp_path: Path, small_dataset: Dataset):
+    folder = tmp_path / "data"
+    shutil.copytree(small_dataset.folder, folder)
+    first, second, third = (info.trial for info in small_dataset.trials[:3])
+    trial_path(folder, first).unlink()
+    with trial_path(folder, second).open("r+b") as stream:
+        stream.truncate(1000)
+    shutil.copy(trial_path(folder, third), folder / "trials" / "stray.parquet")
+    found = whats(folder)
+    assert f"{first}: has no file" in found
+    assert any(one.startswith(f"{second}: has a file that is not the one") for one in found)
+    assert any(one.startswith(f"{second}: cannot be read: ") for one in found)
+    assert "trials/stray.parquet: is not in the table of the data set" in found
+
+
+def test_a_trial_in_two_splits_is_found(tmp_path: Path, recording: Recording):
+    folder = write(tmp_path, recording)
+    table = json.loads((folder / "dataset.json").read_text())
+    table["trials"].append({**table["trials"][0], "split": "test"})
+    (folder / "dataset.json").write_text(json.dumps(table))
+    assert "trial: is listed 2 times, in split test and train" in whats(folder)
+
+
+def test_a_table_that_lies_is_found(tmp_path: Path, recording: Recording):
+    folder = write(tmp_path, recording)
+    table = json.loads((folder / "dataset.json").read_text())
+    table["trials"][0] |= {"day": 7, "frames": 99}
+    (folder / "dataset.json").write_text(json.dumps(table))
+    assert whats(folder) == ["trial: has day 1, the table says 7", "trial: has frames 12, the table says 99"]
+
+
+def changed(values: np.ndarray, at: int, value: float) -> np.ndarray:
+    copy = values.copy()
+    copy[at] = value
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda one: {"normal_force_n": changed(one.normal_force_n, 3, np.nan)}, "frame 3: normal_force_n is not a nu"),
+        (lambda one: {"normal_force_n": changed(one.normal_force_n, 3, -1.0)}, "frame 3: the normal force is negative"),
+        (lambda one: {"safety_margin": changed(one.safety_margin, 5, 0.123)}, "frame 5: the safety margin is not 1 -"),
+        (lambda one: {"stick_ratio": changed(one.stick_ratio, 5, np.nan)}, "frame 5: only one of margin and stick rat"),
+        (
+            lambda one: {"contact_state": (ContactState.NO_CONTACT,) * len(one)},
+            r"frame 1: a frame without contact has a safety margin (11 frames)",
+        ),
+        (
+            lambda one: {"contact_state": (ContactState.FULL_SLIP,) * len(one)},
+            r"frame 1: full slip has a margin above 0 (10 frames)",
+        ),
+    ],
+)
+def test_a_broken_law_is_found_at_its_frame(tmp_path: Path, recording: Recording, change, message: str):
+    assert whats(write(tmp_path / "good", recording)) == []
+    found = whats(write(tmp_path / "bad", replace(recording, **change(recording))))
+    assert len(found) == 1
+    assert f"trial: {message}" in found[0]
+
+
+def test_the_command_lists_what_is_wrong(tmp_path: Path, recording: Recording, capsys: pytest.CaptureFixture[str]):
+    assert main(["check", str(write(tmp_path / "good", recording))]) == 0
+    assert "is sound: 1 trials, 12 frames" in capsys.readouterr().out
+    bad = replace(recording, safety_margin=changed(recording.safety_margin, 5, 0.123))
+    assert main(["check", str(write(tmp_path / "bad", bad))]) == 2
+    captured = capsys.readouterr()
+    assert "frame 5" in captured.out
+    assert "has 1 thing wrong, listed above; mend or make these trials again" in captured.err
