@@ -1,9 +1,14 @@
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import torch
 
 from sliplens.datasets import get_encoding, load_frames
 from sliplens.datasets.frames import UNTOUCHED
-from sliplens.recordings import Dataset
+from sliplens.recordings import Dataset, Recording
+from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.store import save_recording
 
 
 def test_frames_without_a_label_are_left_out(small_dataset: Dataset):
@@ -51,3 +56,14 @@ def test_the_untouched_sensor_is_added_as_full_stick_only_when_asked_for(small_d
     assert not more.images[added].any()
     assert more.safety_margin[added].eq(1).all()
     assert UNTOUCHED not in plain.frame
+
+
+def test_frames_whose_label_cannot_be_trusted_are_left_out(tmp_path: Path, recording: Recording):
+    doubted = replace(recording, valid=np.arange(12) < 7)
+    path = trial_path(tmp_path, "trial")
+    save_recording(doubted, path)
+    write_dataset_table(tmp_path, [trial_info(path, split="train")])
+    data = Dataset.open(tmp_path)
+    frames = load_frames(data, data.trials, encoding=get_encoding("difference"), image_size=32)
+    # frame 0 has no contact, frames 7 to 11 are not trusted
+    assert frames.frame == (1, 2, 3, 4, 5, 6)

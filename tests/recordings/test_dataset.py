@@ -1,5 +1,5 @@
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +9,8 @@ import pytest
 from sliplens.errors import InputError, RecordingError
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.dataset import write_dataset_table
-from sliplens.recordings.store import load_recording, save_recording
+from sliplens.recordings.recording import SIGNALS
+from sliplens.recordings.store import ROW_GROUP, load_recording, save_recording
 
 
 def test_a_trial_comes_back_without_loss(tmp_path: Path, recording: Recording):
@@ -17,6 +18,40 @@ def test_a_trial_comes_back_without_loss(tmp_path: Path, recording: Recording):
     back = load_recording(tmp_path / "a.parquet")
     for field in fields(Recording):
         np.testing.assert_array_equal(getattr(back, field.name), getattr(recording, field.name))
+
+
+def test_trust_in_the_labels_comes_back_with_them(tmp_path: Path, recording: Recording):
+    trusted = np.arange(12) % 3 > 0
+    doubted = replace(recording, valid=trusted, safety_margin_sigma=np.linspace(0.01, 0.2, 12))
+    save_recording(doubted, tmp_path / "a.parquet")
+    back = load_recording(tmp_path / "a.parquet")
+    np.testing.assert_array_equal(back.valid, trusted)
+    np.testing.assert_array_equal(back.safety_margin_sigma, doubted.safety_margin_sigma)
+    # the first frame has no contact, so no margin to trust
+    np.testing.assert_array_equal(back.labelled, trusted & (np.arange(12) > 0))
+    assert recording.labelled.sum() == 11
+
+
+def test_a_trial_of_many_chunks_comes_back_whole(tmp_path: Path, recording: Recording):
+    count = 2 * ROW_GROUP + 5
+    long = replace(
+        recording,
+        frames=np.resize(recording.frames, (count, *recording.frames.shape[1:])),
+        time_s=np.arange(count) / 30,
+        contact_state=(recording.contact_state[1],) * count,
+        **{name: np.resize(getattr(recording, name), count) for name in SIGNALS[1:]},
+    )
+    save_recording(long, tmp_path / "a.parquet")
+    assert pq.ParquetFile(tmp_path / "a.parquet").num_row_groups == 3
+    back = load_recording(tmp_path / "a.parquet")
+    np.testing.assert_array_equal(back.frames, long.frames)
+    np.testing.assert_array_equal(back.time_s, long.time_s)
+    np.testing.assert_array_equal(pq.read_table(tmp_path / "a.parquet")["frame"].to_numpy(), np.arange(count))
+
+
+def test_one_value_a_frame_is_asked_for(recording: Recording):
+    with pytest.raises(RecordingError, match="trial trial has 12 frames but 3 values of valid"):
+        replace(recording, valid=np.ones(3, dtype=bool))
 
 
 def test_the_same_trial_gives_the_same_bytes(tmp_path: Path, recording: Recording):

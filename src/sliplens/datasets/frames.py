@@ -92,7 +92,7 @@ def load_frames(
         raise RecordingError(f"{data.folder} mixes frames of {sorted(sizes)} pixels; use one sensor at a time")
     images, labels, times, rows = [], [], [], []
     for done, recording in enumerate(data.load_all(trials, truth=False), start=1):
-        labelled = np.flatnonzero(np.isfinite(recording.safety_margin))
+        labelled = np.flatnonzero(recording.labelled)
         compared = encoding.compare(recording.frames[labelled], recording.reference)
         images.append(encoding.resize(compared, image_size=image_size))
         labels.append(recording.safety_margin[labelled])

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.truth import GroundTruth
@@ -46,6 +46,10 @@ class Recording:
     safety_margin: Float[np.ndarray, " _"]
     stick_ratio: Float[np.ndarray, " _"]
     contact_state: tuple[ContactState, ...]
+    safety_margin_sigma: Float[np.ndarray, " _"] | None = None
+    """Standard uncertainty of the safety margin; None where it is exact or was not estimated."""
+    valid: Bool[np.ndarray, " _"] | None = None
+    """Frames whose label can be trusted; None where all that have one can."""
     truth: GroundTruth | None = None
     """What a simulator knows beyond the labels; None for a real trial."""
 
@@ -65,6 +69,12 @@ class Recording:
                     f"trial {self.trial} has {count} frames but {len(getattr(self, name))} values of {name}; "
                     "give one value a frame"
                 )
+        for name in ("safety_margin_sigma", "valid"):
+            values = getattr(self, name)
+            if values is not None and len(values) != count:
+                raise RecordingError(
+                    f"trial {self.trial} has {count} frames but {len(values)} values of {name}; give one value a frame"
+                )
         if self.truth is not None and len(self.truth.marker_px) != count:
             raise RecordingError(
                 f"trial {self.trial} has {count} frames but the truth of {len(self.truth.marker_px)}; "
@@ -82,6 +92,12 @@ class Recording:
     def __len__(self) -> int:
         """Count the frames."""
         return len(self.frames)
+
+    @property
+    def labelled(self) -> Bool[np.ndarray, " frames"]:
+        """Frames that have a safety margin, and one that can be trusted."""
+        present = np.isfinite(self.safety_margin)
+        return present if self.valid is None else present & self.valid
 
 
 SIGNALS = (

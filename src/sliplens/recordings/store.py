@@ -1,9 +1,11 @@
 """One trial on disk: a Parquet file, a row a frame."""
 
 import json
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,44 +20,94 @@ from sliplens.recordings.recording import SIGNALS, ContactState, Recording
 from sliplens.recordings.truth import GroundTruth
 
 SCHEMA_VERSION = 1
+ROW_GROUP = 64
+"""Frames that are written, and can be read, together."""
 _DESCRIPTION = ("trial", "sensor", "day", "condition")
+_OPTIONAL = ("safety_margin_sigma", "valid")
 _TRUTH_SIGNALS = ("static_friction", "contact_radius_m", "stick_radius_m")
 _TRUTH_COLUMNS = frozenset({*_TRUTH_SIGNALS, "marker_px", "contact_map"})
 
 
 def save_recording(recording: Recording, path: Path) -> None:
     """Write a trial as one Parquet file: a row a frame, its image a lossless PNG; whole or not at all."""
-    columns: dict[str, Any] = {"frame": np.arange(len(recording))}
-    columns |= {name: getattr(recording, name) for name in SIGNALS}
+    columns: dict[str, Any] = {name: getattr(recording, name) for name in SIGNALS}
     columns["contact_state"] = [str(state) for state in recording.contact_state]
-    description: dict[str, Any] = {name: str(getattr(recording, name)) for name in _DESCRIPTION}
-    with ThreadPoolExecutor() as pool:  # zlib lets go of the interpreter's lock
-        first = recording.frames[0]
-        noisy = len(encode_png(first, huffman_only=True)) < len(encode_png(first))
-        encode = partial(encode_png, huffman_only=noisy)
-        columns["image"] = pa.array(list(pool.map(encode, recording.frames)), type=pa.binary())
-        if recording.truth is not None:
-            truth = recording.truth
-            columns |= {name: getattr(truth, name) for name in _TRUTH_SIGNALS}
-            columns["marker_px"] = pa.FixedSizeListArray.from_arrays(
-                truth.marker_px.ravel(), list_size=truth.marker_rest_px.size
-            )
+    description = {name: str(getattr(recording, name)) for name in _DESCRIPTION}
+    columns |= {name: getattr(recording, name) for name in _OPTIONAL if getattr(recording, name) is not None}
+    if recording.truth is not None:
+        truth = recording.truth
+        columns |= {name: getattr(truth, name) for name in _TRUTH_SIGNALS}
+        columns["marker_px"] = pa.FixedSizeListArray.from_arrays(
+            truth.marker_px.ravel(), list_size=truth.marker_rest_px.size
+        )
+        with ThreadPoolExecutor() as pool:  # zlib lets go of the interpreter's lock
             columns["contact_map"] = pa.array(list(pool.map(encode_png, truth.contact_map)), type=pa.binary())
-            description["truth"] = json.dumps(
-                {
-                    "recipe": truth.recipe,
-                    "displacement": truth.displacement,
-                    "marker_rest_px": truth.marker_rest_px.tolist(),
-                }
-            )
-    table = pa.table(columns).replace_schema_metadata(
-        {**description, b"reference": encode_png(recording.reference), b"schema_version": str(SCHEMA_VERSION)}
-    )
+        description["truth"] = json.dumps(
+            {
+                "recipe": truth.recipe,
+                "displacement": truth.displacement,
+                "marker_rest_px": truth.marker_rest_px.tolist(),
+            }
+        )
+    write_trial(path, encode_frames(recording.frames), columns, description, reference=recording.reference)
+
+
+def encode_frames(frames: Iterable[UInt8[np.ndarray, "height width 3"]]) -> Iterator[list[bytes]]:
+    """PNG of frames, in chunks that are encoded side by side.
+
+    Camera noise leaves nothing that repeats: where the first frame is smaller without looking for it, none is looked
+    for.
+    """
+    huffman_only: bool | None = None
+    with ThreadPoolExecutor() as pool:  # zlib lets go of the interpreter's lock
+        for chunk in _chunks(frames, ROW_GROUP):
+            if huffman_only is None:
+                huffman_only = len(encode_png(chunk[0], huffman_only=True)) < len(encode_png(chunk[0]))
+            yield list(pool.map(partial(encode_png, huffman_only=huffman_only), chunk))
+
+
+def write_trial(
+    path: Path,
+    images: Iterable[list[bytes]],
+    columns: Mapping[str, Any],
+    description: Mapping[str, str],
+    *,
+    reference: UInt8[np.ndarray, "height width 3"],
+) -> None:
+    """Write the Parquet file of a trial, chunk by chunk; it appears when complete.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    images
+        Encoded frames in chunks, a row group each.
+    columns
+        One value a frame for everything else.
+    description, reference
+        What the trial is, and its untouched sensor.
+    """
+    labels = pa.table(columns)
+    metadata = {**description, b"reference": encode_png(reference), b"schema_version": str(SCHEMA_VERSION)}
+    fields = [pa.field("frame", pa.int64()), *labels.schema, pa.field("image", pa.binary())]
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
+    written = 0
     # PNG bytes, nearly all of the file, neither compress further nor repeat
-    pq.write_table(table, part, compression="none", use_dictionary=False)
+    with pq.ParquetWriter(part, pa.schema(fields, metadata), compression="none", use_dictionary=False) as writer:
+        for chunk in images:
+            rows = labels.slice(written, len(chunk)).combine_chunks()
+            numbers = pa.array(np.arange(written, written + len(chunk)))
+            arrays = [numbers, *(column.combine_chunks() for column in rows.columns), pa.array(chunk, type=pa.binary())]
+            writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema))
+            written += len(chunk)
     part.replace(path)
+
+
+def _chunks(items: Iterable[Any], size: int) -> Iterator[list[Any]]:
+    remaining = iter(items)
+    while chunk := list(islice(remaining, size)):
+        yield chunk
 
 
 def load_recording(path: Path, *, truth: bool = True) -> Recording:
@@ -101,6 +153,7 @@ def load_recording(path: Path, *, truth: bool = True) -> Recording:
         reference=reference,
         frames=_decode(table.column("image"), size=reference.shape, where=f"of {path}"),
         contact_state=tuple(ContactState(state) for state in table.column("contact_state").to_pylist()),
+        **{name: table.column(name).to_numpy() for name in _OPTIONAL if name in table.column_names},
         truth=_read_truth(table, json.loads(metadata["truth"]), path) if truth and "truth" in metadata else None,
         **{name: table.column(name).to_numpy().astype(np.float64) for name in SIGNALS},
     )

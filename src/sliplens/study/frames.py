@@ -82,7 +82,7 @@ def frames_from_dataset(
     for info in data.select(split=split, condition=condition)[:trials]:
         recording = data.load(info, truth=False)
         trained.require_frame_size(recording.reference.shape[:2])
-        margin = recording.safety_margin
+        margin = np.where(recording.labelled, recording.safety_margin, np.nan)
         if not np.isfinite(margin).any():
             raise RecordingError(f"trial {recording.trial} has no labelled frame; label it first")
         rows = [_nearest(margin, level) for level in levels]
