@@ -37,7 +37,9 @@ def test_an_unknown_command_exits_with_2(capsys: pytest.CaptureFixture[str]):
     assert exit_info.value.code == 2
 
 
-@pytest.mark.parametrize("command", ["demo", "simulate", "check", "train", "evaluate", "explain", "score", "report"])
+@pytest.mark.parametrize(
+    "command", ["demo", "simulate", "import", "check", "train", "evaluate", "explain", "score", "report"]
+)
 def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as exit_info:
         run(command, "--help")

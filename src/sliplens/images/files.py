@@ -2,7 +2,6 @@
 
 import io
 import re
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -69,37 +68,24 @@ def write_png(path: Path, pixels: UInt8[np.ndarray, "height width *channels"]) -
     Image.fromarray(pixels).save(path, format="PNG")
 
 
-def encode_png(
-    pixels: UInt8[np.ndarray, "height width *channels"], *, compress_level: int = 1, huffman_only: bool = False
-) -> bytes:
-    """Bytes of an image as PNG; noisy tactile frames hardly shrink above the lowest level.
-
-    Parameters
-    ----------
-    pixels
-        The image.
-    compress_level
-        Effort of zlib, 0 to 9.
-    huffman_only
-        Do not look for what repeats: faster, and smaller too where camera noise leaves nothing to find.
-    """
+def encode_png(pixels: UInt8[np.ndarray, "height width *channels"], *, compress_level: int = 1) -> bytes:
+    """Bytes of an image as PNG; noisy tactile frames hardly shrink above the lowest level."""
     buffer = io.BytesIO()
-    strategy = zlib.Z_HUFFMAN_ONLY if huffman_only else zlib.Z_DEFAULT_STRATEGY
-    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=compress_level, compress_type=strategy)
+    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=compress_level)
     return buffer.getvalue()
 
 
-def decode_png(data: bytes, *, where: str, mode: str = "RGB") -> UInt8[np.ndarray, "height width *channels"]:
-    """Pixels of a PNG held in memory: three channels, or none with mode "L" (grey).
+def decode_png(data: bytes, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    """Pixels of an RGB PNG held in memory.
 
     Raises
     ------
     ImageError
-        If the bytes are damaged or no image of this mode; the message begins with `where`.
+        If the bytes are damaged or no RGB image; the message begins with `where`.
     """
     try:
         with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
-            if image.mode != mode:
+            if image.mode != "RGB":
                 raise ImageError(f"{where} has {_CURES.get(image.mode, image.mode)}")
             return np.array(image)
     except (OSError, SyntaxError, ValueError) as error:

@@ -100,9 +100,13 @@ def _check_trial(folder: Path, info: TrialInfo) -> Iterator[str]:
 
 
 def _check_laws(recording: Recording) -> Iterator[str]:
-    for name in SIGNALS[:4]:
-        yield from _first(~np.isfinite(getattr(recording, name)), f"{name} is not a number")
-    yield from _first(recording.normal_force_n < 0, "the normal force is negative; flip its sign on import")
+    yield from _first(~np.isfinite(recording.time_s), "the time is not a number")
+    # a force sensor's noise is negative at times, and its samples may be missing, where there is no label
+    for name in SIGNALS[1:4]:
+        missing = recording.labelled & ~np.isfinite(getattr(recording, name))
+        yield from _first(missing, f"{name} is not a number")
+    negative = recording.labelled & (recording.normal_force_n < 0)
+    yield from _first(negative, "the normal force is negative; flip its sign on import")
     margin, normal = recording.safety_margin, recording.normal_force_n
     labelled = np.isfinite(margin)
     yield from _first(np.isfinite(recording.stick_ratio) != labelled, "only one of margin and stick ratio has a label")

@@ -6,8 +6,9 @@ from pathlib import Path
 
 from sliplens.errors import RecordingError
 from sliplens.provenance import hash_file, hash_json, read_json, require_folder, write_json
+from sliplens.recordings.headers import read_header
 from sliplens.recordings.recording import Recording
-from sliplens.recordings.store import SCHEMA_VERSION, load_recording, read_header
+from sliplens.recordings.store import SCHEMA_VERSION, load_recording
 
 DATASET_FILE = "dataset.json"
 

@@ -3,8 +3,6 @@
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -16,23 +14,24 @@ from jaxtyping import UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.images.files import decode_png, encode_png
+from sliplens.recordings.headers import DESCRIPTION
+from sliplens.recordings.pixels import CODEC, decode_pixels, encode_pixels
 from sliplens.recordings.recording import SIGNALS, ContactState, Recording
 from sliplens.recordings.truth import GroundTruth
 
 SCHEMA_VERSION = 1
 ROW_GROUP = 64
 """Frames that are written, and can be read, together."""
-_DESCRIPTION = ("trial", "sensor", "day", "condition")
 _OPTIONAL = ("safety_margin_sigma", "valid")
 _TRUTH_SIGNALS = ("static_friction", "contact_radius_m", "stick_radius_m")
 _TRUTH_COLUMNS = frozenset({*_TRUTH_SIGNALS, "marker_px", "contact_map"})
 
 
 def save_recording(recording: Recording, path: Path) -> None:
-    """Write a trial as one Parquet file: a row a frame, its image a lossless PNG; whole or not at all."""
+    """Write a trial as one Parquet file: a row a frame, its image lossless (`pixels`); whole or not at all."""
     columns: dict[str, Any] = {name: getattr(recording, name) for name in SIGNALS}
     columns["contact_state"] = [str(state) for state in recording.contact_state]
-    description = {name: str(getattr(recording, name)) for name in _DESCRIPTION}
+    description = {name: str(getattr(recording, name)) for name in DESCRIPTION}
     columns |= {name: getattr(recording, name) for name in _OPTIONAL if getattr(recording, name) is not None}
     if recording.truth is not None:
         truth = recording.truth
@@ -40,8 +39,8 @@ def save_recording(recording: Recording, path: Path) -> None:
         columns["marker_px"] = pa.FixedSizeListArray.from_arrays(
             truth.marker_px.ravel(), list_size=truth.marker_rest_px.size
         )
-        with ThreadPoolExecutor() as pool:  # zlib lets go of the interpreter's lock
-            columns["contact_map"] = pa.array(list(pool.map(encode_png, truth.contact_map)), type=pa.binary())
+        maps = [encoded for chunk in encode_frames(truth.contact_map) for encoded in chunk]
+        columns["contact_map"] = pa.array(maps, type=pa.binary())
         description["truth"] = json.dumps(
             {
                 "recipe": truth.recipe,
@@ -52,18 +51,11 @@ def save_recording(recording: Recording, path: Path) -> None:
     write_trial(path, encode_frames(recording.frames), columns, description, reference=recording.reference)
 
 
-def encode_frames(frames: Iterable[UInt8[np.ndarray, "height width 3"]]) -> Iterator[list[bytes]]:
-    """PNG of frames, in chunks that are encoded side by side.
-
-    Camera noise leaves nothing that repeats: where the first frame is smaller without looking for it, none is looked
-    for.
-    """
-    huffman_only: bool | None = None
-    with ThreadPoolExecutor() as pool:  # zlib lets go of the interpreter's lock
+def encode_frames(frames: Iterable[UInt8[np.ndarray, "height width *channels"]]) -> Iterator[list[bytes]]:
+    """Encode frames in chunks, those of a chunk side by side."""
+    with ThreadPoolExecutor() as pool:  # Zstandard lets go of the interpreter's lock
         for chunk in _chunks(frames, ROW_GROUP):
-            if huffman_only is None:
-                huffman_only = len(encode_png(chunk[0], huffman_only=True)) < len(encode_png(chunk[0]))
-            yield list(pool.map(partial(encode_png, huffman_only=huffman_only), chunk))
+            yield list(pool.map(encode_pixels, chunk))
 
 
 def write_trial(
@@ -88,12 +80,17 @@ def write_trial(
         What the trial is, and its untouched sensor.
     """
     labels = pa.table(columns)
-    metadata = {**description, b"reference": encode_png(reference), b"schema_version": str(SCHEMA_VERSION)}
+    metadata = {
+        **description,
+        "codec": CODEC,
+        "schema_version": str(SCHEMA_VERSION),
+        b"reference": encode_png(reference),
+    }
     fields = [pa.field("frame", pa.int64()), *labels.schema, pa.field("image", pa.binary())]
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
     written = 0
-    # PNG bytes, nearly all of the file, neither compress further nor repeat
+    # the images, nearly all of the file, neither compress further nor repeat
     with pq.ParquetWriter(part, pa.schema(fields, metadata), compression="none", use_dictionary=False) as writer:
         for chunk in images:
             rows = labels.slice(written, len(chunk)).combine_chunks()
@@ -136,11 +133,14 @@ def load_recording(path: Path, *, truth: bool = True) -> Recording:
     except (pa.ArrowInvalid, OSError) as error:
         raise RecordingError(f"{path} is not a readable Parquet file ({error}); make the data set again") from None
     metadata = {key.decode(): value for key, value in (table.schema.metadata or {}).items()}
-    missing = ({"reference", *_DESCRIPTION} - set(metadata)) | (
+    missing = ({"reference", *DESCRIPTION} - set(metadata)) | (
         {"image", "contact_state", *SIGNALS} - set(table.column_names)
     )
     if missing:
         raise RecordingError(f"{path} lacks {', '.join(sorted(missing))}; write it with save_recording")
+    codec = metadata.get("codec", b"png").decode()
+    if codec != CODEC:
+        raise RecordingError(f"{path} keeps its images as {codec}, {CODEC} is needed; make the data set again")
     reference = decode_png(metadata["reference"], where=f"the reference frame of {path}")
     trial = metadata["trial"].decode()
     if table.num_rows == 0:
@@ -154,92 +154,37 @@ def load_recording(path: Path, *, truth: bool = True) -> Recording:
         frames=_decode(table.column("image"), size=reference.shape, where=f"of {path}"),
         contact_state=tuple(ContactState(state) for state in table.column("contact_state").to_pylist()),
         **{name: table.column(name).to_numpy() for name in _OPTIONAL if name in table.column_names},
-        truth=_read_truth(table, json.loads(metadata["truth"]), path) if truth and "truth" in metadata else None,
+        truth=_read_truth(table, json.loads(metadata["truth"]), reference.shape[:2], path)
+        if truth and "truth" in metadata
+        else None,
         **{name: table.column(name).to_numpy().astype(np.float64) for name in SIGNALS},
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class StoredTrial:
-    """What a trial's file says without its frames being read."""
-
-    trial: str
-    sensor: str
-    day: int
-    condition: str
-    frames: int
-    height: int
-    width: int
-    recipe: str | None
-    """Hash of the recipe of a simulated trial."""
-
-
-def read_header(path: Path) -> StoredTrial:
-    """Read what a trial is, without its frames.
-
-    Raises
-    ------
-    RecordingError
-        If the file is missing or damaged, or no trial.
-    ImageError
-        If its reference frame is damaged.
-    """
-    try:
-        file = pq.read_metadata(path)
-    except FileNotFoundError:
-        raise RecordingError(f"{path} does not exist; make the data set again") from None
-    except (pa.ArrowInvalid, OSError) as error:
-        raise RecordingError(f"{path} is not a readable Parquet file ({error}); make the data set again") from None
-    metadata = {key.decode(): value for key, value in (file.metadata or {}).items()}
-    missing = {"reference", *_DESCRIPTION} - set(metadata)
-    if missing:
-        raise RecordingError(f"{path} lacks {', '.join(sorted(missing))}; write it with save_recording")
-    height, width, _ = decode_png(metadata["reference"], where=f"the reference frame of {path}").shape
-    return StoredTrial(
-        trial=metadata["trial"].decode(),
-        sensor=metadata["sensor"].decode(),
-        day=int(metadata["day"]),
-        condition=metadata["condition"].decode(),
-        frames=file.num_rows,
-        height=height,
-        width=width,
-        recipe=json.loads(metadata["truth"])["recipe"] if "truth" in metadata else None,
-    )
-
-
-def _read_truth(table: pa.Table, description: dict[str, Any], path: Path) -> GroundTruth:
+def _read_truth(table: pa.Table, description: dict[str, Any], size: tuple[int, ...], path: Path) -> GroundTruth:
     missing = _TRUTH_COLUMNS - set(table.column_names)
     if missing:
         raise RecordingError(f"{path} lacks {', '.join(sorted(missing))} of its truth; make the data set again")
     rest = np.array(description["marker_rest_px"], dtype=np.float32).reshape(-1, 2)
     # a trial is read as one chunk or many, as Arrow likes
     flat = table.column("marker_px").combine_chunks().flatten()
-    maps = table.column("contact_map")
-    size = decode_png(maps[0].as_py(), where=f"the contact map of frame 0 of {path}", mode="L").shape
     return GroundTruth(
         recipe=description["recipe"],
         displacement=description["displacement"],
         marker_rest_px=rest,
         marker_px=flat.to_numpy().astype(np.float32).reshape(table.num_rows, -1, 2),
-        contact_map=_decode(maps, size=size, where=f"(contact map) of {path}"),
+        contact_map=_decode(table.column("contact_map"), size=size, where=f"(contact map) of {path}"),
         **{name: table.column(name).to_numpy().astype(np.float64) for name in _TRUTH_SIGNALS},
     )
 
 
 def _decode(images: pa.ChunkedArray, *, size: tuple[int, ...], where: str) -> UInt8[np.ndarray, "frames ..."]:
-    """Decode the PNG images of a trial, all of the reference's size, in threads."""
+    """Decode the images of a trial in threads."""
     pixels = np.empty((len(images), *size), dtype=np.uint8)
-    mode = "RGB" if len(size) == 3 else "L"
 
-    def decode(index: int) -> UInt8[np.ndarray, "height width *channels"]:
-        return decode_png(images[index].as_py(), where=f"frame {index} {where}", mode=mode)
+    def decode(index: int) -> None:
+        pixels[index] = decode_pixels(images[index].as_buffer(), size=size, where=f"frame {index} {where}")
 
     with ThreadPoolExecutor() as pool:
-        for index, image in enumerate(pool.map(decode, range(len(images)))):
-            if image.shape != size:
-                raise RecordingError(
-                    f"frame {index} {where} is {image.shape[:2]} pixels but the reference is {tuple(size[:2])}; "
-                    "record both with the same camera settings"
-                )
-            pixels[index] = image
+        list(pool.map(decode, range(len(images))))
     return pixels

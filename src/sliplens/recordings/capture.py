@@ -1,0 +1,81 @@
+"""What a reader finds in a file: frames and forces as they were recorded, nothing interpreted."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from sliplens.errors import RecordingError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Forces:
+    """Samples of a force sensor, on its own clock and axes.
+
+    Raises
+    ------
+    RecordingError
+        If there is no sample, lengths disagree, times do not rise, or a value is not finite.
+    """
+
+    time_s: Float[np.ndarray, " _"]
+    force_n: Float[np.ndarray, "_ 3"]
+    """x, y, z of the sensor, sign and tare as recorded."""
+    source: str
+    """Topic, file or column names, for people."""
+
+    def __post_init__(self) -> None:
+        """Check what every reader must hold."""
+        if len(self.time_s) == 0:
+            raise RecordingError(f"{self.source} has no force sample; record the force sensor too")
+        if len(self.force_n) != len(self.time_s):
+            raise RecordingError(
+                f"{self.source} has {len(self.time_s)} times but {len(self.force_n)} forces; give one force a time"
+            )
+        _require_rising(self.time_s, what=self.source)
+        bad = ~np.isfinite(self.force_n).all(axis=1)
+        if bad.any():
+            raise RecordingError(f"{self.source}: sample {int(np.argmax(bad))} is not a number; mend or drop it")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capture:
+    """One trial as recorded. Frames are read one at a time, so that a long recording needs no more memory than a short.
+
+    Raises
+    ------
+    RecordingError
+        If there is no frame or times do not rise.
+    """
+
+    name: str
+    """Of the trial: letters, digits, dots, dashes and underscores."""
+    source: str
+    """File, folder or topic, for people."""
+    frame_time_s: Float[np.ndarray, " _"]
+    """On the clock of the camera, from the same zero as the forces."""
+    frame_size: tuple[int, int]
+    """Height and width, in pixels."""
+    read_frames: Callable[[], Iterator[UInt8[np.ndarray, "height width 3"]]]
+    """Begins anew at every call: one RGB image for each time, in their order."""
+    forces: Forces | None
+    """None where only images were recorded."""
+    notes: tuple[str, ...] = ()
+    """What the reader had to assume or leave out, a sentence each, to be shown to the user."""
+
+    def __post_init__(self) -> None:
+        """Check what every reader must hold."""
+        if len(self.frame_time_s) == 0:
+            raise RecordingError(f"{self.source} has no frame; leave it out or record it again")
+        _require_rising(self.frame_time_s, what=f"the frames of {self.source}")
+
+
+def _require_rising(time_s: Float[np.ndarray, " samples"], *, what: str) -> None:
+    steps = np.diff(time_s)
+    if not np.all(steps > 0):
+        at = int(np.argmax(~(steps > 0))) + 1
+        raise RecordingError(
+            f"{what}: time does not rise at sample {at} ({time_s[at - 1]:.6f} s, then {time_s[at]:.6f} s); "
+            "sort the samples or mend their stamps"
+        )

@@ -1,0 +1,80 @@
+"""What a stored trial says of itself, read without its frames."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from sliplens.errors import RecordingError
+from sliplens.images.files import decode_png
+
+DESCRIPTION = ("trial", "sensor", "day", "condition")
+"""What every trial tells in its metadata."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredTrial:
+    """What a trial's file says without its frames being read."""
+
+    trial: str
+    sensor: str
+    day: int
+    condition: str
+    frames: int
+    height: int
+    width: int
+    recipe: str | None
+    """Hash of the recipe of a simulated trial."""
+
+
+def read_header(path: Path) -> StoredTrial:
+    """Read what a trial is, without its frames.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing or damaged, or no trial.
+    ImageError
+        If its reference frame is damaged.
+    """
+    metadata = _read_metadata(path)
+    missing = {"reference", *DESCRIPTION} - set(metadata)
+    if missing:
+        raise RecordingError(f"{path} lacks {', '.join(sorted(missing))}; write it with save_recording")
+    height, width, _ = decode_png(metadata["reference"], where=f"the reference frame of {path}").shape
+    return StoredTrial(
+        trial=metadata["trial"].decode(),
+        sensor=metadata["sensor"].decode(),
+        day=int(metadata["day"]),
+        condition=metadata["condition"].decode(),
+        frames=int(metadata["frames"]),
+        height=height,
+        width=width,
+        recipe=json.loads(metadata["truth"])["recipe"] if "truth" in metadata else None,
+    )
+
+
+def read_labelling(path: Path) -> dict[str, Any] | None:
+    """What the labels of an imported trial rest on, as `import_trial` found it; None where nothing is kept.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing or damaged.
+    """
+    metadata = _read_metadata(path)
+    return json.loads(metadata["labelling"]) if "labelling" in metadata else None
+
+
+def _read_metadata(path: Path) -> dict[str, bytes]:
+    try:
+        file = pq.read_metadata(path)
+    except FileNotFoundError:
+        raise RecordingError(f"{path} does not exist; make the data set again") from None
+    except (pa.ArrowInvalid, OSError) as error:
+        raise RecordingError(f"{path} is not a readable Parquet file ({error}); make the data set again") from None
+    metadata = {key.decode(): value for key, value in (file.metadata or {}).items()}
+    return {**metadata, "frames": str(file.num_rows).encode()}

@@ -1,0 +1,211 @@
+"""Which axis of the force sensor presses, with which sign, and what it reads untouched: declared or inferred."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import Float
+
+from sliplens.errors import RecordingError
+from sliplens.recordings.capture import Forces
+from sliplens.recordings.labels.smoothing import mean_force, noise_sigma
+
+AXES = ("x", "y", "z")
+
+_WINDOW_S = 0.03
+"""Time over which the force is averaged to find the touch: a press takes longer, a spike is shorter."""
+_FIRST_S = 0.1
+"""How long the sensor must be untouched at the start for its tare to be read."""
+_TOUCH_SIGMAS = 6.0
+"""A departure from the tare by so many standard deviations of the averaged noise is a touch."""
+_TOUCH_SHARE = 0.05
+"""And by so much of the largest force: drift and vibration are no touch."""
+_GUARD_S = 0.15
+"""Samples before the touch that are left out of the tare: a soft press begins before it is noticed."""
+_PRESS_SHARE = 0.25
+"""Share of the contact, from its start, in which the object is pressed and held but not yet pulled far."""
+
+
+_SPIKE_SIGMAS = 4.0
+"""A still sample further from the median is a spike."""
+_MOST = 0.9
+"""Share of the still samples that cannot all be spikes."""
+_FEW_STILL = 10
+"""Fewer still samples tell no tare."""
+_STRETCHES = 10
+"""Parts of the still samples whose means are compared."""
+_DOUBTFUL = 0.6
+"""A second axis that departs by this share of the first makes the normal axis doubtful."""
+
+
+class Found(StrEnum):
+    """How a setting came about."""
+
+    DECLARED = "declared"
+    INFERRED = "inferred"
+    ASSUMED = "assumed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForceAxes:
+    """How to read a force sensor.
+
+    Raises
+    ------
+    RecordingError
+        If the axis or the sign is none.
+    """
+
+    normal: str
+    """x, y or z: the axis that presses."""
+    sign: int
+    """1 where pressing is positive as recorded, else -1."""
+    tare_n: Float[np.ndarray, "3"]
+    """What the sensor reads untouched, x, y, z as recorded."""
+    noise_n: Float[np.ndarray, "3"]
+    """Standard deviation of a sample's noise, x, y, z."""
+    tare_sigma_n: Float[np.ndarray, "3"]
+    """Standard uncertainty of the tare."""
+    still_until_s: float | None
+    """Until when the sensor is surely untouched; None where it is never touched."""
+    normal_found: Found
+    sign_found: Found
+    tare_found: Found
+    notes: tuple[str, ...] = ()
+    """What is doubtful, a sentence each, for people."""
+
+    def __post_init__(self) -> None:
+        """Check what can be declared wrongly."""
+        if self.normal not in AXES:
+            raise RecordingError(f"the normal axis is {self.normal!r}; name x, y or z")
+        if self.sign not in (-1, 1):
+            raise RecordingError(f"the sign of the normal force is {self.sign}; give 1, or -1 if pressing is negative")
+
+    @property
+    def normal_index(self) -> int:
+        """Column of the normal axis."""
+        return AXES.index(self.normal)
+
+
+def infer_axes(
+    forces: Forces,
+    *,
+    normal: str | None = None,
+    sign: int | None = None,
+    tare_n: Float[np.ndarray, "3"] | None = None,
+) -> ForceAxes:
+    """Infer what is not declared of how to read a force sensor.
+
+    The tare is the mean of the samples before the touch, spikes left out. The normal axis is the one that departs
+    furthest from it, on average, in the first quarter of the contact, when the object is pressed and held but not yet
+    pulled far; its sign makes that positive. A sensor that is pressed from the first sample on looks untouched: declare
+    its tare.
+
+    Parameters
+    ----------
+    forces
+        As recorded.
+    normal, sign, tare_n
+        What is declared.
+
+    Raises
+    ------
+    RecordingError
+        If nothing is ever pressed, so that axis or sign cannot be inferred.
+    """
+    noise = np.asarray(noise_sigma(forces.force_n))
+    touch, until = _find_touch(forces, tare_n=tare_n)
+    if np.isinf(touch) and (normal is None or sign is None):
+        raise RecordingError(
+            f"{forces.source} never departs from its noise: no touch to infer the axes from; "
+            "declare normal axis, sign and tare, or leave the trial out"
+        )
+    tare = (
+        _read_tare(forces, until_s=until, noise=noise)
+        if tare_n is None
+        else _Tare(value_n=tare_n, sigma_n=np.zeros(3), found=Found.DECLARED)
+    )
+    press = _mean_press(forces, touch_s=touch, tare_n=tare.value_n)
+    axis = AXES[int(np.argmax(np.abs(press)))] if normal is None else normal
+    notes = [tare.note] if tare.note else []
+    first, second = np.sort(np.abs(press))[[-1, -2]]
+    if normal is None and second > _DOUBTFUL * first:
+        notes.append(
+            f"the normal axis is doubtful: {axis} departs by {first:.2f} N in the press, another by {second:.2f} N; "
+            "declare it"
+        )
+    # an axis that is none is ForceAxes' to refuse
+    inferred_sign = 1 if axis not in AXES or press[AXES.index(axis)] >= 0 else -1
+    return ForceAxes(
+        normal=axis,
+        sign=inferred_sign if sign is None else sign,
+        tare_n=tare.value_n,
+        noise_n=noise,
+        tare_sigma_n=tare.sigma_n,
+        still_until_s=None if np.isinf(until) else until,
+        normal_found=Found.INFERRED if normal is None else Found.DECLARED,
+        sign_found=Found.INFERRED if sign is None else Found.DECLARED,
+        tare_found=tare.found,
+        notes=tuple(notes),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Tare:
+    value_n: Float[np.ndarray, "3"]
+    sigma_n: Float[np.ndarray, "3"]
+    found: Found
+    note: str = ""
+
+
+def _read_tare(forces: Forces, *, until_s: float, noise: Float[np.ndarray, "3"]) -> _Tare:
+    """Mean of the untouched samples; 0 where there are none."""
+    still = forces.force_n[forces.time_s < until_s]
+    if len(still) < _FEW_STILL:
+        return _Tare(
+            value_n=np.zeros(3),
+            sigma_n=np.zeros(3),
+            found=Found.ASSUMED,
+            note="no still samples before contact: the tare is taken as zero; declare it if the sensor has one",
+        )
+    # a spike must not move it, and a plain median of Gaussian samples would be less certain by a quarter
+    middle = np.median(still, axis=0)
+    kept = np.abs(still - middle) <= np.maximum(_SPIKE_SIGMAS * noise, 1e-9 + np.abs(middle) * 1e-9)
+    # where the sensor wanders by more than its noise, what lies further out is no spike
+    kept |= kept.mean(axis=0) < _MOST
+    white = np.std(still, axis=0, where=kept) / np.sqrt(kept.sum(axis=0))
+    # noise with a memory leaves the means of stretches further apart than white noise would
+    parts = np.array([part.mean(axis=0) for part in np.array_split(still, _STRETCHES)])
+    return _Tare(
+        value_n=np.mean(still, axis=0, where=kept),
+        sigma_n=np.maximum(white, np.std(parts, axis=0, ddof=1) / np.sqrt(_STRETCHES)),
+        found=Found.INFERRED,
+    )
+
+
+def _mean_press(forces: Forces, *, touch_s: float, tare_n: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Mean force while the object is pressed and held; 0 where it never is."""
+    if np.isinf(touch_s):
+        return np.zeros(3)
+    end = touch_s + _PRESS_SHARE * (forces.time_s[-1] - touch_s)
+    return np.mean(forces.force_n[(forces.time_s >= touch_s) & (forces.time_s <= end)], axis=0) - tare_n
+
+
+def _find_touch(forces: Forces, *, tare_n: Float[np.ndarray, "3"] | None) -> tuple[float, float]:
+    """When the sensor is first touched, and until when its samples are surely still; infinite if it never is."""
+    time, start = forces.time_s, float(forces.time_s[0])
+    first = forces.force_n[time <= start + _FIRST_S]
+    rest = np.median(first, axis=0) if tare_n is None else tare_n
+    # means taken one after the other tell their noise, whatever its memory
+    apart = np.arange(start + _WINDOW_S / 2, time[-1], _WINDOW_S)
+    sigma = float(np.linalg.norm(noise_sigma(mean_force(time, forces.force_n, apart, window_s=_WINDOW_S))))
+    # the rest itself is known from a few windows only
+    sigma *= np.sqrt(1 + 1.5 * _WINDOW_S / _FIRST_S)
+    away = np.linalg.norm(mean_force(time, forces.force_n, time, window_s=_WINDOW_S) - rest, axis=1)
+    touched = away > max(_TOUCH_SIGMAS * sigma, _TOUCH_SHARE * away.max(), 1e-9)
+    # the window shrinks at the ends, where a single sample's noise is no touch
+    touched &= (time >= start + _WINDOW_S / 2) & (time <= time[-1] - _WINDOW_S / 2)
+    if not touched.any():
+        return float("inf"), float("inf")
+    touch = float(time[np.argmax(touched)])
+    return touch, touch - min(_GUARD_S, (touch - start) / 2)

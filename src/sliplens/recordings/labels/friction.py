@@ -1,0 +1,240 @@
+"""Static friction of a trial: the ratio of tangential to normal force at which the contact slips as a whole."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from sliplens.errors import RecordingError
+from sliplens.recordings.labels.axes import Found
+from sliplens.recordings.labels.change import fit_break
+from sliplens.recordings.labels.contact import ContactForces, magnitude
+from sliplens.recordings.labels.smoothing import mean_force, typical_step
+
+_WINDOWS_S = (0.03, 0.1)
+"""Times over which the forces are averaged to find roughly where the ratio breaks off: the longer finds faint falls."""
+_DROP_SIGMAS = 5.0
+"""A fall of the averaged ratio by so many standard deviations of its noise is no chance."""
+_DROP_SHARE = 0.03
+"""And by so much of the ratio: less is a wobble of the hand that pulls."""
+_DROP_S = 0.25
+"""Time in which the ratio must have fallen: slip is sudden, letting go is slow."""
+_PULLED_SHARE = 0.5
+"""A slip is looked for where the ratio is this share of its largest or more."""
+_PRESSED_SHARE = 0.25
+"""And where the normal force is this share of its largest: in a light touch the ratio is all noise."""
+_STEP_S = 0.06
+"""Time over which the ratio before and after a fall is compared to place it."""
+_BEFORE_S, _AFTER_S = 0.6, 0.2
+"""What of the ratio is fitted, before and after its break."""
+_BAND = (0.16, 0.84)
+"""Quantiles that hold 68 %."""
+_SEEN_SIGMAS = 3.0
+"""An image that moves by so many standard deviations more than before sees the slip."""
+_QUIET_S = 0.5
+"""Time before the onset that tells how much the image moves without slip."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrictionEstimate:
+    """Static friction of a trial, and when its contact slipped."""
+
+    mu: float
+    """Static coefficient of friction mu_s."""
+    low: float
+    high: float
+    """Ends of the 68 % interval."""
+    onset_s: float | None
+    """First gross slip, on the force sensor's clock; None where it is not known to slip."""
+    found: Found
+    method: str
+    """How it was found, for people."""
+    onset_sigma_s: float = float("nan")
+    """Standard uncertainty of the onset, from the same bootstrap; NaN where it is not known."""
+    image_sigmas: float = float("nan")
+    """By how much the image moves more than before, at the onset, in standard deviations; NaN where not asked."""
+
+    def __post_init__(self) -> None:
+        """Check what can be given wrongly.
+
+        Raises
+        ------
+        RecordingError
+            If the coefficient is not positive or outside its interval.
+        """
+        if not 0 < self.mu < np.inf:
+            raise RecordingError(f"the coefficient of friction is {self.mu:.3g}; give a positive one")
+        if not 0 <= self.low <= self.mu <= self.high < np.inf:
+            raise RecordingError(
+                f"the coefficient of friction {self.mu:.3g} lies outside its interval {self.low:.3g} to "
+                f"{self.high:.3g}; give low, mu, high in their order"
+            )
+
+    @property
+    def sigma(self) -> float:
+        """Standard uncertainty: half the 68 % interval."""
+        return (self.high - self.low) / 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageMotion:
+    """How much each frame differs from the one before, at the frames' times on the force sensor's clock."""
+
+    time_s: Float[np.ndarray, " frames"]
+    motion: Float[np.ndarray, " frames"]
+    """See `measure_motion`; the first value is not used."""
+
+
+def given_friction(
+    mu: float, *, low: float | None = None, high: float | None = None, onset_s: float | None = None
+) -> FrictionEstimate:
+    """Friction given by hand; without an interval it counts as exact.
+
+    Parameters
+    ----------
+    mu
+        Static coefficient of friction.
+    low, high
+        Ends of its 68 % interval.
+    onset_s
+        When the contact first slips, if it is known to.
+    """
+    return FrictionEstimate(
+        mu=mu,
+        low=mu if low is None else low,
+        high=mu if high is None else high,
+        onset_s=onset_s,
+        found=Found.DECLARED,
+        method="given by hand",
+    )
+
+
+def estimate_friction(
+    forces: ContactForces,
+    *,
+    contact_threshold_n: float,
+    rng: np.random.Generator,
+    image: ImageMotion | None = None,
+    draws: int = 300,
+) -> FrictionEstimate:
+    """Estimate static friction at the onset of gross slip, with a bootstrap interval.
+
+    The slip is the first sudden fall of F_t / F_n from its height so far. About it the ratio is fitted by a line that
+    breaks off: rising until the onset, falling after it; mu_s is its value at the break. Where several falls compete,
+    the one that the image moves at wins.
+
+    Parameters
+    ----------
+    forces
+        In the axes of the contact.
+    contact_threshold_n
+        Normal force below which the ratio means nothing.
+    rng
+        Source of the bootstrap.
+    image
+        How the image moves, to support the onset.
+    draws
+        Bootstrap draws.
+
+    Raises
+    ------
+    RecordingError
+        If the trial never slips: its friction is then unknown, only that it is larger than all that was seen.
+    """
+    candidates: list[float] = []
+    highest = 0.0
+    for window_s in _WINDOWS_S:
+        candidates, highest = _find_falls(forces, window_s=window_s, contact_threshold_n=contact_threshold_n)
+        if candidates:
+            break
+    if not candidates:
+        raise RecordingError(
+            f"the trial never slips (F_t / F_n reaches {highest:.2f} without breaking off), so its friction is "
+            "unknown; give the coefficient of friction by hand"
+        )
+    support = [_image_sigmas(image, rough) for rough in candidates]
+    # a slip that the image does not see is a knock at the force sensor, unless no fall is seen
+    seen = [rough for rough, sigmas in zip(candidates, support, strict=True) if sigmas >= _SEEN_SIGMAS]
+    rough = (seen or candidates)[0]
+    near = (forces.time_s >= rough - _BEFORE_S) & (forces.time_s <= rough + _AFTER_S)
+    near &= forces.normal_n > contact_threshold_n
+    time, ratio = forces.time_s[near], _ratio_along_pull(forces, near, rough)
+    fit = fit_break(time, ratio, about_s=rough, rng=rng, draws=draws)
+    tare = _tare_share(forces, mu=fit.level, at=near)
+    low, high = np.quantile(fit.levels + rng.normal(0, tare, draws), _BAND)
+    early, late = np.quantile(fit.times_s, _BAND)
+    return FrictionEstimate(
+        mu=fit.level,
+        low=float(min(low, fit.level)),
+        high=float(max(high, fit.level)),
+        onset_s=fit.time_s,
+        found=Found.INFERRED,
+        method="break of F_t / F_n" + (", seen in the image" if seen else ""),
+        onset_sigma_s=float(late - early) / 2,
+        image_sigmas=_image_sigmas(image, fit.time_s),
+    )
+
+
+def _find_falls(forces: ContactForces, *, window_s: float, contact_threshold_n: float) -> tuple[list[float], float]:
+    """Rough times at which the ratio suddenly falls from its height so far, and the greatest height."""
+    time, step = forces.time_s, max(typical_step(forces.time_s), 1e-9)
+    normal = mean_force(time, forces.normal_n, time, window_s=window_s)
+    noise = forces.noise_of_means_n(window_s)
+    sigma_n = noise.tangential
+    tangential = magnitude(mean_force(time, forces.tangential_n, time, window_s=window_s), sigma_n=sigma_n)
+    pressed = normal > max(contact_threshold_n, _PRESSED_SHARE * normal.max())
+    # the window shrinks at the ends, where a single sample's noise is no fall
+    pressed &= (time - time[0] >= window_s / 2) & (time[-1] - time >= window_s / 2)
+    if not pressed.any():
+        return [], 0.0
+    safe = np.where(pressed, normal, 1)
+    ratio = np.where(pressed, tangential / safe, 0)
+    sigma = np.where(pressed, np.hypot(sigma_n, ratio * noise.normal) / safe, 0)
+    highest = float(ratio[tangential > 3 * sigma_n].max(initial=0))
+    # the least that it has fallen to within the time of a slip
+    count = max(1, round(_DROP_S / step))
+    padded = np.concatenate((np.where(pressed, ratio, np.inf), np.full(count, np.inf)))
+    least = np.lib.stride_tricks.sliding_window_view(padded, count + 1).min(axis=1)
+    fall = ratio - least
+    enough = pressed & (ratio >= _PULLED_SHARE * highest) & (tangential > 3 * sigma_n)
+    falls = enough & (fall > np.maximum(_DROP_SIGMAS * np.sqrt(2) * sigma, _DROP_SHARE * ratio))
+    starts = np.flatnonzero(falls & ~np.concatenate(([False], falls[:-1])))
+    ends = np.flatnonzero(falls & ~np.concatenate((falls[1:], [False])))
+    # of each stretch the moment at which the ratio falls most steeply
+    steep = mean_force(time, ratio, time - _STEP_S / 2, window_s=_STEP_S) - mean_force(
+        time, ratio, time + _STEP_S, window_s=_STEP_S
+    )
+    # a stretch begins before its fall by the time that a fall may take, and may end as it begins
+    tops = [start + int(np.argmax(steep[start : end + count + 1])) for start, end in zip(starts, ends, strict=True)]
+    return sorted({float(time[top]) for top in tops}), highest
+
+
+def _ratio_along_pull(
+    forces: ContactForces, near: Bool[np.ndarray, " all_samples"], rough: float
+) -> Float[np.ndarray, " samples"]:
+    """F_t / F_n of single samples, along the direction of the pull: a projection is not biased by noise."""
+    before = near & (forces.time_s <= rough)
+    pull = forces.tangential_n[before].mean(axis=0)
+    return forces.tangential_n[near] @ (pull / np.linalg.norm(pull)) / forces.normal_n[near]
+
+
+def _tare_share(forces: ContactForces, *, mu: float, at: Bool[np.ndarray, " samples"]) -> float:
+    """Uncertainty of the ratio from that of the tare, which no resampling of the slip can show."""
+    tare = forces.tare_sigma_n
+    return float(np.hypot(tare.tangential, mu * tare.normal) / forces.normal_n[at].mean())
+
+
+def _image_sigmas(image: ImageMotion | None, onset_s: float) -> float:
+    """How far the image's largest motion at the onset stands out of that before it."""
+    if image is None:
+        return float("nan")
+    # a frame's motion happens between it and the one before; a lag may not be known to the frame
+    step = typical_step(image.time_s)
+    after = image.time_s - onset_s
+    quiet = image.motion[1:][(after[1:] < -3 * step) & (after[1:] > -_QUIET_S - 3 * step)]
+    burst = image.motion[1:][(after[1:] >= -2 * step) & (after[1:] <= 3 * step)]
+    if len(quiet) < 3 or len(burst) == 0:
+        return float("nan")
+    middle = np.median(quiet)
+    spread = 1.4826 * np.median(np.abs(quiet - middle))
+    return float((burst.max() - middle) / max(spread, 1e-9))

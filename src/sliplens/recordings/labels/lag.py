@@ -1,0 +1,154 @@
+"""The lag between camera and force sensor, from what both feel: the image moves when the force changes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from sliplens.errors import RecordingError
+from sliplens.recordings.capture import Forces
+from sliplens.recordings.labels.smoothing import mean_force, typical_step
+
+_STEPS_A_FRAME = 16
+"""Lags tried in the time of a frame; between them the peak is a parabola's."""
+_BLOCKS = 24
+"""Stretches of a trial that are drawn anew: long enough to hold a slip whole, many enough to draw from."""
+_LEAST_INTERVALS = 2 * _BLOCKS
+_LEAST_CORRELATION = 0.3
+_OVERLAP = 0.7
+"""Share of the frames that must have forces for a lag to be tried."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lag:
+    """By how much the camera's stamps are later than the force sensor's, for the same event."""
+
+    lag_s: float
+    """Positive where the camera is late; an event stamped t by the camera is t - lag_s to the force sensor."""
+    sigma_s: float
+    """Standard uncertainty of the lag."""
+    correlation: float
+    """Of image motion and force rate, at this lag."""
+    doubt: str = ""
+    """Why the lag cannot be told from this trial, a sentence for people; empty where it can."""
+
+
+def estimate_lag(
+    frame_time_s: Float[np.ndarray, " frames"],
+    image_motion: Float[np.ndarray, " frames"],
+    forces: Forces,
+    *,
+    rng: np.random.Generator,
+    longest_s: float = 0.25,
+    draws: int = 200,
+) -> Lag:
+    """Estimate the lag by cross-correlation of image motion and force rate, each frame keeping its own time.
+
+    For every lag tried, the force is averaged about the lagged time of each frame; the length of its change from frame
+    to frame is what the image's motion is correlated with. The length does not know axes, signs or tare, so these may
+    all still be wrong. The uncertainty is the spread of the peak when stretches of the trial are drawn anew.
+
+    Parameters
+    ----------
+    frame_time_s
+        Times on the camera's clock.
+    image_motion
+        How much each frame differs from the one before it; see `measure_motion`. The first is not used.
+    forces
+        As recorded.
+    rng
+        Source of the draws.
+    longest_s
+        Longest lag tried, either way.
+    draws
+        Bootstrap draws.
+
+    Raises
+    ------
+    RecordingError
+        If frames or overlap are too few to correlate.
+    """
+    intervals = len(frame_time_s) - 1
+    if intervals < _LEAST_INTERVALS:
+        raise RecordingError(
+            f"{len(frame_time_s)} frames are too few to estimate a lag from, {_LEAST_INTERVALS + 1} are needed; "
+            "record longer or give the lag by hand"
+        )
+    step = typical_step(frame_time_s) / _STEPS_A_FRAME
+    reach = int(np.ceil(longest_s / step))
+    lags = np.arange(-reach, reach + 1) * step
+    changes = np.stack([_force_changes(frame_time_s - lag, forces) for lag in lags])
+    covered = ~np.isnan(changes)
+    usable = covered.mean(axis=1) >= _OVERLAP
+    if not usable.any():
+        raise RecordingError(
+            f"no lag up to {longest_s:g} s lets the forces of {forces.source} cover the frames; "
+            "bring both clocks to the same zero on import"
+        )
+    lags, changes, covered = lags[usable], np.nan_to_num(changes[usable]), covered[usable]
+    weights = np.concatenate((np.ones((1, intervals)), _block_weights(intervals, draws=draws, rng=rng)))
+    curves = _correlations(weights, image_motion[1:], changes=changes, covered=covered)
+    peaks = np.array([_peak(lags, curve) for curve in curves])
+    low, high = np.quantile(peaks[1:], (0.16, 0.84))
+    lag, sigma, correlation = float(peaks[0]), float(high - low) / 2, float(curves[0].max())
+    return Lag(lag_s=lag, sigma_s=sigma, correlation=correlation, doubt=_doubt(lag, sigma, correlation, lags))
+
+
+def _force_changes(time_s: Float[np.ndarray, " frames"], forces: Forces) -> Float[np.ndarray, " intervals"]:
+    """Length of the change of the force from frame to frame; NaN beyond the ends of the samples."""
+    # over a frame's time: as the images do, the change then tells of all that happened since the last frame
+    force = mean_force(forces.time_s, forces.force_n, time_s, window_s=typical_step(time_s))
+    inside = (time_s >= forces.time_s[0]) & (time_s <= forces.time_s[-1])
+    force[~inside] = np.nan
+    return np.linalg.norm(np.diff(force, axis=0), axis=1)
+
+
+def _correlations(
+    weights: Float[np.ndarray, "draws intervals"],
+    motion: Float[np.ndarray, " intervals"],
+    *,
+    changes: Float[np.ndarray, "lags intervals"],
+    covered: Bool[np.ndarray, "lags intervals"],
+) -> Float[np.ndarray, "draws lags"]:
+    """Weighted correlation of the motion with the force's changes, for every draw and lag."""
+    mask = covered.astype(np.float64)
+    # centred first: the sums below lose digits where a mean is large
+    motion, changes = motion - motion.mean(), (changes - changes.mean()) * mask
+    total = weights @ mask.T
+    first, second = (weights * motion) @ mask.T / total, weights @ changes.T / total
+    product = (weights * motion) @ changes.T / total - first * second
+    variances = ((weights * motion**2) @ mask.T / total - first**2) * (weights @ (changes**2).T / total - second**2)
+    return product / np.sqrt(np.where(variances > 0, variances, np.inf))
+
+
+def _peak(lags: Float[np.ndarray, " lags"], curve: Float[np.ndarray, " lags"]) -> float:
+    """Where a curve is highest, between the lags tried: the top of the parabola through a frame's worth of them."""
+    top = int(np.argmax(curve))
+    near = slice(max(0, top - _STEPS_A_FRAME // 4), top + _STEPS_A_FRAME // 4 + 1)
+    if top in (0, len(lags) - 1):
+        return float(lags[top])
+    centre = lags[top]
+    bend, slope, _ = np.polyfit(lags[near] - centre, curve[near], 2)
+    shift = -slope / (2 * bend) if bend < 0 else 0.0
+    return float(np.clip(centre + shift, lags[near][0], lags[near][-1]))
+
+
+def _block_weights(intervals: int, *, draws: int, rng: np.random.Generator) -> Float[np.ndarray, "draws intervals"]:
+    """How often each interval is drawn when whole stretches are: what is near in time is not independent."""
+    length = int(np.ceil(intervals / _BLOCKS))
+    starts = rng.integers(0, intervals, (draws, _BLOCKS))
+    # round the end: every interval is as likely as any other
+    drawn = (starts[..., None] + np.arange(length)) % intervals
+    weights = np.zeros((draws, intervals))
+    np.add.at(weights, (np.arange(draws)[:, None, None], drawn), 1.0)
+    return weights
+
+
+def _doubt(lag: float, sigma: float, correlation: float, lags: Float[np.ndarray, " lags"]) -> str:
+    if correlation < _LEAST_CORRELATION:
+        return f"image motion and force rate correlate by {correlation:.2f} only, {_LEAST_CORRELATION} is needed"
+    if lag in (lags[0], lags[-1]):
+        return f"the correlation still rises at {lag:.3f} s, the longest lag tried"
+    if sigma > (lags[-1] - lags[0]) / 8:
+        return f"the lag is uncertain by {sigma:.3f} s: several lags fit alike"
+    return ""

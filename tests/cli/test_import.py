@@ -1,0 +1,166 @@
+"""`sliplens import`: from files of one's own to a data set that trains a network."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from sliplens.cli import main
+from sliplens.images import write_png
+from sliplens.recordings import Dataset, Recording
+from sliplens.recordings.headers import read_labelling
+from sliplens.simulation import PRESETS, plan_trials, simulate_trial
+
+FORCE_RATE = 500
+TARE = np.array([0.3, -0.2, 1.1])
+
+
+def run(*words: object) -> int:
+    return main([str(word) for word in words])
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    assert run(*words) == 2
+    captured = capsys.readouterr()
+    assert "Traceback" not in captured.err + captured.out
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def trial() -> Recording:
+    """A simulated trial at 30 frames a second."""
+    return simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=240))
+
+
+@pytest.fixture(scope="module")
+def table(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its forces as a sensor saw them: tared wrongly, upside down, with noise."""
+    rng = np.random.default_rng(1)
+    time = np.arange(0, trial.time_s[-1] + 0.1, 1 / FORCE_RATE)
+    normal, pull = (
+        np.interp(time, trial.time_s, values) for values in (trial.normal_force_n, trial.tangential_force_n)
+    )
+    seen = np.stack([pull, np.zeros_like(pull), -normal], axis=-1) + TARE + rng.normal(0, 0.02, (len(time), 3))
+    path = tmp_path_factory.mktemp("forces") / "forces.csv"
+    with path.open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["time [s]", "Fx [N]", "Fy [N]", "Fz [N]"])
+        writer.writerows(np.column_stack([time, seen]).round(5).tolist())
+    return path
+
+
+@pytest.fixture(scope="module")
+def video(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its frames as a lossless video."""
+    path = tmp_path_factory.mktemp("video") / "cup.mkv"
+    with av.open(str(path), "w", format="matroska") as container:
+        stream = container.add_stream("ffv1", rate=30)
+        stream.height, stream.width = trial.reference.shape[:2]
+        stream.pix_fmt = "bgr0"
+        for frame in trial.frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+    return path
+
+
+@pytest.fixture(scope="module")
+def recorded(video: Path, table: Path) -> tuple[Path, Path]:
+    return video, table
+
+
+def test_labels_of_an_imported_video_are_those_of_the_simulator(
+    tmp_path: Path, trial: Recording, table: Path, video: Path, capsys: pytest.CaptureFixture[str]
+):
+    command = ("import", video, "-o", tmp_path / "data", "--sensor", "mine", "--forces", table)
+    assert run(*command) == 0
+    assert run("check", tmp_path / "data") == 0
+    data = Dataset.open(tmp_path / "data")
+    back = data.load(data.trials[0])
+    assert (back.trial, back.sensor, data.simulated) == ("cup", "mine", False)
+    np.testing.assert_array_equal(back.frames, trial.frames)
+    assert back.valid is not None
+    assert back.safety_margin_sigma is not None
+    # the labels' own goal: Gamma within 0.03 rms, mu within 5 %
+    assert back.valid.sum() > 180
+    error = (back.safety_margin - trial.safety_margin)[back.valid]
+    assert np.sqrt(np.mean(error**2)) < 0.03
+    told = read_labelling(tmp_path / "data" / "trials" / "cup.parquet")
+    assert told is not None
+    assert trial.truth is not None
+    slip = int(np.argmax(trial.safety_margin == 0))
+    assert told["friction"]["mu"] == pytest.approx(trial.truth.static_friction[slip], rel=0.05)
+    assert (told["axes"]["normal"], told["axes"]["sign"]) == ("z", -1)
+    np.testing.assert_allclose(told["axes"]["tare_n"], TARE, atol=0.01)
+    # the reference was taken before the contact
+    np.testing.assert_array_equal(back.reference, trial.frames[told["reference"]["index"]])
+    assert np.isnan(trial.safety_margin[told["reference"]["index"]])
+    assert run(*command) == 0
+    assert "kept" in capsys.readouterr().out
+
+
+def test_a_folder_of_images_gives_the_labels_of_the_video(tmp_path: Path, trial: Recording, table: Path, video: Path):
+    folder = tmp_path / "cup"
+    folder.mkdir()
+    for index, frame in enumerate(trial.frames):
+        write_png(folder / f"frame_{index}.png", frame)
+    shared = ("--sensor", "mine", "--forces", table)
+    assert run("import", folder, "-o", tmp_path / "a", *shared, "--frame-rate", 30) == 0
+    assert run("import", video, "-o", tmp_path / "b", *shared, "--frame-rate", 30) == 0
+    one, other = (Dataset.open(tmp_path / name) for name in "ab")
+    np.testing.assert_array_equal(one.load(one.trials[0]).safety_margin, other.load(other.trials[0]).safety_margin)
+
+
+def test_friction_by_hand_is_taken(tmp_path: Path, table: Path, video: Path):
+    assert run("import", video, "-o", tmp_path / "data", "--sensor", "mine", "--forces", table, "--mu", 1.4) == 0
+    data = Dataset.open(tmp_path / "data")
+    told = read_labelling(tmp_path / "data" / "trials" / "cup.parquet")
+    assert told is not None
+    assert (told["friction"]["mu"], told["friction"]["found"]) == (1.4, "declared")
+    # with more friction than there was the trial never comes near slip
+    assert np.nanmin(data.load(data.trials[0]).safety_margin) > 0.2
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((), "has no forces, and without them there is no label; give the table of the force sensor"),
+        (("--forces", "MISSING.csv"), "MISSING.csv does not exist"),
+        (("--format", "papyrus"), "format 'papyrus' is not known; choose rosbag, lerobot, images, video"),
+        (("--image-topic", "/camera"), "is read as video, which does not take image_topic"),
+        (("--forces", "TABLE", "--test-trials", "2"), "2 to test are more than the 1 there are; give fewer"),
+        (("--forces", "TABLE", "--test-trials", "-1"), "numbers of trials are not negative"),
+        (("--forces", "TABLE", "--reference-frame", "999"), "the reference is frame 999 of 240"),
+    ],
+)
+def test_mistakes_are_told_in_one_line_and_leave_nothing(
+    tmp_path: Path,
+    recorded: tuple[Path, Path],
+    capsys: pytest.CaptureFixture[str],
+    words: tuple[str, ...],
+    message: str,
+):
+    video, table = recorded
+    named = [str(table) if word == "TABLE" else word for word in words]
+    assert message in refused(capsys, "import", video, "-o", tmp_path / "data", "--sensor", "mine", *named)
+    assert not list(tmp_path.iterdir())
+
+
+def test_recordings_of_one_name_are_refused(tmp_path: Path, video: Path, capsys: pytest.CaptureFixture[str]):
+    line = refused(capsys, "import", video, video, "-o", tmp_path / "data", "--sensor", "mine")
+    assert "several recordings are named cup; rename their files" in line
+
+
+def test_a_real_bag_without_images_is_refused_with_its_topics(
+    tmp_path: Path, reference_folder: Path, capsys: pytest.CaptureFixture[str]
+):
+    bag = reference_folder / "rosbags" / "tactip_db3"
+    if not bag.is_dir():
+        pytest.skip(f"the real bags are not at {bag}")
+    line = refused(capsys, "import", bag, "-o", tmp_path / "data", "--sensor", "mine")
+    assert "/sensors/tactip" in line
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,105 @@
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from sliplens.errors import RecordingError
+from sliplens.recordings.capture import Forces
+from sliplens.recordings.labels import Found, infer_axes
+from sliplens.recordings.labels.contact import apply_axes, magnitude
+
+from .conftest import NORMAL_N, TOUCH_S, Trial
+
+TARE = (0.7, -0.4, 0.2)
+
+
+@pytest.mark.parametrize("order", list(permutations(range(3))))
+@pytest.mark.parametrize("sign", [1, -1])
+def test_axis_and_sign_come_back_however_the_sensor_is_mounted(
+    trial: Trial, rng: np.random.Generator, order: tuple[int, int, int], sign: int
+):
+    axes = infer_axes(trial.forces(noise_n=0.02, rng=rng, tare_n=TARE, order=order, sign=sign))
+    assert (axes.normal, axes.sign) == ("xyz"[order.index(0)], sign)
+    assert (axes.normal_found, axes.sign_found, axes.tare_found) == (Found.INFERRED,) * 3
+    assert axes.notes == ()
+
+
+def test_tare_and_noise_come_back(trial: Trial, rng: np.random.Generator):
+    axes = infer_axes(trial.forces(noise_n=0.02, rng=rng, tare_n=TARE))
+    assert np.all(np.abs(axes.tare_n - TARE) < 4 * axes.tare_sigma_n)
+    # 0.6 s less the guard hold some 225 samples: 0.02 / 15; ten stretches know it to a quarter
+    np.testing.assert_allclose(axes.tare_sigma_n, 0.02 / 15, rtol=0.6)
+    np.testing.assert_allclose(axes.noise_n, 0.02, rtol=0.1)
+    assert axes.still_until_s is not None
+    assert axes.still_until_s < TOUCH_S
+
+
+def test_a_spike_before_the_touch_does_not_move_the_tare(trial: Trial, rng: np.random.Generator):
+    clean = trial.forces(noise_n=0.02, rng=rng, tare_n=TARE)
+    force = clean.force_n.copy()
+    force[100, 2] += 0.25
+    spiked = infer_axes(Forces(time_s=clean.time_s, force_n=force, source="sensor"))
+    # one sample of 225 fewer moves a mean by less than its uncertainty
+    assert np.all(np.abs(spiked.tare_n - infer_axes(clean).tare_n) < spiked.tare_sigma_n)
+
+
+def test_noise_with_a_memory_makes_the_tare_less_certain(trial: Trial, rng: np.random.Generator):
+    white = rng.normal(0, 0.02, (len(trial.time_s) + 24, 3))
+    # means over 25 samples, as of a sensor that filters: the same spread sample by sample, a 25th as many of them
+    slow = np.lib.stride_tricks.sliding_window_view(white, 25, axis=0).mean(axis=-1) * 5
+    quick, filtered = (
+        infer_axes(Forces(time_s=trial.time_s, force_n=trial.contact_n + noise, source="sensor"))
+        for noise in (white[:-24], slow)
+    )
+    assert np.all(filtered.tare_sigma_n > 1.5 * quick.tare_sigma_n)
+
+
+def test_turned_forces_press_positively_without_tare(trial: Trial):
+    forces = trial.forces(tare_n=TARE, order=(1, 0, 2), sign=-1)
+    turned = apply_axes(forces, infer_axes(forces))
+    np.testing.assert_allclose(turned.normal_n, trial.contact_n[:, 0], atol=1e-9)
+    np.testing.assert_allclose(turned.tangential_n, trial.contact_n[:, 1:], atol=1e-9)
+
+
+def test_what_is_declared_is_kept(trial: Trial):
+    axes = infer_axes(trial.forces(), normal="z", sign=-1, tare_n=np.array([0.1, 0.2, 0.3]))
+    assert (axes.normal, axes.sign) == ("z", -1)
+    np.testing.assert_array_equal(axes.tare_n, [0.1, 0.2, 0.3])
+    assert (axes.normal_found, axes.sign_found, axes.tare_found) == (Found.DECLARED,) * 3
+
+
+def test_a_recording_that_begins_in_the_press_has_no_still_samples(trial: Trial, rng: np.random.Generator):
+    whole = trial.forces(noise_n=0.02, rng=rng)
+    kept = whole.time_s > TOUCH_S + 0.02
+    axes = infer_axes(Forces(time_s=whole.time_s[kept], force_n=whole.force_n[kept], source="sensor"))
+    assert axes.tare_found is Found.ASSUMED
+    assert "no still samples before contact" in axes.notes[0]
+    np.testing.assert_array_equal(axes.tare_n, 0)
+
+
+def test_two_axes_that_press_alike_are_doubtful(trial: Trial):
+    tilted = np.stack((trial.contact_n[:, 0], 0.9 * trial.contact_n[:, 0], trial.contact_n[:, 1]), axis=1)
+    axes = infer_axes(Forces(time_s=trial.time_s, force_n=tilted, source="sensor"))
+    assert "the normal axis is doubtful: x" in axes.notes[0]
+
+
+def test_a_sensor_that_is_never_touched_is_refused(trial: Trial, rng: np.random.Generator):
+    forces = Forces(time_s=trial.time_s, force_n=rng.normal(0.5, 0.02, (len(trial.time_s), 3)), source="sensor")
+    with pytest.raises(RecordingError, match=r"sensor never departs from its noise.*; declare normal axis, sign and"):
+        infer_axes(forces)
+    assert infer_axes(forces, normal="z", sign=1).still_until_s is None
+
+
+def test_an_axis_that_is_none_is_refused(trial: Trial):
+    with pytest.raises(RecordingError, match="the normal axis is 'w'; name x, y or z"):
+        infer_axes(trial.forces(), normal="w")
+    with pytest.raises(RecordingError, match="the sign of the normal force is 0; give 1, or -1"):
+        infer_axes(trial.forces(), sign=0)
+
+
+@pytest.mark.parametrize("force_n", [0.1, NORMAL_N])
+def test_magnitude_is_not_lengthened_by_noise(rng: np.random.Generator, force_n: float):
+    noisy = np.array([0.6, 0.8]) * force_n + rng.normal(0, 0.02, (40_000, 2))
+    # the mean of 40000 is known to 1e-4; the plain length is too long by sigma^2 / 2 F, 2e-3 of the smaller force
+    assert magnitude(noisy, sigma_n=0.02).mean() == pytest.approx(force_n, abs=4e-4)
+    assert magnitude(noisy, sigma_n=0.02).mean() <= np.linalg.norm(noisy, axis=1).mean()

@@ -1,0 +1,107 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sliplens.errors import RecordingError
+from sliplens.recordings.capture import Forces
+from sliplens.recordings.labels import ContactForces, Found, ImageMotion, apply_axes, estimate_friction, given_friction
+from sliplens.recordings.labels.change import fit_break
+
+from .conftest import SLIP_S, STATIC, Trial
+
+THRESHOLD_N = 0.05
+
+
+def test_friction_and_onset_come_back(trial: Trial, rng: np.random.Generator):
+    friction = estimate_friction(trial.contact(noise_n=0.02, rng=rng), contact_threshold_n=THRESHOLD_N, rng=rng)
+    # 0.02 N on 1.5 N, averaged over the half second before the slip, is 0.3 % of mu; four of that
+    assert friction.mu == pytest.approx(STATIC, rel=0.012)
+    assert friction.onset_s == pytest.approx(SLIP_S, abs=0.01)
+    assert friction.low < friction.mu < friction.high
+    assert friction.found is Found.INFERRED
+
+
+def test_friction_is_exact_without_noise(trial: Trial, rng: np.random.Generator):
+    friction = estimate_friction(trial.contact(), contact_threshold_n=THRESHOLD_N, rng=rng)
+    # breaks are tried 2 ms apart, in which the ratio rises by 4e-4
+    assert friction.mu == pytest.approx(STATIC, abs=5e-4)
+
+
+def test_the_interval_covers(trial: Trial):
+    hits = []
+    for number in range(60):
+        rng = np.random.default_rng(number)
+        friction = estimate_friction(trial.contact(noise_n=0.02, rng=rng), contact_threshold_n=THRESHOLD_N, rng=rng)
+        hits.append(friction.low <= STATIC <= friction.high)
+    # 68 % of 60 is known to 6 %: three standard deviations
+    assert 0.5 <= np.mean(hits) <= 0.86
+
+
+def test_friction_has_no_unit(trial: Trial):
+    contact = trial.contact(noise_n=0.02, rng=np.random.default_rng(3))
+    doubled = apply_axes(
+        replace(contact.recorded, force_n=2 * contact.recorded.force_n),
+        replace(contact.axes, noise_n=2 * contact.axes.noise_n),
+    )
+    one, two = (
+        estimate_friction(each, contact_threshold_n=THRESHOLD_N, rng=np.random.default_rng(4))
+        for each in (contact, doubled)
+    )
+    assert (two.mu, two.low, two.onset_s) == pytest.approx((one.mu, one.low, one.onset_s), rel=1e-9)
+
+
+def test_an_uncertain_tare_widens_the_interval(trial: Trial):
+    contact = trial.contact(noise_n=0.02, rng=np.random.default_rng(3))
+    axes = replace(contact.axes, tare_sigma_n=np.full(3, 0.03))
+    sure, unsure = (
+        estimate_friction(each, contact_threshold_n=THRESHOLD_N, rng=np.random.default_rng(4))
+        for each in (contact, apply_axes(contact.recorded, axes))
+    )
+    # 0.03 N of 1.5 N, along the pull and, times mu, across it: 0.023, known from 300 draws to 4 %
+    assert unsure.sigma == pytest.approx(np.hypot(sure.sigma, 0.02 * np.hypot(1, STATIC)), rel=0.2)
+
+
+def knocked(trial: Trial, at_s: float) -> ContactForces:
+    """A jolt at the force sensor that nothing at the fingertip feels."""
+    contact = trial.contact()
+    jolt = np.where(np.abs(trial.time_s - at_s) < 0.05, 0.8, 1.0)
+    force = contact.recorded.force_n * np.stack((np.ones_like(jolt), jolt, jolt), axis=1)
+    return apply_axes(Forces(time_s=trial.time_s, force_n=force, source="sensor"), contact.axes)
+
+
+def test_a_knock_that_the_image_does_not_see_is_no_slip(trial: Trial, rng: np.random.Generator):
+    forces = knocked(trial, 3.8)
+    motion = trial.motion + rng.normal(0, 0.005, len(trial.motion))
+    seen = ImageMotion(time_s=trial.frame_time_s, motion=motion)
+    blind = estimate_friction(forces, contact_threshold_n=THRESHOLD_N, rng=rng)
+    assert blind.onset_s == pytest.approx(3.75, abs=0.01)
+    friction = estimate_friction(forces, contact_threshold_n=THRESHOLD_N, rng=rng, image=seen)
+    assert friction.onset_s == pytest.approx(SLIP_S, abs=0.01)
+    assert friction.method == "break of F_t / F_n, seen in the image"
+    assert friction.image_sigmas > 5
+
+
+def test_a_trial_that_never_slips_is_refused(trial_without_slip: Trial, rng: np.random.Generator):
+    # the pull ends half a second early: 0.6 * 2.5 / 3
+    with pytest.raises(RecordingError, match=r"never slips \(F_t / F_n reaches 0\.50 without .*by hand"):
+        estimate_friction(trial_without_slip.contact(), contact_threshold_n=THRESHOLD_N, rng=rng)
+
+
+def test_too_few_samples_about_the_slip_are_refused(rng: np.random.Generator):
+    time = np.arange(0, 1, 0.2)
+    with pytest.raises(RecordingError, match=r"only 3 samples before the slip at 0\.50 s and 2 after it"):
+        fit_break(time, time, about_s=0.5, rng=rng, draws=10)
+
+
+def test_friction_by_hand_is_exact_unless_an_interval_is_given():
+    assert given_friction(0.5).sigma == 0
+    assert given_friction(0.5, low=0.4, high=0.7).sigma == pytest.approx(0.15)
+    assert given_friction(0.5).found is Found.DECLARED
+
+
+def test_friction_that_cannot_be_is_refused():
+    with pytest.raises(RecordingError, match="the coefficient of friction is 0; give a positive one"):
+        given_friction(0.0)
+    with pytest.raises(RecordingError, match=r"0\.5 lies outside its interval 0\.6 to 0\.7; give low, mu, high"):
+        given_friction(0.5, low=0.6, high=0.7)

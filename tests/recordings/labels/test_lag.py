@@ -1,0 +1,86 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sliplens.errors import RecordingError
+from sliplens.recordings.capture import Forces
+from sliplens.recordings.labels import estimate_lag
+
+from .conftest import Trial
+
+
+def seed() -> np.random.Generator:
+    return np.random.default_rng(1)
+
+
+@pytest.mark.parametrize("lag_s", [-0.1, -0.033, 0.0, 0.007, 0.2])
+def test_lag_comes_back_within_five_milliseconds(trial: Trial, rng: np.random.Generator, lag_s: float):
+    forces = trial.forces(noise_n=0.02, rng=rng, tare_n=(1.0, 2.0, -1.0))
+    motion = trial.motion + rng.normal(0, 0.01, len(trial.motion))
+    lag = estimate_lag(trial.frame_time_s + lag_s, motion, forces, rng=rng)
+    assert lag.lag_s == pytest.approx(lag_s, abs=0.005)
+    assert lag.doubt == ""
+    assert lag.correlation > 0.9
+
+
+def test_lag_knows_neither_tare_nor_sign_nor_order_of_the_axes(trial: Trial):
+    right = estimate_lag(trial.frame_time_s, trial.motion, trial.forces(), rng=seed())
+    turned = trial.forces(tare_n=(3.0, -1.0, 0.5), order=(2, 0, 1), sign=-1)
+    other = estimate_lag(trial.frame_time_s, trial.motion, turned, rng=seed())
+    assert other.lag_s == pytest.approx(right.lag_s, abs=1e-9)
+    assert other.sigma_s == pytest.approx(right.sigma_s, abs=1e-9)
+
+
+def test_a_later_camera_has_so_much_more_lag(trial: Trial, rng: np.random.Generator):
+    forces = trial.forces(noise_n=0.02, rng=rng)
+    first = estimate_lag(trial.frame_time_s, trial.motion, forces, rng=seed())
+    later = estimate_lag(trial.frame_time_s + 0.0125, trial.motion, forces, rng=seed())
+    # the grid of lags does not move along, and the parabola is not the same about another of its points
+    assert later.lag_s - first.lag_s == pytest.approx(0.0125, abs=0.002)
+
+
+def test_frames_need_not_be_evenly_spaced(trial: Trial, rng: np.random.Generator):
+    kept = np.sort(rng.choice(len(trial.frame_time_s), size=120, replace=False))
+    time = trial.frame_time_s[kept]
+    at = np.stack([np.interp(time, trial.time_s, column) for column in trial.contact_n.T], axis=1)
+    motion = np.append(0, np.linalg.norm(np.diff(at, axis=0), axis=1))
+    assert estimate_lag(time + 0.03, motion, trial.forces(), rng=rng).lag_s == pytest.approx(0.03, abs=0.005)
+
+
+def test_the_uncertainty_covers(trial: Trial):
+    hits = []
+    for number in range(40):
+        rng = np.random.default_rng(number)
+        forces = trial.forces(noise_n=0.02, rng=rng)
+        motion = trial.motion + rng.normal(0, 0.03, len(trial.motion))
+        lag = estimate_lag(trial.frame_time_s + 0.02, motion, forces, rng=rng)
+        hits.append(abs(lag.lag_s - 0.02) <= lag.sigma_s)
+    # 68 % of 40 is known to 7 %: two standard deviations, and the bootstrap's own few per cent
+    assert 0.5 <= np.mean(hits) <= 0.9
+
+
+def test_an_image_that_moves_by_itself_tells_no_lag(trial: Trial, rng: np.random.Generator):
+    lag = estimate_lag(trial.frame_time_s, rng.normal(1, 0.1, len(trial.motion)), trial.forces(), rng=rng)
+    assert "image motion and force rate correlate by" in lag.doubt
+
+
+def test_a_lag_beyond_the_longest_tried_is_doubtful(trial: Trial, rng: np.random.Generator):
+    lag = estimate_lag(trial.frame_time_s + 0.1, trial.motion, trial.forces(), rng=rng, longest_s=0.05)
+    assert lag.doubt != ""
+
+
+def test_too_few_frames_are_refused(trial: Trial, rng: np.random.Generator):
+    with pytest.raises(RecordingError, match="48 frames are too few to estimate a lag from, 49 are needed; record"):
+        estimate_lag(trial.frame_time_s[:48], trial.motion[:48], trial.forces(), rng=rng)
+
+
+def test_clocks_of_another_zero_are_refused(trial: Trial, rng: np.random.Generator):
+    forces = replace(trial.forces(), time_s=trial.time_s + 1e9)
+    with pytest.raises(RecordingError, match=r"no lag up to 0.25 s lets the forces of sensor cover the frames; bring"):
+        estimate_lag(trial.frame_time_s, trial.motion, forces, rng=rng)
+
+
+def test_a_sensor_that_reads_one_value_tells_no_lag(trial: Trial, rng: np.random.Generator):
+    still = Forces(time_s=trial.time_s, force_n=np.ones((len(trial.time_s), 3)), source="sensor")
+    assert estimate_lag(trial.frame_time_s, trial.motion, still, rng=rng).doubt != ""

@@ -1,0 +1,177 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sliplens.errors import RecordingError
+from sliplens.recordings import ContactState
+from sliplens.recordings.labels import Labels, Lag, Reason, apply_axes, estimate_friction, given_friction, label_frames
+
+from .conftest import NORMAL_N, PULL_S, SLIP_S, STATIC, TOUCH_S, Trial, ratio
+
+FRICTION = given_friction(STATIC, onset_s=SLIP_S)
+LAG = Lag(lag_s=0.04, sigma_s=0.003, correlation=0.9)
+
+
+def reasons(labels: Labels) -> set[Reason]:
+    return set(labels.reason)
+
+
+def test_the_margin_is_one_less_the_used_friction(trial: Trial):
+    labels = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION)
+    truth = 1 - ratio(trial.frame_time_s) / STATIC
+    # windows lie evenly about their frames, so that only those over a kink of the pull err: by its slope times an
+    # eighth of the window of 33 ms
+    np.testing.assert_allclose(labels.safety_margin[labels.valid], truth[labels.valid], atol=0.0015)
+    np.testing.assert_allclose(labels.stick_ratio, labels.safety_margin ** (2 / 3))
+
+
+def test_frames_keep_their_own_times(trial: Trial, rng: np.random.Generator):
+    time = np.sort(rng.uniform(0.1, 5.4, 80))
+    labels = label_frames(time, trial.contact(), friction=FRICTION, window_s=0.0)
+    np.testing.assert_array_equal(labels.time_s, time)
+    np.testing.assert_allclose(labels.normal_force_n, np.interp(time, trial.time_s, trial.contact_n[:, 0]))
+
+
+def test_every_margin_in_contact_is_that_of_the_friction_that_holds(trial: Trial):
+    labels = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION)
+    contact = ~np.isnan(labels.safety_margin)
+    held = (labels.friction_coefficient * labels.normal_force_n)[contact]
+    used = labels.tangential_force_n[contact] / held
+    np.testing.assert_allclose(labels.safety_margin[contact], 1 - used, atol=1e-9)
+
+
+def test_states_follow_the_grasp(trial: Trial):
+    labels = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION)
+    states = np.array(labels.contact_state)
+    time = trial.frame_time_s
+    assert set(states[time < TOUCH_S]) == {ContactState.NO_CONTACT}
+    assert set(states[(time > TOUCH_S + 0.1) & (time < PULL_S - 0.1)]) == {ContactState.CONTACT}
+    assert set(states[(time > PULL_S + 0.1) & (time < SLIP_S)]) == {ContactState.INCIPIENT_SLIP}
+    assert set(states[time >= SLIP_S]) == {ContactState.FULL_SLIP}
+
+
+def test_after_gross_slip_the_margin_never_returns(trial: Trial):
+    # let go after the slip, and pressed anew: whether that contact sticks cannot be known
+    time = trial.time_s
+    again = trial.contact_n.copy()
+    again[(time > 4.8) & (time < 5.1)] = 0
+    again[time >= 5.1, 1:] = 0
+    contact = replace(trial, contact_n=again).contact()
+    labels = label_frames(trial.frame_time_s, contact, friction=FRICTION)
+    pressed = (trial.frame_time_s >= SLIP_S) & (labels.normal_force_n > 1)
+    assert pressed.sum() > 10
+    assert np.all(labels.safety_margin[pressed] == 0)
+    assert {reason for reason, here in zip(labels.reason, pressed, strict=True) if here} == {Reason.AFTER_GROSS_SLIP}
+    gone = (trial.frame_time_s > 4.85) & (trial.frame_time_s < 5.05)
+    assert np.all(np.isnan(labels.safety_margin[gone]))
+    assert not labels.valid[trial.frame_time_s >= SLIP_S].any()
+
+
+def test_a_frame_is_valid_exactly_where_it_has_no_reason_not_to_be(trial: Trial):
+    labels = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION)
+    assert [reason == Reason.NONE for reason in labels.reason] == labels.valid.tolist()
+    assert reasons(labels) == {Reason.NONE, Reason.NO_CONTACT, Reason.AFTER_GROSS_SLIP}
+    assert sum(labels.count().values()) == len(labels.valid)
+    assert labels.count()["valid"] == labels.valid.sum()
+    assert np.all(np.isnan(labels.safety_margin_sigma[~labels.valid]))
+
+
+def test_frames_without_samples_have_no_label(trial: Trial):
+    forces = trial.forces()
+    kept = (forces.time_s < 3.0) | (forces.time_s > 3.2)
+    kept &= forces.time_s < 5.3
+    thinned = replace(forces, time_s=forces.time_s[kept], force_n=forces.force_n[kept])
+    labels = label_frames(trial.frame_time_s, apply_axes(thinned, trial.contact().axes), friction=FRICTION)
+    time = trial.frame_time_s
+    missing = np.array([reason == Reason.MISSING_SAMPLES for reason in labels.reason])
+    np.testing.assert_array_equal(missing, ((time > 2.998) & (time < 3.202)) | (time > 5.298))
+    assert np.all(np.isnan(labels.safety_margin[missing]))
+    assert np.all(np.isnan(labels.normal_force_n[missing]))
+
+
+def test_forces_outside_the_range_have_no_label(trial: Trial):
+    labels = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION, force_range_n=NORMAL_N - 0.1)
+    assert Reason.OUT_OF_RANGE in reasons(labels)
+    assert np.nanmax(labels.normal_force_n[labels.valid]) < NORMAL_N - 0.1
+    everything = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION, force_range_n=NORMAL_N + 0.1)
+    assert Reason.OUT_OF_RANGE not in reasons(everything)
+
+
+def test_range_is_that_of_the_sensor_not_of_the_contact(trial: Trial):
+    contact = trial.contact()
+    offset = replace(contact.recorded, force_n=contact.recorded.force_n + np.array([5.0, 0, 0]))
+    turned = apply_axes(offset, replace(contact.axes, tare_n=np.array([5.0, 0, 0])))
+    labels = label_frames(trial.frame_time_s, turned, friction=FRICTION, force_range_n=6.0)
+    assert Reason.OUT_OF_RANGE in reasons(labels)
+
+
+def test_a_lag_is_applied_only_when_asked(trial: Trial):
+    plain = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION)
+    known = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION, lag=LAG)
+    applied = label_frames(trial.frame_time_s + 0.04, trial.contact(), friction=FRICTION, lag=LAG, apply_lag=True)
+    np.testing.assert_array_equal(known.safety_margin, plain.safety_margin)
+    np.testing.assert_allclose(applied.safety_margin, plain.safety_margin, atol=1e-9)
+    np.testing.assert_allclose(applied.force_time_s, trial.frame_time_s, atol=1e-12)
+    assert (known.lag_applied, applied.lag_applied) == (False, True)
+
+
+def test_an_unapplied_lag_is_an_error_of_its_size(trial: Trial):
+    known = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION, lag=LAG)
+    pulled = (trial.frame_time_s > PULL_S + 0.2) & (trial.frame_time_s < SLIP_S - 0.2)
+    # without noise the slope of the margin is all that is left: 1 in 3 s
+    expected = np.hypot(LAG.lag_s, LAG.sigma_s) / (SLIP_S - PULL_S)
+    np.testing.assert_allclose(known.safety_margin_sigma[pulled], expected, rtol=1e-6)
+
+
+def test_a_doubtful_lag_is_not_applied(trial: Trial):
+    doubtful = replace(LAG, doubt="several lags fit alike")
+    with pytest.raises(RecordingError, match="the lag cannot be applied: several lags fit alike; give the lag by hand"):
+        label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION, lag=doubtful, apply_lag=True)
+    with pytest.raises(RecordingError, match="the lag cannot be applied: it is not estimated"):
+        label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION, apply_lag=True)
+
+
+def test_friction_moves_the_margin_by_its_share(trial: Trial):
+    friction = given_friction(STATIC, low=0.95 * STATIC, high=1.05 * STATIC, onset_s=SLIP_S)
+    labels = label_frames(trial.frame_time_s, trial.contact(), friction=friction)
+    valid = labels.valid
+    np.testing.assert_allclose(labels.safety_margin_sigma[valid], 0.05 * (1 - labels.safety_margin[valid]), atol=1e-6)
+
+
+def test_drifting_friction_is_known_best_at_the_slip(trial: Trial):
+    labels = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION, friction_change=0.15)
+    late = labels.valid & (trial.frame_time_s > SLIP_S - 0.1)
+    middle = labels.valid & (np.abs(trial.frame_time_s - 2.5) < 0.1)
+    # two thirds of the pull are used up at the end, one at 2.5 s: where the friction may have changed most of its way
+    assert labels.safety_margin_sigma[late].max() < labels.safety_margin_sigma[middle].min()
+
+
+def test_the_band_of_the_margin_covers(trial: Trial):
+    truth = 1 - ratio(trial.frame_time_s) / STATIC
+    shares = []
+    for number in range(20):
+        rng = np.random.default_rng(number)
+        contact = trial.contact(noise_n=0.03, rng=rng)
+        friction = estimate_friction(contact, contact_threshold_n=0.1, rng=rng)
+        labels = label_frames(trial.frame_time_s, contact, friction=friction)
+        used = labels.valid & (truth < 0.9)  # at 1 the margin cannot err upwards
+        shares.append(np.mean(np.abs(labels.safety_margin - truth)[used] <= labels.safety_margin_sigma[used]))
+    assert 0.6 <= np.mean(shares) <= 0.76
+
+
+def test_without_an_onset_slip_begins_outside_the_friction_cone(trial: Trial):
+    labels = label_frames(trial.frame_time_s, trial.contact(), friction=given_friction(0.4))
+    # the ratio reaches 0.4 after two thirds of the pull; the next frame is outside
+    assert labels.slip_s == pytest.approx(PULL_S + 2 / 3 * (SLIP_S - PULL_S), abs=0.04)
+    assert not labels.valid[trial.frame_time_s > labels.slip_s].any()
+
+
+def test_a_contact_that_holds_is_valid_to_the_end(trial_without_slip: Trial):
+    labels = label_frames(
+        trial_without_slip.frame_time_s, trial_without_slip.contact(), friction=given_friction(STATIC)
+    )
+    assert labels.slip_s is None
+    assert labels.valid[trial_without_slip.frame_time_s > TOUCH_S + 0.1].all()
+    # pulled to five sixths
+    assert labels.safety_margin[-1] == pytest.approx(1 / 6, abs=1e-3)

@@ -1,0 +1,93 @@
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from sliplens.errors import RecordingError
+from sliplens.recordings.labels import choose_reference
+
+SIZE = 84
+
+
+class Film:
+    """Untouched at both ends, touched between; a hand shakes the first frames, the touch leaves its rim in one."""
+
+    def __init__(self, *, drift: int = 0) -> None:
+        rng = np.random.default_rng(5)
+        skin = np.kron(rng.integers(60, 120, (28, 28, 1)), np.ones((3, 3, 3))).astype(np.float64)
+        self.untouched = np.array([True] * 8 + [False] * 6 + [True] * 6)
+        self.frames = np.empty((20, SIZE, SIZE, 3), dtype=np.uint8)
+        for index in range(20):
+            image = skin + rng.normal(0, 2, skin.shape)
+            if index < 2:
+                image = np.roll(image, 6 * (index + 1), axis=1)
+            if index in range(6, 14):
+                image[20 : 20 + 4 * (index - 4), 30:40] += 60
+            if index == 3:
+                image += 12  # a flicker of the lamp
+            if index >= 14:
+                image += drift
+            self.frames[index] = image.round().clip(0, 255)
+
+    def read(self) -> Iterator[np.ndarray]:
+        return iter(self.frames)
+
+
+def test_the_least_energy_is_neither_shaken_nor_touched():
+    film = Film()
+    reference = choose_reference(film.read, film.untouched)
+    assert reference.index in {2, 3, 4, 5}
+    assert reference.method == "least contact energy"
+    np.testing.assert_array_equal(reference.image, film.frames[reference.index])
+
+
+def test_brightness_alone_is_no_contact():
+    film = Film()
+    flicker, plain, touched = (
+        choose_reference(film.read, film.untouched, index=index).contact_energy for index in (3, 4, 12)
+    )
+    # the flickering frame is never the median of eight, and so stays further from it by its own noise, sqrt(9 / 7)
+    assert flicker == pytest.approx(plain, rel=0.3)
+    assert touched > 2 * plain
+
+
+def test_the_first_still_frame_is_after_the_hand_has_gone():
+    film = Film()
+    assert choose_reference(film.read, film.untouched, method="first still").index in {2, 4, 5}
+
+
+def test_a_named_frame_is_taken_even_if_it_touches():
+    film = Film()
+    reference = choose_reference(film.read, film.untouched, index=10)
+    assert (reference.index, reference.method) == (10, "named")
+
+
+@pytest.mark.parametrize("drift", [0, 5, -9])
+def test_drift_is_measured_in_grey_levels(drift: int):
+    film = Film(drift=drift)
+    # what the shaken, flickering and touched frames leave in medians of six, and the noise of 9 pixels a block
+    reference = choose_reference(film.read, film.untouched & (np.arange(20) > 1))
+    assert reference.drift == pytest.approx(abs(drift), abs=1.2)
+    assert reference.drift_span == (2, 19)
+
+
+def test_a_recording_that_begins_pressed_has_its_reference_after_that():
+    film = Film()
+    film.untouched[:8] = False
+    assert choose_reference(film.read, film.untouched).index >= 14
+
+
+def test_no_untouched_frame_is_refused():
+    film = Film()
+    film.untouched[:] = False
+    with pytest.raises(RecordingError, match="no frame is known to be untouched; name the reference frame by hand"):
+        choose_reference(film.read, film.untouched)
+    assert choose_reference(film.read, film.untouched, index=0).index == 0
+
+
+def test_a_frame_or_method_that_is_not_there_is_refused():
+    film = Film()
+    with pytest.raises(RecordingError, match="the reference is frame 20 of 20; name one from 0 on"):
+        choose_reference(film.read, film.untouched, index=20)
+    with pytest.raises(RecordingError, match="cannot be chosen by 'best'; choose least contact energy or first still"):
+        choose_reference(film.read, film.untouched, method="best")
