@@ -47,6 +47,9 @@ def test_a_trial_of_many_chunks_comes_back_whole(tmp_path: Path, recording: Reco
     np.testing.assert_array_equal(back.frames, long.frames)
     np.testing.assert_array_equal(back.time_s, long.time_s)
     np.testing.assert_array_equal(pq.read_table(tmp_path / "a.parquet")["frame"].to_numpy(), np.arange(count))
+    some = load_recording(tmp_path / "a.parquet", every=7)
+    np.testing.assert_array_equal(some.frames, long.frames[::7])
+    np.testing.assert_array_equal(some.time_s, long.time_s[::7])
 
 
 def test_one_value_a_frame_is_asked_for(recording: Recording):

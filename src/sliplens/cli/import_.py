@@ -11,6 +11,8 @@ from sliplens.cli.console import OUT, print_table, progress_bar, say, unchanged,
 from sliplens.errors import InputError, RecordingError
 from sliplens.provenance import output_folder, write_json
 
+_AUDITED_FRAMES = 800
+
 if TYPE_CHECKING:
     from sliplens.recordings.capture import Capture
     from sliplens.recordings.importing import ImportedTrial
@@ -80,6 +82,8 @@ class Import:
     """How to choose the untouched frame among those before the contact."""
     reference_frame: int | None = None
     """Number of the untouched frame, by hand."""
+    audit: bool = True
+    """Draw a page for each trial, in `audit/` of the folder, from which to judge its labels."""
     seed: int = 0
     """Seed of the bootstraps behind the uncertainties."""
     overwrite: bool = False
@@ -112,6 +116,8 @@ class Import:
             say(f"  {capture.name}: frames without a valid label: {told}")
         frames = sum(len(capture.frame_time_s) for capture, _ in imported)
         wrote(self.output, f"{len(imported)} trials, {frames:,} frames")
+        if self.audit:
+            wrote(self.output / "audit", "a page a trial: look at them before you train")
 
     def _open(self) -> "list[Capture]":
         from sliplens.recordings.readers import ReadOptions, open_captures
@@ -190,10 +196,22 @@ class Import:
                 done += len(capture.frame_time_s)
                 imported.append((capture, trial))
                 table.append(trial_info(path, split=split))
+                if self.audit:
+                    _draw_audit(path, folder / "audit" / f"{capture.name}.png", frames=len(capture.frame_time_s))
         if not table:
             raise RecordingError("there is no trial to import; name a recording")
         write_dataset_table(folder, table)
         return imported
+
+
+def _draw_audit(trial: Path, picture: Path, *, frames: int) -> None:
+    from sliplens.recordings.headers import read_labelling
+    from sliplens.recordings.store import load_recording
+    from sliplens.report.audit import write_audit
+
+    # a page shows no more than this of a long trial, and memory stays small
+    recording = load_recording(trial, every=max(1, frames // _AUDITED_FRAMES))
+    write_audit(recording, read_labelling(trial) or {}, picture)
 
 
 def _fingerprint(path: Path) -> list[object]:

@@ -107,7 +107,7 @@ def _chunks(items: Iterable[Any], size: int) -> Iterator[list[Any]]:
         yield chunk
 
 
-def load_recording(path: Path, *, truth: bool = True) -> Recording:
+def load_recording(path: Path, *, truth: bool = True, every: int = 1) -> Recording:
     """Read a trial written by `save_recording`.
 
     Parameters
@@ -116,6 +116,8 @@ def load_recording(path: Path, *, truth: bool = True) -> Recording:
         The Parquet file.
     truth
         Read a simulated trial's ground truth too; training does without it.
+    every
+        Read every so many frames only, from the first on: a look at a long trial.
 
     Raises
     ------
@@ -127,7 +129,7 @@ def load_recording(path: Path, *, truth: bool = True) -> Recording:
     try:
         stored = pq.read_schema(path)
         wanted = None if truth else [name for name in stored.names if name not in _TRUTH_COLUMNS]
-        table = pq.read_table(path, columns=wanted)
+        table = pq.read_table(path, columns=wanted) if every == 1 else _read_some(path, wanted, every)
     except FileNotFoundError:
         raise RecordingError(f"{path} does not exist; make the data set again") from None
     except (pa.ArrowInvalid, OSError) as error:
@@ -159,6 +161,17 @@ def load_recording(path: Path, *, truth: bool = True) -> Recording:
         else None,
         **{name: table.column(name).to_numpy().astype(np.float64) for name in SIGNALS},
     )
+
+
+def _read_some(path: Path, columns: list[str] | None, every: int) -> pa.Table:
+    """Rows of a trial, one row group in memory at a time."""
+    file = pq.ParquetFile(path)
+    parts, first = [file.schema_arrow.empty_table().select(columns or file.schema_arrow.names)], 0
+    for group in range(file.num_row_groups):
+        rows = file.read_row_group(group, columns=columns)
+        parts.append(rows.take(np.arange(-first % every, rows.num_rows, every)))
+        first += rows.num_rows
+    return pa.concat_tables(parts)
 
 
 def _read_truth(table: pa.Table, description: dict[str, Any], size: tuple[int, ...], path: Path) -> GroundTruth:

@@ -1,5 +1,6 @@
 """The report of a workspace: figures, tables and one page, from saved results only."""
 
+from sliplens.report.audit import draw_audit, write_audit
 from sliplens.report.contact_sheet import draw_contact_sheet, write_contact_sheet
 from sliplens.report.figures import (
     plot_bins,
@@ -16,6 +17,7 @@ from sliplens.report.results import load_results
 __all__ = [
     "Results",
     "build_report",
+    "draw_audit",
     "draw_contact_sheet",
     "load_results",
     "overlay_saliency",
@@ -26,5 +28,6 @@ __all__ = [
     "plot_margin_over_time",
     "plot_overlay",
     "plot_predictions",
+    "write_audit",
     "write_contact_sheet",
 ]

@@ -1,10 +1,8 @@
 """Contact sheet: what trials look like from the untouched sensor to full slip, on one picture."""
 
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from textwrap import fill
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -17,6 +15,7 @@ from sliplens.errors import InputError
 from sliplens.images import absolute_difference
 from sliplens.recordings import ContactState, Recording
 from sliplens.recordings.truth import OUTSIDE, STICKS
+from sliplens.report.pages import place_axes, place_text, require_picture_path, save_page
 from sliplens.report.panels import NOMINAL_MARGINS
 from sliplens.report.style import BLACK, GREY, SKY, decimals, drawing_style, percent
 from sliplens.report.trial_charts import (
@@ -32,7 +31,6 @@ from sliplens.report.trial_charts import (
 
 _REACHED_WITHIN = 0.1 - 1e-9  # half the distance between two columns: no frame stands in both
 _ALIKE = 0.005  # margins that whole percents do not tell apart
-_METADATA: dict[str, dict[str, Any]] = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 
 # inches, from left to right: what is told of the trial, the pictures, the charts
 _WIDTH, _EDGE, _INFO, _GAP, _AXIS, _CHART = 16.0, 0.2, 1.9, 0.07, 0.62, 2.9
@@ -74,7 +72,7 @@ def draw_contact_sheet(recordings: Sequence[Recording], *, title: str | None = N
     with drawing_style():
         figure = Figure(figsize=(_WIDTH, top + sum(bands) + _LEGEND))
         if title is not None:
-            _write(figure, _EDGE, 0.16, title, fontsize=14, fontweight="bold", parse_math=False)
+            place_text(figure, _EDGE, 0.16, title, fontsize=14, fontweight="bold", parse_math=False)
         for recording, row, height, band in zip(recordings, rows, heights, bands, strict=True):
             _draw_pictures(figure, recording, row, top=top + _HEAD, height=height, factor=factor)
             chosen = [at for at in row[1:] if at is not None]
@@ -101,22 +99,8 @@ def write_contact_sheet(recordings: Sequence[Recording], path: Path, *, title: s
     InputError
         If there is no trial, the suffix is another one, or the file cannot be written.
     """
-    suffix = path.suffix.lower()
-    if suffix not in _METADATA:
-        raise InputError(f"{path} does not end in {', '.join(_METADATA)}; name a picture, such as preview.png")
-    figure = draw_contact_sheet(recordings, title=title)
-    part = path.with_name(f".{path.name}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with drawing_style():
-            # 150 dots an inch show frames of 224 pixels about pixel for pixel; no date: the same trials, the same file
-            figure.savefig(part, format=suffix[1:], dpi=150, metadata=_METADATA[suffix])
-        part.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot write {path} ({error.strerror}); choose another file") from None
-    finally:
-        with suppress(OSError):  # it has its name by now, or could not be made
-            part.unlink()
+    require_picture_path(path, example="preview.png")
+    save_page(draw_contact_sheet(recordings, title=title), path)
 
 
 def choose_margins(recording: Recording) -> list[int | None]:
@@ -153,10 +137,10 @@ def _draw_pictures(
     left, second = _EDGE + _INFO, top + height + _GAP
     for text, middle in (("camera", top + height / 2), (f"difference\n{TIMES} {factor:g}", second + height / 2)):
         turned = {"rotation": 90, "ha": "right", "va": "center", "multialignment": "center"}
-        _write(figure, left - 0.06, middle, text, fontsize=8.5, color=GREY, **turned)
+        place_text(figure, left - 0.06, middle, text, fontsize=8.5, color=GREY, **turned)
     for column, index in enumerate(row):
         x = left + column * (_PICTURE + _GAP)
-        camera, below = (_axes(figure, x, y, _PICTURE, height) for y in (top, second))
+        camera, below = (place_axes(figure, x, y, _PICTURE, height) for y in (top, second))
         for ax in (camera, below):
             ax.set(xticks=[], yticks=[])
             ax.spines[:].set_visible(False)
@@ -173,7 +157,7 @@ def _draw_pictures(
         name = f"Γ {percent(float(recording.safety_margin[index]))}" if index is not None and column else "untouched"
         told = "reference" if index is None else f"{recording.time_s[index]:.1f} s, {recording.contact_state[index]}"
         for words, up, settings in ((name, 0.2, {"weight": "bold"}), (told, 0.05, {"fontsize": 8, "color": GREY})):
-            _write(figure, x + _PICTURE / 2, top - up, words, ha="center", va="bottom", **settings)
+            place_text(figure, x + _PICTURE / 2, top - up, words, ha="center", va="bottom", **settings)
 
 
 def _plot_outlines(contact: UInt8[np.ndarray, "height width"], *, ax: Axes) -> None:
@@ -187,9 +171,9 @@ def _plot_outlines(contact: UInt8[np.ndarray, "height width"], *, ax: Axes) -> N
 
 def _draw_charts(figure: Figure, recording: Recording, marked: list[int], *, top: float, height: float) -> None:
     left, tall, gap = _WIDTH - _EDGE - _CHART, 0.56 * height, 0.1
-    forces = plot_forces(recording, ax=_axes(figure, left, top, _CHART, tall))
+    forces = plot_forces(recording, ax=place_axes(figure, left, top, _CHART, tall))
     forces.tick_params(labelbottom=False)
-    margin = plot_margin(recording, ax=_axes(figure, left, top + tall + gap, _CHART, height - tall - gap))
+    margin = plot_margin(recording, ax=place_axes(figure, left, top + tall + gap, _CHART, height - tall - gap))
     for ax in (forces, margin):
         for time_s in recording.time_s[marked]:
             ax.axvline(time_s, color=BLACK, linewidth=0.7, alpha=0.45, zorder=1)
@@ -200,15 +184,15 @@ def _draw_charts(figure: Figure, recording: Recording, marked: list[int], *, top
 def _tell_trial(figure: Figure, recording: Recording, chosen: list[int], *, top: float) -> None:
     # whoever names a trial may write a dollar sign, which begins no formula here
     name = fill(recording.trial, 17, max_lines=3, placeholder="…")
-    _write(figure, _EDGE, top, name, fontsize=10, fontweight="bold", parse_math=False)
+    place_text(figure, _EDGE, top, name, fontsize=10, fontweight="bold", parse_math=False)
     top += 0.19 * len(name.splitlines()) + 0.05
     facts = (f"{recording.condition}, day {recording.day}", recording.sensor)
     length = f"{len(recording)} frames in {np.ptp(recording.time_s):.1f} s"
     told = "\n".join(fill(fact, 20, max_lines=2, placeholder="…") for fact in (*facts, length))
-    _write(figure, _EDGE, top, told, fontsize=9.5, linespacing=1.5, parse_math=False)
+    place_text(figure, _EDGE, top, told, fontsize=9.5, linespacing=1.5, parse_math=False)
     top += 0.205 * len(told.splitlines()) + 0.08
     force, friction = recording.normal_force_n[chosen], recording.friction_coefficient[chosen]
-    _write(figure, _EDGE, top, f"$F_n$ {_range(force)} N\n$\\mu$ {_range(friction)}", fontsize=9.5, linespacing=1.5)
+    place_text(figure, _EDGE, top, f"$F_n$ {_range(force)} N\n$\\mu$ {_range(friction)}", fontsize=9.5, linespacing=1.5)
 
 
 def _range(values: Float[np.ndarray, " frames"]) -> str:
@@ -223,19 +207,9 @@ def _explain(figure: Figure, recordings: Sequence[Recording], factor: float) -> 
         "ranges of their $F_n$ and $\\mu$. Differences are $|T_n - T_0|$ against the untouched sensor, brightened "
         f"{TIMES} {factor:g}: one factor for the whole sheet, so pictures compare."
     )
-    _write(figure, _EDGE, bottom - 0.65, words, fontsize=9)
+    place_text(figure, _EDGE, bottom - 0.65, words, fontsize=9)
     mark = Line2D([], [], color=BLACK, linewidth=0.7, marker="o", markersize=5, label="frame shown")
     tints = [(state, {"color": colour, "alpha": STATE_TINTS[state]}) for state, colour in STATE_COLOURS.items()]
     states = [Patch(linewidth=0, label=str(state), **tint) for state, tint in tints]
     place = {"loc": "lower left", "bbox_to_anchor": (_EDGE / _WIDTH, 0.1 / bottom), "borderaxespad": 0, "borderpad": 0}
     figure.legend(handles=[*outline_handles(recordings), mark, *states], ncols=7, **place)
-
-
-def _axes(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
-    across, down = figure.get_size_inches()
-    return figure.add_axes((left / across, 1 - (top + height) / down, width / across, height / down))
-
-
-def _write(figure: Figure, left: float, top: float, text: str, **settings: Any) -> None:
-    across, down = figure.get_size_inches()
-    figure.text(left / across, 1 - top / down, text, **{"va": "top", **settings})

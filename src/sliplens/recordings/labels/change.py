@@ -10,10 +10,10 @@ from sliplens.errors import RecordingError
 
 _REACH_S = 0.08
 """How far the break may lie from the rough guess."""
-_TRIES = 81
+_TRIES = 41
 """Breaks tried over that reach."""
-_FALLS_S = (0.005, 0.01, 0.02, 0.04, 0.08)
-"""Lengths of the fall that are tried: each twice the one before, from a sudden drop to that of a soft fingertip."""
+_FALLS_S = (0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056, 0.08)
+"""Lengths of the fall that are tried, from a sudden drop to that of a soft fingertip."""
 _LEAST_BEFORE, _LEAST_AFTER = 6, 3
 """Samples that the two sides of a break need."""
 _PARAMETERS = 7

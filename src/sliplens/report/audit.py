@@ -1,0 +1,213 @@
+"""Audit of an imported trial: one page that shows what its labels rest on."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from textwrap import wrap
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from sliplens.images import absolute_difference
+from sliplens.recordings import ContactState, Recording
+from sliplens.report.audit_charts import plot_contact_forces, plot_force_ratio, plot_labels
+from sliplens.report.audit_facts import audit_facts
+from sliplens.report.contact_sheet import choose_margins
+from sliplens.report.pages import place_axes, place_text, require_picture_path, save_page
+from sliplens.report.style import BLACK, GREY, SKY, VERMILLION, drawing_style
+from sliplens.report.trial_charts import STATE_COLOURS, STATE_TINTS, TIMES, brighten, brightening
+
+_SHARES = (0, 1, 0.25, 0.5, 0.75)  # of the way from full stick to the slip; its ends first
+_EVEN = 0.05  # frames of like margins are spread over time: for that, a margin may be off by so much
+_ONSET = "slip", r"as the camera sees it (lag $\pm\,\sigma$)"
+# inches; from left to right: what is told, then charts above pictures
+_WIDTH, _HEIGHT, _EDGE, _LEFT, _GAP = 12.0, 9.0, 0.2, 3.75, 0.07
+_SPAN = _WIDTH - _LEFT - _EDGE
+_PICTURE = (_SPAN + _GAP) / (1 + len(_SHARES)) - _GAP
+# from top to bottom
+_TOP, _LEGEND, _TICKS, _LEADER, _HEAD, _FOOT, _PICTURE_HEIGHT = 0.78, 0.25, 0.22, 0.26, 0.52, 0.36, (0.6, 1.36)
+_LINE, _WRAP = 0.145, 43  # height of a line of facts, and its characters
+
+
+def draw_audit(recording: Recording, labelling: Mapping[str, Any]) -> Figure:
+    """Draw a page from which to judge whether the labels of an imported trial can be defended.
+
+    Forces, their ratio beside the static friction, and the safety margin with its uncertainty, on the camera's clock;
+    beneath them the reference and five frames from full stick down to the slip, each with its absolute difference; at
+    the left what was declared, found and assumed.
+
+    Parameters
+    ----------
+    recording
+        The trial.
+    labelling
+        What its labels rest on, as `import_trial` keeps it; what is not known is None.
+    """
+    height = float(np.clip(_PICTURE * recording.reference.shape[0] / recording.reference.shape[1], *_PICTURE_HEIGHT))
+    top = _HEIGHT - _FOOT - 2 * height - _GAP
+    with drawing_style():
+        figure = Figure(figsize=(_WIDTH, _HEIGHT))
+        charts = _draw_charts(figure, recording, labelling, bottom=top - _HEAD - _LEADER - _TICKS)
+        places = [labelling["reference"]["index"], *choose_along(recording)]
+        _draw_pictures(figure, recording, places, top=top, height=height)
+        for column, time_s in enumerate(recording.time_s[places]):
+            middle = (_LEFT + column * (_PICTURE + _GAP) + _PICTURE / 2) / _WIDTH
+            _lead(figure, charts, float(time_s), middle, top=top - _HEAD - _LEADER)
+        _tell(figure, recording, labelling)
+    return figure
+
+
+def write_audit(recording: Recording, labelling: Mapping[str, Any], path: Path) -> None:
+    """Save the audit of a trial as .png, .pdf or .svg; it appears when complete.
+
+    Parameters
+    ----------
+    recording, labelling
+        As `draw_audit` takes them.
+    path
+        File to write.
+
+    Raises
+    ------
+    InputError
+        If the suffix is another one, or the file cannot be written.
+    """
+    require_picture_path(path, example="audit.png")
+    save_page(draw_audit(recording, labelling), path)
+
+
+def choose_along(recording: Recording) -> list[int]:
+    """Five different frames in the order of time, or all if there are fewer, evenly spaced in their margins.
+
+    They begin at full stick, pressed hardest, and end in full slip; a trial without begins at its first label, or ends
+    at its least margin.
+    """
+    margins, margin = choose_margins(recording), np.nan_to_num(recording.safety_margin)
+    allowed = recording.labelled.copy()
+    places = np.flatnonzero(allowed) if allowed.any() else np.arange(len(recording))
+    begin = int(places[0]) if margins[0] is None else margins[0]
+    end = int(places[np.argmin(margin[places])]) if margins[-1] is None else margins[-1]
+    allowed[[begin, end]] = True
+    free, way = np.ones(len(recording), dtype=bool), end - begin
+    for share in _SHARES[: len(recording)]:
+        wanted = margin[begin] + share * (margin[end] - margin[begin])
+        late = np.abs(np.arange(len(recording)) - (begin + share * way)) / max(abs(way), 1)
+        cost = np.abs(margin - wanted) + _EVEN * late + np.where(allowed, 0, 1)
+        free[np.argmin(np.where(free, cost, np.inf))] = False
+    return [int(at) for at in np.flatnonzero(~free)]
+
+
+def _draw_charts(figure: Figure, recording: Recording, labelling: Mapping[str, Any], *, bottom: float) -> list[Axes]:
+    height = (bottom - _TOP) / 3 - _LEGEND
+    tops = [_TOP + row * (height + _LEGEND) + _LEGEND for row in range(3)]
+    charts = [place_axes(figure, _LEFT, top, _SPAN, height) for top in tops]
+    plot_contact_forces(recording, labelling["contact_threshold_n"], ax=charts[0])
+    plot_force_ratio(recording, labelling["friction"], ax=charts[1])
+    plot_labels(recording, ax=charts[2])
+    lag = labelling["lag"]
+    shift = (lag["lag_s"] or 0.0) if lag and labelling["lag_applied"] else 0.0
+    shades = [(str(state), colour, STATE_TINTS[state]) for state, colour in STATE_COLOURS.items()]
+    tints = [Patch(color=colour, alpha=tint, linewidth=0, label=name) for name, colour, tint in shades]
+    for ax in charts:
+        if labelling["slip_s"] is not None:
+            slip_s = labelling["slip_s"] + shift
+            ax.axvline(slip_s, color=BLACK, linestyle="-.", linewidth=1.3, label=f"{_ONSET[0]} at {slip_s:.2f} s")
+            if lag is not None and not lag["doubt"] and None not in (lag["lag_s"], lag["sigma_s"]):
+                seen = labelling["slip_s"] + lag["lag_s"] + np.array([-1, 1]) * lag["sigma_s"]
+                ax.axvspan(*seen, color=SKY, alpha=0.6, linewidth=0, label=_ONSET[1], zorder=0)
+        place = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.1, "borderpad": 0}
+        handles, names = ax.get_legend_handles_labels()
+        if ax is not charts[1]:  # what stands in all of them is told once
+            handles = [one for one, name in zip(handles, names, strict=True) if not name.startswith(_ONSET)]
+        handles += tints if ax is charts[2] else []
+        ax.legend(
+            handles=handles, ncols=9, columnspacing=1.1, handlelength=1.9, handletextpad=0.5, fontsize=8.5, **place
+        )
+        ax.tick_params(labelbottom=ax is charts[-1], labelsize=8.5)
+        ax.xaxis.set_major_formatter("{x:g} s")
+        ax.yaxis.set_label_coords(-0.058, 0.5)
+        ax.sharex(charts[0])
+    return charts
+
+
+def _lead(figure: Figure, charts: list[Axes], time_s: float, middle: float, *, top: float) -> None:
+    """Mark on the charts when a frame was taken, and lead from there to its picture."""
+    for ax in charts:
+        ax.axvline(time_s, color=BLACK, linewidth=0.7, alpha=0.45, zorder=1, label="_frame")
+    low, high = charts[-1].get_xlim()
+    from_x = (_LEFT + _SPAN * (time_s - low) / (high - low)) / _WIDTH
+    ends = [1 - top / _HEIGHT, 1 - (top + _LEADER - 0.04) / _HEIGHT]
+    figure.add_artist(Line2D([from_x, middle], ends, color=BLACK, linewidth=0.7, alpha=0.45))
+
+
+def _draw_pictures(figure: Figure, recording: Recording, places: list[int], *, top: float, height: float) -> None:
+    reference, second = recording.reference, top + height + _GAP
+    free = [at for at, state in enumerate(recording.contact_state) if state == ContactState.NO_CONTACT]
+    # the reference less itself would tell nothing, an untouched frame long before or after it tells how it drifts
+    far = max(free, key=lambda at: abs(at - places[0]), default=places[0])
+    frames = [reference, *recording.frames[places[1:]]]
+    differences = absolute_difference(recording.frames[[far, *places[1:]]], reference)
+    factor = brightening([differences])
+    for text, middle in (("camera", top + height / 2), (f"difference\n{TIMES} {factor:g}", second + height / 2)):
+        turned = {"rotation": 90, "ha": "right", "va": "center", "multialignment": "center"}
+        place_text(figure, _LEFT - 0.06, middle, text, fontsize=8.5, color=GREY, **turned)
+    for column, (at, frame, difference) in enumerate(zip(places, frames, differences, strict=True)):
+        x = _LEFT + column * (_PICTURE + _GAP)
+        state = recording.contact_state[at]
+        for y, picture in ((top, frame), (second, brighten(difference, factor))):
+            ax = place_axes(figure, x, y, _PICTURE, height)
+            ax.imshow(picture)
+            ax.set(xticks=[], yticks=[])
+            ax.spines[:].set(visible=True, color=STATE_COLOURS[state], linewidth=2)
+        told = _margin(recording, at) if column else "reference"
+        apart = "" if recording.labelled[at] or not column else ", not valid"
+        lines = (
+            (told, 0.37, "bold"),
+            (f"{recording.time_s[at]:.2f} s", 0.21, "normal"),
+            (state + apart, 0.06, "normal"),
+        )
+        for text, up, weight in lines:
+            place_text(figure, x + _PICTURE / 2, top - up, text, ha="center", va="bottom", fontsize=8, weight=weight)
+    words = f"Differences are $|T_n - T_0|$, brightened {TIMES} {factor:g}"
+    if free:
+        untouched = f"that of the untouched frame at {recording.time_s[far]:.2f} s"
+        words += f"; beneath the reference {untouched}: it should be dark"
+    place_text(figure, _LEFT, _HEIGHT - _FOOT + 0.08, words, fontsize=8, color=GREY)
+
+
+def _margin(recording: Recording, at: int) -> str:
+    margin, sigma = float(recording.safety_margin[at]), recording.safety_margin_sigma
+    if not np.isfinite(margin):
+        return "no Γ"
+    band = "" if sigma is None or not np.isfinite(sigma[at]) else f" ± {100 * sigma[at]:.1f}"
+    return f"Γ {100 * margin:.0f}{band} %"
+
+
+def _tell(figure: Figure, recording: Recording, labelling: Mapping[str, Any]) -> None:
+    # whoever names a trial may write a dollar sign, which begins no formula here
+    plain = {"parse_math": False}
+    place_text(figure, _EDGE, 0.17, _cut(recording.trial, 75), fontsize=14, fontweight="bold", **plain)
+    about = f"{_cut(recording.sensor, 30)}, day {recording.day}, {_cut(recording.condition, 20)}"
+    sources = [_cut(str(labelling[name]), 50) for name in ("source", "forces") if labelling[name]]
+    place_text(figure, _EDGE, 0.47, "   ·   ".join([about, *sources]), fontsize=9, color=GREY, **plain)
+    top = _TOP + 0.05
+    facts = audit_facts(recording, labelling)
+    if any(fact.doubtful for fact in facts):
+        place_text(figure, _EDGE, _HEIGHT - _FOOT + 0.08, "▲ may put the labels in doubt", fontsize=8, color=VERMILLION)
+    for fact in facts:
+        lines = [line for words in fact.words for line in wrap(words, _WRAP, subsequent_indent=fact.indent)]
+        room = max(1, int((_HEIGHT - _FOOT - top) / _LINE - 1.15))
+        lines = lines if len(lines) <= room else [*lines[: room - 1], "…"]
+        colour, mark = (VERMILLION, "▲ ") if fact.doubtful else (BLACK, "")
+        place_text(figure, _EDGE, top, mark + fact.head, fontsize=9, fontweight="bold", color=colour)
+        for row, line in enumerate(lines):
+            place_text(figure, _EDGE, top + (row + 1.15) * _LINE, line, fontsize=8, **plain)
+        top += (len(lines) + 1.8) * _LINE
+
+
+def _cut(words: str, most: int) -> str:
+    """Leave out the middle of what is too long: of a path, or of numbered trials, the end tells most."""
+    return words if len(words) <= most else f"{words[: most // 3]}…{words[most // 3 + 1 - most :]}"
