@@ -68,6 +68,9 @@ class Import:
     """Feature of a LeRobot data set with the forces."""
     mu: float | None = None
     """Static coefficient of friction, if you know it; estimated at the onset of slip otherwise."""
+    friction_change: float = 0.0
+    """Relative standard deviation by which friction may change from touch to slip; on wet objects some 0.1 to 0.2. It
+    widens the uncertainty."""
     apply_lag: bool = False
     """Shift the forces by the lag that was found between camera and force sensor; it is always shown."""
     normal_axis: Literal["x", "y", "z"] | None = None
@@ -164,6 +167,7 @@ class Import:
             normal=self.normal_axis,
             sign=self.normal_sign,
             friction=None if self.mu is None else given_friction(self.mu),
+            friction_change=self.friction_change,
             apply_lag=self.apply_lag,
             contact_threshold_n=self.contact_threshold,
             force_range_n=self.force_range,

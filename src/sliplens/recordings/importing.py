@@ -11,8 +11,15 @@ from jaxtyping import UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.labels import Labels, LabelSettings, Reference, choose_reference, label_trial, measure_motion
-from sliplens.recordings.recording import ContactState
+from sliplens.recordings.labels import (
+    Labels,
+    LabelSettings,
+    Reason,
+    Reference,
+    choose_reference,
+    label_trial,
+    measure_motion,
+)
 from sliplens.recordings.store import encode_frames, write_trial
 
 
@@ -82,7 +89,7 @@ def import_trial(
     motion = measure_motion(_exactly(capture, count))
     try:
         labels = label_trial(capture.frame_time_s, motion, capture.forces, settings=settings, rng=rng)
-        untouched = np.array([state is ContactState.NO_CONTACT for state in labels.contact_state])
+        untouched = np.array([reason is Reason.NO_CONTACT for reason in labels.reason])
         reference = choose_reference(capture.read_frames, untouched, index=reference_index, method=reference_method)
     except RecordingError as error:
         raise RecordingError(f"{capture.source}: {error}") from None
@@ -104,7 +111,7 @@ def import_trial(
         "sensor": about.sensor,
         "day": str(about.day),
         "condition": about.condition,
-        "labelling": json.dumps(_told(capture, labels, reference), allow_nan=False),
+        "labelling": json.dumps(_told(capture, labels, reference, settings), allow_nan=False),
     }
     write_trial(
         path, _counted(encode_frames(_exactly(capture, count)), count, on_frames), columns, description,
@@ -139,7 +146,7 @@ def _counted(
             on_frames(done, count)
 
 
-def _told(capture: Capture, labels: Labels, reference: Reference) -> dict[str, Any]:
+def _told(capture: Capture, labels: Labels, reference: Reference, settings: LabelSettings) -> dict[str, Any]:
     """All that the labels rest on, as JSON can hold it."""
     told = {
         "source": capture.source,
@@ -147,6 +154,7 @@ def _told(capture: Capture, labels: Labels, reference: Reference) -> dict[str, A
         "notes": capture.notes,
         "axes": labels.axes,
         "friction": labels.friction,
+        "friction_change": settings.friction_change,
         "slip_s": labels.slip_s,
         "lag": labels.lag,
         "lag_applied": labels.lag_applied,

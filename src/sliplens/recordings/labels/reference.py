@@ -80,7 +80,9 @@ def choose_reference(
     before = [place for place in places if untouched[places[0] : place].all()]
 
     wanted = {*places, *([] if index is None else [index])}
-    soft = {place: soften(frame) for place, frame in enumerate(read_frames()) if place in wanted}
+    # no further than to the last of them
+    opening = islice(read_frames(), max(wanted) + 1)
+    soft = {place: soften(frame) for place, frame in enumerate(opening) if place in wanted}
     still = np.stack([soft[place] for place in before or sorted(wanted)])
     middle = np.median(still, axis=0)
     energy = {place: float(np.mean(np.abs(_high_pass(one - middle)))) for place, one in soft.items()}
