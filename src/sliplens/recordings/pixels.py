@@ -1,7 +1,7 @@
 """How the images of a trial are stored: each row less the one above, under Zstandard.
 
 Camera noise is what fills a tactile image, and it does not compress: what pays is speed. On simulated frames this is
-ten times as fast to write as PNG and more than twice as fast to read, for 4 % more bytes (`benchmarks/stores.py`).
+several times as fast to write and to read as PNG, FFV1 or Zarr, within 10 % of the smallest (`benchmarks/stores.py`).
 Anything that reads Parquet can undo it: Zstandard, then a running sum down the rows, modulo 256.
 """
 
