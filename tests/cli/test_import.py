@@ -1,8 +1,10 @@
 """`sliplens import`: from files of one's own to a data set that trains a network."""
 
 import csv
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -12,6 +14,8 @@ from sliplens.cli import main
 from sliplens.images import write_png
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.headers import read_labelling
+from sliplens.recordings.readers import ReadOptions
+from sliplens.recordings.store import write_trial
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 FORCE_RATE = 500
@@ -123,6 +127,35 @@ def test_friction_by_hand_is_taken(tmp_path: Path, table: Path, video: Path):
     assert (told["friction"]["mu"], told["friction"]["found"]) == (1.4, "declared")
     # with more friction than there was the trial never comes near slip
     assert np.nanmin(data.load(data.trials[0]).safety_margin) > 0.2
+
+
+def test_an_interrupted_import_goes_on_where_it_stopped(
+    tmp_path: Path, recorded: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+):
+    video, table = recorded
+    # two trials of one table cannot be told in one command, so the table is given as the default of the options
+    sources = [tmp_path / name for name in ("a.mkv", "b.mkv")]
+    for source in sources:
+        shutil.copy(video, source)
+    monkeypatch.setattr(ReadOptions, "given", lambda _: {"forces": table})
+    whole, broken = (("import", *sources, "-o", tmp_path / name, "--sensor", "mine", "--no-audit") for name in "wb")
+    assert run(*whole) == 0
+    written = []
+
+    def write(path: Path, *arguments: Any, **more: Any) -> None:
+        if len(written) == 1:
+            raise KeyboardInterrupt
+        written.append(path)
+        write_trial(path, *arguments, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sliplens.recordings.importing.write_trial", write)
+        assert run(*broken) == 130
+    assert not (tmp_path / "b").exists()
+    kept = written[0].stat().st_mtime_ns
+    assert run(*broken) == 0
+    assert (tmp_path / "b" / "trials" / "a.parquet").stat().st_mtime_ns == kept
+    assert Dataset.open(tmp_path / "b").hash == Dataset.open(tmp_path / "w").hash
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -15,7 +15,6 @@ _AUDITED_FRAMES = 800
 
 if TYPE_CHECKING:
     from sliplens.recordings.capture import Capture
-    from sliplens.recordings.importing import ImportedTrial
     from sliplens.recordings.labels import LabelSettings
 
 
@@ -106,19 +105,18 @@ class Import:
             if out.complete:
                 unchanged(self.output)
                 return
-            imported = self._import(out.folder, captures, splits, settings)
-            write_json(out.folder / "result.json", {"trials": [_told(*one) for one in imported]})
-        rows = [_row(capture, trial) for capture, trial in imported]
+            found = self._import(out.folder, captures, splits, settings)
+            write_json(out.folder / "result.json", {"trials": [_told(name, told) for name, told in found.items()]})
         header = ("trial", "frames", "valid", "mu", "lag, ms", "reference")
-        print_table("Imported", header, rows)
-        for note in dict.fromkeys(note for _, trial in imported for note in trial.notes):
+        print_table("Imported", header, [_row(name, told) for name, told in found.items()])
+        for note in dict.fromkeys(note for told in found.values() for note in (*told["notes"], *told["axes"]["notes"])):
             say(f"  note: {note}")
-        for capture, trial in imported:
-            lost = {reason: count for reason, count in trial.labels.count().items() if reason != "valid"}
-            told = ", ".join(f"{count} {reason}" for reason, count in lost.items()) or "none"
-            say(f"  {capture.name}: frames without a valid label: {told}")
-        frames = sum(len(capture.frame_time_s) for capture, _ in imported)
-        wrote(self.output, f"{len(imported)} trials, {frames:,} frames")
+        for name, told in found.items():
+            lost = {reason: count for reason, count in told["frames_by_reason"].items() if reason != "valid"}
+            why = ", ".join(f"{count} {reason}" for reason, count in lost.items()) or "none"
+            say(f"  {name}: frames without a valid label: {why}")
+        frames = sum(len(capture.frame_time_s) for capture in captures)
+        wrote(self.output, f"{len(captures)} trials, {frames:,} frames")
         if self.audit:
             wrote(self.output / "audit", "a page a trial: look at them before you train")
 
@@ -175,47 +173,51 @@ class Import:
 
     def _import(
         self, folder: Path, captures: "list[Capture]", splits: list[str], settings: "LabelSettings"
-    ) -> "list[tuple[Capture, ImportedTrial]]":
+    ) -> dict[str, dict[str, Any]]:
+        """Write the trials that are not there yet; give what the labels of each rest on."""
         import numpy as np
 
         from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+        from sliplens.recordings.headers import read_labelling
         from sliplens.recordings.importing import About, import_trial
 
         about = About(sensor=self.sensor, day=self.day, condition=self.condition)
-        imported, table, done = [], [], 0
+        found, table, done = {}, [], 0
         total = sum(len(capture.frame_time_s) for capture in captures)
         with progress_bar("Importing frames") as bar:
             for number, (capture, split) in enumerate(zip(captures, splits, strict=True)):
                 path = trial_path(folder, capture.name)
-                trial = import_trial(
-                    capture,
-                    path,
-                    about=about,
-                    settings=settings,
-                    rng=np.random.default_rng((self.seed, number)),
-                    reference_index=self.reference_frame,
-                    reference_method=self.reference,
-                    on_frames=lambda written, _, before=done: bar(before + written, total),
-                )
+                # a trial is there whole or not at all, and the folder is of this very import
+                if not path.is_file():
+                    import_trial(
+                        capture,
+                        path,
+                        about=about,
+                        settings=settings,
+                        rng=np.random.default_rng((self.seed, number)),
+                        reference_index=self.reference_frame,
+                        reference_method=self.reference,
+                        on_frames=lambda written, _, before=done: bar(before + written, total),
+                    )
                 done += len(capture.frame_time_s)
-                imported.append((capture, trial))
+                bar(done, total)
+                found[capture.name] = read_labelling(path) or {}
                 table.append(trial_info(path, split=split))
                 if self.audit:
-                    _draw_audit(path, folder / "audit" / f"{capture.name}.png", frames=len(capture.frame_time_s))
+                    _draw_audit(path, folder / "audit" / f"{capture.name}.png", found[capture.name])
         if not table:
             raise RecordingError("there is no trial to import; name a recording")
         write_dataset_table(folder, table)
-        return imported
+        return found
 
 
-def _draw_audit(trial: Path, picture: Path, *, frames: int) -> None:
-    from sliplens.recordings.headers import read_labelling
+def _draw_audit(trial: Path, picture: Path, labelling: dict[str, Any]) -> None:
     from sliplens.recordings.store import load_recording
     from sliplens.report.audit import write_audit
 
     # a page shows no more than this of a long trial, and memory stays small
-    recording = load_recording(trial, every=max(1, frames // _AUDITED_FRAMES))
-    write_audit(recording, read_labelling(trial) or {}, picture)
+    frames = sum(labelling["frames_by_reason"].values())
+    write_audit(load_recording(trial, every=max(1, frames // _AUDITED_FRAMES)), labelling, picture)
 
 
 def _fingerprint(path: Path) -> list[object]:
@@ -231,30 +233,28 @@ def _fingerprint(path: Path) -> list[object]:
     ]
 
 
-def _row(capture: "Capture", trial: "ImportedTrial") -> tuple[str, ...]:
-    labels = trial.labels
-    friction, lag = labels.friction, labels.lag
+def _row(name: str, told: dict[str, Any]) -> tuple[str, ...]:
+    friction, lag, reference = told["friction"], told["lag"], told["reference"]
     told_lag = "-"
     if lag is not None:
-        told_lag = "not told" if lag.doubt else f"{1e3 * lag.lag_s:+.1f} +- {1e3 * lag.sigma_s:.1f}"
-        told_lag += " (applied)" if labels.lag_applied else ""
+        told_lag = "not told" if lag["doubt"] else f"{1e3 * lag['lag_s']:+.1f} +- {1e3 * lag['sigma_s']:.1f}"
+        told_lag += " (applied)" if told["lag_applied"] else ""
+    drift = "not told" if reference["drift"] is None else f"{reference['drift']:.1f}"
     return (
-        capture.name,
-        str(len(labels.valid)),
-        str(int(labels.valid.sum())),
-        f"{friction.mu:.3f} [{friction.low:.3f}, {friction.high:.3f}] {friction.found}",
+        name,
+        str(sum(told["frames_by_reason"].values())),
+        str(told["frames_by_reason"].get("valid", 0)),
+        f"{friction['mu']:.3f} [{friction['low']:.3f}, {friction['high']:.3f}] {friction['found']}",
         told_lag,
-        f"frame {trial.reference.index}, drift {trial.reference.drift:.1f}",
+        f"frame {reference['index']}, drift {drift}",
     )
 
 
-def _told(capture: "Capture", trial: "ImportedTrial") -> dict[str, object]:
-    labels = trial.labels
+def _told(name: str, told: dict[str, Any]) -> dict[str, Any]:
     return {
-        "trial": capture.name,
-        "source": capture.source,
-        "frames": len(labels.valid),
-        "by_reason": labels.count(),
-        "friction": labels.friction.mu,
-        "reference_frame": trial.reference.index,
+        "trial": name,
+        "source": told["source"],
+        "frames_by_reason": told["frames_by_reason"],
+        "friction": told["friction"]["mu"],
+        "reference_frame": told["reference"]["index"],
     }

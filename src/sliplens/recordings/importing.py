@@ -150,6 +150,7 @@ def _told(capture: Capture, labels: Labels, reference: Reference, settings: Labe
     """All that the labels rest on, as JSON can hold it."""
     told = {
         "source": capture.source,
+        "frames_by_reason": labels.count(),
         "forces": capture.forces.source if capture.forces else None,
         "notes": capture.notes,
         "axes": labels.axes,
