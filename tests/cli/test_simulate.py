@@ -61,6 +61,14 @@ def test_options_change_a_preset_and_drop_its_totals():
     assert (changed.days, changed.dry_trials, changed.frame_totals) == (6, 191, None)
 
 
+def test_a_picture_that_cannot_be_is_refused_before_the_other_is_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    words = ("--preview", tmp_path / "sheet.png", "--video", tmp_path / "clip.avi")
+    assert "clip.avi does not end in .mp4" in refused(capsys, "simulate", *SMALL, *words)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -64,6 +64,7 @@ class Simulate:
 
         if self.output is None and self.preview is None and self.video is None:
             raise InputError("nothing to do; name a folder to make, or a picture with --preview")
+        self._require_pictures()
         _require_device(self.device)
         recipe = self._recipe()
         plans = plan_trials(recipe)
@@ -95,6 +96,17 @@ class Simulate:
             seed=self.seed,
             **changes,
         )
+
+    def _require_pictures(self) -> None:
+        """Refuse a wrong suffix before anything is simulated."""
+        if self.preview is not None:
+            from sliplens.report.pages import require_picture_path
+
+            require_picture_path(self.preview, example="sheet.png")
+        if self.video is not None:
+            from sliplens.report.clip import require_clip_path
+
+            require_clip_path(self.video)
 
     def _draw_preview(self, path: Path, recipe: "SimulationRecipe", plans: "list[TrialPlan]") -> None:
         from sliplens.report.contact_sheet import write_contact_sheet

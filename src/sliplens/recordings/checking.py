@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from sliplens.errors import SliplensError
 from sliplens.provenance import hash_file
 from sliplens.recordings.dataset import Dataset, TrialInfo, trial_path
+from sliplens.recordings.headers import read_header
 from sliplens.recordings.recording import SIGNALS, ContactState, Recording
 from sliplens.recordings.store import load_recording
 
@@ -79,23 +80,13 @@ def _check_trial(folder: Path, info: TrialInfo) -> Iterator[str]:
     if hash_file(path) != info.sha256:
         yield "has a file that is not the one the table was made for (its hash differs)"
     try:
-        recording = load_recording(path)
+        stored, recording = asdict(read_header(path)), load_recording(path)
     except SliplensError as error:
         yield f"cannot be read: {error}"
         return
-    size = recording.reference.shape
-    found = {
-        "trial": recording.trial,
-        "sensor": recording.sensor,
-        "day": recording.day,
-        "condition": recording.condition,
-        "frames": len(recording),
-        "height": size[0],
-        "width": size[1],
-    }
-    for name, value in found.items():
-        if value != getattr(info, name):
-            yield f"has {name} {value}, the table says {getattr(info, name)}"
+    for name, value in asdict(info).items():
+        if name in stored and value != stored[name]:
+            yield f"has {name} {stored[name]}, the table says {value}"
     yield from _check_laws(recording)
 
 

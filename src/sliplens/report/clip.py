@@ -80,8 +80,7 @@ def write_clip(
     InputError
         If the suffix is another one, PyAV is missing, the rate lies outside 1 to 120, or the file cannot be written.
     """
-    if path.suffix.lower() != ".mp4":
-        raise InputError(f"{path} does not end in .mp4; name a clip, such as trial.mp4")
+    require_clip_path(path)
     if frames_per_s is not None and not 1 <= frames_per_s <= 120:
         raise InputError(f"{frames_per_s:g} frames a second cannot be watched; ask for {_SLOWEST} to {_FASTEST}")
     try:
@@ -110,6 +109,18 @@ def write_clip(
     finally:
         with suppress(OSError):  # it has its name by now, or could not be made
             part.unlink()
+
+
+def require_clip_path(path: Path) -> None:
+    """Check that a file is named as a clip.
+
+    Raises
+    ------
+    InputError
+        If its suffix is another one.
+    """
+    if path.suffix.lower() != ".mp4":
+        raise InputError(f"{path} does not end in .mp4; name a clip, such as trial.mp4")
 
 
 def natural_rate(time_s: Float[np.ndarray, " frames"]) -> float:
