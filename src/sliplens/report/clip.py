@@ -1,7 +1,6 @@
 """Clip of a trial for people to watch: camera, difference and forces at real speed."""
 
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
@@ -19,6 +18,7 @@ from sliplens.errors import InputError
 from sliplens.images import absolute_difference
 from sliplens.recordings import Recording
 from sliplens.recordings.truth import OUTSIDE, STICKS
+from sliplens.report.pages import written_whole
 from sliplens.report.style import BLACK, GREY, PURPLE, SKY, drawing_style, percent
 from sliplens.report.trial_charts import (
     STATE_COLOURS,
@@ -89,26 +89,20 @@ def write_clip(
         raise InputError("a clip needs PyAV, which is not installed; install it with `pip install av`") from None
     rate = Fraction(frames_per_s or natural_rate(recording.time_s)).limit_denominator(1001)
     indices, stage = clip_frames(recording.time_s, float(rate)), _set_stage(recording)
-    part = path.with_name(f".{path.name}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        written_whole(path) as part,
         # the index comes first, so that a browser plays before it has all
-        with av.open(str(part), "w", format="mp4", options={"movflags": "faststart"}) as container:
-            stream = container.add_stream("libx264", rate=rate, options={"crf": "20", "preset": "veryfast"})
-            stream.height, stream.width, stream.pix_fmt = *stage.still.shape[:2], "yuv420p"
-            # what FFmpeg turns RGB into, BT.601: untold, a player guesses by the size
-            stream.codec_context.colorspace = 5
-            for done, pixels in enumerate(_draw_frames(recording, indices, stage, float(rate)), start=1):
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
-                if on_frames is not None:
-                    on_frames(done, len(indices))
-            container.mux(stream.encode())
-        part.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot write {path} ({error.strerror}); choose another file") from None
-    finally:
-        with suppress(OSError):  # it has its name by now, or could not be made
-            part.unlink()
+        av.open(str(part), "w", format="mp4", options={"movflags": "faststart"}) as container,
+    ):
+        stream = container.add_stream("libx264", rate=rate, options={"crf": "20", "preset": "veryfast"})
+        stream.height, stream.width, stream.pix_fmt = *stage.still.shape[:2], "yuv420p"
+        # what FFmpeg turns RGB into, BT.601: untold, a player guesses by the size
+        stream.codec_context.colorspace = 5
+        for done, pixels in enumerate(_draw_frames(recording, indices, stage, float(rate)), start=1):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+            if on_frames is not None:
+                on_frames(done, len(indices))
+        container.mux(stream.encode())
 
 
 def require_clip_path(path: Path) -> None:

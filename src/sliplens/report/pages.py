@@ -1,6 +1,7 @@
 """Pages of pictures and charts: laid out in inches from the left upper corner, saved whole or not at all."""
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -35,12 +36,24 @@ def save_page(figure: Figure, path: Path) -> None:
         If the file cannot be written.
     """
     suffix = path.suffix.lower()
+    with written_whole(path) as part, drawing_style():
+        # 150 dots an inch show frames of 224 pixels about pixel for pixel
+        figure.savefig(part, format=suffix[1:], dpi=150, metadata=_METADATA[suffix])
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """Give a file beside the target to write to; it takes the target's name when all went well, else it is gone.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
     part = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with drawing_style():
-            # 150 dots an inch show frames of 224 pixels about pixel for pixel
-            figure.savefig(part, format=suffix[1:], dpi=150, metadata=_METADATA[suffix])
+        yield part
         part.replace(path)
     except OSError as error:
         raise InputError(f"cannot write {path} ({error.strerror}); choose another file") from None
