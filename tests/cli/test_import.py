@@ -163,7 +163,7 @@ def test_an_interrupted_import_goes_on_where_it_stopped(
     [
         ((), "has no forces, and without them there is no label; give the table of the force sensor"),
         (("--forces", "MISSING.csv"), "MISSING.csv does not exist"),
-        (("--format", "papyrus"), "format 'papyrus' is not known; choose rosbag, lerobot, images, video"),
+        (("--format", "papyrus"), "format 'papyrus' is not known; choose sliplens, rosbag, lerobot, thesis, gelsight"),
         (("--image-topic", "/camera"), "is read as video, which does not take image_topic"),
         (("--forces", "TABLE", "--test-trials", "2"), "2 to test are more than the 1 there are; give fewer"),
         (("--forces", "TABLE", "--test-trials", "-1"), "numbers of trials are not negative"),

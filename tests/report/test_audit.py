@@ -19,7 +19,7 @@ from sliplens.recordings import ContactState, Recording
 from sliplens.report.audit import choose_along, draw_audit, write_audit
 from sliplens.report.trial_charts import STATE_COLOURS
 
-NO_CONTACT, CONTACT, INCIPIENT_SLIP, FULL_SLIP = ContactState
+NO_CONTACT, CONTACT, INCIPIENT_SLIP, FULL_SLIP, _ = ContactState
 MU = 0.53
 
 

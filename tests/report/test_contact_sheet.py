@@ -19,7 +19,7 @@ from sliplens.report.contact_sheet import choose_margins, choose_untouched
 from sliplens.report.panels import NOMINAL_MARGINS
 from sliplens.report.trial_charts import brighten, brightening
 
-NO_CONTACT, CONTACT, INCIPIENT_SLIP, FULL_SLIP = ContactState
+NO_CONTACT, CONTACT, INCIPIENT_SLIP, FULL_SLIP, _ = ContactState
 
 
 def make_trial(*, pull: int = 41, lowest: float = 0.0, size: tuple[int, int] = (24, 24), bright: int = 90) -> Recording:

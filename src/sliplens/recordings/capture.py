@@ -1,12 +1,13 @@
 """What a reader finds in a file: frames and forces as they were recorded, nothing interpreted."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from sliplens.errors import RecordingError
+from sliplens.recordings.given import GivenLabels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +41,17 @@ class Forces:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Told:
+    """What a source says of a trial itself; None where it says nothing."""
+
+    sensor: str | None = None
+    day: int | None = None
+    condition: str | None = None
+    object: str | None = None
+    split: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Capture:
     """One trial as recorded. Frames are read one at a time, so that a long recording needs no more memory than a short.
 
@@ -63,12 +75,28 @@ class Capture:
     """None where only images were recorded."""
     notes: tuple[str, ...] = ()
     """What the reader had to assume or leave out, a sentence each, to be shown to the user."""
+    labels: GivenLabels | None = None
+    """Labels that came with the frames; None where they are to be found."""
+    reference: UInt8[np.ndarray, "height width 3"] | None = None
+    """The sensor untouched, where it was recorded apart from the frames."""
+    reference_index: int | None = None
+    """Frame that a source, or its reader, takes for the untouched one."""
+    told: Told = field(default_factory=Told)
 
     def __post_init__(self) -> None:
         """Check what every reader must hold."""
         if len(self.frame_time_s) == 0:
             raise RecordingError(f"{self.source} has no frame; leave it out or record it again")
         _require_rising(self.frame_time_s, what=f"the frames of {self.source}")
+        if self.labels is not None and len(self.labels) != len(self.frame_time_s):
+            raise RecordingError(
+                f"{self.source} has {len(self.frame_time_s)} frames but {len(self.labels)} labels; give one a frame"
+            )
+        if self.reference is not None and self.reference.shape[:2] != self.frame_size:
+            raise RecordingError(
+                f"{self.source} has frames of {self.frame_size[0]} x {self.frame_size[1]} pixels but a reference of "
+                f"{self.reference.shape[0]} x {self.reference.shape[1]}; record both with the same camera settings"
+            )
 
 
 def _require_rising(time_s: Float[np.ndarray, " samples"], *, what: str) -> None:

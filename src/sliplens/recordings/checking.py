@@ -12,6 +12,7 @@ from sliplens.provenance import hash_file
 from sliplens.recordings.dataset import Dataset, TrialInfo, trial_path
 from sliplens.recordings.headers import read_header
 from sliplens.recordings.recording import SIGNALS, ContactState, Recording
+from sliplens.recordings.samples import forces_path
 from sliplens.recordings.store import load_recording
 
 _ROUNDING = 1e-6
@@ -79,6 +80,9 @@ def _check_trial(folder: Path, info: TrialInfo) -> Iterator[str]:
         return
     if hash_file(path) != info.sha256:
         yield "has a file that is not the one the table was made for (its hash differs)"
+    samples = forces_path(folder, info.trial)
+    if info.forces_sha256 and (not samples.is_file() or hash_file(samples) != info.forces_sha256):
+        yield "has samples of forces that are missing or changed since the table was made"
     try:
         stored, recording = asdict(read_header(path)), load_recording(path)
     except SliplensError as error:
@@ -92,9 +96,11 @@ def _check_trial(folder: Path, info: TrialInfo) -> Iterator[str]:
 
 def _check_laws(recording: Recording) -> Iterator[str]:
     yield from _first(~np.isfinite(recording.time_s), "the time is not a number")
-    # a force sensor's noise is negative at times, and its samples may be missing, where there is no label
+    # a force sensor's noise is negative at times, and its samples may be missing, where there is no label;
+    # of a trial whose margins alone are known, none is there
+    measured = bool(np.isfinite(recording.normal_force_n).any())
     for name in SIGNALS[1:4]:
-        missing = recording.labelled & ~np.isfinite(getattr(recording, name))
+        missing = measured & recording.labelled & ~np.isfinite(getattr(recording, name))
         yield from _first(missing, f"{name} is not a number")
     negative = recording.labelled & (recording.normal_force_n < 0)
     yield from _first(negative, "the normal force is negative; flip its sign on import")

@@ -8,6 +8,7 @@ from sliplens.errors import RecordingError
 from sliplens.provenance import hash_file, hash_json, read_json, require_folder, write_json
 from sliplens.recordings.headers import read_header
 from sliplens.recordings.recording import Recording
+from sliplens.recordings.samples import forces_path
 from sliplens.recordings.store import SCHEMA_VERSION, load_recording
 
 DATASET_FILE = "dataset.json"
@@ -26,6 +27,10 @@ class TrialInfo:
     height: int
     width: int
     sha256: str
+    object: str = ""
+    """What was held; empty where it is not told."""
+    forces_sha256: str = ""
+    """Hash of the samples of the force sensor; empty where none are kept."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +114,13 @@ def trial_info(path: Path, *, split: str) -> TrialInfo:
     """
     header = asdict(read_header(path))
     del header["recipe"]
-    return TrialInfo(**header, split=split, sha256=hash_file(path))
+    samples = forces_path(path.parent.parent, path.stem)
+    return TrialInfo(
+        **header,
+        split=split,
+        sha256=hash_file(path),
+        forces_sha256=hash_file(samples) if samples.is_file() else "",
+    )
 
 
 def write_dataset_table(folder: Path, trials: Sequence[TrialInfo], *, simulated: bool = False) -> None:

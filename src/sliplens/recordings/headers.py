@@ -5,14 +5,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from jaxtyping import UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.images.files import decode_png
 
 DESCRIPTION = ("trial", "sensor", "day", "condition")
 """What every trial tells in its metadata."""
+OBJECT = "object"
+"""And what it may tell."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +27,7 @@ class StoredTrial:
     sensor: str
     day: int
     condition: str
+    object: str
     frames: int
     height: int
     width: int
@@ -50,11 +55,28 @@ def read_header(path: Path) -> StoredTrial:
         sensor=metadata["sensor"].decode(),
         day=int(metadata["day"]),
         condition=metadata["condition"].decode(),
+        object=metadata.get(OBJECT, b"").decode(),
         frames=int(metadata["frames"]),
         height=height,
         width=width,
         recipe=json.loads(metadata["truth"])["recipe"] if "truth" in metadata else None,
     )
+
+
+def read_reference(path: Path) -> UInt8[np.ndarray, "height width 3"]:
+    """Read the reference frame of a trial.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing or damaged, or no trial.
+    ImageError
+        If the image is damaged.
+    """
+    metadata = _read_metadata(path)
+    if "reference" not in metadata:
+        raise RecordingError(f"{path} lacks a reference frame; write it with save_recording")
+    return decode_png(metadata["reference"], where=f"the reference frame of {path}")
 
 
 def read_labelling(path: Path) -> dict[str, Any] | None:

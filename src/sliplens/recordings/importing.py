@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, is_dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +11,18 @@ import numpy as np
 from jaxtyping import UInt8
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.capture import Capture
+from sliplens.recordings.capture import Capture, Forces
+from sliplens.recordings.given import GIVEN_SIGNALS, GivenLabels
+from sliplens.recordings.headers import OBJECT
 from sliplens.recordings.labels import (
     Labels,
     LabelSettings,
     Reason,
-    Reference,
     choose_reference,
     label_trial,
     measure_motion,
 )
+from sliplens.recordings.samples import save_forces
 from sliplens.recordings.store import encode_frames, write_trial
 
 
@@ -31,15 +34,24 @@ class About:
     day: int
     condition: str
     """dry or wet, or any other word for the state of the surface."""
+    object: str = ""
+    """What was held; empty where it is not told."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ImportedTrial:
-    """A trial that was written, and what its labels rest on."""
-
-    labels: Labels
-    reference: Reference
-    notes: tuple[str, ...]
+_NO_CHOICE = dict.fromkeys(("index", "method", "contact_energy", "drift"))
+"""What is told of a reference frame."""
+_RESTS_ON = (
+    "axes",
+    "friction",
+    "friction_change",
+    "slip_s",
+    "lag",
+    "contact_threshold_n",
+    "window_s",
+    "gap_s",
+    "force_range_n",
+)
+"""What is told of labels that were found; None of labels that came with the frames."""
 
 
 def import_trial(
@@ -49,11 +61,12 @@ def import_trial(
     about: About,
     settings: LabelSettings,
     rng: np.random.Generator,
+    forces_path: Path | None = None,
     reference_index: int | None = None,
     reference_method: str = "least contact energy",
     on_frames: Callable[[int, int], None] | None = None,
-) -> ImportedTrial:
-    """Label a recording and write it as a trial of a data set; whole or not at all.
+) -> dict[str, Any]:
+    """Write a recording as a trial of a data set, with the labels that came with it, or found; whole or not at all.
 
     The frames are read several times, never all at once: to see the image move, to find the untouched sensor, and to
     write them.
@@ -61,63 +74,130 @@ def import_trial(
     Parameters
     ----------
     capture
-        What a reader found; it must have forces.
+        What a reader found; it must have labels or forces.
     path
         Parquet file to write.
     about
         What the trial is.
     settings
-        What is known of axes, friction and lag.
+        What is known of axes, friction and lag, where labels are to be found.
     rng
         Source of the bootstraps.
+    forces_path
+        Where to keep the samples of the force sensor, from which labels can be made anew; not kept if None.
     reference_index, reference_method
-        The untouched frame by hand, or how to choose it.
+        The untouched frame by hand, or how to choose it where the source does not tell it.
     on_frames
         Called with the frames written and the frames in all.
+
+    Returns
+    -------
+    dict
+        What the labels rest on, as `read_labelling` gives it back.
 
     Raises
     ------
     RecordingError
-        If there are no forces, nothing touches, the trial never slips and no friction is given, or no frame is
-        untouched and none is named.
+        If there are neither labels nor forces, nothing touches, the trial never slips and no friction is given, or no
+        frame is untouched and none is named.
     """
-    if capture.forces is None:
+    if capture.labels is None and capture.forces is None:
         raise RecordingError(
             f"{capture.source} has no forces, and without them there is no label; give the table of the force sensor"
         )
-    count = len(capture.frame_time_s)
-    motion = measure_motion(_exactly(capture, count))
     try:
-        labels = label_trial(capture.frame_time_s, motion, capture.forces, settings=settings, rng=rng)
-        untouched = np.array([reason is Reason.NO_CONTACT for reason in labels.reason])
-        reference = choose_reference(capture.read_frames, untouched, index=reference_index, method=reference_method)
+        if capture.labels is not None:
+            made = _given(capture, capture.labels, index=reference_index)
+        else:
+            assert capture.forces is not None
+            made = _found(capture, capture.forces, settings, rng, index=reference_index, method=reference_method)
     except RecordingError as error:
         raise RecordingError(f"{capture.source}: {error}") from None
+    description = {
+        **{name: str(getattr(about, name)) for name in ("sensor", "day", "condition")},
+        "trial": capture.name,
+        "labelling": json.dumps(made.labelling, allow_nan=False),
+    }
+    if about.object:
+        description[OBJECT] = about.object
+    # before the trial, whose file tells that all of it is there
+    if forces_path is not None and capture.forces is not None:
+        save_forces(capture.forces, forces_path)
+    count = len(capture.frame_time_s)
+    images = _counted(encode_frames(_exactly(capture, count)), count, on_frames)
+    write_trial(path, images, {"time_s": capture.frame_time_s, **made.columns}, description, reference=made.reference)
+    return made.labelling
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Made:
+    """What is written besides frames and times."""
+
+    columns: dict[str, Any]
+    labelling: dict[str, Any]
+    reference: UInt8[np.ndarray, "height width 3"]
+
+
+def _found(
+    capture: Capture,
+    forces: Forces,
+    settings: LabelSettings,
+    rng: np.random.Generator,
+    *,
+    index: int | None,
+    method: str,
+) -> _Made:
+    motion = measure_motion(_exactly(capture, len(capture.frame_time_s)))
+    labels = label_trial(capture.frame_time_s, motion, forces, settings=settings, rng=rng)
+    index = capture.reference_index if index is None else index
+    if capture.reference is not None and index is None:
+        image, told = capture.reference, {**_NO_CHOICE, "method": "recorded apart from the frames"}
+    else:
+        untouched = np.array([reason is Reason.NO_CONTACT for reason in labels.reason])
+        chosen = choose_reference(capture.read_frames, untouched, index=index, method=method)
+        image, told = chosen.image, {name: getattr(chosen, name) for name in _NO_CHOICE}
     columns = {
-        "time_s": labels.time_s,
-        "normal_force_n": labels.normal_force_n,
-        "tangential_force_n": labels.tangential_force_n,
-        "friction_coefficient": labels.friction_coefficient,
-        "safety_margin": labels.safety_margin,
-        "stick_ratio": labels.stick_ratio,
+        **{name: getattr(labels, name) for name in GIVEN_SIGNALS},
         "contact_state": [str(state) for state in labels.contact_state],
         "safety_margin_sigma": labels.safety_margin_sigma,
         "valid": labels.valid,
         "invalid_reason": [str(reason) for reason in labels.reason],
         "force_time_s": labels.force_time_s,
     }
-    description = {
-        "trial": capture.name,
-        "sensor": about.sensor,
-        "day": str(about.day),
-        "condition": about.condition,
-        "labelling": json.dumps(_told(capture, labels, reference, settings), allow_nan=False),
-    }
-    write_trial(
-        path, _counted(encode_frames(_exactly(capture, count)), count, on_frames), columns, description,
-        reference=reference.image,
-    )  # fmt: skip
-    return ImportedTrial(labels=labels, reference=reference, notes=capture.notes + labels.axes.notes)
+    return _Made(columns=columns, labelling=_told(capture, labels, told, settings), reference=image)
+
+
+def _given(capture: Capture, labels: GivenLabels, *, index: int | None) -> _Made:
+    index = capture.reference_index if index is None else index
+    told: dict[str, Any] = {**_NO_CHOICE, "method": "came with the recording"}
+    if index is not None:
+        if not 0 <= index < len(labels):
+            raise RecordingError(f"the reference is frame {index} of {len(labels)}; name one from 0 on that is there")
+        image = next(islice(capture.read_frames(), index, None))
+        told |= {"index": index, "method": "named"}
+    elif capture.reference is not None:
+        image = capture.reference
+    else:
+        raise RecordingError("no frame is known to be untouched; name one with --reference-frame")
+    columns: dict[str, Any] = {name: getattr(labels, name) for name in GIVEN_SIGNALS}
+    columns["contact_state"] = [str(state) for state in labels.contact_state]
+    for name, column in (("safety_margin_sigma",) * 2, ("valid",) * 2, ("reason", "invalid_reason")):
+        values = getattr(labels, name)
+        if values is not None:
+            columns[column] = list(values) if name == "reason" else values
+    labelling = labels.labelling
+    if labelling is None:
+        labelling = {
+            **dict.fromkeys(_RESTS_ON),
+            "source": capture.source,
+            "frames_by_reason": labels.count(),
+            "forces": capture.forces.source if capture.forces else None,
+            "notes": list(capture.notes),
+            "lag_applied": False,
+            "reference": told,
+            "clip": labels.clip,
+        }
+    return _Made(columns=columns, labelling=labelling, reference=image)
 
 
 def _exactly(capture: Capture, count: int) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
@@ -146,7 +226,7 @@ def _counted(
             on_frames(done, count)
 
 
-def _told(capture: Capture, labels: Labels, reference: Reference, settings: LabelSettings) -> dict[str, Any]:
+def _told(capture: Capture, labels: Labels, reference: dict[str, Any], settings: LabelSettings) -> dict[str, Any]:
     """All that the labels rest on, as JSON can hold it."""
     told = {
         "source": capture.source,
@@ -163,12 +243,8 @@ def _told(capture: Capture, labels: Labels, reference: Reference, settings: Labe
         "window_s": labels.window_s,
         "gap_s": labels.gap_s,
         "force_range_n": labels.force_range_n,
-        "reference": {
-            "index": reference.index,
-            "method": reference.method,
-            "contact_energy": reference.contact_energy,
-            "drift": reference.drift,
-        },
+        "reference": reference,
+        "clip": None,
     }
     return _plain(told)
 

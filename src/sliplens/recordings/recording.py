@@ -11,12 +11,13 @@ from sliplens.recordings.truth import GroundTruth
 
 
 class ContactState(StrEnum):
-    """Phase of a grasp, as in Fig. 4 of the thesis."""
+    """Phase of a grasp, as in Fig. 4 of the thesis; unknown where nothing measured it."""
 
     NO_CONTACT = "no contact"
     CONTACT = "contact"
     INCIPIENT_SLIP = "incipient slip"
     FULL_SLIP = "full slip"
+    UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +51,8 @@ class Recording:
     """Standard uncertainty of the safety margin; None where it is exact or was not estimated."""
     valid: Bool[np.ndarray, " _"] | None = None
     """Frames whose label can be trusted; None where all that have one can."""
+    object: str = ""
+    """What was held; empty where it is not told."""
     truth: GroundTruth | None = None
     """What a simulator knows beyond the labels; None for a real trial."""
 

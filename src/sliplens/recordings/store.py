@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.images.files import decode_png, encode_png
-from sliplens.recordings.headers import DESCRIPTION
+from sliplens.recordings.headers import DESCRIPTION, OBJECT, read_header
 from sliplens.recordings.pixels import CODEC, decode_pixels, encode_pixels
 from sliplens.recordings.recording import SIGNALS, ContactState, Recording
 from sliplens.recordings.truth import GroundTruth
@@ -32,6 +32,8 @@ def save_recording(recording: Recording, path: Path) -> None:
     columns: dict[str, Any] = {name: getattr(recording, name) for name in SIGNALS}
     columns["contact_state"] = [str(state) for state in recording.contact_state]
     description = {name: str(getattr(recording, name)) for name in DESCRIPTION}
+    if recording.object:
+        description[OBJECT] = recording.object
     columns |= {name: getattr(recording, name) for name in _OPTIONAL if getattr(recording, name) is not None}
     if recording.truth is not None:
         truth = recording.truth
@@ -152,6 +154,7 @@ def load_recording(path: Path, *, truth: bool = True, every: int = 1) -> Recordi
         sensor=metadata["sensor"].decode(),
         day=int(metadata["day"]),
         condition=metadata["condition"].decode(),
+        object=metadata.get(OBJECT, b"").decode(),
         reference=reference,
         frames=_decode(table.column("image"), size=reference.shape, where=f"of {path}"),
         contact_state=tuple(ContactState(state) for state in table.column("contact_state").to_pylist()),
@@ -161,6 +164,26 @@ def load_recording(path: Path, *, truth: bool = True, every: int = 1) -> Recordi
         else None,
         **{name: table.column(name).to_numpy().astype(np.float64) for name in SIGNALS},
     )
+
+
+def stream_frames(path: Path) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    """Frames of a stored trial one at a time, a row group of them in memory.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing or damaged, or keeps its images in another way.
+    ImageError
+        If an image inside is damaged.
+    """
+    header, first = read_header(path), 0
+    file = pq.ParquetFile(path, memory_map=True)
+    for group in range(file.num_row_groups):
+        images = file.read_row_group(group, columns=["image"]).column("image")
+        for at, image in enumerate(images):
+            where = f"frame {first + at} of {path}"
+            yield decode_pixels(image.as_buffer(), size=(header.height, header.width, 3), where=where)
+        first += len(images)
 
 
 def _read_some(path: Path, columns: list[str] | None, every: int) -> pa.Table:

@@ -18,7 +18,7 @@ from sliplens.report.audit_facts import audit_facts
 from sliplens.report.contact_sheet import choose_margins
 from sliplens.report.pages import place_axes, place_text, require_picture_path, save_page
 from sliplens.report.style import BLACK, GREY, SKY, VERMILLION, drawing_style
-from sliplens.report.trial_charts import STATE_COLOURS, STATE_TINTS, TIMES, brighten, brightening
+from sliplens.report.trial_charts import NAMED_STATES, STATE_COLOURS, STATE_TINTS, TIMES, brighten, brightening
 
 _SHARES = (0, 1, 0.25, 0.5, 0.75)  # of the way from full stick to the slip; its ends first
 _EVEN = 0.05  # frames of like margins are spread over time: for that, a margin may be off by so much
@@ -109,7 +109,7 @@ def _draw_charts(figure: Figure, recording: Recording, labelling: Mapping[str, A
     plot_labels(recording, ax=charts[2])
     lag = labelling["lag"]
     shift = (lag["lag_s"] or 0.0) if lag and labelling["lag_applied"] else 0.0
-    shades = [(str(state), colour, STATE_TINTS[state]) for state, colour in STATE_COLOURS.items()]
+    shades = [(str(state), STATE_COLOURS[state], STATE_TINTS[state]) for state in NAMED_STATES]
     tints = [Patch(color=colour, alpha=tint, linewidth=0, label=name) for name, colour, tint in shades]
     for ax in charts:
         if labelling["slip_s"] is not None:

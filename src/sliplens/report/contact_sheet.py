@@ -19,6 +19,7 @@ from sliplens.report.pages import place_axes, place_text, require_picture_path, 
 from sliplens.report.panels import NOMINAL_MARGINS
 from sliplens.report.style import BLACK, GREY, SKY, decimals, drawing_style, percent
 from sliplens.report.trial_charts import (
+    NAMED_STATES,
     STATE_COLOURS,
     STATE_TINTS,
     TIMES,
@@ -209,7 +210,7 @@ def _explain(figure: Figure, recordings: Sequence[Recording], factor: float) -> 
     )
     place_text(figure, _EDGE, bottom - 0.65, words, fontsize=9)
     mark = Line2D([], [], color=BLACK, linewidth=0.7, marker="o", markersize=5, label="frame shown")
-    tints = [(state, {"color": colour, "alpha": STATE_TINTS[state]}) for state, colour in STATE_COLOURS.items()]
+    tints = [(state, {"color": STATE_COLOURS[state], "alpha": STATE_TINTS[state]}) for state in NAMED_STATES]
     states = [Patch(linewidth=0, label=str(state), **tint) for state, tint in tints]
     place = {"loc": "lower left", "bbox_to_anchor": (_EDGE / _WIDTH, 0.1 / bottom), "borderaxespad": 0, "borderpad": 0}
     figure.legend(handles=[*outline_handles(recordings), mark, *states], ncols=7, **place)

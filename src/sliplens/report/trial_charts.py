@@ -12,9 +12,11 @@ from matplotlib.patheffects import Normal, Stroke
 from sliplens.recordings import ContactState, Recording
 from sliplens.report.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILLION
 
-STATE_COLOURS = dict(zip(ContactState, (GREY, BLUE, ORANGE, VERMILLION), strict=True))
+STATE_COLOURS = dict(zip(ContactState, (GREY, BLUE, ORANGE, VERMILLION, "white"), strict=True))
 # full slip darker than the rest: told from incipient slip by its lightness too
-STATE_TINTS = dict(zip(ContactState, (0.2, 0.2, 0.2, 0.55), strict=True))
+STATE_TINTS = dict(zip(ContactState, (0.2, 0.2, 0.2, 0.55, 0), strict=True))
+NAMED_STATES = tuple(state for state in ContactState if state is not ContactState.UNKNOWN)
+"""What a legend tells of."""
 TIMES = "\N{MULTIPLICATION SIGN}"
 
 _BRIGHT_PERCENTILE = 99.5  # of the differences: a few outlying pixels would leave the rest dark

@@ -8,9 +8,13 @@ from pathlib import Path
 from sliplens.errors import InputError
 from sliplens.images.files import IMAGE_SUFFIXES
 from sliplens.recordings.capture import Capture
+from sliplens.recordings.dataset import DATASET_FILE
+from sliplens.recordings.readers.gelsight import is_gelsight, read_gelsight
 from sliplens.recordings.readers.images import read_image_folder
 from sliplens.recordings.readers.lerobot import read_lerobot
 from sliplens.recordings.readers.rosbag import read_rosbag
+from sliplens.recordings.readers.stored import read_stored
+from sliplens.recordings.readers.thesis import is_thesis_list, read_thesis
 from sliplens.recordings.readers.video import read_video
 
 _BAG_SUFFIXES = frozenset({".mcap", ".db3"})
@@ -34,6 +38,9 @@ class ReadOptions:
     wrench_topic: str | None = None
     camera_key: str | None = None
     force_key: str | None = None
+    image_root: Path | None = None
+    """Folder under which listed images lie now."""
+    margin_unit: str | None = None
 
     def given(self) -> dict[str, object]:
         """What was said."""
@@ -57,6 +64,12 @@ class Reader:
 _TABLE = ("forces", "frame_rate", "start_s", "time_column", "force_columns", "time_unit", "force_unit")
 
 READERS = {
+    "sliplens": Reader(
+        words="data set of sliplens, simulated or imported, with its labels",
+        recognises=lambda path: (path / DATASET_FILE).is_file(),
+        takes=(),
+        read=read_stored,
+    ),
     "rosbag": Reader(
         words="ROS 2 bag (MCAP or sqlite3)",
         recognises=lambda path: path.suffix in _BAG_SUFFIXES or (path / "metadata.yaml").is_file(),
@@ -68,6 +81,18 @@ READERS = {
         recognises=lambda path: (path / "meta" / "info.json").is_file(),
         takes=("camera_key", "force_key"),
         read=read_lerobot,
+    ),
+    "thesis": Reader(
+        words="lists of the thesis (*_images_L.txt), with their margins",
+        recognises=is_thesis_list,
+        takes=("image_root", "margin_unit", "frame_rate"),
+        read=read_thesis,
+    ),
+    "gelsight": Reader(
+        words="GelSight Mini clips of the data set behind 'Incipient Slip Detection', without a label of any frame",
+        recognises=is_gelsight,
+        takes=("frame_rate",),
+        read=read_gelsight,
     ),
     "images": Reader(
         words="folder of images, with a table of forces",

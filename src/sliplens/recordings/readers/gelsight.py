@@ -4,8 +4,11 @@ import csv
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from sliplens.errors import RecordingError
-from sliplens.recordings.capture import Capture
+from sliplens.recordings.capture import Capture, Told
+from sliplens.recordings.given import labels_of_margins
 from sliplens.recordings.readers.stale import count_stale, least_contact, small_copies
 from sliplens.recordings.readers.video import read_video
 
@@ -49,7 +52,7 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
     RecordingError
         If the table is missing or does not list the clip, or the clip cannot be read or has another number of frames.
     """
-    table = path.parent.parent.parent / LABELS_FILE if labels is None else labels
+    table = path.absolute().parent.parent.parent / LABELS_FILE if labels is None else labels
     rows = _read_labels(table)
     # the names of clips repeat in every folder: the last three parts tell them apart
     key = "/".join(path.absolute().parts[-3:])
@@ -82,6 +85,58 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
         stale_frames=stale,
         reference_index=reference,
     )
+
+
+def read_gelsight(path: Path, *, frame_rate: float | None = None) -> list[Capture]:
+    """Read clips as captures without a label of any frame; what is known of the whole clip is kept beside.
+
+    Parameters
+    ----------
+    path
+        The data set's folder, for all clips that are there; the folder of a grasp; or a clip.
+    frame_rate
+        Frames per second that the times assume; roughly known if None.
+
+    Raises
+    ------
+    RecordingError
+        As `read_gelsight_clip`, or if a folder holds no clip.
+    """
+    if path.is_file():
+        clips = [path]
+    elif (path / LABELS_FILE).is_file():
+        clips = list_gelsight_clips(path)
+    else:
+        clips = sorted(path.glob("*.avi"))
+    if not clips:
+        raise RecordingError(f"{path} holds no clip; name a clip, the folder of a grasp, or that of {LABELS_FILE}")
+    rate = FRAME_RATE_HZ if frame_rate is None else frame_rate
+    return [_labelled(read_gelsight_clip(clip, frame_rate=rate)) for clip in clips]
+
+
+def is_gelsight(path: Path) -> bool:
+    """Whether a path is a clip of the data set, the folder of a grasp, or the data set; told by its `labels.csv`."""
+    tables = [folder / LABELS_FILE for folder in (path, *path.absolute().parents[1:3])]
+    try:
+        return any(table.is_file() and {"file", "slip_label"} <= _columns(table) for table in tables)
+    except (OSError, UnicodeDecodeError, csv.Error):
+        return False
+
+
+def _labelled(clip: GelSightClip) -> Capture:
+    capture = clip.capture
+    known = {"slips": clip.slipped, "grasp": clip.grasp, "stale_frames": clip.stale_frames}
+    return replace(
+        capture,
+        labels=labels_of_margins(np.full(len(capture.frame_time_s), np.nan), clip=known),
+        reference_index=clip.reference_index,
+        told=Told(sensor="gelsight-mini", object=clip.grasped),
+    )
+
+
+def _columns(table: Path) -> set[str]:
+    with table.open(newline="", encoding="utf-8-sig") as stream:
+        return set(next(csv.reader(stream), []))
 
 
 def list_gelsight_clips(folder: Path) -> list[Path]:

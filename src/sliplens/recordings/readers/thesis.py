@@ -10,13 +10,16 @@ from jaxtyping import Float, UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.images.files import natural_key
-from sliplens.recordings.readers.clocks import trial_name
+from sliplens.recordings.capture import Capture
+from sliplens.recordings.given import labels_of_margins
+from sliplens.recordings.readers.clocks import evenly_spaced, trial_name
 from sliplens.recordings.readers.image_frames import common_size, read_frame
 from sliplens.recordings.readers.listed_files import ListedFiles, read_lines
 from sliplens.recordings.recording import require_unit_interval
 
 FRAMES, REFERENCES, MARGINS = "_images_L.txt", "_images_Lref.txt", "_gamma.csv"
 """How the names of the three lists end."""
+_FRAME_RATE_HZ = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,6 +102,47 @@ def read_thesis_lists(
         _trial(name, reference, rows[reference], source=str(frames_list), notes=notes)
         for name, reference in zip(names, rows, strict=True)
     )
+
+
+def read_thesis(
+    path: Path, *, image_root: Path | None = None, margin_unit: str | None = None, frame_rate: float | None = None
+) -> list[Capture]:
+    """Read the lists of a set as captures, one for each reference frame, with the margins of the list as their labels.
+
+    Parameters
+    ----------
+    path, image_root, margin_unit
+        As `read_thesis_lists` takes them.
+    frame_rate
+        Frames per second, which the lists do not give; those of a usual camera if None.
+
+    Raises
+    ------
+    RecordingError
+        As `read_thesis_lists`.
+    """
+    rate = _FRAME_RATE_HZ if frame_rate is None else frame_rate
+    how = "assumed" if frame_rate is None else "declared"
+    times = f"The lists give no times: {rate:g} frames/s were {how}; how fast the margin falls rests on it."
+    return [
+        Capture(
+            name=trial.name,
+            source=f"{trial.name} of {trial.source}",
+            frame_time_s=evenly_spaced(len(trial), frame_rate=rate),
+            frame_size=trial.frame_size,
+            read_frames=trial.read_frames,
+            forces=None,
+            notes=(*trial.notes, times),
+            labels=labels_of_margins(trial.safety_margin),
+            reference=trial.read_reference(),
+        )
+        for trial in read_thesis_lists(path, root=image_root, margin_unit=margin_unit)
+    ]
+
+
+def is_thesis_list(path: Path) -> bool:
+    """Whether a path is named like a list of the thesis, or a folder that holds one."""
+    return path.name.endswith(FRAMES) or (path.is_dir() and next(path.glob(f"*{FRAMES}"), None) is not None)
 
 
 def _frames_list(path: Path) -> Path:
