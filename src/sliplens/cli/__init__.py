@@ -14,6 +14,7 @@ from sliplens.cli.demo import Demo
 from sliplens.cli.evaluate import Evaluate
 from sliplens.cli.explain import Explain
 from sliplens.cli.import_ import Import
+from sliplens.cli.label import Label
 from sliplens.cli.report import Report
 from sliplens.cli.score import Score
 from sliplens.cli.simulate import Simulate
@@ -24,6 +25,7 @@ Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[Import, tyro.conf.subcommand("import")]
+    | Annotated[Label, tyro.conf.subcommand("label")]
     | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]

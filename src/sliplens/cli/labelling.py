@@ -65,8 +65,6 @@ def write_trials(
     abouts: "Sequence[About]",
     splits: Sequence[str],
     options: LabelOptions,
-    *,
-    simulated: bool = False,
 ) -> dict[str, dict[str, Any]]:
     """Write the trials of a data set that are not there yet; give what the labels of each rest on."""
     import numpy as np
@@ -103,7 +101,7 @@ def write_trials(
                 draw_audit_page(path, folder / "audit" / f"{capture.name}.png", found[capture.name])
     if not table:
         raise RecordingError("there is no trial to import; name a recording")
-    write_dataset_table(folder, table, simulated=simulated)
+    write_dataset_table(folder, table, simulated=all(capture.told.simulated for capture in captures))
     return found
 
 
@@ -146,7 +144,7 @@ def summary(found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _row(name: str, told: dict[str, Any]) -> tuple[str, ...]:
     friction, lag, reference = told["friction"], told["lag"], told["reference"]
-    told_friction = "came with it"
+    told_friction = "came with it" if told["frames_by_reason"].get("valid") else "-"
     if friction is not None:
         told_friction = f"{friction['mu']:.3f} [{friction['low']:.3f}, {friction['high']:.3f}] {friction['found']}"
     told_lag = "-"

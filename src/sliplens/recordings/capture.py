@@ -49,6 +49,7 @@ class Told:
     condition: str | None = None
     object: str | None = None
     split: str | None = None
+    simulated: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

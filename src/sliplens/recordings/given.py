@@ -58,6 +58,11 @@ class GivenLabels:
         """Count the frames."""
         return len(self.safety_margin)
 
+    @property
+    def found(self) -> bool:
+        """Whether they were found from forces by an import, and so can be found again."""
+        return self.labelling is not None and self.labelling.get("friction") is not None
+
     def count(self) -> dict[str, int]:
         """Count the frames by the reason why they have no valid label, those that have one as 'valid'."""
         valid = np.isfinite(self.safety_margin)

@@ -51,9 +51,12 @@ def draw_audit(recording: Recording, labelling: Mapping[str, Any]) -> Figure:
     with drawing_style():
         figure = Figure(figsize=(_WIDTH, _HEIGHT))
         charts = _draw_charts(figure, recording, labelling, bottom=top - _HEAD - _LEADER - _TICKS)
-        places = [labelling["reference"]["index"], *choose_along(recording)]
-        _draw_pictures(figure, recording, places, top=top, height=height)
-        for column, time_s in enumerate(recording.time_s[places]):
+        index, along = labelling["reference"]["index"], choose_along(recording)
+        _draw_pictures(figure, recording, index, along, top=top, height=height)
+        for column, at in enumerate([index, *along]):
+            if at is None:  # the reference was recorded apart from the frames
+                continue
+            time_s = recording.time_s[at]
             middle = (_LEFT + column * (_PICTURE + _GAP) + _PICTURE / 2) / _WIDTH
             _lead(figure, charts, float(time_s), middle, top=top - _HEAD - _LEADER)
         _tell(figure, recording, labelling)
@@ -83,8 +86,10 @@ def choose_along(recording: Recording) -> list[int]:
     """Five different frames in the order of time, or all if there are fewer, evenly spaced in their margins.
 
     They begin at full stick, pressed hardest, and end in full slip; a trial without begins at its first label, or ends
-    at its least margin.
+    at its least margin. Where no frame has a margin, they are evenly spaced in time.
     """
+    if not np.isfinite(recording.safety_margin).any():
+        return np.unique(np.linspace(0, len(recording) - 1, len(_SHARES)).round().astype(int)).tolist()
     margins, margin = choose_margins(recording), np.nan_to_num(recording.safety_margin)
     allowed = recording.labelled.copy()
     places = np.flatnonzero(allowed) if allowed.any() else np.arange(len(recording))
@@ -143,36 +148,39 @@ def _lead(figure: Figure, charts: list[Axes], time_s: float, middle: float, *, t
     figure.add_artist(Line2D([from_x, middle], ends, color=BLACK, linewidth=0.7, alpha=0.45))
 
 
-def _draw_pictures(figure: Figure, recording: Recording, places: list[int], *, top: float, height: float) -> None:
+def _draw_pictures(
+    figure: Figure, recording: Recording, index: int | None, along: list[int], *, top: float, height: float
+) -> None:
     reference, second = recording.reference, top + height + _GAP
     free = [at for at, state in enumerate(recording.contact_state) if state == ContactState.NO_CONTACT]
     # the reference less itself would tell nothing, an untouched frame long before or after it tells how it drifts
-    far = max(free, key=lambda at: abs(at - places[0]), default=places[0])
-    frames = [reference, *recording.frames[places[1:]]]
-    differences = absolute_difference(recording.frames[[far, *places[1:]]], reference)
+    far = max(free, key=lambda at: abs(at - (index or 0)), default=index)
+    frames = [reference, *recording.frames[along]]
+    untouched = reference if far is None else recording.frames[far]
+    differences = absolute_difference(np.stack([untouched, *recording.frames[along]]), reference)
     factor = brightening([differences])
     for text, middle in (("camera", top + height / 2), (f"difference\n{TIMES} {factor:g}", second + height / 2)):
         turned = {"rotation": 90, "ha": "right", "va": "center", "multialignment": "center"}
         place_text(figure, _LEFT - 0.06, middle, text, fontsize=8.5, color=GREY, **turned)
-    for column, (at, frame, difference) in enumerate(zip(places, frames, differences, strict=True)):
+    for column, (at, frame, difference) in enumerate(zip([index, *along], frames, differences, strict=True)):
         x = _LEFT + column * (_PICTURE + _GAP)
-        state = recording.contact_state[at]
+        state = ContactState.NO_CONTACT if at is None else recording.contact_state[at]
         for y, picture in ((top, frame), (second, brighten(difference, factor))):
             ax = place_axes(figure, x, y, _PICTURE, height)
             ax.imshow(picture)
             ax.set(xticks=[], yticks=[])
             ax.spines[:].set(visible=True, color=STATE_COLOURS[state], linewidth=2)
-        told = _margin(recording, at) if column else "reference"
-        apart = "" if recording.labelled[at] or not column else ", not valid"
+        told = _margin(recording, at) if at is not None and column else "reference"
+        apart = "" if at is None or recording.labelled[at] or not column else ", not valid"
         lines = (
             (told, 0.37, "bold"),
-            (f"{recording.time_s[at]:.2f} s", 0.21, "normal"),
+            ("recorded apart" if at is None else f"{recording.time_s[at]:.2f} s", 0.21, "normal"),
             (state + apart, 0.06, "normal"),
         )
         for text, up, weight in lines:
             place_text(figure, x + _PICTURE / 2, top - up, text, ha="center", va="bottom", fontsize=8, weight=weight)
     words = f"Differences are $|T_n - T_0|$, brightened {TIMES} {factor:g}"
-    if free:
+    if free and far is not None:
         untouched = f"that of the untouched frame at {recording.time_s[far]:.2f} s"
         words += f"; beneath the reference {untouched}: it should be dark"
     place_text(figure, _LEFT, _HEIGHT - _FOOT + 0.08, words, fontsize=8, color=GREY)

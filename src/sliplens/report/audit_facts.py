@@ -25,6 +25,8 @@ class Fact(NamedTuple):
 
 def audit_facts(recording: Recording, labelling: Mapping[str, Any]) -> list[Fact]:
     """Tell what the labels rest on: what was declared, found and assumed, and what of it is doubtful."""
+    if labelling["friction"] is None:
+        return _tell_given(recording, labelling)
     axes, notes = labelling["axes"], [*labelling["axes"]["notes"], *labelling["notes"]]
     found = {name: _found(axes[f"{name}_found"]) for name in ("normal", "sign", "tare")}
     pressing = f"normal force is {'+' if axes['sign'] > 0 else _MINUS}{axes['normal']}"
@@ -61,13 +63,38 @@ def audit_facts(recording: Recording, labelling: Mapping[str, Any]) -> list[Fact
         ),
         Fact(
             "Reference",
-            [
+            [str(reference["method"])]
+            if reference["index"] is None
+            else [
                 f"frame {reference['index']}, {reference['method']}",
                 f"contact energy {energy}, drift {drift} grey levels",
             ],
         ),
         *([Fact("Notes", [f"• {note}" for note in notes], indent="   ")] if notes else []),
     ]
+
+
+def _tell_given(recording: Recording, labelling: Mapping[str, Any]) -> list[Fact]:
+    """Tell of labels that came with the frames, and were not found from forces."""
+    reference, clip = labelling["reference"], labelling.get("clip") or {}
+    which = "recorded apart from the frames" if reference["index"] is None else f"frame {reference['index']}"
+    labelled = bool(recording.labelled.any())
+    words = ["They came with the recording; nothing was found from forces."] if labelled else ["No frame has one."]
+    known = [f"{name.replace('_', ' ')}: {_plainly(value)}" for name, value in clip.items()]
+    notes = [f"• {note}" for note in labelling["notes"]]
+    counts = labelling["frames_by_reason"]
+    lost = [", ".join(f"{count} {reason}" for reason, count in counts.items() if reason != "valid")]
+    return [
+        Fact(f"Frames: {counts.get('valid', 0)} of {sum(counts.values())} valid", lost),
+        Fact("Labels", words, doubtful=not labelled),
+        *([Fact("Known of the whole clip", known)] if known else []),
+        Fact("Reference", [which]),
+        *([Fact("Notes", notes, indent="   ")] if notes else []),
+    ]
+
+
+def _plainly(value: object) -> str:
+    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
 
 
 def _tell_frames(recording: Recording) -> Fact:

@@ -35,10 +35,12 @@ def read_stored(folder: Path) -> list[Capture]:
     InputError, RecordingError
         If the folder is no data set, or a trial is missing or damaged.
     """
-    return [_capture(folder, info) for info in Dataset.open(folder).trials]
+    data = Dataset.open(folder)
+    return [_capture(data, info) for info in data.trials]
 
 
-def _capture(folder: Path, info: TrialInfo) -> Capture:
+def _capture(data: Dataset, info: TrialInfo) -> Capture:
+    folder = data.folder
     path = trial_path(folder, info.trial)
     try:
         present = set(pq.read_schema(path).names)
@@ -70,7 +72,12 @@ def _capture(folder: Path, info: TrialInfo) -> Capture:
         labels=labels,
         reference=read_reference(path),
         told=Told(
-            sensor=info.sensor, day=info.day, condition=info.condition, object=info.object or None, split=info.split
+            sensor=info.sensor,
+            day=info.day,
+            condition=info.condition,
+            object=info.object or None,
+            split=info.split,
+            simulated=data.simulated,
         ),
     )
 

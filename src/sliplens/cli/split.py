@@ -1,0 +1,121 @@
+"""`sliplens split`."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from rich.markup import escape
+
+from sliplens.cli.console import print_table, say, wrote
+from sliplens.errors import InputError
+
+if TYPE_CHECKING:
+    from sliplens.recordings import Dataset, TrialInfo
+    from sliplens.recordings.splits import SplitPlan
+
+_SHOWN = 6
+"""So many names are shown before the rest is counted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Split:
+    """Deal the trials of a data set to train, validation and test, as a file of rules or a preset says.
+
+    A trial is never torn apart. Shows what each split holds and which trials move; the rules are kept beside the table
+    of the data set, in splits.json.
+    """
+
+    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
+    """Data set to split."""
+    rules: Path | None = None
+    """File of rules (TOML): the first that fits a trial decides."""
+    preset: Literal["thesis", "objects", "trials"] | None = None
+    """thesis: the last day tests, the first trains, a quarter of the dry trials between validates. objects: 70, 15 and
+    15 percent of the objects train, validate and test. trials: the same of the trials."""
+    dry_run: bool = False
+    """Show what would be done and write nothing."""
+
+    def run(self) -> None:
+        """Split, show and write."""
+        from sliplens.recordings import Dataset
+        from sliplens.recordings.splits import SPLITS_FILE, assign_splits, store_splits
+
+        if (self.rules is None) == (self.preset is None):
+            raise InputError("give the file of rules with --rules, or a --preset, one of the two")
+        data = Dataset.open(self.data)
+        plan = self._plan(data)
+        result = assign_splits(plan, data.trials)
+        moved = [(info, to) for info, to in zip(data.trials, result.splits, strict=True) if info.split != to]
+        _show_splits(data.trials, result.splits)
+        _show_moves(moved)
+        for note in result.notes:
+            say(f"note: {note}")
+        if self.dry_run:
+            say("nothing is written (--dry-run)")
+            return
+        store_splits(data, plan, result)
+        wrote(self.data, f"{len(moved)} of {len(data.trials)} trials moved; {SPLITS_FILE} keeps the rules")
+        if moved:
+            say("networks trained before saw other splits: a trial that tests now may have trained them, train anew")
+
+    def _plan(self, data: "Dataset") -> "SplitPlan":
+        from sliplens.recordings.splits import PRESETS, read_splits
+
+        if self.rules is not None:
+            return read_splits(self.rules)
+        assert self.preset is not None
+        return PRESETS[self.preset](data.trials)
+
+
+def _show_splits(trials: "Sequence[TrialInfo]", splits: Sequence[str]) -> None:
+    rows = []
+    for name in _in_order(splits):
+        infos = [info for info, split in zip(trials, splits, strict=True) if split == name]
+        rows.append(
+            (
+                name,
+                str(len(infos)),
+                f"{sum(info.frames for info in infos):,}",
+                _ranges(info.day for info in infos),
+                _some({info.object for info in infos} - {""}),
+                _some({info.condition for info in infos}),
+            )
+        )
+    print_table("Splits", ("split", "trials", "frames", "days", "objects", "conditions"), rows)
+
+
+def _show_moves(moved: "Sequence[tuple[TrialInfo, str]]") -> None:
+    if not moved:
+        say("every trial is in its split already")
+        return
+    names: dict[tuple[str, str], list[str]] = {}
+    for info, to in moved:
+        names.setdefault((info.split, to), []).append(info.trial)
+    rows = [(escape(old), to, str(len(those)), _some(those)) for (old, to), those in sorted(names.items())]
+    print_table("Moves", ("from", "to", "trials", "which"), rows)
+
+
+def _in_order(splits: Iterable[str]) -> list[str]:
+    """Splits as one speaks of them, others after them."""
+    usual = ["train", "validation", "test"]
+    present = set(splits)
+    return [name for name in usual if name in present] + sorted(present - set(usual))
+
+
+def _some(names: Iterable[str]) -> str:
+    from sliplens.images.files import natural_key
+
+    ordered = sorted(names, key=natural_key)
+    rest = len(ordered) - _SHOWN
+    shown = ordered if rest < 2 else [*ordered[:_SHOWN], f"{rest} more"]
+    return escape(", ".join(shown)) or "-"
+
+
+def _ranges(numbers: Iterable[int]) -> str:
+    """Numbers with runs drawn together: 1, 3-5."""
+    runs = groupby(enumerate(sorted(set(numbers))), key=lambda pair: pair[1] - pair[0])
+    ends = [(run[0][1], run[-1][1]) for run in (list(run) for _, run in runs)]
+    return ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in ends)

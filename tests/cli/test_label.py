@@ -1,0 +1,204 @@
+"""`sliplens label`, and the import of recordings that bring labels of their own."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sliplens.cli import main
+from sliplens.images import write_png
+from sliplens.recordings import ContactState, Dataset, Recording
+from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.headers import read_labelling
+from sliplens.recordings.samples import forces_path, load_forces
+from sliplens.recordings.store import load_recording, save_recording
+from sliplens.simulation import PRESETS, plan_trials, simulate_trial
+
+
+def run(*words: object) -> int:
+    return main([str(word) for word in words])
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    assert run(*words) == 2
+    captured = capsys.readouterr()
+    assert "Traceback" not in captured.err + captured.out
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def trial() -> Recording:
+    """A simulated trial at 30 frames a second."""
+    return replace(simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=240)), object="cup")
+
+
+@pytest.fixture(scope="module")
+def simulated(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("simulated")
+    path = trial_path(folder, trial.trial)
+    save_recording(trial, path)
+    write_dataset_table(folder, [trial_info(path, split="validation")], simulated=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def relabelled(simulated: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("relabelled") / "data"
+    assert run("label", simulated, "-o", folder) == 0
+    return folder
+
+
+def signals(recording: Recording) -> dict[str, np.ndarray]:
+    names = ("time_s", "normal_force_n", "tangential_force_n", "friction_coefficient", "safety_margin", "stick_ratio")
+    return {name: getattr(recording, name) for name in names}
+
+
+def test_an_imported_data_set_keeps_its_labels_and_what_it_is(tmp_path: Path, trial: Recording, simulated: Path):
+    assert run("import", simulated, "-o", tmp_path / "data") == 0
+    assert run("check", tmp_path / "data") == 0
+    data = Dataset.open(tmp_path / "data")
+    back = data.load(data.trials[0])
+    for name, values in signals(trial).items():
+        np.testing.assert_array_equal(getattr(back, name), values, err_msg=name)
+    np.testing.assert_array_equal(back.frames, trial.frames)
+    np.testing.assert_array_equal(back.reference, trial.reference)
+    assert back.contact_state == trial.contact_state
+    assert (back.sensor, back.day, back.condition, back.object) == (trial.sensor, trial.day, trial.condition, "cup")
+    assert (data.trials[0].split, data.trials[0].object, data.simulated) == ("validation", "cup", True)
+    # a page is drawn of labels that were not found, too
+    assert (tmp_path / "data" / "audit" / f"{trial.trial}.png").is_file()
+
+
+def test_what_is_said_on_the_command_line_counts_before_what_the_source_tells(tmp_path: Path, simulated: Path):
+    words = ("--sensor", "tip", "--day", 7, "--condition", "wet", "--object", "glass", "--test-trials", 1)
+    assert run("import", simulated, "-o", tmp_path / "data", "--no-audit", *words) == 0
+    (info,) = Dataset.open(tmp_path / "data").trials
+    assert (info.sensor, info.day, info.condition, info.object, info.split) == ("tip", 7, "wet", "glass", "test")
+
+
+def test_the_labels_of_a_simulated_trial_come_back_from_its_forces(trial: Recording, relabelled: Path):
+    back = load_recording(trial_path(relabelled, trial.trial))
+    told = read_labelling(trial_path(relabelled, trial.trial))
+    assert told is not None
+    assert trial.truth is not None
+    assert back.valid is not None
+    slip = int(np.argmax(trial.safety_margin == 0))
+    # forces without noise: what is left is the time of a frame over which they are averaged
+    assert told["friction"]["mu"] == pytest.approx(trial.truth.static_friction[slip], rel=0.02)
+    error = (back.safety_margin - trial.safety_margin)[back.valid]
+    assert np.sqrt(np.mean(error**2)) < 0.02
+    np.testing.assert_array_equal(back.reference, trial.reference)
+    assert run("check", relabelled) == 0
+
+
+def test_force_samples_are_kept_and_labels_made_anew_from_them_are_the_same(
+    tmp_path: Path, trial: Recording, relabelled: Path
+):
+    samples = load_forces(forces_path(relabelled, trial.trial))
+    np.testing.assert_array_equal(samples.force_n[:, 2], trial.normal_force_n)
+    np.testing.assert_array_equal(samples.force_n[:, 0], trial.tangential_force_n)
+    shutil.copytree(relabelled, tmp_path / "data")
+    before = load_recording(trial_path(relabelled, trial.trial))
+    # in place, with the same settings and seed
+    assert run("label", tmp_path / "data") == 0
+    after = load_recording(trial_path(tmp_path / "data", trial.trial))
+    for name, values in signals(before).items():
+        np.testing.assert_array_equal(getattr(after, name), values, err_msg=name)
+    # and with another friction: 1 - Gamma is inversely proportional to it
+    assert run("label", tmp_path / "data", "--mu", 1.6) == 0
+    after = load_recording(trial_path(tmp_path / "data", trial.trial))
+    both = before.labelled & after.labelled
+    assert both.sum() > 150
+    expected = 1 - (1 - before.safety_margin) * before.friction_coefficient / 1.6
+    np.testing.assert_allclose(after.safety_margin[both], expected[both], atol=1e-9)
+    assert Dataset.open(tmp_path / "data").trials[0].split == "validation"
+
+
+def test_labels_that_were_not_found_are_not_overwritten(simulated: Path, capsys: pytest.CaptureFixture[str]):
+    before = (simulated / "dataset.json").read_bytes()
+    assert "did not come from its forces and would be lost" in refused(capsys, "label", simulated)
+    assert (simulated / "dataset.json").read_bytes() == before
+
+
+def test_pages_alone_are_drawn_of_what_was_imported(
+    tmp_path: Path, trial: Recording, simulated: Path, relabelled: Path, capsys: pytest.CaptureFixture[str]
+):
+    before = Dataset.open(relabelled).hash
+    assert run("label", relabelled, "--audit-only", "-o", tmp_path) == 0
+    assert (tmp_path / "audit" / f"{trial.trial}.png").is_file()
+    assert Dataset.open(relabelled).hash == before
+    capsys.readouterr()
+    assert "was not imported" in refused(capsys, "label", simulated, "--audit-only")
+
+
+def test_changed_force_samples_are_found(tmp_path: Path, trial: Recording, relabelled: Path):
+    shutil.copytree(relabelled, tmp_path / "data")
+    forces_path(tmp_path / "data", trial.trial).write_bytes(b"PAR1")
+    assert run("check", tmp_path / "data") == 2
+
+
+@pytest.fixture
+def thesis_lists(tmp_path: Path, rng: np.random.Generator) -> Path:
+    """Ten frames and their reference, in the lists of the thesis."""
+    folder = tmp_path / "lists"
+    folder.mkdir()
+    for number in range(11):
+        write_png(folder / f"image_{number}.png", rng.integers(0, 256, (16, 16, 3), dtype=np.uint8))
+    margins = [f"{margin:.2f}" for margin in np.linspace(1, 0, 10)]
+    lines = {
+        "set_images_L.txt": [f"image_{number}.png" for number in range(1, 11)],
+        "set_images_Lref.txt": ["image_0.png"] * 10,
+        "set_gamma.csv": margins,
+    }
+    for name, text in lines.items():
+        (folder / name).write_text("\n".join(text) + "\n")
+    return folder
+
+
+def test_the_lists_of_the_thesis_become_a_data_set(tmp_path: Path, thesis_lists: Path):
+    assert run("import", thesis_lists, "-o", tmp_path / "data", "--sensor", "chromatouch", "--frame-rate", 60) == 0
+    assert run("check", tmp_path / "data") == 0
+    data = Dataset.open(tmp_path / "data")
+    back = data.load(data.trials[0])
+    np.testing.assert_array_equal(back.safety_margin, np.linspace(1, 0, 10).round(2))
+    np.testing.assert_allclose(back.time_s, np.arange(10) / 60)
+    assert np.isnan(back.normal_force_n).all()
+    assert back.contact_state[0] == ContactState.CONTACT
+    assert back.contact_state[-1] == ContactState.FULL_SLIP
+    assert set(back.contact_state[1:-1]) == {ContactState.INCIPIENT_SLIP}
+
+
+def test_labels_cannot_be_found_without_forces(tmp_path: Path, thesis_lists: Path, capsys: pytest.CaptureFixture[str]):
+    assert run("import", thesis_lists, "-o", tmp_path / "data", "--sensor", "chromatouch", "--no-audit") == 0
+    capsys.readouterr()
+    assert "has no forces, and without them there is no label" in refused(capsys, "label", tmp_path / "data")
+
+
+def test_a_source_that_does_not_tell_its_sensor_needs_it_told(
+    tmp_path: Path, thesis_lists: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert "does not tell its sensor" in refused(capsys, "import", thesis_lists, "-o", tmp_path / "data")
+
+
+def test_real_clips_come_with_what_is_known_of_them_and_no_label(tmp_path: Path, reference_folder: Path):
+    grasp = reference_folder / "gelsight_mini_slip" / "slip" / "jute_basket__exp_num_2"
+    if not grasp.is_dir():
+        pytest.skip(f"the real clips are not at {grasp}")
+    assert run("import", grasp, "-o", tmp_path / "data") == 0
+    assert run("check", tmp_path / "data") == 0
+    data = Dataset.open(tmp_path / "data")
+    assert {info.object for info in data.trials} == {"jute_basket"}
+    assert {info.sensor for info in data.trials} == {"gelsight-mini"}
+    for info in data.trials:
+        back = data.load(info)
+        told = read_labelling(trial_path(tmp_path / "data", info.trial))
+        assert told is not None
+        assert told["clip"]["slips"] is True
+        assert not back.labelled.any()
+        assert set(back.contact_state) == {ContactState.UNKNOWN}
+        np.testing.assert_array_equal(back.reference, back.frames[told["reference"]["index"]])
+    assert len(list((tmp_path / "data" / "audit").glob("*.png"))) == 2
