@@ -11,8 +11,8 @@ def frames(rng: np.random.Generator) -> np.ndarray:
     return rng.integers(0, 200, (3, 16, 16, 3), dtype=np.uint8)
 
 
-@pytest.mark.parametrize("name", ENCODINGS)
-def test_every_input_spans_up_to_one(name: str, frames: np.ndarray):
+@pytest.mark.parametrize("name", [name for name, encoding in ENCODINGS.items() if encoding.own_maximum])
+def test_an_image_divided_by_its_own_maximum_spans_up_to_one(name: str, frames: np.ndarray):
     encoded = ENCODINGS[name].encode(frames, np.zeros_like(frames[0]), image_size=8)
     assert encoded.shape == (3, 3, 8, 8)
     torch.testing.assert_close(encoded.amax(dim=(1, 2, 3)), torch.ones(3))
@@ -50,3 +50,22 @@ def test_frames_of_another_size_than_the_reference_are_refused(frames: np.ndarra
 def test_an_unknown_input_lists_those_there_are():
     with pytest.raises(InputError, match="no input named 'depth'; choose one of difference, raw"):
         get_encoding("depth")
+
+
+def test_a_signed_difference_tells_up_from_down_and_leaves_equal_pixels_alone(rng: np.random.Generator):
+    reference = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
+    frame = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
+    encoding = ENCODINGS["signed"]
+    untouched = encoding.empty(reference, image_size=8)
+    torch.testing.assert_close(untouched, torch.full_like(untouched, encoding.neutral))
+    told = encoding.encode(frame[None], reference, image_size=8)[0].permute(1, 2, 0).numpy()
+    true = (frame.astype(float) - reference) / 2 / 255 + 128 / 255
+    # each of the two images is halved and rounded down: at most half a step apart
+    np.testing.assert_allclose(told, true, atol=0.5 / 255 + 1e-6)
+
+
+def test_an_amplitude_is_kept():
+    reference = np.zeros((8, 8, 3), dtype=np.uint8)
+    frames = np.stack([np.full((8, 8, 3), level, dtype=np.uint8) for level in (10, 20, 200)])
+    told = ENCODINGS["amplitude"].encode(frames, reference, image_size=8)
+    torch.testing.assert_close(told.amax(dim=(1, 2, 3)), torch.tensor([10.0, 20.0, 200.0]) / 255)

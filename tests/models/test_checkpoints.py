@@ -57,13 +57,13 @@ def test_a_pickle_in_place_of_weights_is_refused_unopened(run: Path):
     weights = run / "model.safetensors"
     weights.write_bytes(pickle.dumps(Bomb()))
     edit_manifest(run, weights_sha256=hash_file(weights))
-    with pytest.raises(CheckpointError, match="does not hold a shufflenet_v2_x1_0 with one output"):
+    with pytest.raises(CheckpointError, match="does not hold a shufflenet_v2_x1_0 with a point head"):
         load_checkpoint(run)
 
 
 def test_a_manifest_of_another_backbone_is_refused(run: Path):
     edit_manifest(run, backbone="resnet18")
-    with pytest.raises(CheckpointError, match="does not hold a resnet18 with one output"):
+    with pytest.raises(CheckpointError, match="does not hold a resnet18 with a point head"):
         load_checkpoint(run)
 
 

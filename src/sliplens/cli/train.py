@@ -1,6 +1,6 @@
 """`sliplens train`."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -8,7 +8,6 @@ import tyro
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from sliplens.cli.console import OUT, progress_bar, unchanged, wrote
-from sliplens.errors import InputError
 from sliplens.provenance import output_folder, write_json
 
 
@@ -23,24 +22,32 @@ class Train:
     """Data set, as `sliplens simulate` makes it."""
     output: Annotated[Path, tyro.conf.arg(aliases=("-o",))]
     """Folder to make: weights, manifest, learning curve."""
-    input: Literal["difference", "raw"] = "difference"
-    """What the network sees: |T_n - T_0|, or the frame itself."""
-    backbone: str = "shufflenet_v2_x1_0"
-    """A TorchVision classifier; its last layer becomes one output."""
-    image_size: int = 224
+    recipe: Literal["default", "thesis"] = "default"
+    """default: a distribution over the margin, AdamW. thesis: as the thesis trained, one output and Ranger21. The
+    options below change it."""
+    input: Literal["difference", "raw", "signed", "amplitude"] = "difference"
+    """What the network sees: |T_n - T_0| divided by its own maximum, the frame itself, T_n - T_0, or |T_n - T_0| with
+    its amplitude."""
+    backbone: str | None = None
+    """A TorchVision classifier, such as resnet18."""
+    head: Literal["point", "histogram"] | None = None
+    """What the network answers with: one number, or a distribution, which tells how sure it is."""
+    image_size: int | None = None
     """Height and width of the network's input, in pixels."""
-    epochs: int = 25
+    epochs: int | None = None
     """Most passes over the training frames."""
     max_minutes: float | None = None
     """Stop after this time; the learning rate falls with it."""
-    batch_size: int = 64
+    batch_size: int | None = None
     """Images a step."""
-    learning_rate: float = 2e-3
+    optimizer: Literal["adamw", "ranger21"] | None = None
+    """With its own schedule of the learning rate."""
+    learning_rate: float | None = None
     """Peak learning rate."""
-    untouched_share: float = 0.05
+    untouched_share: float | None = None
     """Share of images that show the untouched sensor as full stick: what explanations are measured against."""
-    augment: bool = True
-    """Slight rotations, noise and blur."""
+    augmentation: Literal["default", "thesis", "none"] | None = None
+    """Slight rotations, noise and blur; by default shifts and colour too."""
     seed: int = 0
     """Seed of weights, order and augmentation."""
     overwrite: bool = False
@@ -50,26 +57,16 @@ class Train:
         """Train and write the run."""
         from sliplens.datasets import get_encoding, load_frames
         from sliplens.recordings import Dataset
-        from sliplens.training import TrainConfig, TrainProgress, fit
+        from sliplens.training import TrainConfig, TrainProgress, fit, get_recipe
 
-        config = TrainConfig(
-            backbone=self.backbone,
-            image_size=self.image_size,
-            epochs=self.epochs,
-            batch_size=self.batch_size,
-            learning_rate=self.learning_rate,
-            max_minutes=self.max_minutes,
-            augment=self.augment,
-            seed=self.seed,
-        )
+        names = {item.name for item in fields(TrainConfig)} - {"recipe"}
+        said = {name: value for name in names if (value := getattr(self, name, None)) is not None}
+        config = replace(get_recipe(self.recipe), **said)
         data = Dataset.open(self.data)
         train_trials, validation_trials = data.select(split="train"), data.select(split="validation")
-        if not 0 <= self.untouched_share <= 1:
-            raise InputError(f"--untouched-share must lie in [0, 1], got {self.untouched_share:g}")
         recipe = {
             "input": self.input,
             "training": config,
-            "untouched_share": self.untouched_share,
             "data_hash": data.hash,
         }
         with output_folder(self.output, stage="train", config=recipe, overwrite=self.overwrite) as out:
@@ -83,15 +80,17 @@ class Train:
                     data,
                     train_trials,
                     encoding=encoding,
-                    image_size=self.image_size,
-                    untouched_share=self.untouched_share,
+                    image_size=config.image_size,
+                    untouched_share=config.untouched_share,
+                    scratch=out.folder,
                     on_trial=lambda done, _: bar(done, total),
                 )
                 validation = load_frames(
                     data,
                     validation_trials,
                     encoding=encoding,
-                    image_size=self.image_size,
+                    image_size=config.image_size,
+                    scratch=out.folder,
                     on_trial=lambda done, _: bar(len(train_trials) + done, total),
                 )
             columns = (
@@ -122,8 +121,8 @@ class Train:
                 out.folder / "result.json",
                 {
                     "input": self.input,
-                    "backbone": self.backbone,
-                    "image_size": self.image_size,
+                    "backbone": config.backbone,
+                    "image_size": config.image_size,
                     "frame_size": [info.height, info.width],
                     "train_frames": len(frames),
                     "validation_frames": len(validation),

@@ -1,13 +1,15 @@
 """Augmentation of batches, on whatever device they lie."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 from torchvision.transforms.v2 import functional as transforms
+
+from sliplens.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +27,8 @@ class Augmentation:
         Each channel is scaled by 1 plus or minus up to this: white balance.
     noise_sd
         Standard deviation of the noise is uniform in [0, noise_sd], in units of the image's maximum.
+    neutral
+        What stands for no change in the input; `colour` scales about it.
     blur_probability, blur_sd_px
         Share of batches that are blurred, and the largest standard deviation of the blur in pixels.
 
@@ -39,6 +43,7 @@ class Augmentation:
     noise_sd: float = 0.03
     blur_probability: float = 0.25
     blur_sd_px: float = 0.8
+    neutral: float = 0.0
 
     def __call__(
         self, images: Float[Tensor, "batch 3 size size"], *, generator: torch.Generator
@@ -58,6 +63,29 @@ class Augmentation:
         images = functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
         if float(uniform(1)) < self.blur_probability:
             images = transforms.gaussian_blur(images, [3, 3], [0.1 + (self.blur_sd_px - 0.1) * float(uniform(1))])
-        images = images * (1 + self.colour * (2 * uniform(batch, 3, 1, 1) - 1))
+        scale = 1 + self.colour * (2 * uniform(batch, 3, 1, 1) - 1)
+        images = (images - self.neutral) * scale + self.neutral
         noise = torch.randn(images.shape, generator=generator, device=device)
         return (images + uniform(batch, 1, 1, 1) * self.noise_sd * noise).clamp(0, 1)
+
+
+AUGMENTATIONS = {
+    "none": None,
+    "thesis": Augmentation(shift=0.0, colour=0.0),
+    "default": Augmentation(),
+}
+"""What a recipe may ask for; `thesis` has rotation, noise and blur alone, in amounts of ours, for it gives none."""
+
+
+def get_augmentation(name: str, *, neutral: float = 0.0) -> Augmentation | None:
+    """Look up an augmentation by name, for inputs with a neutral level; None for none.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name; the message lists those there are.
+    """
+    if name not in AUGMENTATIONS:
+        raise InputError(f"there is no augmentation named {name!r}; choose one of {', '.join(AUGMENTATIONS)}")
+    found = AUGMENTATIONS[name]
+    return None if found is None else replace(found, neutral=neutral)

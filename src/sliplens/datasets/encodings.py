@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from sliplens.errors import InputError
-from sliplens.images import absolute_difference
+from sliplens.images import absolute_difference, signed_difference
 
 Frames = UInt8[np.ndarray, "batch height width 3"]
 Reference = UInt8[np.ndarray, "_ _ 3"]
@@ -29,6 +29,10 @@ class Encoding:
     compare: Callable[[Frames, Reference], Frames]
     empty_is_black: bool
     """Whether an untouched sensor is a black image, so that no reference frame is needed to explain."""
+    own_maximum: bool = True
+    """Whether each image is divided by its own maximum, as in the thesis; else by 255, which keeps its amplitude."""
+    neutral: float = 0.0
+    """What stands for no change, in the network's input."""
 
     def resize(self, compared: Frames, *, image_size: int) -> UInt8[Tensor, "batch 3 size size"]:
         """Bring compared frames to the network's square size, in 8 bits.
@@ -44,12 +48,14 @@ class Encoding:
         return resized.round().clamp(0, 255).to(torch.uint8)
 
     def normalise(self, images: UInt8[Tensor, "batch 3 size size"]) -> Float[Tensor, "batch 3 size size"]:
-        """Divide each image by its own maximum, as the thesis does; an all-black image stays black.
+        """Scale to [0, 1]: by each image's own maximum, as the thesis does, or by 255; an all-black image stays black.
 
         References
         ----------
         Polak, section 4 ("max normalization").
         """
+        if not self.own_maximum:
+            return images.float() / 255
         largest = images.amax(dim=(-3, -2, -1), keepdim=True).clamp(min=1)
         return images.float() / largest
 
@@ -83,8 +89,13 @@ def _keep(frames: Frames, reference: Reference) -> Frames:
 
 
 ENCODINGS = {
+    # |T_n - T_0| by its own maximum and T_n itself, both as the thesis; T_n - T_0; |T_n - T_0| with its amplitude
     "difference": Encoding(name="difference", compare=absolute_difference, empty_is_black=True),
     "raw": Encoding(name="raw", compare=_keep, empty_is_black=False),
+    "signed": Encoding(
+        name="signed", compare=signed_difference, empty_is_black=False, own_maximum=False, neutral=128 / 255
+    ),
+    "amplitude": Encoding(name="amplitude", compare=absolute_difference, empty_is_black=True, own_maximum=False),
 }
 
 

@@ -36,5 +36,30 @@ def absolute_difference(
     return np.maximum(frames, reference) - np.minimum(frames, reference)
 
 
+def signed_difference(
+    frames: UInt8[np.ndarray, "*batch height width 3"], reference: UInt8[np.ndarray, "_ _ 3"]
+) -> UInt8[np.ndarray, "*batch height width 3"]:
+    """Signed difference T_n - T_0 of frames against the reference frame, in 8 bits: half the grey levels, plus 128.
+
+    What brightens lies above 128, what darkens below; a step is two grey levels, less than the noise of a camera.
+
+    Parameters
+    ----------
+    frames
+        One or more frames T_n, uint8.
+    reference
+        The sensor untouched, T_0, uint8, of the same height and width.
+
+    Raises
+    ------
+    ImageError
+        If a frame's size differs from the reference's.
+    """
+    if frames.shape[-3:] != reference.shape:
+        absolute_difference(frames, reference)  # says what is wrong
+    # T_n / 2 - T_0 / 2 + 128 without leaving uint8: halves of both, rounded alike, so that equal pixels give 128
+    return (frames >> 1) + (np.uint8(128) - (reference >> 1))
+
+
 def _size(image: np.ndarray) -> str:
     return f"{image.shape[-3]} x {image.shape[-2]}"

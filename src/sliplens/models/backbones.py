@@ -1,9 +1,10 @@
-"""Backbones: any TorchVision classifier, with one output."""
+"""Backbones: any TorchVision classifier, with the outputs that its head needs."""
 
 import torchvision
 from torch import nn
 
 from sliplens.errors import ModelError
+from sliplens.models.heads import HistogramRegressor, head_outputs
 
 DEFAULT_BACKBONE = "shufflenet_v2_x1_0"
 
@@ -13,13 +14,15 @@ def backbone_names() -> list[str]:
     return torchvision.models.list_models(module=torchvision.models)
 
 
-def build_model(backbone: str = DEFAULT_BACKBONE) -> nn.Module:
+def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point") -> nn.Module:
     """Build a classifier from scratch, its last layer replaced by one output: the safety margin.
 
     Parameters
     ----------
     backbone
         Name in TorchVision's table of classifiers.
+    head
+        `point` for one number, `histogram` for the mean of a distribution (`HistogramRegressor`).
 
     Returns
     -------
@@ -29,7 +32,7 @@ def build_model(backbone: str = DEFAULT_BACKBONE) -> nn.Module:
     Raises
     ------
     ModelError
-        If TorchVision has no classifier of that name.
+        If TorchVision has no classifier, or sliplens no head, of that name.
 
     References
     ----------
@@ -37,4 +40,5 @@ def build_model(backbone: str = DEFAULT_BACKBONE) -> nn.Module:
     """
     if backbone not in backbone_names():
         raise ModelError(f"there is no backbone named {backbone!r}; choose a TorchVision classifier such as resnet18")
-    return torchvision.models.get_model(backbone, weights=None, num_classes=1)
+    model = torchvision.models.get_model(backbone, weights=None, num_classes=head_outputs(head))
+    return HistogramRegressor(model) if head == "histogram" else model

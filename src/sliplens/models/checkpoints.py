@@ -14,6 +14,8 @@ from torch import Tensor, nn
 from sliplens.datasets import Encoding, get_encoding
 from sliplens.errors import CheckpointError, ImageError
 from sliplens.models.backbones import build_model
+from sliplens.models.calibration import Calibration, quantiles
+from sliplens.models.heads import HistogramRegressor
 from sliplens.provenance import hash_file, read_json, require_folder, write_json
 
 WEIGHTS_FILE = "model.safetensors"
@@ -31,10 +33,14 @@ class Manifest:
     frame_size: tuple[int, int]
     sensor: str
     data_hash: str
+    head: str = "point"
+    recipe: str = ""
     target: str = "safety_margin"
     weights_sha256: str = ""
     schema_version: int = SCHEMA_VERSION
     metrics: dict[str, Any] = field(default_factory=dict)
+    calibration: dict[str, Any] | None = None
+    """See `Calibration`; None where none was found."""
     versions: dict[str, str] = field(default_factory=dict)
 
 
@@ -83,6 +89,68 @@ class TrainedModel:
         answers = [self.model(batch).reshape(len(batch)) for batch in inputs.split(batch_size)]
         return torch.cat(answers) if answers else torch.empty(0)
 
+    @property
+    def calibration(self) -> Calibration | None:
+        """How sure the network may be; None for one that was never calibrated."""
+        found = self.manifest.calibration
+        return None if found is None else Calibration.from_json(found)
+
+    @torch.no_grad()
+    def estimate(self, inputs: Float[Tensor, "batch 3 size size"], *, batch_size: int = 64) -> "Estimate":
+        """Safety margin of encoded frames, with how sure it is."""
+        if isinstance(self.model, HistogramRegressor):
+            parts = [self.model.probabilities(batch) for batch in inputs.split(batch_size)]
+            bins = len(self.model.edges) - 1
+            probabilities = torch.cat(parts) if parts else torch.empty((0, bins))
+            return Estimate(
+                margin=(probabilities @ self.model.centres).double().cpu().numpy(),
+                probabilities=probabilities.double().cpu().numpy(),
+                edges=self.model.edges.double().cpu().numpy(),
+                calibration=self.calibration,
+            )
+        margin = self.predict(inputs, batch_size=batch_size).double().cpu().numpy()
+        return Estimate(margin=margin, calibration=self.calibration)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """Safety margins of some frames, and how sure they are."""
+
+    margin: Float[np.ndarray, " frames"]
+    calibration: Calibration | None
+    probabilities: Float[np.ndarray, "frames bins"] | None = None
+    """Over the margin; None for a network that answers with one number."""
+    edges: Float[np.ndarray, " edges"] | None = None
+    """Of the bins, in margin units."""
+
+    @property
+    def sigma(self) -> Float[np.ndarray, " frames"] | None:
+        """Standard deviation of each distribution; None where there is none."""
+        if self.probabilities is None or self.edges is None:
+            return None
+        centres = (self.edges[1:] + self.edges[:-1]) / 2
+        spread = (centres[None] - self.margin[:, None]) ** 2
+        return np.sqrt((self.probabilities * spread).sum(axis=1))
+
+    def interval(self, level: float) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]] | None:
+        """Margins between which each label lies with a level of confidence, within [0, 1]; None if not calibrated.
+
+        Raises
+        ------
+        ModelError
+            If the level is not one that was calibrated.
+        """
+        if self.calibration is None:
+            return None
+        offset = self.calibration.offset(level)
+        low = high = self.margin
+        if self.probabilities is not None and self.edges is not None:
+            low, high = (
+                quantiles(self.probabilities, self.edges, share) for share in ((1 - level) / 2, (1 + level) / 2)
+            )
+        # a label lies in [0, 1], so cutting there loses none
+        return np.clip(low - offset, 0, 1), np.clip(high + offset, 0, 1)
+
 
 def save_checkpoint(folder: Path, model: nn.Module, manifest: Manifest) -> None:
     """Write weights and manifest into a folder; the manifest, which makes it a checkpoint, comes last."""
@@ -110,12 +178,14 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> TrainedModel:
         raise CheckpointError(f"{weights} is missing; train the network again or copy the whole folder")
     if hash_file(weights) != manifest.weights_sha256:
         raise CheckpointError(f"{weights} is not the file its manifest describes; copy the whole folder again")
-    model = build_model(manifest.backbone)
+    model = build_model(manifest.backbone, head=manifest.head)
     try:
         model.load_state_dict(load_file(weights, device="cpu"))
     except (SafetensorError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
-        raise CheckpointError(f"{weights} does not hold a {manifest.backbone} with one output ({reason})") from None
+        raise CheckpointError(
+            f"{weights} does not hold a {manifest.backbone} with a {manifest.head} head ({reason})"
+        ) from None
     # channels last: depthwise convolutions run up to half as fast again on a CPU
     model = model.to(device, memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
     return TrainedModel(model=model, manifest=manifest)
@@ -139,4 +209,6 @@ def _read_manifest(path: Path) -> Manifest:
     except TypeError as error:
         raise CheckpointError(f"{path} is incomplete ({error}); train the network again") from None
     get_encoding(manifest.input)
+    if manifest.calibration is not None:
+        Calibration.from_json(manifest.calibration)
     return manifest

@@ -4,6 +4,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
 from sliplens.errors import RecordingError
 from sliplens.provenance import hash_file, hash_json, read_json, require_folder, write_json
 from sliplens.recordings.headers import read_header
@@ -102,6 +106,26 @@ class Dataset:
 def trial_path(folder: Path, trial: str) -> Path:
     """File that holds a trial of a data set."""
     return folder / "trials" / f"{trial}.parquet"
+
+
+def count_labelled(path: Path) -> int:
+    """Count the frames of a trial that have a safety margin, and one that can be trusted, without reading its images.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing or damaged.
+    """
+    try:
+        names = [name for name in ("safety_margin", "valid") if name in pq.read_schema(path).names]
+        table = pq.read_table(path, columns=names)
+    except FileNotFoundError:
+        raise RecordingError(f"{path} does not exist; make the data set again") from None
+    except (pa.ArrowException, OSError) as error:
+        raise RecordingError(f"{path} is not a readable Parquet file ({error}); make the data set again") from None
+    columns = {name: table.column(name).to_numpy() for name in names}
+    present = np.isfinite(columns["safety_margin"].astype(np.float64))
+    return int(np.sum(present & columns["valid"] if "valid" in columns else present))
 
 
 def trial_info(path: Path, *, split: str) -> TrialInfo:

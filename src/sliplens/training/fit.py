@@ -6,7 +6,7 @@ import signal
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,47 +16,15 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.utils.data import DataLoader, Sampler
 
-from sliplens.datasets import Augmentation, FrameSet
+from sliplens.datasets import FrameSet, get_augmentation
 from sliplens.errors import InputError
 from sliplens.models import Manifest, build_model, save_checkpoint
-from sliplens.models.backbones import DEFAULT_BACKBONE
 from sliplens.provenance import versions
+from sliplens.training.calibrate import calibrate
+from sliplens.training.config import TrainConfig
 from sliplens.training.module import Clock, Regressor, TrainProgress
 
 _LAST = "last.ckpt"
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainConfig:
-    """A training recipe: all that shapes the network besides its data."""
-
-    backbone: str = DEFAULT_BACKBONE
-    image_size: int = 224
-    epochs: int = 25
-    batch_size: int = 64
-    learning_rate: float = 2e-3
-    weight_decay: float = 1e-2
-    max_minutes: float | None = None
-    augment: bool = True
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Refuse numbers that cannot train a network.
-
-        Raises
-        ------
-        InputError
-            Naming the option and its value.
-        """
-        for name in ("image_size", "epochs", "batch_size", "learning_rate"):
-            if getattr(self, name) <= 0:
-                raise InputError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.image_size < 32:
-            raise InputError(f"image_size must be at least 32 pixels, got {self.image_size}")
-        if self.batch_size < 2:
-            raise InputError("batch_size must be at least 2, since batch normalisation needs more than one image")
-        if self.max_minutes is not None and self.max_minutes <= 0:
-            raise InputError(f"max_minutes must be positive, got {self.max_minutes}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +80,7 @@ def fit(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)  # the initial weights; forked, so that the caller's random state is untouched
         # channels last: depthwise convolutions run up to half as fast again on a CPU
-        model = build_model(config.backbone).to(memory_format=torch.channels_last)
+        model = build_model(config.backbone, head=config.head).to(memory_format=torch.channels_last)
     loaders = _loaders(config, train, validation)
     clock = Clock(
         steps=config.epochs * len(loaders[0]),
@@ -122,10 +90,9 @@ def fit(
     )
     module = Regressor(
         model,
-        learning_rate=config.learning_rate,
-        weight_decay=config.weight_decay,
-        augmentation=Augmentation() if config.augment else None,
-        seed=config.seed,
+        config=config,
+        augmentation=get_augmentation(config.augmentation, neutral=train.encoding.neutral),
+        steps=clock.steps,
         fraction_done=clock.fraction,
     )
     checkpoints = folder / "checkpoints"
@@ -137,17 +104,21 @@ def fit(
     module.load_state_dict(state)
     assert best.best_model_score is not None  # set whenever a best path is
     best_mse = float(best.best_model_score)
+    calibration = calibrate(module.model, validation, batch_size=config.batch_size)
     save_checkpoint(
         folder,
         module.model,
         Manifest(
             backbone=config.backbone,
+            head=config.head,
+            recipe=config.recipe,
             input=train.encoding.name,
             image_size=config.image_size,
             frame_size=frame_size,
             sensor=sensor,
             data_hash=data_hash,
             metrics={"validation_mse": best_mse},
+            calibration=asdict(calibration),
             versions=versions(),
         ),
     )
@@ -210,7 +181,9 @@ def _run(
             enable_progress_bar=False,
             enable_model_summary=False,
             num_sanity_val_steps=0,
-            gradient_clip_val=1.0,
+            # Ranger21 clips by itself, adaptively
+            gradient_clip_val=1.0 if config.optimizer == "adamw" else None,
+            precision="16-mixed" if config.mixed_precision and torch.cuda.is_available() else "32-true",
         )
         on_interrupt = signal.getsignal(signal.SIGINT)
         try:

@@ -11,11 +11,14 @@ import lightning
 import torch
 from jaxtyping import Float
 from lightning.pytorch.callbacks import Callback
+from pytorch_optimizer import Ranger21
 from torch import Tensor, nn
 from torch.nn import functional
 
 from sliplens.datasets import Augmentation
 from sliplens.errors import ModelError
+from sliplens.models.heads import margin_loss
+from sliplens.training.config import TrainConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,28 +32,26 @@ class TrainProgress:
 
 
 class Regressor(lightning.LightningModule):
-    """Mean squared error on the safety margin, AdamW, one warm-up and one cosine descent of the learning rate.
+    """A network with its loss, its augmentation and its optimizer.
 
-    The learning rate follows the share of the training that is done, in epochs or in minutes, so that a training cut
-    short by its time limit still ends on a small step.
+    With AdamW the learning rate follows the share of the training that is done, in epochs or in minutes, so that a
+    training cut short by its time limit still ends on a small step.
     """
 
     def __init__(
         self,
         model: nn.Module,
         *,
-        learning_rate: float,
-        weight_decay: float,
+        config: TrainConfig,
         augmentation: Augmentation | None,
-        seed: int,
+        steps: int,
         fraction_done: Callable[[], float],
     ) -> None:
         super().__init__()
         self.model = model
-        self.learning_rate = learning_rate
-        self.weight_decay = weight_decay
+        self.config = config
         self.augmentation = augmentation
-        self.seed = seed
+        self.steps = steps
         self.fraction_done = fraction_done
 
     def forward(self, images: Float[Tensor, "batch 3 size size"]) -> Float[Tensor, " batch"]:
@@ -62,14 +63,22 @@ class Regressor(lightning.LightningModule):
         images, labels = batch
         if self.augmentation is not None:
             # seeded by the step, so that a resumed training draws what it would have drawn
-            generator = torch.Generator(device=images.device).manual_seed(self.seed * 1_000_003 + self.global_step)
+            generator = torch.Generator(device=images.device).manual_seed(
+                self.config.seed * 1_000_003 + self.global_step
+            )
             images = self.augmentation(images, generator=generator)
-        loss = functional.mse_loss(self(images), labels)
+        loss, margins = margin_loss(self.model, images, labels)
         if not torch.isfinite(loss):
             raise ModelError(
                 f"the training loss is {loss.item()} at step {self.global_step}; lower the learning rate and try again"
             )
-        self.log("train_mse", loss, on_step=False, on_epoch=True, batch_size=len(images))
+        self.log(
+            "train_mse",
+            functional.mse_loss(margins.detach(), labels),
+            on_step=False,
+            on_epoch=True,
+            batch_size=len(images),
+        )
         return loss
 
     def validation_step(self, batch: tuple[Tensor, Tensor], batch_idx: int) -> None:
@@ -79,20 +88,27 @@ class Regressor(lightning.LightningModule):
         self.log("validation_mse", loss, on_epoch=True, batch_size=len(images))
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
-        """Set the learning rate for the share of the training that is done."""
+        """Set the learning rate for the share of the training that is done; Ranger21 sets its own."""
+        if self.config.optimizer != "adamw":
+            return
         warm_up, done = 0.1, self.fraction_done()
         descent = 0.5 * (1 + math.cos(math.pi * min(1.0, max(0.0, (done - warm_up) / (1 - warm_up)))))
         factor = max(done / warm_up, 0.02) if done < warm_up else max(descent, 0.005)
         for optimizer in self.trainer.optimizers:
             for group in optimizer.param_groups:
-                group["lr"] = self.learning_rate * factor
+                group["lr"] = self.config.learning_rate * factor
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """AdamW, without weight decay on biases and normalisation."""
+        """AdamW, without weight decay on biases and normalisation; or Ranger21 with its defaults."""
+        if self.config.optimizer == "ranger21":
+            return Ranger21(self.parameters(), num_iterations=self.steps, lr=self.config.learning_rate)
         decayed = [value for value in self.parameters() if value.ndim > 1]
         others = [value for value in self.parameters() if value.ndim <= 1]
-        groups = [{"params": decayed, "weight_decay": self.weight_decay}, {"params": others, "weight_decay": 0.0}]
-        return torch.optim.AdamW(groups, lr=self.learning_rate)
+        groups = [
+            {"params": decayed, "weight_decay": self.config.weight_decay},
+            {"params": others, "weight_decay": 0.0},
+        ]
+        return torch.optim.AdamW(groups, lr=self.config.learning_rate)
 
 
 class Clock(Callback):

@@ -1,0 +1,138 @@
+"""How sure a network may be: the temperature of its distribution, and intervals that hold as often as they say."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sliplens.errors import ModelError
+
+LEVELS = (0.68, 0.9)
+"""Shares of the frames for which an interval is to hold."""
+_COLDEST, _HOTTEST = -3.0, 3.0  # natural logarithms of the temperature
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """What was found on validation frames.
+
+    Of a distribution, the interval of a level lies between its quantiles, widened by an offset (conformalised quantile
+    regression); of one number, it is that number plus and minus the offset (split conformal). Both hold for the level's
+    share of frames like those of the validation, and promise nothing for others.
+
+    References
+    ----------
+    Vovk et al., *Algorithmic Learning in a Random World* (2005); Romano et al., *Conformalized Quantile Regression*
+    (2019); Guo et al., *On Calibration of Modern Neural Networks* (2017), for the temperature.
+    """
+
+    temperature: float
+    """By which logits are divided; 1 for one number."""
+    offsets: dict[str, float]
+    """By level, in margin units; negative where quantiles were too far apart."""
+    frames: int
+    """Validation frames."""
+
+    def offset(self, level: float) -> float:
+        """Offset of a level.
+
+        Raises
+        ------
+        ModelError
+            If the level is not one that was calibrated.
+        """
+        if str(level) not in self.offsets:
+            raise ModelError(f"there is no interval of level {level:g}; choose {', '.join(self.offsets)}")
+        return self.offsets[str(level)]
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> "Calibration":
+        """Read what a manifest keeps.
+
+        Raises
+        ------
+        ModelError
+            If a number is missing or is none.
+        """
+        try:
+            offsets = {str(level): float(offset) for level, offset in values["offsets"].items()}
+            made = cls(temperature=float(values["temperature"]), offsets=offsets, frames=int(values["frames"]))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise ModelError(f"the calibration is damaged ({error}); train the network again") from None
+        if not (np.isfinite([made.temperature, *offsets.values()]).all() and made.temperature > 0):
+            raise ModelError("the calibration holds no usable numbers; train the network again")
+        return made
+
+
+def fit_temperature(logits: Float[Tensor, "frames bins"], targets: Float[Tensor, "frames bins"]) -> float:
+    """Temperature with the least cross-entropy, by golden-section search on its logarithm (the loss is convex in 1/T).
+
+    Parameters
+    ----------
+    logits
+        Of validation frames, as trained.
+    targets
+        Their labels as `histogram_targets` gives them.
+    """
+
+    def loss(log_temperature: float) -> float:
+        return float(torch.nn.functional.cross_entropy(logits / float(np.exp(log_temperature)), targets))
+
+    ratio, low, high = (np.sqrt(5) - 1) / 2, _COLDEST, _HOTTEST
+    while high - low > 1e-4:
+        left, right = high - ratio * (high - low), low + ratio * (high - low)
+        low, high = (low, right) if loss(left) < loss(right) else (left, high)
+    return float(np.exp((low + high) / 2))
+
+
+def quantiles(
+    probabilities: Float[np.ndarray, "frames bins"], edges: Float[np.ndarray, " edges"], share: float
+) -> Float[np.ndarray, " frames"]:
+    """Margin below which a share of each distribution lies; within a bin the distribution is even.
+
+    Parameters
+    ----------
+    probabilities
+        Each row sums to 1.
+    edges
+        Of the bins, rising.
+    share
+        Between 0 and 1.
+    """
+    below = np.concatenate([np.zeros((len(probabilities), 1)), np.cumsum(probabilities, axis=1)], axis=1)
+    below /= below[:, -1:]
+    at = np.clip((below <= share).sum(axis=1) - 1, 0, probabilities.shape[1] - 1)
+    rows = np.arange(len(probabilities))
+    inside = np.maximum(below[rows, at + 1] - below[rows, at], 1e-12)
+    part = np.clip((share - below[rows, at]) / inside, 0, 1)
+    return edges[at] + part * (edges[at + 1] - edges[at])
+
+
+def conformal_offset(
+    low: Float[np.ndarray, " frames"],
+    high: Float[np.ndarray, " frames"],
+    margins: Float[np.ndarray, " frames"],
+    *,
+    level: float,
+) -> float:
+    """By how much intervals must widen to hold for a share of the frames, a frame more counted as missed.
+
+    Parameters
+    ----------
+    low, high
+        Intervals of validation frames; equal for one number.
+    margins
+        Their labels.
+    level
+        Share that is to hold.
+
+    References
+    ----------
+    Romano et al. (2019), eq. 6 and 7.
+    """
+    missed = np.sort(np.maximum(low - margins, margins - high))
+    rank = int(np.ceil(level * (len(missed) + 1)))
+    return float(missed[min(rank, len(missed)) - 1])

@@ -1,0 +1,93 @@
+"""Recipes: all that shapes a network besides its data."""
+
+from dataclasses import dataclass
+from math import isfinite
+from typing import Literal
+
+from sliplens.datasets.augmentation import get_augmentation
+from sliplens.errors import InputError
+from sliplens.models.backbones import DEFAULT_BACKBONE
+from sliplens.models.heads import head_outputs
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """A training recipe.
+
+    Raises
+    ------
+    InputError
+        If a number cannot train a network.
+    ModelError
+        If there is no such head.
+    """
+
+    recipe: str = "default"
+    """Its name, kept in the manifest."""
+    backbone: str = DEFAULT_BACKBONE
+    head: str = "point"
+    """What the network answers with; see `sliplens.models.heads`."""
+    image_size: int = 224
+    epochs: int = 25
+    batch_size: int = 64
+    optimizer: Literal["adamw", "ranger21"] = "adamw"
+    """AdamW with one warm-up and one cosine descent, or Ranger21 with its own schedule and defaults."""
+    learning_rate: float = 2e-3
+    weight_decay: float = 1e-2
+    """Of AdamW; Ranger21 keeps its own."""
+    mixed_precision: bool = False
+    """16-bit floats where they are safe; on a GPU alone, for a CPU is not faster with them."""
+    max_minutes: float | None = None
+    augmentation: str = "default"
+    untouched_share: float = 0.05
+    """Images of the untouched sensor, as full stick, for each labelled frame."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that cannot train a network."""
+        for name in ("image_size", "epochs", "batch_size", "learning_rate"):
+            value = getattr(self, name)
+            if not (isfinite(value) and value > 0):
+                raise InputError(f"{name} must be positive, got {value}")
+        if self.image_size < 32:
+            raise InputError(f"image_size must be at least 32 pixels, got {self.image_size}")
+        if self.batch_size < 2:
+            raise InputError("batch_size must be at least 2, since batch normalisation needs more than one image")
+        if self.max_minutes is not None and not self.max_minutes > 0:
+            raise InputError(f"max_minutes must be positive, got {self.max_minutes}")
+        if not 0 <= self.untouched_share <= 1:
+            raise InputError(f"untouched_share must lie in [0, 1], got {self.untouched_share:g}")
+        if self.optimizer not in {"adamw", "ranger21"}:
+            raise InputError(f"there is no optimizer named {self.optimizer!r}; choose adamw or ranger21")
+        head_outputs(self.head)
+        get_augmentation(self.augmentation)
+
+
+RECIPES = {
+    "default": TrainConfig(head="histogram"),
+    "thesis": TrainConfig(
+        recipe="thesis",
+        batch_size=124,
+        optimizer="ranger21",
+        learning_rate=8e-4,
+        mixed_precision=True,
+        augmentation="thesis",
+        untouched_share=0.0,
+    ),
+}
+"""`thesis` is that of Polak, section 4: ShuffleNetV2 x1.0 from scratch, one output, Ranger21 with its defaults, mean
+squared error, 25 epochs, batches of 124, 224 x 224 pixels, a learning rate of 8e-4, mixed precision, the best
+checkpoint on validation, rotation, noise and blur. `default` is ours; docs/networks.md tells why."""
+
+
+def get_recipe(name: str) -> TrainConfig:
+    """Look up a recipe by name.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name; the message lists those there are.
+    """
+    if name not in RECIPES:
+        raise InputError(f"there is no recipe named {name!r}; choose one of {', '.join(RECIPES)}")
+    return RECIPES[name]
