@@ -28,9 +28,10 @@ class Simulate:
 
     output: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[OUT]")] = None
     """Folder to make. Not needed for --preview and --video alone."""
-    preset: Literal["small", "thesis"] = "small"
+    preset: Literal["small", "thesis", "varied"] = "small"
     """small: 104 short trials on 12 days, for a laptop. thesis: the days, splits and 160,757 frames of the thesis, some
-    14 GB. The options below change it."""
+    14 GB. varied: 40 days, 8 sensors and objects from slippery to rough, for a network that is to meet others. The
+    options below change it."""
     sensor: Literal["chromatouch", "flat-gel"] = "chromatouch"
     """chromatouch: a dome with a fisheye inside, fitted to real images. flat-gel: a flat gel with dots, lit from three
     sides, like a GelSight; not fitted to one device."""
@@ -45,6 +46,8 @@ class Simulate:
     """Frames of each trial; the thesis has about 800."""
     days: int | None = None
     """Days, each with its own friction, stiffness, light and camera; the last one tests."""
+    dry_friction: tuple[float, float] | None = None
+    """Least and largest coefficient of friction of the dry object; a wider range makes a network rely on it less."""
     release: bool = False
     """Let go of the object at the end of each trial."""
     seed: int = 0
@@ -85,7 +88,9 @@ class Simulate:
             changes["dry_trials"] = sum(preset.dry_trials)
         if self.frames_per_trial is not None:
             changes["frames_per_trial"] = self.frames_per_trial
-        if changes:
+        if self.dry_friction is not None:
+            changes["nuisances"] = replace(preset.nuisances, dry_friction=self.dry_friction)
+        if changes.keys() - {"nuisances"}:
             # the totals are those of the preset as it stands
             changes["frame_totals"] = None
         return replace(

@@ -1,5 +1,6 @@
 """Data sets worth a name."""
 
+from sliplens.simulation.nuisances import Nuisances
 from sliplens.simulation.plan import FrameTotals, SimulationRecipe
 
 PRESETS = {
@@ -12,7 +13,16 @@ PRESETS = {
         frame_totals=FrameTotals(train=128_043, validation=15_839, test=16_875),
         days=4,
     ),
+    "varied": SimulationRecipe(
+        dry_trials=400,
+        wet_trials=20,
+        frames_per_trial=64,
+        days=40,
+        sensors=8,
+        nuisances=Nuisances(dry_friction=(0.15, 1.2)),
+    ),
 }
 """`small` fits a laptop and shows many days; `thesis` has the days, splits and number of frames of the thesis: Polak,
 *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning*. It does not say how many trials it
-had, nor how dry and wet shared the test day: that is assumed, from about 800 frames a trial."""
+had, nor how dry and wet shared the test day: that is assumed, from about 800 frames a trial. `varied` is for networks
+that are to meet other days, sensors and objects."""
