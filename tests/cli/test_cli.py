@@ -38,7 +38,21 @@ def test_an_unknown_command_exits_with_2(capsys: pytest.CaptureFixture[str]):
 
 
 @pytest.mark.parametrize(
-    "command", ["demo", "simulate", "import", "check", "train", "evaluate", "explain", "score", "report"]
+    "command",
+    [
+        "demo",
+        "simulate",
+        "import",
+        "label",
+        "split",
+        "check",
+        "view",
+        "train",
+        "evaluate",
+        "explain",
+        "score",
+        "report",
+    ],
 )
 def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as exit_info:

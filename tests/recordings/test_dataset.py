@@ -1,4 +1,7 @@
 import json
+import os
+import weakref
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -9,8 +12,9 @@ import pytest
 from sliplens.errors import InputError, RecordingError
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.dataset import write_dataset_table
+from sliplens.recordings.pixels import ROW_GROUP, decode_pixels, encode_frames
 from sliplens.recordings.recording import SIGNALS
-from sliplens.recordings.store import ROW_GROUP, load_recording, save_recording
+from sliplens.recordings.store import load_recording, read_frames, save_recording
 
 
 def test_a_trial_comes_back_without_loss(tmp_path: Path, recording: Recording):
@@ -47,9 +51,45 @@ def test_a_trial_of_many_chunks_comes_back_whole(tmp_path: Path, recording: Reco
     np.testing.assert_array_equal(back.frames, long.frames)
     np.testing.assert_array_equal(back.time_s, long.time_s)
     np.testing.assert_array_equal(pq.read_table(tmp_path / "a.parquet")["frame"].to_numpy(), np.arange(count))
-    some = load_recording(tmp_path / "a.parquet", every=7)
-    np.testing.assert_array_equal(some.frames, long.frames[::7])
-    np.testing.assert_array_equal(some.time_s, long.time_s[::7])
+    places = [count - 1, 0, ROW_GROUP, ROW_GROUP - 1, 0]
+    np.testing.assert_array_equal(read_frames(tmp_path / "a.parquet", places), long.frames[places])
+
+
+@pytest.mark.parametrize("place", [-1, 12])
+def test_a_frame_that_is_not_there_is_refused(tmp_path: Path, recording: Recording, place: int):
+    save_recording(recording, tmp_path / "a.parquet")
+    with pytest.raises(RecordingError, match=rf"a\.parquet has no frame {place}; name one from 0 to 11"):
+        read_frames(tmp_path / "a.parquet", [0, place])
+
+
+def test_a_trial_without_its_pixels_is_all_but_these(tmp_path: Path, recording: Recording):
+    save_recording(recording, tmp_path / "a.parquet")
+    whole, bare = load_recording(tmp_path / "a.parquet"), load_recording(tmp_path / "a.parquet", pixels=False)
+    for name in (*SIGNALS, "safety_margin_sigma", "valid", "contact_state", "reference", "trial", "sensor"):
+        np.testing.assert_array_equal(getattr(bare, name), getattr(whole, name))
+    np.testing.assert_array_equal(bare.frames, np.stack([recording.reference] * 12))
+    # one image in memory, seen twelve times
+    assert bare.frames.strides[0] == 0
+
+
+def test_no_more_than_a_few_frames_are_held_while_a_long_trial_is_encoded():
+    workers = os.cpu_count() or 1
+    made: list[weakref.ref[np.ndarray]] = []
+    most = 0
+
+    def frames() -> Iterator[np.ndarray]:
+        nonlocal most
+        for index in range(100 * workers):
+            frame = np.full((8, 8, 3), index % 256, dtype=np.uint8)
+            made.append(weakref.ref(frame))
+            yield frame
+            most = max(most, sum(one() is not None for one in made))
+
+    images = [image for chunk in encode_frames(frames()) for image in chunk]
+    decoded = [decode_pixels(image, size=(8, 8, 3), where="frame") for image in images]
+    np.testing.assert_array_equal([one[0, 0, 0] for one in decoded], np.arange(100 * workers) % 256)
+    # two a worker that wait or are worked on, one a worker that it has just done, and the newest
+    assert most <= 3 * workers + 2
 
 
 def test_one_value_a_frame_is_asked_for(recording: Recording):

@@ -18,7 +18,9 @@ from sliplens.cli.label import Label
 from sliplens.cli.report import Report
 from sliplens.cli.score import Score
 from sliplens.cli.simulate import Simulate
+from sliplens.cli.split import Split
 from sliplens.cli.train import Train
+from sliplens.cli.view import View
 from sliplens.errors import SliplensError
 
 Command = (
@@ -26,7 +28,9 @@ Command = (
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[Label, tyro.conf.subcommand("label")]
+    | Annotated[Split, tyro.conf.subcommand("split")]
     | Annotated[Check, tyro.conf.subcommand("check")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Explain, tyro.conf.subcommand("explain")]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sliplens.cli.console import OUT, unchanged, wrote
+from sliplens.cli.console import OUT, say, unchanged, wrote
 from sliplens.cli.labelling import LabelOptions, show_found, summary, write_trials
 from sliplens.errors import InputError
 from sliplens.provenance import output_folder, write_json
@@ -15,6 +15,7 @@ from sliplens.provenance import output_folder, write_json
 if TYPE_CHECKING:
     from sliplens.recordings.capture import Capture
     from sliplens.recordings.importing import About
+    from sliplens.recordings.splits import SplitPlan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +44,8 @@ class Import:
     """So many of the last trials, before those that test, validate the training."""
     test_trials: int | None = None
     """So many of the last trials test; all others train. Trials are never split."""
+    splits: Path | None = None
+    """File of rules that deal the trials to splits (TOML; see docs/splits.md), in place of the two numbers above."""
     format: str | None = None
     """rosbag, lerobot, sliplens, thesis, gelsight, images or video; recognised if not given."""
     forces: Path | None = None
@@ -77,15 +80,26 @@ class Import:
 
     def run(self) -> None:
         """Read, label, write, and show what was found."""
+        from sliplens.recordings.splits import TrialFacts, assign_splits, write_split_record
+
         captures = self._open()
-        splits = self._deal(captures)
         abouts = [self._about(capture) for capture in captures]
+        plan = self._plan()
+        facts = [
+            TrialFacts(
+                trial=one.name, sensor=about.sensor, day=about.day, condition=about.condition, object=about.object
+            )
+            for one, about in zip(captures, abouts, strict=True)
+        ]
+        dealt = None if plan is None else assign_splits(plan, facts)
+        splits = self._deal(captures) if dealt is None else dealt.splits
         own = {"output", "overwrite", "sources", "labels", "forces"}
         config = {
             **{name: value for name, value in vars(self).items() if name not in own},
             **vars(self.labels),
             "sources": [_fingerprint(path) for path in self.sources],
             "forces": None if self.forces is None else _fingerprint(self.forces),
+            "splits": None if plan is None else [rule.as_table() for rule in plan.rules],
         }
         with output_folder(self.output, stage="import", config=config, overwrite=self.overwrite) as out:
             if out.complete:
@@ -93,7 +107,11 @@ class Import:
                 return
             found = write_trials(out.folder, captures, abouts, splits, self.labels)
             write_json(out.folder / "result.json", {"trials": summary(found)})
+            if plan is not None and dealt is not None:
+                write_split_record(out.folder, plan, facts, dealt)
         show_found("Imported", found)
+        for note in dealt.notes if dealt else ():
+            say(f"  note: {note}")
         frames = sum(len(capture.frame_time_s) for capture in captures)
         wrote(self.output, f"{len(captures)} trials, {frames:,} frames")
         if self.labels.audit:
@@ -142,6 +160,15 @@ class Import:
             condition=self.condition or told.condition or "dry",
             object=self.object or told.object or "",
         )
+
+    def _plan(self) -> "SplitPlan | None":
+        from sliplens.recordings.splits import read_splits
+
+        if self.splits is None:
+            return None
+        if self.validation_trials is not None or self.test_trials is not None:
+            raise InputError("splits come from a file or from numbers of trials, not from both; leave one out")
+        return read_splits(self.splits)
 
     def _deal(self, captures: "list[Capture]") -> list[str]:
         count = len(captures)

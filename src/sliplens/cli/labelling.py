@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -12,8 +13,6 @@ if TYPE_CHECKING:
     from sliplens.recordings.capture import Capture
     from sliplens.recordings.importing import About
     from sliplens.recordings.labels import LabelSettings
-
-_AUDITED_FRAMES = 800
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,12 +106,11 @@ def write_trials(
 
 def draw_audit_page(trial: Path, picture: Path, labelling: dict[str, Any]) -> None:
     """Draw the page of a trial from which to judge its labels."""
-    from sliplens.recordings.store import load_recording
+    from sliplens.recordings.store import load_recording, read_frames
     from sliplens.report.audit import write_audit
 
-    # a page shows no more than this of a long trial, and memory stays small
-    frames = sum(labelling["frames_by_reason"].values())
-    write_audit(load_recording(trial, every=max(1, frames // _AUDITED_FRAMES)), labelling, picture)
+    # all numbers, but only the pixels that the page shows: memory stays small however long the trial
+    write_audit(load_recording(trial, pixels=False), labelling, picture, read_frames=partial(read_frames, trial))
 
 
 def show_found(title: str, found: dict[str, dict[str, Any]]) -> None:

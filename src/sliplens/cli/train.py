@@ -115,6 +115,7 @@ class Train:
                     frame_size=(info.height, info.width),
                     sensor=info.sensor,
                     data_hash=data.hash,
+                    trained_on=[one.sha256[:12] for one in (*train_trials, *validation_trials)],
                     on_progress=show,
                 )
             write_json(

@@ -109,4 +109,4 @@ def list_images(folder: Path) -> list[Path]:
 
 def natural_key(text: str) -> list[tuple[int, int | str]]:
     """Sort key that reads runs of digits as numbers."""
-    return [(0, int(part)) if part.isdigit() else (1, part.lower()) for part in re.split(r"(\d+)", text)]
+    return [(0, int(part)) if part.isdecimal() else (1, part.lower()) for part in re.split(r"(\d+)", text)]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sliplens.errors import ModelError
 
-LEVELS = (0.68, 0.9)
+LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)
 """Shares of the frames for which an interval is to hold."""
 _COLDEST, _HOTTEST = -3.0, 3.0  # natural logarithms of the temperature
 

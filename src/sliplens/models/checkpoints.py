@@ -1,5 +1,6 @@
 """Checkpoints: safetensors for the weights, a JSON manifest for what they are."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,8 @@ class Manifest:
     calibration: dict[str, Any] | None = None
     """See `Calibration`; None where none was found."""
     versions: dict[str, str] = field(default_factory=dict)
+    trained_on: tuple[str, ...] = ()
+    """First 12 hex digits of the hash of every trial that trained or validated it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,6 +155,17 @@ class Estimate:
         return np.clip(low - offset, 0, 1), np.clip(high + offset, 0, 1)
 
 
+def join_estimates(parts: Sequence[Estimate]) -> Estimate:
+    """Join the estimates of one network, in their order; there must be one at least."""
+    told = [part.probabilities for part in parts if part.probabilities is not None]
+    return Estimate(
+        margin=np.concatenate([part.margin for part in parts]),
+        probabilities=np.concatenate(told) if told else None,
+        edges=parts[0].edges,
+        calibration=parts[0].calibration,
+    )
+
+
 def save_checkpoint(folder: Path, model: nn.Module, manifest: Manifest) -> None:
     """Write weights and manifest into a folder; the manifest, which makes it a checkpoint, comes last."""
     weights = folder / WEIGHTS_FILE
@@ -204,6 +218,7 @@ def _read_manifest(path: Path) -> Manifest:
         raise CheckpointError(f"{path} gives no usable image_size or frame_size; train the network again")
     given: dict[str, Any] = {name: value for name, value in values.items() if name in known}
     given["frame_size"] = (frame[0], frame[1])
+    given["trained_on"] = tuple(str(one) for one in values.get("trained_on", ()))
     try:
         manifest = Manifest(**given)
     except TypeError as error:

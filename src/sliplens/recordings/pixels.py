@@ -5,7 +5,10 @@ several times as fast to write and to read as PNG, FFV1 or Zarr, within 10 % of 
 Anything that reads Parquet can undo it: Zstandard, then a running sum down the rows, modulo 256.
 """
 
-from collections.abc import Sequence
+import os
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 import pyarrow as pa
@@ -15,13 +18,45 @@ from sliplens.errors import RecordingError
 
 CODEC = "rows+zstd"
 """Its name in the metadata of a trial."""
+ROW_GROUP = 64
+"""Frames that are written, and can be read, together."""
 
 
 def encode_pixels(pixels: UInt8[np.ndarray, "height width *channels"]) -> bytes:
     """Bytes of an image; the size is kept elsewhere."""
     rows = pixels.copy()
     rows[1:] -= pixels[:-1]
-    return pa.compress(rows.tobytes(), codec="zstd", asbytes=True)
+    # a copy of the right size: bytes that are cut down in place leave holes, and memory would grow with every frame
+    return pa.compress(rows, codec="zstd").to_pybytes()
+
+
+def encode_frames(frames: Iterable[UInt8[np.ndarray, "height width *channels"]]) -> Iterator[list[bytes]]:
+    """Encode frames side by side while the next are made, and give them in chunks of a row group.
+
+    Two frames a processor are held as pixels, however many there are.
+    """
+    workers = os.cpu_count() or 1
+    with ThreadPoolExecutor(workers) as pool:  # Zstandard lets go of the interpreter's lock
+        chunk: list[bytes] = []
+        for image in _in_turn(pool, frames, ahead=2 * workers):
+            chunk.append(image)
+            if len(chunk) == ROW_GROUP:
+                yield chunk
+                chunk = []
+        if chunk:
+            yield chunk
+
+
+def _in_turn(
+    pool: ThreadPoolExecutor, frames: Iterable[UInt8[np.ndarray, "height width *channels"]], *, ahead: int
+) -> Iterator[bytes]:
+    waiting: deque[Future[bytes]] = deque()
+    for frame in frames:
+        waiting.append(pool.submit(encode_pixels, frame))
+        if len(waiting) == ahead:
+            yield waiting.popleft().result()
+    while waiting:
+        yield waiting.popleft().result()
 
 
 def decode_pixels(

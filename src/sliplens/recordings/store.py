@@ -1,9 +1,8 @@
 """One trial on disk: a Parquet file, a row a frame."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +14,11 @@ from jaxtyping import UInt8
 from sliplens.errors import RecordingError
 from sliplens.images.files import decode_png, encode_png
 from sliplens.recordings.headers import DESCRIPTION, OBJECT, read_header
-from sliplens.recordings.pixels import CODEC, decode_pixels, encode_pixels
+from sliplens.recordings.pixels import CODEC, decode_pixels, encode_frames
 from sliplens.recordings.recording import SIGNALS, ContactState, Recording
 from sliplens.recordings.truth import GroundTruth
 
 SCHEMA_VERSION = 1
-ROW_GROUP = 64
-"""Frames that are written, and can be read, together."""
 _OPTIONAL = ("safety_margin_sigma", "valid")
 _TRUTH_SIGNALS = ("static_friction", "contact_radius_m", "stick_radius_m")
 _TRUTH_COLUMNS = frozenset({*_TRUTH_SIGNALS, "marker_px", "contact_map"})
@@ -51,13 +48,6 @@ def save_recording(recording: Recording, path: Path) -> None:
             }
         )
     write_trial(path, encode_frames(recording.frames), columns, description, reference=recording.reference)
-
-
-def encode_frames(frames: Iterable[UInt8[np.ndarray, "height width *channels"]]) -> Iterator[list[bytes]]:
-    """Encode frames in chunks, those of a chunk side by side."""
-    with ThreadPoolExecutor() as pool:  # Zstandard lets go of the interpreter's lock
-        for chunk in _chunks(frames, ROW_GROUP):
-            yield list(pool.map(encode_pixels, chunk))
 
 
 def write_trial(
@@ -97,19 +87,23 @@ def write_trial(
         for chunk in images:
             rows = labels.slice(written, len(chunk)).combine_chunks()
             numbers = pa.array(np.arange(written, written + len(chunk)))
-            arrays = [numbers, *(column.combine_chunks() for column in rows.columns), pa.array(chunk, type=pa.binary())]
+            arrays = [numbers, *(column.combine_chunks() for column in rows.columns), _in_place(chunk)]
             writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema))
             written += len(chunk)
     part.replace(path)
 
 
-def _chunks(items: Iterable[Any], size: int) -> Iterator[list[Any]]:
-    remaining = iter(items)
-    while chunk := list(islice(remaining, size)):
-        yield chunk
+def _in_place(images: list[bytes]) -> pa.ChunkedArray:
+    """As Arrow sees them, none copied."""
+    ends = (pa.py_buffer(np.array([0, len(image)], dtype=np.int32)) for image in images)
+    parts = [
+        pa.Array.from_buffers(pa.binary(), 1, [None, end, pa.py_buffer(image)])
+        for end, image in zip(ends, images, strict=True)
+    ]
+    return pa.chunked_array(parts, type=pa.binary())
 
 
-def load_recording(path: Path, *, truth: bool = True, every: int = 1) -> Recording:
+def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Recording:
     """Read a trial written by `save_recording`.
 
     Parameters
@@ -118,8 +112,9 @@ def load_recording(path: Path, *, truth: bool = True, every: int = 1) -> Recordi
         The Parquet file.
     truth
         Read a simulated trial's ground truth too; training does without it.
-    every
-        Read every so many frames only, from the first on: a look at a long trial.
+    pixels
+        Read the images too. Without them, and the truth, a trial of any length takes little memory: the reference
+        stands for every frame, and `read_frames` reads those that are needed.
 
     Raises
     ------
@@ -130,16 +125,14 @@ def load_recording(path: Path, *, truth: bool = True, every: int = 1) -> Recordi
     """
     try:
         stored = pq.read_schema(path)
-        wanted = None if truth else [name for name in stored.names if name not in _TRUTH_COLUMNS]
-        table = pq.read_table(path, columns=wanted) if every == 1 else _read_some(path, wanted, every)
+        left_out = (set() if truth and pixels else _TRUTH_COLUMNS) | (set() if pixels else {"image"})
+        table = pq.read_table(path, columns=[name for name in stored.names if name not in left_out])
     except FileNotFoundError:
         raise RecordingError(f"{path} does not exist; make the data set again") from None
     except (pa.ArrowInvalid, OSError) as error:
         raise RecordingError(f"{path} is not a readable Parquet file ({error}); make the data set again") from None
     metadata = {key.decode(): value for key, value in (table.schema.metadata or {}).items()}
-    missing = ({"reference", *DESCRIPTION} - set(metadata)) | (
-        {"image", "contact_state", *SIGNALS} - set(table.column_names)
-    )
+    missing = ({"reference", *DESCRIPTION} - set(metadata)) | ({"image", "contact_state", *SIGNALS} - set(stored.names))
     if missing:
         raise RecordingError(f"{path} lacks {', '.join(sorted(missing))}; write it with save_recording")
     codec = metadata.get("codec", b"png").decode()
@@ -156,11 +149,13 @@ def load_recording(path: Path, *, truth: bool = True, every: int = 1) -> Recordi
         condition=metadata["condition"].decode(),
         object=metadata.get(OBJECT, b"").decode(),
         reference=reference,
-        frames=_decode(table.column("image"), size=reference.shape, where=f"of {path}"),
+        frames=_decode(table.column("image"), size=reference.shape, where=f"of {path}")
+        if pixels
+        else np.broadcast_to(reference, (table.num_rows, *reference.shape)),
         contact_state=tuple(ContactState(state) for state in table.column("contact_state").to_pylist()),
         **{name: table.column(name).to_numpy() for name in _OPTIONAL if name in table.column_names},
         truth=_read_truth(table, json.loads(metadata["truth"]), reference.shape[:2], path)
-        if truth and "truth" in metadata
+        if truth and pixels and "truth" in metadata
         else None,
         **{name: table.column(name).to_numpy().astype(np.float64) for name in SIGNALS},
     )
@@ -186,15 +181,39 @@ def stream_frames(path: Path) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
         first += len(images)
 
 
-def _read_some(path: Path, columns: list[str] | None, every: int) -> pa.Table:
-    """Rows of a trial, one row group in memory at a time."""
-    file = pq.ParquetFile(path)
-    parts, first = [file.schema_arrow.empty_table().select(columns or file.schema_arrow.names)], 0
-    for group in range(file.num_row_groups):
-        rows = file.read_row_group(group, columns=columns)
-        parts.append(rows.take(np.arange(-first % every, rows.num_rows, every)))
-        first += rows.num_rows
-    return pa.concat_tables(parts)
+def read_frames(path: Path, places: Sequence[int]) -> UInt8[np.ndarray, "frames height width 3"]:
+    """Some frames of a stored trial, in the order asked for, a row group in memory at a time.
+
+    Parameters
+    ----------
+    path
+        The Parquet file.
+    places
+        Numbers of the frames.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing or damaged, or a frame is not there.
+    ImageError
+        If an image inside is damaged.
+    """
+    header, first = read_header(path), 0
+    strange = [place for place in places if not 0 <= place < header.frames]
+    if strange:
+        raise RecordingError(f"{path} has no frame {strange[0]}; name one from 0 to {header.frames - 1}")
+    found = np.empty((len(places), header.height, header.width, 3), dtype=np.uint8)
+    with pq.ParquetFile(path, memory_map=True) as file:
+        for group in range(file.num_row_groups):
+            end = first + file.metadata.row_group(group).num_rows
+            inside = [(at, place) for at, place in enumerate(places) if first <= place < end]
+            images = file.read_row_group(group, columns=["image"]).column("image") if inside else None
+            for at, place in inside:
+                assert images is not None
+                where = f"frame {place} of {path}"
+                found[at] = decode_pixels(images[place - first].as_buffer(), size=found.shape[1:], where=where)
+            first = end
+    return found
 
 
 def _read_truth(table: pa.Table, description: dict[str, Any], size: tuple[int, ...], path: Path) -> GroundTruth:

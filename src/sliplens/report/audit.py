@@ -1,11 +1,12 @@
 """Audit of an imported trial: one page that shows what its labels rest on."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -32,7 +33,11 @@ _TOP, _LEGEND, _TICKS, _LEADER, _HEAD, _FOOT, _PICTURE_HEIGHT = 0.78, 0.25, 0.22
 _LINE, _WRAP = 0.145, 43  # height of a line of facts, and its characters
 
 
-def draw_audit(recording: Recording, labelling: Mapping[str, Any]) -> Figure:
+ReadFrames = Callable[[Sequence[int]], UInt8[np.ndarray, "frames height width 3"]]
+"""Gives the frames of these numbers, in their order."""
+
+
+def draw_audit(recording: Recording, labelling: Mapping[str, Any], *, read_frames: ReadFrames | None = None) -> Figure:
     """Draw a page from which to judge whether the labels of an imported trial can be defended.
 
     Forces, their ratio beside the static friction, and the safety margin with its uncertainty, on the camera's clock;
@@ -45,6 +50,8 @@ def draw_audit(recording: Recording, labelling: Mapping[str, Any]) -> Figure:
         The trial.
     labelling
         What its labels rest on, as `import_trial` keeps it; what is not known is None.
+    read_frames
+        Gives the frames of these numbers, for a trial that was loaded without its pixels; its own if None.
     """
     height = float(np.clip(_PICTURE * recording.reference.shape[0] / recording.reference.shape[1], *_PICTURE_HEIGHT))
     top = _HEIGHT - _FOOT - 2 * height - _GAP
@@ -52,7 +59,8 @@ def draw_audit(recording: Recording, labelling: Mapping[str, Any]) -> Figure:
         figure = Figure(figsize=(_WIDTH, _HEIGHT))
         charts = _draw_charts(figure, recording, labelling, bottom=top - _HEAD - _LEADER - _TICKS)
         index, along = labelling["reference"]["index"], choose_along(recording)
-        _draw_pictures(figure, recording, index, along, top=top, height=height)
+        read = recording.frames.__getitem__ if read_frames is None else read_frames
+        _draw_pictures(figure, recording, index, along, read, top=top, height=height)
         for column, at in enumerate([index, *along]):
             if at is None:  # the reference was recorded apart from the frames
                 continue
@@ -63,7 +71,9 @@ def draw_audit(recording: Recording, labelling: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def write_audit(recording: Recording, labelling: Mapping[str, Any], path: Path) -> None:
+def write_audit(
+    recording: Recording, labelling: Mapping[str, Any], path: Path, *, read_frames: ReadFrames | None = None
+) -> None:
     """Save the audit of a trial as .png, .pdf or .svg; it appears when complete.
 
     Parameters
@@ -72,6 +82,8 @@ def write_audit(recording: Recording, labelling: Mapping[str, Any], path: Path) 
         As `draw_audit` takes them.
     path
         File to write.
+    read_frames
+        As `draw_audit` takes it.
 
     Raises
     ------
@@ -79,7 +91,7 @@ def write_audit(recording: Recording, labelling: Mapping[str, Any], path: Path) 
         If the suffix is another one, or the file cannot be written.
     """
     require_picture_path(path, example="audit.png")
-    save_page(draw_audit(recording, labelling), path)
+    save_page(draw_audit(recording, labelling, read_frames=read_frames), path)
 
 
 def choose_along(recording: Recording) -> list[int]:
@@ -149,15 +161,23 @@ def _lead(figure: Figure, charts: list[Axes], time_s: float, middle: float, *, t
 
 
 def _draw_pictures(
-    figure: Figure, recording: Recording, index: int | None, along: list[int], *, top: float, height: float
+    figure: Figure,
+    recording: Recording,
+    index: int | None,
+    along: list[int],
+    read_frames: ReadFrames,
+    *,
+    top: float,
+    height: float,
 ) -> None:
     reference, second = recording.reference, top + height + _GAP
     free = [at for at, state in enumerate(recording.contact_state) if state == ContactState.NO_CONTACT]
     # the reference less itself would tell nothing, an untouched frame long before or after it tells how it drifts
     far = max(free, key=lambda at: abs(at - (index or 0)), default=index)
-    frames = [reference, *recording.frames[along]]
-    untouched = reference if far is None else recording.frames[far]
-    differences = absolute_difference(np.stack([untouched, *recording.frames[along]]), reference)
+    shown = read_frames(along if far is None else [*along, far])
+    frames = [reference, *shown[: len(along)]]
+    untouched = reference if far is None else shown[-1]
+    differences = absolute_difference(np.stack([untouched, *frames[1:]]), reference)
     factor = brightening([differences])
     for text, middle in (("camera", top + height / 2), (f"difference\n{TIMES} {factor:g}", second + height / 2)):
         turned = {"rotation": 90, "ha": "right", "va": "center", "multialignment": "center"}

@@ -10,6 +10,9 @@ from jaxtyping import Bool, Float
 from sliplens.datasets import FrameSet
 from sliplens.errors import RecordingError
 from sliplens.models import TrainedModel
+from sliplens.models.checkpoints import Estimate, join_estimates
+from sliplens.training.lead_time import LeadTimes, lead_times
+from sliplens.training.reliability import auroc, coverages
 
 BIN_COUNT = 10
 
@@ -40,10 +43,29 @@ class RegressionScores:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Reliability:
+    """How far the network's own uncertainty can be believed, in one condition."""
+
+    coverage: dict[str, float]
+    """Share of the labels inside the interval of each level; empty without a calibration."""
+    mean_width_90: float | None
+    """Of the intervals that should hold 90 %, in margin units."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """Scores by condition, and the predictions behind them."""
+    """Scores by condition, day and trial, how sure the network was, and the predictions behind it all."""
 
     conditions: dict[str, RegressionScores]
+    days: dict[str, RegressionScores]
+    """By condition and day."""
+    trials: dict[str, RegressionScores]
+    reliability: dict[str, Reliability]
+    """By condition."""
+    wet_auroc: float | None
+    """How often the uncertainty of a wet frame is above that of a dry one; None without both, or without a spread."""
+    lead_times: dict[str, LeadTimes]
+    """By condition."""
     predictions: pa.Table
 
 
@@ -112,13 +134,16 @@ def evaluate(
         Called with the number of frames done and the number of all.
     """
     count = len(frames)
-    answers = []
+    if not count:
+        raise RecordingError("there is no labelled frame to evaluate; check the split and the condition")
+    parts = []
     for start in range(0, count, batch_size):
         rows = range(start, min(start + batch_size, count))
-        answers.append(trained.predict(frames.__getitems__(rows)[0], batch_size=batch_size).cpu().numpy())
+        parts.append(trained.estimate(frames.__getitems__(rows)[0], batch_size=batch_size))
         if on_batch is not None:
             on_batch(rows.stop, count)
-    predictions = np.concatenate(answers).astype(np.float64)
+    estimate = join_estimates(parts)
+    predictions = estimate.margin
     labels = frames.safety_margin.numpy().astype(np.float64)
     condition, trial = np.array(frames.condition), np.array(frames.trial)
     table = pa.table(
@@ -130,10 +155,49 @@ def evaluate(
             "time_s": frames.time_s,
             "safety_margin": labels,
             "prediction": predictions,
+            **_told_uncertainty(estimate),
         }
     )
-    scores = {}
-    for name in sorted(set(frames.condition)):
-        rows = condition == name
-        scores[name] = regression_scores(labels[rows], predictions[rows], trials=len(set(trial[rows])))
-    return Evaluation(conditions=scores, predictions=table)
+
+    def score(rows: Bool[np.ndarray, " frames"]) -> RegressionScores:
+        return regression_scores(labels[rows], predictions[rows], trials=len(set(trial[rows])))
+
+    day = np.array(frames.day)
+    by_condition = {name: condition == name for name in sorted(set(frames.condition))}
+    by_day = {
+        f"{name}, day {number}": rows & (day == number)
+        for name, rows in by_condition.items()
+        for number in sorted(set(day[rows].tolist()))
+    }
+    sigma = estimate.sigma
+    wet = by_condition.get("wet")
+    dry = by_condition.get("dry")
+    return Evaluation(
+        conditions={name: score(rows) for name, rows in by_condition.items()},
+        days={name: score(rows) for name, rows in by_day.items()},
+        trials={name: score(trial == name) for name in dict.fromkeys(frames.trial)},
+        reliability={name: _reliability(estimate, labels, rows) for name, rows in by_condition.items()},
+        wet_auroc=None if sigma is None or wet is None or dry is None else auroc(sigma[wet], sigma[dry]),
+        lead_times={
+            name: lead_times(trial[rows].tolist(), frames.time_s[rows], labels[rows], predictions[rows])
+            for name, rows in by_condition.items()
+        },
+        predictions=table,
+    )
+
+
+def _told_uncertainty(estimate: Estimate) -> dict[str, Float[np.ndarray, " frames"]]:
+    """Columns of the standard deviation and of the 90 % interval, as far as the network tells them."""
+    columns = {} if estimate.sigma is None else {"sigma": estimate.sigma}
+    interval = estimate.interval(0.9)
+    return columns if interval is None else {**columns, "low_90": interval[0], "high_90": interval[1]}
+
+
+def _reliability(
+    estimate: Estimate, labels: Float[np.ndarray, " frames"], rows: Bool[np.ndarray, " frames"]
+) -> Reliability:
+    interval = estimate.interval(0.9)
+    return Reliability(
+        coverage=coverages(estimate, labels, rows),
+        mean_width_90=None if interval is None else float((interval[1] - interval[0])[rows].mean()),
+    )

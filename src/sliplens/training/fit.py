@@ -4,7 +4,7 @@ import logging
 import shutil
 import signal
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -47,6 +47,7 @@ def fit(
     frame_size: tuple[int, int],
     sensor: str,
     data_hash: str,
+    trained_on: Sequence[str] = (),
     on_progress: Callable[[TrainProgress], None] | None = None,
 ) -> TrainResult:
     """Train a network and save the weights that were best on the validation frames.
@@ -60,8 +61,9 @@ def fit(
     folder
         Gets `model.safetensors`, `manifest.json` and `metrics.csv`. While training runs it also holds checkpoints, from
         which a call with the same folder goes on.
-    frame_size, sensor, data_hash
-        Kept in the manifest: height and width of the sensor's frames, its name, and the data set's hash.
+    frame_size, sensor, data_hash, trained_on
+        Kept in the manifest: height and width of the sensor's frames, its name, the data set's hash, and those of the
+        trials.
     on_progress
         Called after every step.
 
@@ -117,6 +119,7 @@ def fit(
             frame_size=frame_size,
             sensor=sensor,
             data_hash=data_hash,
+            trained_on=tuple(trained_on),
             metrics={"validation_mse": best_mse},
             calibration=asdict(calibration),
             versions=versions(),

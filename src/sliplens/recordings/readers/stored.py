@@ -36,10 +36,11 @@ def read_stored(folder: Path) -> list[Capture]:
         If the folder is no data set, or a trial is missing or damaged.
     """
     data = Dataset.open(folder)
-    return [_capture(data, info) for info in data.trials]
+    return [read_stored_trial(data, info) for info in data.trials]
 
 
-def _capture(data: Dataset, info: TrialInfo) -> Capture:
+def read_stored_trial(data: Dataset, info: TrialInfo) -> Capture:
+    """Read one trial of a data set as `read_stored` does."""
     folder = data.folder
     path = trial_path(folder, info.trial)
     try:

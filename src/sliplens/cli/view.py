@@ -1,0 +1,67 @@
+"""`sliplens view`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from sliplens.cli.console import progress_bar, say, wrote
+from sliplens.errors import InputError
+
+if TYPE_CHECKING:
+    from sliplens.recordings import Dataset, TrialInfo
+
+_NAMED = 10
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Look at a trial in the Rerun viewer: frames, differences, forces and labels on one clock.
+
+    Needs the extra `view`: pip install "sliplens[view]". The viewer opens on this machine and listens to it alone; with
+    --output a file is written instead, to be opened with `rerun FILE.rrd` wherever Rerun is installed.
+    """
+
+    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
+    """Data set to read."""
+    trial: str | None = None
+    """Name of the trial; the first of the data set if not given."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="FILE.rrd")] = None
+    """File to write instead of opening the viewer."""
+    overwrite: bool = False
+    """Write the file anew if it exists."""
+
+    def run(self) -> None:
+        """Open the viewer, or write its file."""
+        from sliplens.recordings import Dataset
+        from sliplens.report.viewer import open_viewer, write_rrd
+        from sliplens.report.viewer_process import require_rerun, require_rrd_path
+
+        require_rerun()
+        if self.output is not None:
+            require_rrd_path(self.output)
+            if self.output.exists() and not self.overwrite:
+                raise InputError(f"{self.output} exists; choose another file or pass --overwrite")
+        data = Dataset.open(self.data)
+        info = self._find(data)
+        with progress_bar(f"Reading {info.trial}") as bar:
+            if self.output is None:
+                open_viewer(data, info, on_frames=bar)
+            else:
+                write_rrd(data, info, self.output, on_frames=bar)
+        if self.output is None:
+            say(f"{info.trial} is in the Rerun viewer, {info.frames:,} frames")
+            say("the viewer tells its makers that it is used, not what is seen; `rerun analytics disable` ends that")
+        else:
+            wrote(self.output, f"{info.trial}, {info.frames:,} frames; open it with `rerun {self.output}`")
+
+    def _find(self, data: "Dataset") -> "TrialInfo":
+        if self.trial is None:
+            return data.trials[0]
+        for info in data.trials:
+            if info.trial == self.trial:
+                return info
+        names = [info.trial for info in data.trials]
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        raise InputError(f"{self.data} has no trial {self.trial}; it has {', '.join(names[:_NAMED])}{more}")

@@ -1,0 +1,164 @@
+"""One picture of an evaluation: errors, where they lie, and whether the network knows."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from sliplens.report.pages import place_axes, place_text, save_page
+from sliplens.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, conditions_in_order, drawing_style
+
+_COLOURS = {"dry": ORANGE, "wet": BLUE}
+_WIDTH, _HEIGHT, _LEFT, _TOP, _GAP, _CHART = 12.0, 7.4, 0.75, 1.0, 0.95, (3.05, 2.25)
+_MOST_DOTS = 4000
+
+
+def draw_evaluation(predictions: pa.Table, told: Mapping[str, Any], path: Path, *, title: str) -> None:
+    """Save a page of six charts as .png, .pdf or .svg.
+
+    Answers against labels; mean squared error in ten bins of the margin (thesis, Fig. 7); bias of each trial; how often
+    intervals hold; uncertainty by condition; the trial of median error over time.
+
+    Parameters
+    ----------
+    predictions, told
+        `predictions.parquet` and `result.json` of `sliplens evaluate`.
+    path
+        File to write.
+    title
+        Head of the page.
+
+    Raises
+    ------
+    InputError
+        If the suffix is another one, or the file cannot be written.
+    """
+    columns = {name: predictions.column(name).to_numpy() for name in predictions.column_names}
+    conditions = conditions_in_order(told["conditions"])
+    with drawing_style():
+        figure = Figure(figsize=(_WIDTH, _HEIGHT))
+        charts = []
+        for index in range(6):
+            row, column = divmod(index, 3)
+            left = _LEFT + column * (_CHART[0] + _GAP)
+            top = _TOP + row * (_CHART[1] + 1.05)
+            charts.append(place_axes(figure, left, top, *_CHART))
+        _plot_answers(columns, conditions, ax=charts[0])
+        _plot_bins(told["conditions"], conditions, ax=charts[1])
+        _plot_trials(columns, conditions, ax=charts[2])
+        _plot_coverage(told["reliability"], conditions, ax=charts[3])
+        _plot_uncertainty(columns, conditions, told["wet_auroc"], ax=charts[4])
+        _plot_typical(columns, told["trials"], ax=charts[5])
+        place_text(figure, _LEFT - 0.5, 0.2, title, fontsize=13, fontweight="bold", parse_math=False)
+        place_text(figure, _LEFT - 0.5, 0.52, _summary(told, conditions), fontsize=9, color=GREY)
+    save_page(figure, path)
+
+
+def _plot_answers(columns: Mapping[str, np.ndarray], conditions: list[str], *, ax: Axes) -> None:
+    for name in conditions:
+        rows = np.flatnonzero(columns["condition"] == name)
+        rows = rows[:: max(1, len(rows) // _MOST_DOTS)]
+        label, answer = (100 * columns[key][rows] for key in ("safety_margin", "prediction"))
+        ax.scatter(
+            label, answer, s=5, alpha=0.35, linewidths=0, rasterized=True, color=_COLOURS.get(name, GREEN), label=name
+        )
+    ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="perfect")
+    ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103), title="Answers")
+    ax.legend(markerscale=2.5, fontsize=8, loc="upper left")
+
+
+def _plot_bins(scores: Mapping[str, Any], conditions: list[str], *, ax: Axes) -> None:
+    width = 0.8 / max(1, len(conditions))
+    for index, name in enumerate(conditions):
+        bins = scores[name]["bins"]
+        at = np.arange(len(bins)) + (index - (len(conditions) - 1) / 2) * width
+        heights = [np.nan if one["mse"] is None else one["mse"] for one in bins]
+        ax.bar(at, heights, width=width, color=_COLOURS.get(name, GREEN), label=name)
+    ax.set(xlabel="True Γ, lower edge of the bin (%)", ylabel="MSE (Γ as a fraction, squared)", title="Error by margin")
+    ax.set_xticks(range(10), [str(10 * one) for one in range(10)])
+    ax.legend(fontsize=8)
+
+
+def _plot_trials(columns: Mapping[str, np.ndarray], conditions: list[str], *, ax: Axes) -> None:
+    for place, name in enumerate(conditions):
+        biases = []
+        inside = columns["condition"] == name
+        for trial in np.unique(columns["trial"][inside]):
+            rows = inside & (columns["trial"] == trial)
+            biases.append(100 * float(np.mean(columns["prediction"][rows] - columns["safety_margin"][rows])))
+        spread = np.linspace(-0.25, 0.25, len(biases)) if len(biases) > 1 else np.zeros(1)
+        ax.scatter(np.sort(biases), place + spread, s=14, color=_COLOURS.get(name, GREEN), linewidths=0)
+    ax.axvline(0, color=BLACK, linewidth=1, linestyle="--")
+    ax.set(
+        xlabel="Mean of predicted less true Γ (points)", title="Bias of each trial", ylim=(len(conditions) - 0.5, -0.5)
+    )
+    ax.set_yticks(range(len(conditions)), conditions)
+
+
+def _plot_coverage(reliability: Mapping[str, Any], conditions: list[str], *, ax: Axes) -> None:
+    known = {name: reliability[name]["coverage"] for name in conditions if reliability[name]["coverage"]}
+    for name, shares in known.items():
+        levels = sorted(shares, key=float)
+        drawn = {"color": _COLOURS.get(name, GREEN), "marker": "o", "markersize": 4}
+        ax.plot(
+            [100 * float(level) for level in levels], [100 * shares[level] for level in levels], label=name, **drawn
+        )
+    ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="as promised")
+    ax.set(xlabel="Promised (% of the frames)", ylabel="Held (%)", xlim=(40, 100), ylim=(0, 102), title="Intervals")
+    if not known:
+        _say(ax, "this network was never calibrated")
+    ax.legend(fontsize=8, loc="upper left")
+
+
+def _plot_uncertainty(
+    columns: Mapping[str, np.ndarray], conditions: list[str], auroc: float | None, *, ax: Axes
+) -> None:
+    title = "Uncertainty" if auroc is None else f"Uncertainty: wet told from dry, AUROC {auroc:.2f}"
+    ax.set(xlabel="Standard deviation of the answer (points of Γ)", ylabel="Share of the frames (%)", title=title)
+    if "sigma" not in columns:
+        _say(ax, "one number, and no distribution")
+        return
+    sigma = 100 * columns["sigma"]
+    edges = np.linspace(0, max(1.0, float(np.quantile(sigma, 0.995))), 30).tolist()
+    for name in conditions:
+        shown = sigma[columns["condition"] == name]
+        weights = np.full(len(shown), 100 / len(shown))
+        ax.hist(shown, bins=edges, weights=weights, color=_COLOURS.get(name, GREEN), alpha=0.6, label=name)
+    ax.legend(fontsize=8)
+
+
+def _plot_typical(columns: Mapping[str, np.ndarray], trials: Mapping[str, Any], *, ax: Axes) -> None:
+    ranked = sorted(trials, key=lambda name: trials[name]["mse"])
+    trial = ranked[(len(ranked) - 1) // 2]
+    rows = np.flatnonzero(columns["trial"] == trial)
+    rows = rows[np.argsort(columns["time_s"][rows], kind="stable")]
+    time = columns["time_s"][rows]
+    if "low_90" in columns:
+        low, high = 100 * columns["low_90"][rows], 100 * columns["high_90"][rows]
+        ax.fill_between(time, low, high, color=VERMILLION, alpha=0.2, linewidth=0, label="90 % interval")
+    ax.plot(time, 100 * columns["prediction"][rows], color=VERMILLION, label="predicted")
+    ax.plot(time, 100 * columns["safety_margin"][rows], color=BLACK, linestyle="--", label="true")
+    ax.set(xlabel="Time (s)", ylabel="Γ (%)")
+    ax.set_title(f"The trial of median error: {trial}", parse_math=False)
+    ax.legend(fontsize=8)
+
+
+def _summary(told: Mapping[str, Any], conditions: list[str]) -> str:
+    parts = []
+    for name in conditions:
+        scores, lead = told["conditions"][name], told["lead_times"][name]
+        r2 = "none" if scores["r2"] is None else f"{scores['r2']:.3f}"
+        words = f"{name}: {scores['frames']:,} frames, MSE {scores['mse']:.4f}, R² {r2}"
+        words += f", MAE {100 * scores['mae']:.1f} points"
+        if lead["median_ms"] is not None:
+            words += f", warns {lead['median_ms']:.0f} ms before the slip (the true Γ: {lead['ideal_ms']:.0f} ms)"
+        parts.append(f"{words}, {lead['false_per_minute']:.1f} false alarms a minute")
+    return "\n".join(parts)
+
+
+def _say(ax: Axes, words: str) -> None:
+    ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=GREY)

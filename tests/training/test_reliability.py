@@ -1,0 +1,85 @@
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from sliplens.training.lead_time import lead_times
+from sliplens.training.reliability import auroc, coverage
+
+SCORES = arrays(np.float64, st.integers(1, 12), elements=st.integers(0, 5).map(float))
+
+
+@given(SCORES, SCORES)
+def test_the_area_is_the_share_of_pairs_in_the_right_order(positive: np.ndarray, negative: np.ndarray):
+    pairs = [1.0 if one > other else 0.5 if one == other else 0.0 for one, other in product(positive, negative)]
+    found = auroc(positive, negative)
+    assert found == pytest.approx(np.mean(pairs))
+    # and what tells the one apart tells the other apart the other way round
+    assert auroc(negative, positive) == pytest.approx(1 - np.mean(pairs))
+
+
+def test_nothing_is_told_apart_from_an_empty_class():
+    assert auroc(np.array([]), np.array([1.0])) is None
+
+
+def test_the_ends_of_an_interval_belong_to_it():
+    low, high = np.array([0.0, 0.2, 0.5, 0.0]), np.array([0.1, 0.4, 0.5, 0.3])
+    assert coverage(low, high, np.array([0.1, 0.2, 0.5, 0.4])) == 0.75
+
+
+def trial(seconds: float = 10.0) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """A margin that falls evenly to 0 at `seconds` and stays there for a second, 10 frames a second."""
+    time = np.arange(0, seconds + 1.05, 0.1)
+    # rounded: 1 - 0.8 is not 0.2 in binary, and a threshold would tell them apart
+    return ["one"] * len(time), time, np.clip(1 - time / seconds, 0, 1).round(6)
+
+
+def test_a_perfect_network_warns_as_early_as_the_margin_itself():
+    name, time, labels = trial()
+    found = lead_times(name, time, labels, labels)
+    # below 0.2 from the first frame after 8 s on, at 10 s it slips
+    assert found.median_ms == pytest.approx(1900)
+    assert found.median_ms == found.ideal_ms
+    assert (found.trials, found.warned, found.false_per_minute) == (1, 1, 0)
+
+
+def test_a_network_that_reads_too_much_warns_late_and_one_that_always_does_never():
+    name, time, labels = trial()
+    late = lead_times(name, time, labels, (labels + 0.1).round(6))
+    # below 0.2 where the label is below 0.1: the last second
+    assert late.median_ms == pytest.approx(900)
+    never = lead_times(name, time, labels, labels + 0.3)
+    assert (never.median_ms, never.warned, never.trials) == (None, 0, 1)
+
+
+def test_alarms_far_from_slip_are_false_and_counted_by_the_minute():
+    name, time, labels = trial()
+    predictions = labels.copy()
+    predictions[[5, 20, 21]] = 0.1  # two stretches, at margins of 0.95 and 0.8
+    found = lead_times(name, time, labels, predictions)
+    # 9.9 s lie between the first frame and the last before the slip
+    assert found.false_per_minute == pytest.approx(2 / (9.9 / 60))
+    assert found.median_ms == pytest.approx(1900)
+
+
+def test_what_comes_after_the_slip_and_trials_that_never_slip_count_no_lead():
+    name, time, labels = trial()
+    held = labels >= 0.5
+    found = lead_times(["one"] * int(held.sum()), time[held], labels[held], labels[held])
+    assert (found.trials, found.median_ms, found.ideal_ms) == (0, None, None)
+    after = labels.copy()
+    after[labels <= 0] = 0.9
+    # an answer after the slip changes nothing
+    assert lead_times(name, time, labels, after) == lead_times(name, time, labels, labels)
+
+
+def test_the_order_of_the_frames_does_not_matter(rng: np.random.Generator):
+    name, time, labels = trial()
+    predictions = np.clip(labels + rng.normal(0, 0.1, len(labels)), 0, 1)
+    order = rng.permutation(len(labels))
+    assert lead_times(name, time, labels, predictions) == lead_times(
+        name, time[order], labels[order], predictions[order]
+    )
