@@ -9,11 +9,11 @@ import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sliplens.report.pages import place_axes, place_text, save_page
+from sliplens.report.pages import place_axes, place_text, require_picture_path, save_page
 from sliplens.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, conditions_in_order, drawing_style
 
 _COLOURS = {"dry": ORANGE, "wet": BLUE}
-_WIDTH, _HEIGHT, _LEFT, _TOP, _GAP, _CHART = 12.0, 7.4, 0.75, 1.0, 0.95, (3.05, 2.25)
+_WIDTH, _HEIGHT, _LEFT, _TOP, _GAP, _CHART = 12.0, 7.5, 0.75, 1.25, 0.95, (3.05, 2.25)
 _MOST_DOTS = 4000
 
 
@@ -37,6 +37,7 @@ def draw_evaluation(predictions: pa.Table, told: Mapping[str, Any], path: Path, 
     InputError
         If the suffix is another one, or the file cannot be written.
     """
+    require_picture_path(path, example="evaluation.png")
     columns = {name: predictions.column(name).to_numpy() for name in predictions.column_names}
     conditions = conditions_in_order(told["conditions"])
     with drawing_style():
@@ -117,7 +118,7 @@ def _plot_coverage(reliability: Mapping[str, Any], conditions: list[str], *, ax:
 def _plot_uncertainty(
     columns: Mapping[str, np.ndarray], conditions: list[str], auroc: float | None, *, ax: Axes
 ) -> None:
-    title = "Uncertainty" if auroc is None else f"Uncertainty: wet told from dry, AUROC {auroc:.2f}"
+    title = "Uncertainty" if auroc is None else f"Wet told from dry: AUROC {auroc:.2f}"
     ax.set(xlabel="Standard deviation of the answer (points of Γ)", ylabel="Share of the frames (%)", title=title)
     if "sigma" not in columns:
         _say(ax, "one number, and no distribution")

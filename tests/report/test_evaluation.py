@@ -1,0 +1,67 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from PIL import Image
+
+from sliplens.errors import InputError
+from sliplens.provenance import to_jsonable
+from sliplens.report.evaluation import draw_evaluation
+from sliplens.training import regression_scores
+from sliplens.training.evaluate import Reliability
+from sliplens.training.lead_time import lead_times
+
+
+def evaluation(*, sure: bool = True) -> tuple[pa.Table, dict[str, Any]]:
+    """Two dry trials that are read well, and a wet one that is read too high."""
+    rng = np.random.default_rng(0)
+    time = np.arange(60) / 8
+    columns: dict[str, list] = {name: [] for name in ("trial", "condition", "time_s", "safety_margin", "prediction")}
+    for trial, condition, bias in (("a", "dry", 0.0), ("b", "dry", 0.03), ("c_$1", "wet", 0.2)):
+        labels = np.clip(1.1 - time / 6.5, 0, 1)
+        columns["trial"] += [trial] * len(time)
+        columns["condition"] += [condition] * len(time)
+        columns["time_s"] += time.tolist()
+        columns["safety_margin"] += labels.tolist()
+        columns["prediction"] += (labels + bias + rng.normal(0, 0.04, len(time))).tolist()
+    table = {name: np.array(values) for name, values in columns.items()}
+    if sure:
+        table["sigma"] = np.where(table["condition"] == "wet", 0.12, 0.05) * rng.uniform(0.7, 1.3, len(table["trial"]))
+        table["low_90"] = np.clip(table["prediction"] - 1.6 * table["sigma"], 0, 1)
+        table["high_90"] = np.clip(table["prediction"] + 1.6 * table["sigma"], 0, 1)
+    told: dict[str, Any] = {"conditions": {}, "trials": {}, "reliability": {}, "lead_times": {}}
+    for name in ("dry", "wet"):
+        rows = table["condition"] == name
+        labels, answers = table["safety_margin"][rows], table["prediction"][rows]
+        told["conditions"][name] = regression_scores(labels, answers)
+        shares = {"0.5": 0.48, "0.9": 0.88 if name == "dry" else 0.6} if sure else {}
+        told["reliability"][name] = Reliability(coverage=shares, mean_width_90=None)
+        told["lead_times"][name] = lead_times(table["trial"][rows].tolist(), table["time_s"][rows], labels, answers)
+    for name in np.unique(table["trial"]):
+        rows = table["trial"] == name
+        told["trials"][str(name)] = regression_scores(table["safety_margin"][rows], table["prediction"][rows])
+    told["wet_auroc"] = 0.97 if sure else None
+    return pa.table({name: values.tolist() for name, values in table.items()}), to_jsonable(told)
+
+
+@pytest.mark.parametrize("sure", [True, False])
+def test_the_picture_of_an_evaluation_is_drawn_with_and_without_uncertainty(tmp_path: Path, sure: bool):
+    draw_evaluation(*evaluation(sure=sure), tmp_path / "page.png", title="train-difference, test trials")
+    with Image.open(tmp_path / "page.png") as image:
+        pixels = np.array(image.convert("L"))
+    # 12 inches at 150 dots, and something is drawn in every third of it
+    assert pixels.shape[1] == 1800
+    assert all(part.std() > 10 for part in np.array_split(pixels, 3, axis=1))
+
+
+def test_the_same_numbers_give_the_same_picture(tmp_path: Path):
+    for name in "ab":
+        draw_evaluation(*evaluation(), tmp_path / f"{name}.png", title="same")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_a_file_that_is_no_picture_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="does not end in"):
+        draw_evaluation(*evaluation(), tmp_path / "page.doc", title="no")
