@@ -2,7 +2,8 @@
 
 A trial is simulated at the rate of its force sensor, and only every so-manieth frame is drawn: forces and frames then
 come from one loading, not from forces interpolated between frames. Each trial is filmed once and labelled several
-times, every time with another noise, offset, lag, direction of the pull, order of the axes and sign.
+times, every time with another noise, offset, lag, direction of the pull, order of the axes and sign. Views of one trial
+share its drift and friction, so the error of a coverage is counted over trials; several seeds make it small.
 """
 
 import argparse
@@ -46,6 +47,7 @@ class Score:
     """How far the labels of one trial are from the truth."""
 
     trial: str
+    """With its seed, so that trials of several seeds stay apart."""
     wet: bool
     mu_error: float
     """Relative, signed."""
@@ -127,7 +129,7 @@ def _compare(labels: Labels, seen: Seen, *, lag_s: float, axes_right: bool) -> S
     assert lag is not None
     known = np.isfinite(error)
     return Score(
-        trial=seen.plan.trial,
+        trial=f"seed{seen.plan.recipe.seed}-{seen.plan.trial}",
         wet=seen.plan.condition == "wet",
         mu_error=labels.friction.mu / mu - 1,
         mu_covered=labels.friction.low <= mu <= labels.friction.high,
@@ -144,15 +146,18 @@ def _compare(labels: Labels, seen: Seen, *, lag_s: float, axes_right: bool) -> S
 def summarise(scores: list[Score]) -> dict[str, float]:
     """One number for each claim; a trial counts alike however many valid frames it has, as they err together."""
     errors = np.concatenate([score.margin_error for score in scores])
-    by_trial = {score.trial: score for score in scores}
     rms = [np.sqrt(np.mean(score.margin_error**2)) for score in scores]
     kinds = {"coverage_68": scores}
     kinds |= {f"coverage_68_{name}": [score for score in scores if score.wet == wet] for name, wet in _CONDITIONS}
-    coverage = {
-        name: float(np.mean([score.margin_covered.mean() for score in some])) for name, some in kinds.items() if some
-    }
+    coverage: dict[str, float] = {}
+    for name, some in kinds.items():
+        if some:
+            shares = _coverage_of_trials(some)
+            coverage[name] = float(shares.mean())
+            if len(shares) > 1:
+                coverage[f"{name}_error"] = float(shares.std(ddof=1) / np.sqrt(len(shares)))
     return {
-        "trials": len(by_trial),
+        "trials": len({score.trial for score in scores}),
         "mu_error": float(np.median([abs(score.mu_error) for score in scores])),
         "mu_error_worst": float(np.max([abs(score.mu_error) for score in scores])),
         "mu_coverage_68": float(np.mean([score.mu_covered for score in scores])),
@@ -168,6 +173,29 @@ def summarise(scores: list[Score]) -> dict[str, float]:
     }
 
 
+def _coverage_of_trials(scores: list[Score]) -> Float[np.ndarray, " trials"]:
+    """Share of the valid frames whose band holds the truth, the mean of a trial's views."""
+    views: dict[str, list[float]] = {}
+    for score in scores:
+        views.setdefault(score.trial, []).append(float(score.margin_covered.mean()))
+    return np.array([np.mean(view) for view in views.values()])
+
+
+def measure_seed(
+    seed: int, *, dry: int, wet: int, draws: int, noise_n: float, know_drift: bool, release: bool
+) -> list[Score | None]:
+    """Score the trials of one seed, each seen `draws` times."""
+    recipe = SimulationRecipe(
+        dry_trials=dry, wet_trials=wet, frames_per_trial=round(TRIAL_S * FORCE_HZ), release=release, seed=seed
+    )
+    rng = np.random.default_rng(seed)
+    scores: list[Score | None] = []
+    for plan in plan_trials(recipe):
+        seen = film_trial(plan)
+        scores += [score_trial(seen, noise_n=noise_n, know_drift=know_drift, rng=rng) for _ in range(draws)]
+    return scores
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -176,23 +204,24 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=4, help="times each trial is spoilt and labelled")
     parser.add_argument("--noise", type=float, default=0.02, help="standard deviation of a force sample, in newtons")
     parser.add_argument("--seed", type=int, default=0, help="of the trials and of what spoils them")
+    parser.add_argument("--seeds", type=int, default=1, help="pool so many seeds, from --seed on")
+    parser.add_argument("--release", action="store_true", help="let go of the object at the end of each trial")
     parser.add_argument("--unknown-drift", action="store_true", help="do not tell the labels that wet friction drifts")
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
     arguments = parser.parse_args()
-    recipe = SimulationRecipe(
-        dry_trials=arguments.dry,
-        wet_trials=arguments.wet,
-        frames_per_trial=round(TRIAL_S * FORCE_HZ),
-        seed=arguments.seed,
-    )
-    rng = np.random.default_rng(arguments.seed)
-    scores: list[Score | None] = []
-    for plan in plan_trials(recipe):
-        seen = film_trial(plan)
-        scores += [
-            score_trial(seen, noise_n=arguments.noise, know_drift=not arguments.unknown_drift, rng=rng)
-            for _ in range(arguments.draws)
-        ]
+    scores = [
+        score
+        for seed in range(arguments.seed, arguments.seed + arguments.seeds)
+        for score in measure_seed(
+            seed,
+            dry=arguments.dry,
+            wet=arguments.wet,
+            draws=arguments.draws,
+            noise_n=arguments.noise,
+            know_drift=not arguments.unknown_drift,
+            release=arguments.release,
+        )
+    ]
     kept = [score for score in scores if score is not None]
     numbers = {"labelled": len(kept), "refused": len(scores) - len(kept), **summarise(kept)}
     for name, value in numbers.items():

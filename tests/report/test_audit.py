@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
 from itertools import combinations, pairwise
@@ -329,6 +330,24 @@ def test_six_pictures_are_the_reference_and_five_frames_in_the_order_of_time(cha
     for ax, index in zip(camera[1:], along, strict=True):
         np.testing.assert_array_equal(ax.images[0].get_array(), trial.frames[index])
         assert to_hex(ax.spines["top"].get_edgecolor()).upper() == STATE_COLOURS[trial.contact_state[index]]
+
+
+def test_a_trial_without_its_pixels_has_those_read_that_are_shown():
+    trial = make_trial()
+    bare = replace(trial, frames=np.broadcast_to(trial.reference, trial.frames.shape))
+    asked: list[int] = []
+
+    def read(places: Sequence[int]) -> np.ndarray:
+        asked.extend(places)
+        return trial.frames[list(places)]
+
+    shown, expected = draw_audit(bare, make_labelling(), read_frames=read), draw_audit(trial, make_labelling())
+
+    for row, other in zip(pictures(shown), pictures(expected), strict=True):
+        for ax, whole in zip(row, other, strict=True):
+            np.testing.assert_array_equal(ax.images[0].get_array(), whole.images[0].get_array())
+    # the five frames, and an untouched one to tell the drift
+    assert len(asked) == 6
 
 
 @pytest.mark.parametrize("lowest", [0.0, 0.4, 0.8])

@@ -88,7 +88,7 @@ def decode_png(data: bytes, *, where: str) -> UInt8[np.ndarray, "height width 3"
             if image.mode != "RGB":
                 raise ImageError(f"{where} has {_CURES.get(image.mode, image.mode)}")
             return np.array(image)
-    except (OSError, SyntaxError, ValueError) as error:
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise ImageError(f"{where} cannot be read as PNG ({error}); make the data set again") from None
 
 

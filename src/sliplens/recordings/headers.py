@@ -85,10 +85,82 @@ def read_labelling(path: Path) -> dict[str, Any] | None:
     Raises
     ------
     RecordingError
-        If the file is missing or damaged.
+        If the file is missing or damaged, or what it tells of its labels is.
     """
     metadata = _read_metadata(path)
-    return json.loads(metadata["labelling"]) if "labelling" in metadata else None
+    if "labelling" not in metadata:
+        return None
+    try:
+        labelling = json.loads(metadata["labelling"])
+    except ValueError:
+        labelling = None
+    require_labelling(labelling, where=str(path))
+    return labelling
+
+
+def require_labelling(labelling: object, *, where: str) -> None:
+    """Check that what is told of labels has the parts that pages and tables show.
+
+    Raises
+    ------
+    RecordingError
+        If a part is missing or of another kind.
+    """
+
+    def fits(value: object, parts: dict[str, Any]) -> bool:
+        return isinstance(value, dict) and all(name in value and kind(value[name]) for name, kind in parts.items())
+
+    def number(value: object) -> bool:
+        return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+
+    def words(value: object) -> bool:
+        return isinstance(value, list) and all(isinstance(one, str) for one in value)
+
+    def counts(value: object) -> bool:
+        return isinstance(value, dict) and all(isinstance(one, int) and one >= 0 for one in value.values())
+
+    def maybe(**parts: Any) -> Any:
+        return lambda value: value is None or fits(value, parts)
+
+    def text(value: object) -> bool:
+        return value is None or isinstance(value, str)
+
+    def three(value: object) -> bool:
+        return isinstance(value, list) and len(value) == 3 and all(map(number, value))
+
+    seen = {f"{name}_found": text for name in ("normal", "sign", "tare")}
+    axes = maybe(
+        notes=words,
+        normal=text,
+        sign=number,
+        still_until_s=number,
+        tare_n=three,
+        tare_sigma_n=three,
+        noise_n=three,
+        **seen,
+    )
+    parts = {
+        "source": text,
+        "forces": text,
+        "frames_by_reason": counts,
+        "notes": words,
+        "axes": axes,
+        "friction": maybe(mu=number, low=number, high=number, found=text, method=text, image_sigmas=number),
+        "lag": maybe(lag_s=number, sigma_s=number, doubt=text, correlation=number),
+        "lag_applied": lambda value: isinstance(value, bool),
+        "reference": lambda value: fits(
+            value, {"index": number, "method": text, "contact_energy": number, "drift": number}
+        ),
+        **dict.fromkeys(("slip_s", "contact_threshold_n", "window_s", "gap_s", "force_range_n"), number),
+    }
+    if not fits(labelling, parts):
+        assert isinstance(parts, dict)
+        wrong = [
+            name for name, kind in parts.items() if not (isinstance(labelling, dict) and fits(labelling, {name: kind}))
+        ]
+        raise RecordingError(
+            f"{where} tells nothing usable of how its labels were made ({', '.join(wrong[:3])}); import the trial again"
+        )
 
 
 def _read_metadata(path: Path) -> dict[str, bytes]:

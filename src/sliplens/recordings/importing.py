@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.given import GIVEN_SIGNALS, GivenLabels
-from sliplens.recordings.headers import OBJECT
+from sliplens.recordings.headers import OBJECT, require_labelling
 from sliplens.recordings.labels import (
     Labels,
     LabelSettings,
@@ -186,7 +186,9 @@ def _given(capture: Capture, labels: GivenLabels, *, index: int | None) -> _Made
         if values is not None:
             columns[column] = list(values) if name == "reason" else values
     labelling = labels.labelling
-    if labelling is None:
+    if labelling is not None:
+        require_labelling(labelling, where="what came with the frames")
+    else:
         labelling = {
             **dict.fromkeys(_RESTS_ON),
             "source": capture.source,
@@ -220,8 +222,9 @@ def _counted(
 ) -> Iterator[list[bytes]]:
     done = 0
     for chunk in chunks:
-        yield chunk
         done += len(chunk)
+        yield chunk
+        del chunk  # before the next is made
         if on_frames is not None:
             on_frames(done, count)
 

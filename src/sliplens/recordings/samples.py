@@ -37,11 +37,11 @@ def load_forces(path: Path) -> Forces:
     """
     try:
         table = pq.read_table(path)
+        source = (table.schema.metadata or {}).get(b"source", b"the force sensor").decode()
         values = [table.column(name).to_numpy().astype(np.float64) for name in ("time_s", *_AXES)]
     except FileNotFoundError:
         raise RecordingError(f"{path} does not exist; make the data set again") from None
     except (pa.ArrowException, OSError, KeyError, ValueError) as error:
         said = str(error).splitlines()[0]
         raise RecordingError(f"{path} does not hold samples of forces ({said}); make the data set again") from None
-    source = (table.schema.metadata or {}).get(b"source", b"the force sensor").decode()
     return Forces(time_s=values[0], force_n=np.stack(values[1:], axis=-1), source=source)

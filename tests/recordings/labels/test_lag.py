@@ -7,7 +7,7 @@ from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labels import estimate_lag
 
-from .conftest import Trial
+from .conftest import FORCE_HZ, FRAME_HZ, Trial
 
 
 def seed() -> np.random.Generator:
@@ -68,6 +68,44 @@ def test_an_image_that_moves_by_itself_tells_no_lag(trial: Trial, rng: np.random
 def test_a_lag_beyond_the_longest_tried_is_doubtful(trial: Trial, rng: np.random.Generator):
     lag = estimate_lag(trial.frame_time_s + 0.1, trial.motion, trial.forces(), rng=rng, longest_s=0.05)
     assert lag.doubt != ""
+
+
+def pressed(press_s: float, release_s: float | None) -> tuple[np.ndarray, np.ndarray, Forces]:
+    """Frame times, image motion and forces of a soft ball pressed, held, and let go if `release_s` is given.
+
+    Of Hertz's contact the depth is as the force to the power 2/3: the image leads in the press and trails in the
+    release, by more the longer they take.
+    """
+
+    def load(time_s: np.ndarray) -> np.ndarray:
+        risen = np.clip((time_s - 1.0) / press_s, 0, 1)
+        fallen = 0 * time_s if release_s is None else np.clip((time_s - 4.0) / release_s, 0, 1)
+        return (3 - 2 * risen) * risen**2 * (1 - (3 - 2 * fallen) * fallen**2)
+
+    time = np.arange(0, 6, 1 / FORCE_HZ)
+    frame_time = np.arange(0.01, 5.99, 1 / FRAME_HZ)
+    motion = np.abs(np.diff(load(frame_time) ** (2 / 3), prepend=0))
+    force = 1.5 * load(time)[:, None] * np.array([0.6, 0.0, -0.8])
+    return frame_time, motion, Forces(time_s=time, force_n=force, source="sensor")
+
+
+def test_a_fast_release_does_not_outweigh_the_press_it_undoes():
+    alone, alike, faster, fast = (
+        estimate_lag(*pressed(0.6, release_s), rng=seed(), draws=20).lag_s for release_s in (None, 0.6, 0.45, 0.3)
+    )
+    # the press alone leads
+    assert alone < -0.01
+    # as slow a release is its mirror image in time, which leaves no lag: to a sample
+    assert alike == pytest.approx(0, abs=0.002)
+    # weights that balance the two do so to the first order of lead and trail; unbalanced, these are 13 and 19 ms
+    assert faster == pytest.approx(0, abs=0.004)
+    assert fast == pytest.approx(0, abs=0.004)
+
+
+def test_an_object_that_drops_out_at_once_still_tells_the_lag():
+    # the fall lies within a frame, which tells the lag to half of one, though the press leads by more
+    lag = estimate_lag(*pressed(0.6, 0.03), rng=seed(), draws=20)
+    assert lag.lag_s == pytest.approx(0, abs=0.5 / FRAME_HZ)
 
 
 def test_too_few_frames_are_refused(trial: Trial, rng: np.random.Generator):

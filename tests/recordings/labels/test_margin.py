@@ -124,6 +124,18 @@ def test_an_unapplied_lag_is_an_error_of_its_size(trial: Trial):
     np.testing.assert_allclose(known.safety_margin_sigma[pulled], expected, rtol=1e-6)
 
 
+def test_the_noise_is_not_counted_again_as_an_effect_of_the_lag(trial: Trial, rng: np.random.Generator):
+    contact = trial.contact(noise_n=0.03, rng=rng)
+    sure = label_frames(trial.frame_time_s, contact, friction=FRICTION)
+    lag = replace(LAG, lag_s=0.0, sigma_s=0.01)
+    unsure = label_frames(trial.frame_time_s, contact, friction=FRICTION, lag=lag, apply_lag=True)
+    pulled = (trial.frame_time_s > PULL_S + 0.2) & (trial.frame_time_s < SLIP_S - 0.2)
+    more = np.mean((unsure.safety_margin_sigma**2 - sure.safety_margin_sigma**2)[pulled])
+    # the margin falls by 1 in 3 s; over a chord of 0.2 s the noise adds half a per cent of its variance, and may double
+    noise = 0.01 * np.mean(sure.safety_margin_sigma[pulled] ** 2)
+    assert more == pytest.approx((0.01 / (SLIP_S - PULL_S)) ** 2, abs=noise)
+
+
 def test_a_doubtful_lag_is_not_applied(trial: Trial):
     doubtful = replace(LAG, doubt="several lags fit alike")
     with pytest.raises(RecordingError, match="the lag cannot be applied: several lags fit alike; give the lag by hand"):

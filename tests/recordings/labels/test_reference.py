@@ -1,3 +1,4 @@
+import tracemalloc
 from collections.abc import Iterator
 
 import numpy as np
@@ -54,6 +55,41 @@ def test_brightness_alone_is_no_contact():
 def test_the_first_still_frame_is_after_the_hand_has_gone():
     film = Film()
     assert choose_reference(film.read, film.untouched, method="first still").index in {2, 4, 5}
+
+
+def test_the_first_still_frame_is_found_in_a_stretch_of_any_length():
+    film = Film()
+    still = film.frames[2]
+    # a hand shakes 30 frames, then nothing moves but for the camera's noise
+    noise = np.random.default_rng(1).integers(0, 4, (1000, *still.shape), dtype=np.uint8)
+    frames = [np.roll(still, 5 * (index % 3), axis=1) if index < 30 else still + noise[index] for index in range(1000)]
+    reference = choose_reference(lambda: iter(frames), np.ones(1000, dtype=bool), method="first still")
+    # frame 30 still moves, from the one before
+    assert reference.index == 31
+
+
+def test_memory_does_not_grow_with_the_untouched_stretch():
+    film = Film()
+
+    def peak(count: int) -> int:
+        tracemalloc.start()
+        choose_reference(lambda: (film.frames[index % 20] for index in range(count)), np.ones(count, dtype=bool))
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return most
+
+    peak(400)  # what is made once only
+    # two hundred frames are compared of either; 3,600 more softened frames of 9 kB would be 34 MB
+    assert peak(4000) < peak(400) + 1e6
+
+
+def test_drift_of_a_long_stretch_is_that_of_its_first_and_last_ten_frames():
+    dark, bright = (np.full((SIZE, SIZE, 3), level, dtype=np.uint8) for level in (60, 90))
+    middle = np.full((SIZE, SIZE, 3), 200, dtype=np.uint8)
+    frames = [dark] * 10 + [middle] * 980 + [bright] * 10
+    reference = choose_reference(lambda: iter(frames), np.ones(1000, dtype=bool))
+    assert reference.drift == pytest.approx(30)
+    assert reference.drift_span == (0, 999)
 
 
 def test_a_named_frame_is_taken_even_if_it_touches():

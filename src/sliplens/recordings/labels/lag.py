@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
+from sliplens.recordings.labels.axes import infer_axes
 from sliplens.recordings.labels.smoothing import mean_force, typical_step
 
 _STEPS_A_FRAME = 16
@@ -17,6 +18,12 @@ _LEAST_INTERVALS = 2 * _BLOCKS
 _LEAST_CORRELATION = 0.3
 _OVERLAP = 0.7
 """Share of the frames that must have forces for a lag to be tried."""
+_LOAD_WINDOW_S = 0.03
+"""Time over which the load is averaged to see it let go."""
+_PART = (0.25, 0.75)
+"""Shares of the load in hold between which a release is timed."""
+_SUDDEN_STEPS = 2.0
+"""A fall between these within so many frames tells the time however the gel yields."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +53,9 @@ def estimate_lag(
 
     For every lag tried, the force is averaged about the lagged time of each frame; the length of its change from frame
     to frame is what the image's motion is correlated with. The length does not know axes, signs or tare, so these may
-    all still be wrong. The uncertainty is the spread of the peak when stretches of the trial are drawn anew.
+    all still be wrong. A contact yields the more the lighter it is loaded, so the image leads the force in a press and
+    trails it in a release; a release weighs no more than makes the two cancel. The uncertainty is the spread of the
+    peak when stretches of the trial are drawn anew.
 
     Parameters
     ----------
@@ -87,11 +96,51 @@ def estimate_lag(
         )
     lags, changes, covered = lags[usable], np.nan_to_num(changes[usable]), covered[usable]
     weights = np.concatenate((np.ones((1, intervals)), _block_weights(intervals, draws=draws, rng=rng)))
-    curves = _correlations(weights, image_motion[1:], changes=changes, covered=covered)
+    motion, release = image_motion[1:], _find_release(forces, sudden_s=_SUDDEN_STEPS * typical_step(frame_time_s))
+    if release is not None:
+        # the same weights for every lag: a share that depends on the lag would prefer some
+        top = int(np.argmax(_correlations(weights[:1], motion, changes=changes, covered=covered)[0]))
+        weights *= release.balance(frame_time_s[1:] - lags[top], changes[top])
+    curves = _correlations(weights, motion, changes=changes, covered=covered)
     peaks = np.array([_peak(lags, curve) for curve in curves])
     low, high = np.quantile(peaks[1:], (0.16, 0.84))
     lag, sigma, correlation = float(peaks[0]), float(high - low) / 2, float(curves[0].max())
     return Lag(lag_s=lag, sigma_s=sigma, correlation=correlation, doubt=_doubt(lag, sigma, correlation, lags))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Release:
+    """A press, and a release that ends at nothing."""
+
+    pressed_s: float
+    let_go_s: float
+
+    def balance(
+        self, time_s: Float[np.ndarray, " intervals"], changes: Float[np.ndarray, " intervals"]
+    ) -> Float[np.ndarray, " intervals"]:
+        """Weights that give press and release the same pull on the lag.
+
+        Of two like peaks, the one of a rate r has a curvature as r^2 / T and errs as T, where T is how long it takes
+        and r T is the load of both: so each pulls as r^2.
+        """
+        released = time_s > self.let_go_s
+        press, fall = (float(changes[part].max(initial=0)) for part in (time_s <= self.pressed_s, released))
+        return np.where(released, min(1.0, (press / max(fall, 1e-9)) ** 2), 1.0)
+
+
+def _find_release(forces: Forces, *, sudden_s: float) -> _Release | None:
+    """When a load that ends at nothing begins to fall; None where it holds to the end or falls suddenly."""
+    # the tare alone is asked for: neither axis nor sign matters to a length
+    loose = forces.force_n - infer_axes(forces, normal="x", sign=1).tare_n
+    time = forces.time_s
+    load = np.linalg.norm(mean_force(time, loose, time, window_s=_LOAD_WINDOW_S), axis=1)
+    hold = float(np.median(load[load >= load.max() / 2]))
+    light, heavy = (time[load >= share * hold] for share in _PART)
+    fall_s = float(light[-1] - heavy[-1])
+    if light[-1] == time[-1] or fall_s <= sudden_s:
+        return None
+    # the quarter of the load before is let go in about the time of the half between
+    return _Release(pressed_s=float(heavy[0]), let_go_s=float(heavy[-1]) - fall_s)
 
 
 def _force_changes(time_s: Float[np.ndarray, " frames"], forces: Forces) -> Float[np.ndarray, " intervals"]:

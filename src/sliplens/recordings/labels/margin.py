@@ -25,6 +25,8 @@ _GAP_STEPS = 4.0
 """Samples further apart than so many typical steps miss others between them."""
 _STUCK_SIGMAS = 2.0
 """A margin nearer to 1 than so many standard deviations cannot be told from full stick."""
+_RATE_STEPS = 3.0
+"""Frames on either side from which it is read how fast the margin changes: fewer would show the noise's changes."""
 
 
 class Reason(StrEnum):
@@ -156,10 +158,14 @@ def label_frames(
     at = forces_at(time)
     contact = at.normal_n >= threshold
     used = _used(at, friction, threshold)
-    # up to the slip only: beyond it there is no margin to be wrong about
-    swing = [_used(forces_at(np.minimum(time + late, onset)), friction, threshold) for late in (-unsure, unsure)]
+    # a chord as short as the lag's uncertainty would count the noise of its ends, which `_variance` counts already
+    reach = max(unsure, _RATE_STEPS * typical_step(frame_time_s), 1e-9)
+    # up to the slip only: beyond it there is no margin to be wrong about, and a window at it would shrink to a sample
+    end = np.minimum(time + reach, onset - window / 2)
+    early, late = (_used(forces_at(moment), friction, threshold) for moment in (end - 2 * reach, end))
+    swing = (late - early) / 2 * unsure / reach
     drift = friction_change * _remaining(time, contact, until_s=onset)
-    sigma = np.sqrt(_variance(at, friction, threshold) + ((swing[1] - swing[0]) / 2) ** 2 + (used * drift) ** 2)
+    sigma = np.sqrt(_variance(at, friction, threshold) + swing**2 + (used * drift) ** 2)
 
     reliable = contact & ~at.missing & ~at.out_of_range
     slip_s = friction.onset_s

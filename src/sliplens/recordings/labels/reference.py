@@ -5,13 +5,15 @@ from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.labels.motion import soften
+from sliplens.recordings.labels.motion import measure_motion, soften
 
 _STILL_TIMES = 1.5
 """A frame that moves by so many times what the stillest quarter of its fellows do is not still."""
+_COMPARED = 200
+"""Untouched frames that are compared at most: memory stays small where hours are untouched."""
 _ENDS = 10
 """Frames at either end of the untouched ones that are compared for drift."""
 _SMOOTH = 9
@@ -52,7 +54,7 @@ def choose_reference(
     The energy of contact is the mean absolute difference from the median of the untouched frames, after the slow part
     of the image is taken off: what a contact changes is markers and rims, while a lamp that warms up changes all of the
     image alike and should not decide. The least energy is the default, for the first frame of a recording often holds
-    the hand that started it.
+    the hand that started it. Of a long stretch 200 frames are compared, evenly spread.
 
     Parameters
     ----------
@@ -74,50 +76,62 @@ def choose_reference(
         raise RecordingError(f"the reference cannot be chosen by {method!r}; choose {' or '.join(REFERENCES)}")
     if index is not None and not 0 <= index < len(untouched):
         raise RecordingError(f"the reference is frame {index} of {len(untouched)}; name one from 0 on that is there")
-    places = [int(place) for place in np.flatnonzero(untouched)]
-    if not places and index is None:
+    places = np.flatnonzero(untouched)
+    if not len(places) and index is None:
         raise RecordingError("no frame is known to be untouched; name the reference frame by hand")
-    before = [place for place in places if untouched[places[0] : place].all()]
-
-    wanted = {*places, *([] if index is None else [index])}
+    before = places[places - places[:1] == np.arange(len(places))]
+    chosen, how = index, "named"
+    if index is None and method == "first still":
+        opening = islice(read_frames(), int(before[0]), int(before[-1]) + 1)
+        chosen, how = int(before[0]) + _first_still(measure_motion(opening)), method
+    ends = min(_ENDS, len(places) // 2)
+    first, last = places[:ends].tolist(), places[len(places) - ends :].tolist()
+    compared = _spread(before)
+    wanted = {*compared, *first, *last, *([] if chosen is None else [chosen])}
     # no further than to the last of them
     opening = islice(read_frames(), max(wanted) + 1)
     soft = {place: soften(frame) for place, frame in enumerate(opening) if place in wanted}
-    still = np.stack([soft[place] for place in before or sorted(wanted)])
-    middle = np.median(still, axis=0)
-    energy = {place: float(np.mean(np.abs(_high_pass(one - middle)))) for place, one in soft.items()}
-    if index is not None:
-        chosen, how = index, "named"
-    elif method == "first still":
-        chosen, how = before[_first_still(still)], method
-    else:
-        chosen, how = min(before, key=lambda place: energy[place]), method
+    middle = np.median(np.stack([soft[place] for place in compared or sorted(wanted)]), axis=0)
+    if chosen is None:
+        chosen, how = min(compared, key=lambda place: _energy(soft[place] - middle)), method
     return Reference(
         image=next(islice(read_frames(), chosen, None)),
         index=chosen,
         method=how,
-        contact_energy=energy[chosen],
-        drift=_drift([soft[place] for place in places]),
-        drift_span=(places[0], places[-1]) if places else None,
+        contact_energy=_energy(soft[chosen] - middle),
+        drift=_drift([soft[place] for place in first], [soft[place] for place in last]),
+        drift_span=(int(places[0]), int(places[-1])) if len(places) else None,
     )
 
 
-def _first_still(soft: Float[np.ndarray, "frames rows columns 3"]) -> int:
+def _spread(places: Int[np.ndarray, " untouched"]) -> list[int]:
+    """All of them, or so many as are compared, evenly spread from the first to the last."""
+    if len(places) <= _COMPARED:
+        return places.tolist()
+    return places[np.linspace(0, len(places) - 1, _COMPARED).round().astype(int)].tolist()
+
+
+def _first_still(motion: Float[np.ndarray, " frames"]) -> int:
     """First frame that moves no more than its fellows, to and from it."""
-    if len(soft) < 3:
+    if len(motion) < 3:
         return 0
-    steps = np.mean(np.abs(np.diff(soft, axis=0)), axis=(1, 2, 3))
+    steps = motion[1:]
     limit = _STILL_TIMES * np.quantile(steps, 0.25)
     moves = np.maximum(np.append(steps, steps[-1]), np.insert(steps, 0, steps[0]))
     return int(np.argmax(moves <= limit)) if np.any(moves <= limit) else int(np.argmin(moves))
 
 
-def _drift(soft: Sequence[Float[np.ndarray, "rows columns 3"]]) -> float:
-    """Mean absolute difference of the medians of the first and the last few."""
-    count = min(_ENDS, len(soft) // 2)
-    if count == 0:
+def _drift(
+    first: Sequence[Float[np.ndarray, "rows columns 3"]], last: Sequence[Float[np.ndarray, "rows columns 3"]]
+) -> float:
+    """Mean absolute difference of their medians."""
+    if not first:
         return float("nan")
-    return float(np.mean(np.abs(np.median(soft[-count:], axis=0) - np.median(soft[:count], axis=0))))
+    return float(np.mean(np.abs(np.median(last, axis=0) - np.median(first, axis=0))))
+
+
+def _energy(difference: Float[np.ndarray, "rows columns 3"]) -> float:
+    return float(np.mean(np.abs(_high_pass(difference))))
 
 
 def _high_pass(image: Float[np.ndarray, "rows columns 3"]) -> Float[np.ndarray, "rows columns 3"]:

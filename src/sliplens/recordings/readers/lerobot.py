@@ -6,14 +6,15 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.readers.clocks import trial_name
-from sliplens.recordings.readers.lerobot_frames import VideoInfo, read_video_info, stored_images, video_frames
-from sliplens.recordings.readers.lerobot_layout import Episode, Layout, read_columns, read_episodes, read_layout
+from sliplens.recordings.readers.lerobot_frames import VideoInfo, image_frames, read_video_info, video_frames
+from sliplens.recordings.readers.lerobot_kept import kept_captures, read_kept
+from sliplens.recordings.readers.lerobot_layout import Episode, Layout, read_episodes, read_layout
+from sliplens.recordings.readers.lerobot_rows import EpisodeRows
 
 _TACTILE = re.compile(r"tactile|touch|gel|digit|tactip|fingertip|skin", re.IGNORECASE)
 _FORCE = re.compile(r"force|wrench|(?<![a-z])f_?t(?![a-z])", re.IGNORECASE)
@@ -27,6 +28,9 @@ def read_lerobot(
 
     Frames and forces are rows of one table: each force was taken with its frame, and both have its time, in seconds
     from the start of the episode. Frames of a video are those shown within half a frame of their row's time.
+
+    Trials that `write_lerobot` exported come back as they were, with their labels; where a feature is named, like those
+    of any data set.
 
     Parameters
     ----------
@@ -50,21 +54,14 @@ def read_lerobot(
         If the folder is no such data set, it is damaged, or a feature or episode is missing or one of several.
     """
     layout = read_layout(folder)
+    if camera_key is None and force_key is None and (kept := read_kept(layout)) is not None:
+        return kept_captures(layout, kept, episode=episode)
     camera, notes = _choose_camera(layout, camera_key)
     force = _choose_force(layout, force_key)
     if force is None:
         notes.append("There are no forces: no feature of 3 or 6 numbers is named like one.")
-    episodes = read_episodes(layout, camera_key=camera)
-    if episode is not None:
-        found = [one for one in episodes if one.index == episode]
-        if not found:
-            raise RecordingError(
-                f"{folder} has no episode {episode}; it has {len(episodes)}, from {episodes[0].index} to "
-                f"{episodes[-1].index}"
-            )
-        episodes = found
     read = _Reader(layout, camera=camera, force=force, notes=tuple(notes))
-    return [read.capture(one) for one in episodes]
+    return [read.capture(one) for one in read_episodes(layout, camera_key=camera, only=episode)]
 
 
 class _Reader:
@@ -72,15 +69,17 @@ class _Reader:
 
     def __init__(self, layout: Layout, *, camera: str, force: str | None, notes: tuple[str, ...]) -> None:
         self.layout, self.camera, self.force, self.notes = layout, camera, force, notes
-        self.table: tuple[Path, pa.Table] | None = None
+        self.rows = EpisodeRows(layout, ["timestamp", *([force] if force else [])])
         self.videos: dict[Path, VideoInfo] = {}
 
     def capture(self, episode: Episode) -> Capture:
-        rows, time = self._rows(episode)
+        rows = self.rows.of(episode)
+        time = rows.column("timestamp").to_numpy().astype(np.float64)
         source = f"episode {episode.index} of {self.layout.folder}"
         forces = None
         if self.force is not None:
-            forces = Forces(time_s=time, force_n=self._forces(rows, episode), source=f"{self.force} of {source}")
+            force = self.rows.vectors(rows, self.force, episode)[:, :3].copy()
+            forces = Forces(time_s=time, force_n=force, source=f"{self.force} of {source}")
         size, read_frames, notes = self._frames(episode, time)
         return Capture(
             name=trial_name(f"{self.layout.folder.resolve().name}-{episode.index:06d}"),
@@ -92,40 +91,11 @@ class _Reader:
             notes=(*self.notes, *notes),
         )
 
-    def _rows(self, episode: Episode) -> tuple[pa.Table, Float[np.ndarray, " frames"]]:
-        path = episode.data_file
-        if self.table is None or self.table[0] != path:
-            columns = ["episode_index", "timestamp", *([self.force] if self.force else [])]
-            self.table = path, read_columns(path, columns)
-        table = self.table[1]
-        own: Bool[np.ndarray, " rows"] = table.column("episode_index").to_numpy() == episode.index
-        rows = table.filter(pa.array(own))
-        if rows.num_rows != episode.length or not rows.num_rows:
-            raise RecordingError(
-                f"{path} has {rows.num_rows} frames of episode {episode.index}, its metadata say {episode.length}; "
-                "leave the episode out, or copy the data set again"
-            )
-        return rows, rows.column("timestamp").to_numpy().astype(np.float64)
-
-    def _forces(self, rows: pa.Table, episode: Episode) -> Float[np.ndarray, "frames 3"]:
-        assert self.force is not None
-        width = self.layout.width(self.force)
-        column = rows.column(self.force).combine_chunks()
-        numbers = column.flatten() if hasattr(column, "flatten") else column
-        if len(numbers) != len(rows) * width or numbers.null_count or not pa.types.is_floating(numbers.type):
-            raise RecordingError(
-                f"{self.force} of {episode.data_file} does not hold {width} numbers a frame, as meta/info.json says; "
-                "copy the data set again"
-            )
-        return numbers.to_numpy().astype(np.float64).reshape(-1, width)[:, :3].copy()
-
     def _frames(
         self, episode: Episode, time: Float[np.ndarray, " frames"]
     ) -> tuple[tuple[int, int], Callable[[], Iterator[UInt8[np.ndarray, "height width 3"]]], list[str]]:
         if episode.video_file is None:
-            read = partial(stored_images, episode.data_file, self.camera, episode.index)
-            height, width, _ = next(read(frame_size=None)).shape
-            return (height, width), partial(read, frame_size=(height, width)), []
+            return *image_frames(episode, self.camera), []
         video = self.videos.get(episode.video_file)
         if video is None:
             video = self.videos[episode.video_file] = read_video_info(episode.video_file)

@@ -1,9 +1,10 @@
 """Frames of one episode of a LeRobot data set: from a video of many episodes, or from images in Parquet."""
 
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from math import floor
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.readers.lerobot_layout import DAMAGED_PARQUET, one_line
+from sliplens.recordings.readers.lerobot_layout import DAMAGED_PARQUET, Episode, one_line
 
 # what FFmpeg would guess from the content may be a play list that leads to other files and hosts
 _CONTAINERS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska", ".webm": "webm"}
@@ -93,34 +94,47 @@ def video_frames(
             yield frame.to_ndarray(format="rgb24")
 
 
-def stored_images(
-    path: Path, key: str, episode: int, *, frame_size: tuple[int, int] | None
-) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """Decode the images of an episode that lie in a Parquet file.
+def image_frames(
+    episode: Episode, key: str
+) -> tuple[tuple[int, int], Callable[[], Iterator[UInt8[np.ndarray, "height width 3"]]]]:
+    """Find the height and width of the frames of an episode that lie in a Parquet file, and how they are read.
 
     Parameters
     ----------
-    path
-        Parquet file of many episodes.
+    episode
+        Where they lie.
     key
         Column of the images.
-    episode
-        Index of the episode.
-    frame_size
-        Height and width that each must have; any if None.
 
     Raises
     ------
     RecordingError
-        If an image is missing, damaged, neither RGB nor grey, or of another size.
+        If an image is missing, damaged, neither RGB nor grey, or of another size than the first; of those that follow,
+        when they are read.
     """
+    read = partial(_stored_images, episode.data_file, key, episode.index)
+    first = next(read(frame_size=None), None)
+    if first is None:
+        raise RecordingError(f"{episode.data_file} has no frame of episode {episode.index}; copy the data set again")
+    height, width, _ = first.shape
+    return (height, width), partial(read, frame_size=(height, width))
+
+
+def _stored_images(
+    path: Path, key: str, episode: int, *, frame_size: tuple[int, int] | None
+) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     index = 0
     try:
-        for batch in pq.ParquetFile(path).iter_batches(batch_size=16, columns=["episode_index", key]):
+        file = pq.ParquetFile(path)
+        groups = _row_groups(file, episode)
+        for batch in file.iter_batches(batch_size=16, row_groups=groups, columns=["episode_index", key]):
             own = batch.column("episode_index").to_numpy() == episode
             for cell in batch.filter(pa.array(own)).column(key).to_pylist():
                 where = f"frame {index} of {key}, episode {episode} of {path},"
-                pixels = _decode_image(cell, where=where)
+                data = cell.get("bytes") if isinstance(cell, dict) else None
+                if not isinstance(data, bytes) or not data:
+                    raise RecordingError(f"{where} is not in the file; embed the images, or copy the data set again")
+                pixels = decode_image(data, where=where)
                 if frame_size is not None and pixels.shape[:2] != frame_size:
                     raise RecordingError(
                         f"{where} is {pixels.shape[0]} x {pixels.shape[1]} pixels, the first is "
@@ -132,10 +146,29 @@ def stored_images(
         raise RecordingError(f"{path} is not a readable Parquet file ({one_line(error)}); copy it again") from None
 
 
-def _decode_image(cell: object, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    data = cell.get("bytes") if isinstance(cell, dict) else None
-    if not data:
-        raise RecordingError(f"{where} is not in the file; embed the images, or copy the data set again")
+def _row_groups(file: pq.ParquetFile, episode: int) -> list[int]:
+    """Row groups that may hold rows of an episode: without this, each episode would cost all that share its file."""
+    # columns with parts, such as images, count as several here
+    column = [file.schema.column(index).path for index in range(len(file.schema))].index("episode_index")
+    found = []
+    for group in range(file.num_row_groups):
+        told = file.metadata.row_group(group).column(column).statistics
+        if told is not None and told.has_min_max and told.physical_type == "INT64":
+            if told.min <= episode <= told.max:
+                found.append(group)
+        else:
+            found.append(group)
+    return found
+
+
+def decode_image(data: bytes, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    """Pixels of a PNG or JPEG; a grey one gets three equal channels.
+
+    Raises
+    ------
+    RecordingError
+        If it is damaged, or neither RGB nor grey; the message begins with `where`.
+    """
     try:
         with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
             if image.mode not in {"RGB", "L"}:

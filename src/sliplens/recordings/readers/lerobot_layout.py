@@ -85,13 +85,23 @@ def read_layout(folder: Path) -> Layout:
     )
 
 
-def read_episodes(layout: Layout, *, camera_key: str) -> list[Episode]:
+def read_episodes(layout: Layout, *, camera_key: str, only: int | None = None) -> list[Episode]:
     """Episodes of a data set and where their frames from a camera lie, in their order.
+
+    Parameters
+    ----------
+    layout
+        What the data set says of itself.
+    camera_key
+        Feature with the images.
+    only
+        Index of the only episode that is wanted; all if None.
 
     Raises
     ------
     RecordingError
-        If `meta/episodes` is missing or damaged, holds no episode or one twice, or paths lead out of the folder.
+        If `meta/episodes` is missing or damaged, holds no episode or one twice, or not that which is wanted, or paths
+        lead out of the folder.
     """
     in_video = layout.features[camera_key]["dtype"] == "video"
     columns = ["episode_index", "length", "data/chunk_index", "data/file_index"]
@@ -122,7 +132,13 @@ def read_episodes(layout: Layout, *, camera_key: str) -> list[Episode]:
                 video_start_s=float(start),
             )
         )
-    return episodes
+    found = [one for one in episodes if only is None or one.index == only]
+    if not found:
+        raise RecordingError(
+            f"{layout.folder} has no episode {only}; it has {len(episodes)}, from {episodes[0].index} to "
+            f"{episodes[-1].index}"
+        )
+    return found
 
 
 def read_columns(path: Path, columns: list[str]) -> pa.Table:

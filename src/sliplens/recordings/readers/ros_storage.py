@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sliplens.errors import InputError, RecordingError, SliplensError
+from sliplens.recordings.readers.ros_expansion import ExpandsTooFarError, bounded_reader
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
@@ -21,9 +22,9 @@ def bag_topics(path: Path) -> dict[str, str]:
     InputError
         If `rosbags` is not installed.
     RecordingError
-        If the path is no bag, or it is damaged.
+        If the path is no bag, it is damaged, or expands too far.
     """
-    with _open(path) as bag:
+    with open_bag(path) as bag:
         return {connection.topic: connection.msgtype for connection in bag.connections}
 
 
@@ -32,7 +33,7 @@ def bag_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, int
 
     Definitions that the bag brings along are not used, for `rosbags` turns them into code; those of the messages read
     here are the same in all of ROS 2. Message data are views of the bytes read: a large header claims nothing. What is
-    compressed, `rosbags` expands a chunk, message or file at a time, to whatever size that turns out to have.
+    compressed is expanded a chunk, message or file at a time, within the limits of `ros_expansion`.
 
     Parameters
     ----------
@@ -46,9 +47,9 @@ def bag_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, int
     InputError
         If `rosbags` is not installed.
     RecordingError
-        If the path is no bag, or it is damaged.
+        If the path is no bag, it is damaged, or expands too far.
     """
-    with _open(path) as bag:
+    with open_bag(path) as bag:
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 (an extra)
 
         types = get_typestore(Stores.LATEST)
@@ -60,9 +61,10 @@ def bag_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, int
 
 
 @contextmanager
-def _open(path: Path) -> Iterator["Reader"]:
+def open_bag(path: Path) -> Iterator["Reader"]:
+    """Open a bag to read it, as `bag_topics` and `bag_messages` do; they tell of its errors."""
     try:
-        from rosbags.rosbag2 import Reader  # noqa: PLC0415 (an extra)
+        import rosbags.rosbag2  # noqa: F401, PLC0415 (an extra)
     except ImportError:
         raise InputError(
             'a ROS 2 bag needs rosbags, which is not installed; install it with `pip install "sliplens[ros]"`'
@@ -71,10 +73,14 @@ def _open(path: Path) -> Iterator["Reader"]:
     for file in path.glob("*.db3") if path.is_dir() else [path]:
         _require_whole_pages(file)
     try:
-        with Reader(path) as bag:
+        with bounded_reader()(path) as bag:
             yield bag
     except SliplensError:
         raise
+    except ExpandsTooFarError as error:
+        raise RecordingError(
+            f"{path}: {error}, as damaged and hostile files do; expand it beforehand, or record it in smaller pieces"
+        ) from None
     # a damaged byte may lead rosbags, sqlite or YAML into any error there is, from KeyError to MemoryError
     except Exception as error:
         said = " ".join(f"{type(error).__name__}: {error}".split())[:200]

@@ -14,6 +14,7 @@ from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.readers.clocks import trial_name
 from sliplens.recordings.readers.ros_images import COMPRESSED, RAW, image_pixels, image_size
 from sliplens.recordings.readers.ros_storage import bag_messages, bag_topics
+from sliplens.recordings.readers.rosbag_labels import read_trial_bag
 
 _IMAGES = (RAW, COMPRESSED)
 _WRENCHES = ("geometry_msgs/msg/WrenchStamped",)
@@ -27,6 +28,8 @@ def read_rosbag(path: Path, *, image_topic: str | None = None, wrench_topic: str
     frames are read. Frames and forces share one clock, that of the message headers; where a header has no stamp, or
     the two topics have clocks that never meet, both take the times at which the bag received them, and `notes` say so.
     Times are seconds since the first frame or force: since the epoch, double precision would round them to 0.2 us.
+
+    A trial that `write_mcap` exported comes back as it was, with its labels; where a topic is named, like any bag.
 
     Parameters
     ----------
@@ -46,6 +49,8 @@ def read_rosbag(path: Path, *, image_topic: str | None = None, wrench_topic: str
         encoding or its size changes, or times do not rise.
     """
     topics = bag_topics(path)
+    if image_topic is None and wrench_topic is None and (trial := read_trial_bag(path, topics)) is not None:
+        return trial
     images = _choose(topics, image_topic, types=_IMAGES, what="images", path=path)
     wrenches = _choose(topics, wrench_topic, types=_WRENCHES, what="wrenches", path=path)
     if images is None:

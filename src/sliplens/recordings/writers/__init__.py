@@ -1,0 +1,1 @@
+"""Writers: data sets for other programs, one file a format."""
