@@ -41,11 +41,12 @@ class Evaluate:
 
         from sliplens.datasets import load_frames
         from sliplens.models import load_checkpoint
+        from sliplens.models.shipped import find_run
         from sliplens.recordings import Dataset
         from sliplens.report.evaluation import draw_evaluation
         from sliplens.training import evaluate
 
-        trained = load_checkpoint(self.model)
+        trained = load_checkpoint(find_run(self.model))
         data = Dataset.open(self.data)
         trials = data.select(split=self.split)
         for trial in trials:

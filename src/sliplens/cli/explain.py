@@ -50,6 +50,7 @@ class Explain:
     def run(self) -> None:
         """Explain and write the maps."""
         from sliplens.models import load_checkpoint
+        from sliplens.models.shipped import find_run
         from sliplens.study import explain_frames
         from sliplens.study.explaining import require_methods
 
@@ -58,7 +59,7 @@ class Explain:
         if self.trials < 1:
             raise InputError(f"--trials must be at least 1, got {self.trials}")
         require_methods(self.method)
-        trained = load_checkpoint(self.model)
+        trained = load_checkpoint(find_run(self.model))
         chosen = self._choose(trained)
         recipe = {
             "weights_sha256": trained.manifest.weights_sha256,

@@ -37,11 +37,12 @@ class Score:
         """Score and write the curves."""
         from sliplens.faithfulness import get_fill
         from sliplens.models import load_checkpoint
+        from sliplens.models.shipped import find_run
         from sliplens.study import load_explained, score_explanations
         from sliplens.study.scoring import require_same_network
 
         get_fill(self.fill)
-        trained = load_checkpoint(self.model)
+        trained = load_checkpoint(find_run(self.model))
         explained = load_explained(self.explanations)
         require_same_network(trained, explained)
         recipe = {

@@ -1,0 +1,95 @@
+"""The protocol of the thesis on simulated touch: both inputs trained by one recipe, tested on a day never seen.
+
+With its defaults it is the whole of it: 128,043 training frames of 224 x 224 pixels, 25 epochs, difference and raw:
+minutes on a data-centre GPU, a day on two processors. The options make it smaller, and say so in what is printed.
+"""
+
+import argparse
+import json
+import os
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # must be set before torch is imported
+
+from sliplens.datasets import get_encoding, load_frames
+from sliplens.models import load_checkpoint
+from sliplens.recordings import Dataset
+from sliplens.simulation import PRESETS, simulate_dataset
+from sliplens.training import evaluate, fit, get_recipe
+
+INPUTS = ("difference", "raw")
+# what the thesis reports (Table 1)
+THESIS = {"difference": {"dry_r2": 0.89, "wet_r2": 0.66}, "raw": {"dry_r2": 0.85, "wet_r2": 0.57}}
+
+
+def train_and_test(data: Dataset, folder: Path, *, name: str, options: argparse.Namespace) -> dict[str, float]:
+    """Train one input and score it on the test trials, dry and wet."""
+    config = get_recipe(options.recipe)
+    changes = {"epochs": options.epochs, "image_size": options.image_size, "max_minutes": options.max_minutes}
+    config = replace(config, seed=options.seed, **{key: value for key, value in changes.items() if value is not None})
+    encoding, folder = get_encoding(name), folder / name
+    folder.mkdir(parents=True, exist_ok=True)
+    started = time.perf_counter()
+
+    def frames(split: str, untouched_share: float = 0.0) -> Any:
+        return load_frames(
+            data,
+            data.select(split=split),
+            encoding=encoding,
+            image_size=config.image_size,
+            untouched_share=untouched_share,
+            scratch=folder,
+        )
+
+    info = data.trials[0]
+    fit(
+        config,
+        frames("train", config.untouched_share),
+        frames("validation"),
+        folder,
+        frame_size=(info.height, info.width),
+        sensor=info.sensor,
+        data_hash=data.hash,
+    )
+    minutes = (time.perf_counter() - started) / 60
+    scores = evaluate(load_checkpoint(folder), frames("test")).conditions
+    told = {f"{condition}_{key}": getattr(one, key) for condition, one in scores.items() for key in ("r2", "mse")}
+    return {**told, "minutes": minutes}
+
+
+def main() -> None:
+    """Print scores and minutes by input, as a table or as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, help="simulated data set; made with --preset if not given")
+    parser.add_argument("--preset", default="thesis", choices=sorted(PRESETS))
+    parser.add_argument("--recipe", default="thesis", choices=["thesis", "default"])
+    parser.add_argument("--epochs", type=int)
+    parser.add_argument("--image-size", type=int)
+    parser.add_argument("--max-minutes", type=float, help="for each input")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--work", type=Path, help="folder to keep data and networks in; gone afterwards if not given")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        work = options.work or Path(scratch)
+        if options.data is None:
+            folder = work / "data"
+            recipe = replace(PRESETS[options.preset], seed=options.seed)
+            data = simulate_dataset(folder, recipe)
+        else:
+            data = Dataset.open(options.data)
+        found = {name: train_and_test(data, work, name=name, options=options) for name in INPUTS}
+    if options.json:
+        asked = {key: value for key, value in vars(options).items() if key not in {"json", "work", "data"}}
+        print(json.dumps({**found, "minutes": sum(one["minutes"] for one in found.values()), "asked": asked}))
+        return
+    for name, scores in found.items():
+        print(name, ", ".join(f"{key} {value:.4f}" for key, value in scores.items()), f"(thesis: {THESIS[name]})")
+
+
+if __name__ == "__main__":
+    main()
