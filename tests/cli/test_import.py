@@ -119,6 +119,47 @@ def test_a_folder_of_images_gives_the_labels_of_the_video(tmp_path: Path, trial:
     np.testing.assert_array_equal(one.load(one.trials[0]).safety_margin, other.load(other.trials[0]).safety_margin)
 
 
+def test_lag_and_tare_by_hand_are_taken(tmp_path: Path, table: Path, video: Path):
+    late = tmp_path / "late.csv"
+    rows = [line.split(",") for line in table.read_text().splitlines()]
+    # stamps of the forces that are 50 ms early are a camera that is 50 ms late
+    shifted = [[f"{float(time) - 0.05:.5f}", *values] for time, *values in rows[1:]]
+    late.write_text("\n".join(",".join(row) for row in (rows[0], *shifted)) + "\n")
+    words = ("--sensor", "mine", "--tare", *TARE, "--no-audit")
+    assert run("import", video, "-o", tmp_path / "a", "--forces", table, "--lag-ms", 0, *words) == 0
+    assert run("import", video, "-o", tmp_path / "b", "--forces", late, "--lag-ms", 50, *words) == 0
+    one, other = (Dataset.open(tmp_path / name) for name in "ab")
+    first, second = one.load(one.trials[0]), other.load(other.trials[0])
+    # the same samples at the same times, but for the rounding of their stamps to 10 us, of forces that change by some
+    # 50 N/s at most
+    np.testing.assert_allclose(first.normal_force_n, second.normal_force_n, atol=1e-3)
+    told = read_labelling(tmp_path / "b" / "trials" / "cup.parquet")
+    assert told is not None
+    assert (told["lag"]["lag_s"], told["lag_applied"], told["axes"]["tare_found"]) == (0.05, True, "declared")
+
+
+def test_times_of_images_come_from_a_table_or_from_their_names(
+    tmp_path: Path, trial: Recording, table: Path, capsys: pytest.CaptureFixture[str]
+):
+    folder = tmp_path / "cup"
+    folder.mkdir()
+    names = [f"frame_{round(1e6 * time)}.png" for time in trial.time_s]
+    for name, frame in zip(names, trial.frames, strict=True):
+        write_png(folder / name, frame)
+    times = tmp_path / "times.csv"
+    lines = [f"{name},{time:.6f}" for name, time in zip(names, trial.time_s, strict=True)]
+    times.write_text("\n".join(["file,time [s]", *lines]) + "\n")
+    shared = ("--sensor", "mine", "--forces", table, "--no-audit")
+    assert run("import", folder, "-o", tmp_path / "a", *shared, "--times", times) == 0
+    assert run("import", folder, "-o", tmp_path / "b", *shared, "--name-unit", "us") == 0
+    for name in "ab":
+        data = Dataset.open(tmp_path / name)
+        np.testing.assert_allclose(data.load(data.trials[0]).time_s, trial.time_s, atol=1e-6)
+    capsys.readouterr()
+    both = ("--times", times, "--name-unit", "us")
+    assert "more than one source of times" in refused(capsys, "import", folder, "-o", tmp_path / "c", *shared, *both)
+
+
 def test_friction_by_hand_is_taken(tmp_path: Path, table: Path, video: Path):
     assert run("import", video, "-o", tmp_path / "data", "--sensor", "mine", "--forces", table, "--mu", 1.4) == 0
     data = Dataset.open(tmp_path / "data")

@@ -60,6 +60,14 @@ class Import:
     """N, mN, gf or kgf; guessed if not given."""
     frame_rate: float | None = None
     """Frames a second, where a video's stamps are missing or wrong."""
+    times: Path | None = None
+    """Table with the name and the time of every image of a folder (CSV)."""
+    name_unit: str | None = None
+    """Unit (s, ms, us, ns) of the last number in the names of images, which is then their time."""
+    skip_frames: int | None = None
+    """So many frames at the start of a video are left out."""
+    skip_stale: bool = False
+    """Leave out the dark or frozen frames that a camera hands out when it was just started."""
     start_s: float | None = None
     """When the first frame was taken, on the clock of the forces."""
     image_topic: str | None = None
@@ -93,12 +101,15 @@ class Import:
         ]
         dealt = None if plan is None else assign_splits(plan, facts)
         splits = self._deal(captures) if dealt is None else dealt.splits
-        own = {"output", "overwrite", "sources", "labels", "forces"}
+        own = {"output", "overwrite", "sources", "labels", "forces", "times"}
         config = {
             **{name: value for name, value in vars(self).items() if name not in own},
             **vars(self.labels),
             "sources": [_fingerprint(path) for path in self.sources],
-            "forces": None if self.forces is None else _fingerprint(self.forces),
+            **{
+                name: None if path is None else _fingerprint(path)
+                for name, path in (("forces", self.forces), ("times", self.times))
+            },
             "splits": None if plan is None else [rule.as_table() for rule in plan.rules],
         }
         with output_folder(self.output, stage="import", config=config, overwrite=self.overwrite) as out:
@@ -123,6 +134,10 @@ class Import:
         options = ReadOptions(
             forces=self.forces,
             frame_rate=self.frame_rate,
+            times=self.times,
+            name_unit=self.name_unit,
+            skip_frames=self.skip_frames,
+            skip_stale=self.skip_stale or None,
             start_s=self.start_s,
             time_column=self.time_column,
             force_columns=self.force_columns,

@@ -24,6 +24,10 @@ class LabelOptions:
     friction_change: float = 0.0
     """Relative standard deviation by which friction may change from touch to slip; on wet objects some 0.1 to 0.2. It
     widens the uncertainty."""
+    tare: tuple[float, float, float] | None = None
+    """What the force sensor reads untouched (x y z), in newtons; found if not given."""
+    lag_ms: float | None = None
+    """By how much the camera's clock is late, if you know it; it is then applied."""
     apply_lag: bool = False
     """Shift the forces by the lag that was found between camera and force sensor; it is always shown."""
     normal_axis: Literal["x", "y", "z"] | None = None
@@ -45,14 +49,16 @@ class LabelOptions:
 
     def settings(self) -> "LabelSettings":
         """Settings as the library takes them."""
-        from sliplens.recordings.labels import LabelSettings, given_friction
+        from sliplens.recordings.labels import LabelSettings, given_friction, given_lag
 
         return LabelSettings(
             normal=self.normal_axis,
             sign=self.normal_sign,
+            tare_n=self.tare,
+            lag=None if self.lag_ms is None else given_lag(self.lag_ms / 1e3),
             friction=None if self.mu is None else given_friction(self.mu),
             friction_change=self.friction_change,
-            apply_lag=self.apply_lag,
+            apply_lag=self.apply_lag or self.lag_ms is not None,
             contact_threshold_n=self.contact_threshold,
             force_range_n=self.force_range,
         )

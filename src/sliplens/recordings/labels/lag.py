@@ -35,9 +35,22 @@ class Lag:
     sigma_s: float
     """Standard uncertainty of the lag."""
     correlation: float
-    """Of image motion and force rate, at this lag."""
+    """Of image motion and force rate, at this lag; NaN where it was given by hand."""
     doubt: str = ""
     """Why the lag cannot be told from this trial, a sentence for people; empty where it can."""
+
+
+def given_lag(lag_s: float, *, sigma_s: float = 0.0) -> Lag:
+    """Lag given by hand; without an uncertainty it counts as exact.
+
+    Raises
+    ------
+    RecordingError
+        If it is no finite number, or its uncertainty is negative.
+    """
+    if not (np.isfinite(lag_s) and sigma_s >= 0):
+        raise RecordingError(f"a lag of {lag_s:g} s with an uncertainty of {sigma_s:g} s cannot be; give it in seconds")
+    return Lag(lag_s=lag_s, sigma_s=sigma_s, correlation=float("nan"))
 
 
 def estimate_lag(

@@ -28,6 +28,14 @@ class ReadOptions:
     """Table of forces beside the frames."""
     frame_rate: float | None = None
     """Frames a second, where the stamps are missing or wrong."""
+    times: Path | None = None
+    """Table of when each image of a folder was taken."""
+    name_unit: str | None = None
+    """Unit of the last number in the names of images, which is then their time."""
+    skip_frames: int | None = None
+    """Frames at the start of a video to leave out."""
+    skip_stale: bool | None = None
+    """Leave out what a video begins with that belongs to another scene."""
     start_s: float | None = None
     """When the first frame was taken, on the clock of the forces."""
     time_column: str | None = None
@@ -97,13 +105,13 @@ READERS = {
     "images": Reader(
         words="folder of images, with a table of forces",
         recognises=lambda path: path.is_dir() and any(file.suffix.lower() in IMAGE_SUFFIXES for file in path.iterdir()),
-        takes=_TABLE,
+        takes=(*_TABLE, "times", "name_unit"),
         read=read_image_folder,
     ),
     "video": Reader(
         words="video, with a table of forces",
         recognises=lambda path: path.is_file(),
-        takes=_TABLE,
+        takes=(*_TABLE, "skip_frames", "skip_stale"),
         read=read_video,
     ),
 }
