@@ -5,6 +5,7 @@ from torchvision import models
 
 from sliplens.errors import ModelError
 from sliplens.explain import capture, find_layers
+from sliplens.models import build_model
 
 
 @pytest.mark.parametrize(
@@ -131,3 +132,12 @@ def test_capture_takes_its_hooks_off_after_an_exception():
     with pytest.raises(KeyboardInterrupt), capture(model, ["0"]):
         raise KeyboardInterrupt
     assert not model[0]._forward_hooks
+
+
+def test_a_head_that_answers_with_a_distribution_hides_no_layer():
+    images = torch.zeros(1, 3, 64, 64)
+    plain, wrapped = (find_layers(build_model(head=head).eval(), images) for head in ("point", "histogram"))
+    assert [f"backbone.{one.name}" for one in plain] == [one.name for one in wrapped]
+    assert [(one.channels, one.height, one.width) for one in plain] == [
+        (one.channels, one.height, one.width) for one in wrapped
+    ]
