@@ -49,6 +49,8 @@ def test_an_unknown_command_exits_with_2(capsys: pytest.CaptureFixture[str]):
         "view",
         "train",
         "evaluate",
+        "predict",
+        "export",
         "explain",
         "score",
         "report",

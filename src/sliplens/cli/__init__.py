@@ -13,8 +13,10 @@ from sliplens.cli.console import fail
 from sliplens.cli.demo import Demo
 from sliplens.cli.evaluate import Evaluate
 from sliplens.cli.explain import Explain
+from sliplens.cli.export import Export
 from sliplens.cli.import_ import Import
 from sliplens.cli.label import Label
+from sliplens.cli.predict import Predict
 from sliplens.cli.report import Report
 from sliplens.cli.score import Score
 from sliplens.cli.simulate import Simulate
@@ -33,6 +35,8 @@ Command = (
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Predict, tyro.conf.subcommand("predict")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Explain, tyro.conf.subcommand("explain")]
     | Annotated[Score, tyro.conf.subcommand("score")]
     | Annotated[Report, tyro.conf.subcommand("report")]

@@ -1,0 +1,169 @@
+"""Time the inference engines side by side: one frame at a time, as on a robot, on an untrained ShuffleNetV2.
+
+In every round each engine predicts once, in an order that turns, so that whatever else the machine does hits all alike.
+Decoding is left out; encoding (compare, resize, normalise) is reported apart. The answers of each engine are compared
+with those of `eager`. With `--json` the last line is one JSON object.
+"""
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+
+# as the command line does; must be set before torch is imported
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from sliplens.errors import SliplensError
+from sliplens.export import ENGINES, Engine, make_engine
+from sliplens.export.onnx_file import difference
+from sliplens.models import Manifest, TrainedModel, build_model
+from sliplens.provenance import machine, versions
+
+WARM_UP = 5
+ENCODED = ((224, 224), (480, 640))
+"""Heights and widths of camera frames."""
+
+
+def build(*, size: int, head: str) -> TrainedModel:
+    """Make an untrained network whose batch normalisation has seen images, and whose answers vary with them."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = build_model(head=head)
+    for one in model.modules():
+        if isinstance(one, nn.BatchNorm2d):
+            one.momentum = None  # the true statistics; a few steps towards them would let the signal die
+    last = [one for one in model.modules() if isinstance(one, nn.Linear)][-1]
+    with torch.no_grad():
+        for seed in range(3):
+            model.train()(clouds(16, size=64, seed=seed))
+        last.weight.mul_(3)
+    manifest = Manifest(
+        backbone="shufflenet_v2_x1_0",
+        input="difference",
+        image_size=size,
+        frame_size=(size, size),
+        sensor="none",
+        data_hash="none",
+        head=head,
+    )
+    model = model.to(memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
+    return TrainedModel(model=model, manifest=manifest)
+
+
+def clouds(count: int, *, size: int, seed: int) -> Tensor:
+    """Coloured clouds; of noise, every image would give the same answer."""
+    colours = torch.rand(count, 3, 4, 4, generator=torch.Generator().manual_seed(seed)) ** 2
+    return functional.interpolate(colours, size=(size, size), mode="bilinear")
+
+
+def make_ready(
+    names: Sequence[str], trained: TrainedModel, inputs: Tensor
+) -> tuple[dict[str, Engine], dict[str, float], dict[str, str]]:
+    """Engines that can be used here, the seconds until each has answered once, and why the others cannot."""
+    engines, seconds, missing = {}, {}, {}
+    for name in names:
+        start = time.perf_counter()
+        try:
+            engines[name] = make_engine(name, trained)
+            engines[name](inputs)
+        except SliplensError as error:
+            missing[name] = str(error)
+            engines.pop(name, None)
+            continue
+        seconds[name] = time.perf_counter() - start
+    return engines, seconds, missing
+
+
+def time_rounds(work: dict[str, Callable[[], object]], *, rounds: int) -> dict[str, np.ndarray]:
+    """Milliseconds of every call; in each round all are called once."""
+    names = list(work)
+    found: dict[str, list[float]] = {name: [] for name in names}
+    for number in range(WARM_UP + rounds):
+        turn = number % len(names)
+        for name in names[turn:] + names[:turn]:
+            start = time.perf_counter()
+            work[name]()
+            found[name].append(1e3 * (time.perf_counter() - start))
+    return {name: np.array(times[WARM_UP:]) for name, times in found.items()}
+
+
+def encoders(trained: TrainedModel) -> dict[str, Callable[[], object]]:
+    """Encoding of one frame, by the size of the camera's frames."""
+    rng, work = np.random.default_rng(0), {}
+    encode = partial(trained.encoding.encode, image_size=trained.manifest.image_size)
+    for height, width in ENCODED:
+        frame, reference = rng.integers(0, 256, (2, height, width, 3), dtype=np.uint8)
+        work[f"{width}x{height}"] = partial(encode, frame[None], reference)
+    return work
+
+
+def parity(engine: Engine, eager: Engine, inputs: Tensor) -> float:
+    """Largest difference between the margins of an engine and those of `eager`."""
+    return max(difference(engine(one[None]).margin, eager(one[None]).margin) for one in inputs)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the benchmark from the command line."""
+    parser = argparse.ArgumentParser(description="Time the inference engines side by side.")
+    parser.add_argument("--engines", nargs="+", choices=ENGINES, default=list(ENGINES))
+    parser.add_argument("--rounds", type=int, default=300, help="timed calls of each engine")
+    parser.add_argument("--size", type=int, default=224, help="height and width of the network's input in pixels")
+    parser.add_argument("--head", choices=("point", "histogram"), default="histogram")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--json", action="store_true", help="end with one line of JSON")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(options.threads)
+    trained = build(size=options.size, head=options.head)
+    inputs = clouds(8, size=options.size, seed=3)
+    engines, ready_s, missing = make_ready(options.engines, trained, inputs[:1])
+    load = [os.getloadavg()[0]]
+    times = time_rounds(
+        {name: lambda engine=engine: engine(inputs[:1]) for name, engine in engines.items()}, rounds=options.rounds
+    )
+    load.append(os.getloadavg()[0])
+    encode_times = time_rounds(encoders(trained), rounds=options.rounds)
+    eager = engines.get("eager") or make_engine("eager", trained)
+    result = {
+        "p50_ms": {name: float(np.percentile(values, 50)) for name, values in times.items()},
+        "p99_ms": {name: float(np.percentile(values, 99)) for name, values in times.items()},
+        "parity": {name: parity(engine, eager, inputs) for name, engine in engines.items()},
+        "fastest": min(times, key=lambda name: float(np.median(times[name]))),
+        "ready_s": ready_s,
+        "missing": missing,
+        "margin_sd": float(eager(inputs).margin.std()),
+        "encode_p50_ms": {name: float(np.percentile(values, 50)) for name, values in encode_times.items()},
+        "encode_p99_ms": {name: float(np.percentile(values, 99)) for name, values in encode_times.items()},
+        "load_average": load,
+        "rounds": options.rounds,
+        "size": options.size,
+        "head": options.head,
+        "threads": options.threads,
+        "machine": machine(),
+        "versions": versions(),
+    }
+    print(f"{'engine':12s} {'p50 ms':>8s} {'p99 ms':>8s} {'of eager':>9s} {'off eager':>10s} {'ready s':>8s}")
+    slow = float(np.median(times["eager"])) if "eager" in times else float("nan")
+    for name in times:
+        p50 = result["p50_ms"][name]
+        print(
+            f"{name:12s} {p50:8.2f} {result['p99_ms'][name]:8.2f} {p50 / slow:9.2f} {result['parity'][name]:10.1e} "
+            f"{ready_s[name]:8.1f}"
+        )
+    for name, values in encode_times.items():
+        print(f"encoding {name}: {np.percentile(values, 50):.2f} ms, p99 {np.percentile(values, 99):.2f} ms")
+    for name, why in missing.items():
+        print(f"{name}: {why}")
+    print(f"{options.threads} threads, {options.size} px, load average {load[0]:.1f} before and {load[1]:.1f} after")
+    if options.json:
+        print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

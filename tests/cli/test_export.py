@@ -1,0 +1,111 @@
+"""`sliplens export`: what it writes, and what it refuses."""
+
+import json
+from pathlib import Path
+
+import pytest
+import tyro
+
+from sliplens.cli.export import Export
+from sliplens.errors import InputError
+from sliplens.export.extras import import_onnxruntime
+from sliplens.provenance import RUN_FILE
+from sliplens.recordings import Dataset
+from sliplens.recordings.readers import ReadOptions, open_captures
+
+
+def refused(message: str, *words: object) -> None:
+    with pytest.raises(InputError, match=message):
+        run(*words)
+
+
+def run(*words: object) -> None:
+    tyro.cli(Export, args=[str(word) for word in words]).run()
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_network_becomes_an_onnx_file(difference_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    pytest.importorskip("onnxscript")
+    output = tmp_path / "new" / "a.onnx"
+    run(difference_run, "-o", output, "--onnx")
+    assert "answers as the network does in ONNX Runtime" in capsys.readouterr().out
+    assert names(tmp_path / "new") == ["a.onnx"]
+    session = import_onnxruntime().InferenceSession(str(output), providers=["CPUExecutionProvider"])
+    told = session.get_modelmeta().custom_metadata_map
+    assert json.loads(told["sliplens.manifest"])["backbone"] == "shufflenet_v2_x1_0"
+    before = output.read_bytes()
+    refused(r"a\.onnx exists; choose another file or pass --overwrite", difference_run, "-o", output, "--onnx")
+    assert output.read_bytes() == before
+
+
+@pytest.mark.parametrize("kind", ["lerobot", "mcap"])
+def test_a_data_set_comes_back_from_other_formats(
+    kind: str, small_dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    if kind == "mcap":
+        pytest.importorskip("mcap")
+        pytest.importorskip("rosbags")
+    output = tmp_path / "out"
+    chosen = ("--trials", "test-wet-7", "train-dry-1")
+    run(small_dataset.folder, "-o", output, f"--{kind}", *chosen)
+    sources = [output] if kind == "lerobot" else [path for path in sorted(output.iterdir()) if path.suffix == ".mcap"]
+    found = {capture.name for path in sources for capture in open_captures(path, options=ReadOptions())}
+    assert found == {"test-wet-7", "train-dry-1"}
+    # nothing of ours where their readers look
+    assert names(output) == (
+        ["data", "meta"] if kind == "lerobot" else [RUN_FILE, "test-wet-7.mcap", "train-dry-1.mcap"]
+    )
+    record = json.loads(next(output.rglob(RUN_FILE)).read_text())
+    assert record["config"]["data_hash"] == small_dataset.hash
+    assert names(tmp_path) == ["out"]
+    capsys.readouterr()
+    run(small_dataset.folder, "-o", output, f"--{kind}", *chosen)
+    assert "kept" in capsys.readouterr().out
+    refused("holds a result of other settings", small_dataset.folder, "-o", output, f"--{kind}")
+    run(small_dataset.folder, "-o", output, f"--{kind}", "--trials", "test-dry-6", "--overwrite")
+    assert "1 trials, 12 frames" in capsys.readouterr().out
+    assert names(tmp_path) == ["out"]
+
+
+def test_a_failure_leaves_nothing_behind(small_dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def fail(data: Dataset, folder: Path, **_: object) -> None:
+        (folder / "half").write_text("")
+        raise InputError("the disk is full")
+
+    monkeypatch.setattr("sliplens.recordings.writers.lerobot.write_lerobot", fail)
+    refused("the disk is full", small_dataset.folder, "-o", tmp_path / "out", "--lerobot")
+    assert not names(tmp_path)
+
+
+def test_what_others_made_is_never_replaced(small_dataset: Dataset, tmp_path: Path):
+    (tmp_path / "mine").write_text("")
+    refused("was not made by this export", small_dataset.folder, "-o", tmp_path, "--lerobot", "--overwrite")
+    assert names(tmp_path) == ["mine"]
+
+
+def test_the_wrong_kind_of_source_is_told(difference_run: Path, small_dataset: Dataset, tmp_path: Path):
+    data, out = small_dataset.folder, tmp_path / "a.onnx"
+    refused("is a data set, and --onnx writes a network", data, "-o", out, "--onnx")
+    refused("is a run, and --lerobot writes a data set", difference_run, "-o", out, "--lerobot")
+    refused("one of --onnx, --lerobot and --mcap, got none", data, "-o", out)
+    refused("got --lerobot and --mcap", data, "-o", out, "--lerobot", "--mcap")
+    refused("does not end in .onnx", difference_run, "-o", tmp_path / "a", "--onnx")
+    refused("leave it out with --onnx", difference_run, "-o", out, "--onnx", "--trials", "a")
+    refused("has no trial nobody; it has train-dry-0, .*, test-wet-7$", data, "-o", out, "--mcap", "--trials", "nobody")
+    refused("the run .*nothing does not exist", tmp_path / "nothing", "-o", out, "--onnx")
+    refused("the data set .*nothing does not exist", tmp_path / "nothing", "-o", out, "--mcap")
+    assert not names(tmp_path)
+
+
+def test_without_the_extra_the_cure_is_told(difference_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("sliplens.export.extras.find_spec", lambda name: None if name != "onnx" else name)
+    refused(
+        r'needs onnxscript and onnxruntime, which are not installed; install with `pip install "sliplens\[onnx\]"`',
+        difference_run,
+        "-o",
+        tmp_path / "a.onnx",
+        "--onnx",
+    )

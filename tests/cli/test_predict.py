@@ -1,0 +1,85 @@
+"""`sliplens predict`: the file it writes, and what is said to mistakes."""
+
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+import tyro
+
+from sliplens import __version__
+from sliplens.cli.predict import Predict
+from sliplens.errors import InputError, SliplensError
+from sliplens.provenance import hash_file
+from sliplens.recordings import Dataset
+
+
+def run(*words: object) -> None:
+    tyro.cli(Predict, args=[str(word) for word in words]).run()
+
+
+def refused(message: str, *words: object) -> None:
+    with pytest.raises(SliplensError, match=message):
+        run(*words)
+
+
+def test_a_data_set_is_predicted(
+    difference_run: Path, small_dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    output = tmp_path / "new" / "a.parquet"
+    run(difference_run, small_dataset.folder, "-o", output, "--split", "test")
+    table = pq.read_table(output)
+    assert table.num_rows == 24
+    told = {key.decode(): value.decode() for key, value in table.schema.metadata.items() if key.startswith(b"sliplens")}
+    assert told == {
+        "sliplens.version": __version__,
+        "sliplens.engine": "folded",  # for so few frames
+        "sliplens.source": str(small_dataset.folder),
+        "sliplens.manifest_sha256": hash_file(difference_run / "manifest.json"),
+        "sliplens.weights_sha256": hash_file(difference_run / "model.safetensors"),
+    }
+    assert "24 frames, by folded" in capsys.readouterr().out
+    assert [path.name for path in output.parent.iterdir()] == ["a.parquet"]
+
+
+def test_engines_agree_on_a_folder_of_images(difference_run: Path, difference_folder: Path, tmp_path: Path, capsys):
+    answers = {}
+    for engine in ("eager", "folded"):
+        run(difference_run, difference_folder, "-o", tmp_path / f"{engine}.parquet", "--engine", engine)
+        answers[engine] = pq.read_table(tmp_path / f"{engine}.parquet").to_pydict()
+    assert "taken for difference images" in capsys.readouterr().out.replace("\n", " ")
+    # float32 sums in another order, through some 60 layers
+    assert answers["eager"]["prediction"] == pytest.approx(answers["folded"]["prediction"], abs=1e-4)
+    assert [name.split("_")[0] for name in answers["eager"]["file"]] == ["frame1", "frame6", "frame11"]
+
+
+def test_a_file_that_exists_is_kept_unless_told_otherwise(difference_run: Path, difference_folder: Path, tmp_path):
+    output = tmp_path / "a.parquet"
+    output.write_text("somebody's")
+    refused("exists; choose another file or pass --overwrite", difference_run, difference_folder, "-o", output)
+    assert output.read_text() == "somebody's"
+    run(difference_run, difference_folder, "-o", output, "--overwrite")
+    assert pq.read_table(output).num_rows == 3
+
+
+def test_mistakes_are_told_before_anything_is_written(
+    difference_run: Path, difference_folder: Path, small_dataset: Dataset, tmp_path: Path
+):
+    output = tmp_path / "a.parquet"
+    here = ("-o", output)
+    refused("does not end in .parquet", difference_run, difference_folder, "-o", tmp_path / "a.csv")
+    refused("--batch-size must be at least 1, got 0", difference_run, difference_folder, *here, "--batch-size", 0)
+    refused("--device qpu cannot be used", difference_run, difference_folder, *here, "--device", "qpu")
+    refused("the run .*nothing does not exist", tmp_path / "nothing", difference_folder, *here)
+    refused("nothing does not exist", difference_run, tmp_path / "nothing", *here)
+    refused("no trial with split exam", difference_run, small_dataset.folder, *here, "--split", "exam")
+    onnx = ("--onnx", tmp_path / "a.onnx")
+    refused("not for eager; leave it out", difference_run, difference_folder, *here, *onnx, "--engine", "eager")
+    assert not output.exists()
+
+
+def test_a_graphics_card_that_is_not_there_is_told(difference_run: Path, difference_folder: Path, tmp_path: Path):
+    torch = pytest.importorskip("torch")
+    if torch.cuda.is_available():
+        pytest.skip("there is one")
+    with pytest.raises(InputError, match=r"--device cuda cannot be used \(.+\); choose cpu or cuda$"):
+        run(difference_run, difference_folder, "-o", tmp_path / "a.parquet", "--device", "cuda")

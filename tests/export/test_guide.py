@@ -1,0 +1,78 @@
+"""The examples of docs/export.md do what they say."""
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sliplens.images import write_png
+from sliplens.models import TrainedModel
+from sliplens.recordings import Dataset
+
+GUIDE = Path(__file__).parents[2] / "docs" / "export.md"
+
+
+@pytest.fixture
+def blocks() -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```", GUIDE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+
+
+@pytest.mark.parametrize("head", ["point", "histogram"])
+def test_the_file_is_read_without_sliplens(
+    *,
+    head: str,
+    blocks: list[str],
+    onnx_files: dict[str, Path],
+    networks: dict[str, TrainedModel],
+    small_dataset: Dataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    assert "sliplens." not in re.sub(r'"sliplens\.\w+"', "", blocks[0])
+    recording = small_dataset.load(small_dataset.select(split="test")[0])
+    frame, reference = recording.frames[6], recording.reference
+    write_png(tmp_path / "frame.png", frame)
+    write_png(tmp_path / "untouched.png", reference)
+    (tmp_path / "tip.onnx").write_bytes(onnx_files[head].read_bytes())
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ORT_DISABLE_TELEMETRY", "1")
+    names: dict = {"os": os}
+    exec(compile(blocks[0], str(GUIDE), "exec"), names)
+    trained = networks[head]
+    inputs = trained.encode(frame[None], reference)
+    # Pillow resizes in 8 bits, torch in floats: a grey level of the largest, and the largest itself may be off by one
+    largest = names["resized"].max()
+    assert np.abs(names["image"].transpose(2, 0, 1) - inputs[0].numpy()).max() <= 2.1 / largest
+    estimate = trained.estimate(inputs)
+    # what such a level does to an answer; these networks hardly move
+    assert names["margin"][0] == pytest.approx(estimate.margin[0], abs=5e-3)
+    out = capsys.readouterr().out
+    assert f"safety margin {100 * names['margin'][0]:.0f} %" in out
+    if head == "histogram":
+        assert estimate.sigma is not None
+        assert names["sigma"] == pytest.approx(estimate.sigma[0], abs=5e-3)
+        assert "give or take" in out
+
+
+def test_the_library_is_used_as_it_says(
+    *,
+    blocks: list[str],
+    runs: dict[str, Path],
+    small_dataset: Dataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    networks: dict[str, TrainedModel],
+):
+    pytest.importorskip("onnxscript")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "mine").mkdir(parents=True)
+    (tmp_path / "runs" / "mine" / "train").symlink_to(runs["point"])
+    recording = small_dataset.load(small_dataset.select(split="test")[0])
+    names: dict = {"frames": recording.frames, "untouched": recording.reference}
+    exec(compile(blocks[1], str(GUIDE), "exec"), names)
+    expected = networks["point"].estimate(networks["point"].encode(recording.frames, recording.reference))
+    # float32 sums in another order, through some 60 layers
+    np.testing.assert_allclose(names["estimate"].margin, expected.margin, atol=1e-4)
