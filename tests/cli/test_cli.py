@@ -5,25 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import refused, run
 from PIL import Image
 
 from sliplens import __version__
-from sliplens.cli import main
 from sliplens.recordings import Dataset
-
-
-def run(*words: object) -> int:
-    return main([str(word) for word in words])
-
-
-def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    """Run a command that must fail with exit code 2 and one line; returns the line."""
-    assert run(*words) == 2
-    captured = capsys.readouterr()
-    assert "Traceback" not in captured.err + captured.out
-    lines = captured.err.strip().splitlines()
-    assert len(lines) == 1
-    return lines[0]
 
 
 def test_version(capsys: pytest.CaptureFixture[str]):

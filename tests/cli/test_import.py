@@ -9,8 +9,8 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from command_line import refused, run
 
-from sliplens.cli import main
 from sliplens.images import write_png
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.headers import read_labelling
@@ -20,19 +20,6 @@ from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 FORCE_RATE = 500
 TARE = np.array([0.3, -0.2, 1.1])
-
-
-def run(*words: object) -> int:
-    return main([str(word) for word in words])
-
-
-def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    assert run(*words) == 2
-    captured = capsys.readouterr()
-    assert "Traceback" not in captured.err + captured.out
-    lines = captured.err.strip().splitlines()
-    assert len(lines) == 1
-    return lines[0]
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import refused, run
 
-from sliplens.cli import main
 from sliplens.images import write_png
 from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
@@ -15,19 +15,6 @@ from sliplens.recordings.headers import read_labelling
 from sliplens.recordings.samples import forces_path, load_forces
 from sliplens.recordings.store import load_recording, save_recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
-
-
-def run(*words: object) -> int:
-    return main([str(word) for word in words])
-
-
-def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    assert run(*words) == 2
-    captured = capsys.readouterr()
-    assert "Traceback" not in captured.err + captured.out
-    lines = captured.err.strip().splitlines()
-    assert len(lines) == 1
-    return lines[0]
 
 
 @pytest.fixture(scope="module")

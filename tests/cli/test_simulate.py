@@ -5,24 +5,13 @@ from pathlib import Path
 
 import av
 import pytest
+from command_line import refused, run
 from PIL import Image
 
-from sliplens.cli import main
 from sliplens.recordings import Dataset
 from sliplens.simulation import PRESETS
 
 SMALL = ("--dry-trials", "3", "--wet-trials", "1", "--days", "2", "--frames-per-trial", "20")
-
-
-def run(*words: object) -> int:
-    return main([str(word) for word in words])
-
-
-def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    assert run(*words) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1
-    return lines[0]
 
 
 def test_a_data_set_is_written_whole_and_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -5,8 +5,8 @@ import shutil
 from pathlib import Path
 
 import pytest
+from command_line import refused, run
 
-from sliplens.cli import main
 from sliplens.recordings import Dataset
 from sliplens.recordings.splits import SPLITS_FILE
 
@@ -20,19 +20,6 @@ trial = "*-5"
 [[split]]
 name = "train"
 """
-
-
-def run(*words: object) -> int:
-    return main([str(word) for word in words])
-
-
-def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    assert run(*words) == 2
-    captured = capsys.readouterr()
-    assert "Traceback" not in captured.err + captured.out
-    lines = captured.err.strip().splitlines()
-    assert len(lines) == 1
-    return lines[0]
 
 
 def contents(folder: Path) -> dict[str, bytes]:

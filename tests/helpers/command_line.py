@@ -1,0 +1,20 @@
+"""The command line as tests call it."""
+
+import pytest
+
+from sliplens.cli import main
+
+
+def run(*words: object) -> int:
+    """Run a command; gives its exit code."""
+    return main([str(word) for word in words])
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    """Run a command that must fail with exit code 2 and one line; gives the line."""
+    assert run(*words) == 2
+    captured = capsys.readouterr()
+    assert "Traceback" not in captured.err + captured.out
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 1
+    return lines[0]
