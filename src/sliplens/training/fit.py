@@ -1,28 +1,24 @@
 """Fit a network to a data set."""
 
-import logging
 import shutil
-import signal
-import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
-import lightning
-import numpy as np
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
-from torch.utils.data import DataLoader, Sampler
+from lightning.pytorch.loggers import Logger
 
 from sliplens.datasets import FrameSet, get_augmentation
-from sliplens.errors import InputError
+from sliplens.errors import InputError, ModelError
 from sliplens.models import Manifest, build_model, save_checkpoint
 from sliplens.provenance import versions
 from sliplens.training.calibrate import calibrate
 from sliplens.training.config import TrainConfig
-from sliplens.training.module import Clock, Regressor, TrainProgress
+from sliplens.training.hardware import Hardware
+from sliplens.training.module import Clock, DivergedError, Regressor, TrainProgress
+from sliplens.training.running import make_trainer, run_trainer
+from sliplens.training.samplers import EpochShuffle, make_loaders
 
 _LAST = "last.ckpt"
 
@@ -36,6 +32,8 @@ class TrainResult:
     stopped_by: str
     best_validation_mse: float
     parameters: int
+    processes: int
+    """That shared it."""
 
 
 def fit(
@@ -48,9 +46,14 @@ def fit(
     sensor: str,
     data_hash: str,
     trained_on: Sequence[str] = (),
+    hardware: Hardware | None = None,
+    logger: Logger | None = None,
     on_progress: Callable[[TrainProgress], None] | None = None,
-) -> TrainResult:
+) -> TrainResult | None:
     """Train a network and save the weights that were best on the validation frames.
+
+    With several processes, each calls this with the same frames and takes its share of every batch; the first writes.
+    Batch normalisation sees the share alone, so the weights differ from those of one process.
 
     Parameters
     ----------
@@ -60,71 +63,117 @@ def fit(
         Encoded frames, of trials that do not overlap.
     folder
         Gets `model.safetensors`, `manifest.json` and `metrics.csv`. While training runs it also holds checkpoints, from
-        which a call with the same folder goes on.
+        which a call with the same folder goes on. All processes must see it.
     frame_size, sensor, data_hash, trained_on
         Kept in the manifest: height and width of the sensor's frames, its name, the data set's hash, and those of the
         trials.
+    hardware
+        One device, a GPU if there is one, unless told otherwise.
+    logger
+        Gets the errors and the learning rate too.
     on_progress
-        Called after every step.
+        Called after every step, in the first process.
+
+    Returns
+    -------
+    TrainResult or None
+        None in all processes but the first.
 
     Raises
     ------
     InputError
-        If the training set is smaller than one batch, or a trial is in both sets.
+        If the training set is smaller than one batch, a trial is in both sets, the batch does not divide among the
+        processes, the machine has not the devices, or a checkpoint cannot be saved.
     ModelError
-        If the loss is no longer finite, or the backbone is unknown.
+        If the loss is no longer finite, or the backbone is unknown. The best network so far is saved before.
     """
-    if len(train) < config.batch_size:
-        raise InputError(f"{len(train)} training frames do not fill a batch of {config.batch_size}; lower batch_size")
-    shared = set(train.trial) & set(validation.trial)
-    if shared:
-        raise InputError(f"trial {min(shared)} is in both training and validation; split by trial")
+    hardware = hardware or Hardware()
+    share = _check(config, train, validation, hardware)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)  # the initial weights; forked, so that the caller's random state is untouched
         # channels last: depthwise convolutions run up to half as fast again on a CPU
         model = build_model(config.backbone, head=config.head).to(memory_format=torch.channels_last)
-    loaders = _loaders(config, train, validation)
+    first = hardware.rank() == 0
+    per_epoch = len(train) // config.batch_size
     clock = Clock(
-        steps=config.epochs * len(loaders[0]),
+        steps=config.epochs * per_epoch,
         max_minutes=config.max_minutes,
-        metrics_file=folder / "metrics.csv",
-        on_progress=on_progress,
+        metrics_file=folder / "metrics.csv" if first else None,
+        on_progress=on_progress if first else None,
     )
+
+    def batch_rows(epoch: int, batch: int) -> list[str]:
+        order = EpochShuffle(len(train), seed=config.seed).order(epoch)[hardware.rank() :: hardware.processes]
+        return [_name(train, row) for row in order[batch * share : (batch + 1) * share]]
+
     module = Regressor(
         model,
         config=config,
         augmentation=get_augmentation(config.augmentation, neutral=train.encoding.neutral),
         steps=clock.steps,
         fraction_done=clock.fraction,
+        batch_rows=batch_rows,
     )
     checkpoints = folder / "checkpoints"
     best = ModelCheckpoint(dirpath=checkpoints, filename="best", monitor="validation_mse", save_last=True)
-    with torch.random.fork_rng(devices=[]):
-        _run(config, module, [clock, best], loaders, checkpoints / _LAST)
-    # our own file of tensors and plain numbers, read back without unpickling anything else
-    state = torch.load(best.best_model_path, weights_only=True)["state_dict"]
-    module.load_state_dict(state)
-    assert best.best_model_score is not None  # set whenever a best path is
-    best_mse = float(best.best_model_score)
-    calibration = calibrate(module.model, validation, batch_size=config.batch_size)
-    save_checkpoint(
-        folder,
-        module.model,
-        Manifest(
-            backbone=config.backbone,
-            head=config.head,
-            recipe=config.recipe,
-            input=train.encoding.name,
-            image_size=config.image_size,
-            frame_size=frame_size,
-            sensor=sensor,
-            data_hash=data_hash,
-            trained_on=tuple(trained_on),
-            metrics={"validation_mse": best_mse},
-            calibration=asdict(calibration),
-            versions=versions(),
-        ),
+    trainer = make_trainer(
+        config,
+        hardware=hardware,
+        callbacks=[clock, best],
+        folder=checkpoints,
+        logger=logger if first else None,
+        steps_per_epoch=per_epoch,
     )
+    loaders = make_loaders(
+        train,
+        validation,
+        seed=config.seed,
+        batch_size=share,
+        rank=hardware.rank(),
+        processes=hardware.processes,
+    )
+
+    def save_best() -> float:
+        # our own file of tensors and plain numbers, read back without unpickling anything else
+        kept = torch.load(best.best_model_path, map_location="cpu", weights_only=True)
+        module.load_state_dict(kept["state_dict"])
+        # as the file itself has it: after a crash between two files the callback may remember an older one
+        best_mse = float(kept["callbacks"][best.state_key]["current_score"])
+        calibration = calibrate(module.model, validation, batch_size=config.batch_size)
+        save_checkpoint(
+            folder,
+            module.model,
+            Manifest(
+                backbone=config.backbone,
+                head=config.head,
+                recipe=config.recipe,
+                input=train.encoding.name,
+                image_size=config.image_size,
+                frame_size=frame_size,
+                sensor=sensor,
+                data_hash=data_hash,
+                trained_on=tuple(trained_on),
+                metrics={"validation_mse": best_mse},
+                calibration=asdict(calibration),
+                versions=versions(),
+            ),
+        )
+        return best_mse
+
+    try:
+        with torch.random.fork_rng(devices=[]):
+            run_trainer(trainer, module, loaders, checkpoints / _LAST)
+    except DivergedError as error:
+        if not first:
+            return None
+        if not best.best_model_path:
+            raise
+        raise ModelError(
+            f"{error} (the best network so far, of validation MSE {save_best():.4g}, is in {folder})"
+        ) from None
+    if not first:
+        return None
+    best_mse = save_best()
     shutil.rmtree(checkpoints)
     return TrainResult(
         epochs=clock.rows[-1][0],
@@ -132,85 +181,25 @@ def fit(
         stopped_by=clock.stopped_by,
         best_validation_mse=best_mse,
         parameters=sum(value.numel() for value in model.parameters()),
+        processes=hardware.processes,
     )
 
 
-def _loaders(config: TrainConfig, train: FrameSet, validation: FrameSet) -> tuple[DataLoader, DataLoader]:
-    common: dict[str, Any] = {"batch_size": config.batch_size, "collate_fn": _as_is}
-    # a last small batch would make batch normalisation noisy
-    shuffled = DataLoader(train, sampler=EpochShuffle(len(train), seed=config.seed), drop_last=True, **common)
-    return shuffled, DataLoader(validation, **common)
-
-
-class EpochShuffle(Sampler[int]):
-    """A random order for each epoch that depends on the seed and the epoch alone, so that resuming repeats it."""
-
-    def __init__(self, count: int, *, seed: int) -> None:
-        self.count = count
-        self.seed = seed
-        self.epoch = 0
-
-    def set_epoch(self, epoch: int) -> None:
-        """Lightning calls this before each epoch."""
-        self.epoch = epoch
-
-    def __len__(self) -> int:
-        """Count the frames."""
-        return self.count
-
-    def __iter__(self) -> Iterator[int]:
-        """Yield every index once."""
-        return iter(np.random.default_rng((self.seed, self.epoch)).permutation(self.count).tolist())
-
-
-def _as_is(batch: Any) -> Any:
-    return batch  # FrameSet.__getitems__ has made the batch already
-
-
-def _run(
-    config: TrainConfig,
-    module: Regressor,
-    callbacks: list[Any],
-    loaders: tuple[DataLoader, DataLoader],
-    last: Path,
-) -> None:
-    with _quiet_lightning():
-        trainer = lightning.Trainer(
-            accelerator="auto",
-            devices=1,
-            max_epochs=config.epochs,
-            callbacks=callbacks,
-            logger=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            num_sanity_val_steps=0,
-            # Ranger21 clips by itself, adaptively
-            gradient_clip_val=1.0 if config.optimizer == "adamw" else None,
-            precision="16-mixed" if config.mixed_precision and torch.cuda.is_available() else "32-true",
+def _check(config: TrainConfig, train: FrameSet, validation: FrameSet, hardware: Hardware) -> int:
+    """Refuse frames that this recipe or this hardware cannot take; return the share of a batch of one process."""
+    share = hardware.share(config.batch_size)
+    if len(train) < config.batch_size:
+        raise InputError(f"{len(train)} training frames do not fill a batch of {config.batch_size}; lower batch_size")
+    if len(validation) < hardware.processes:
+        raise InputError(
+            f"{len(validation)} validation frames are too few for {hardware.processes} processes; lower --devices"
         )
-        on_interrupt = signal.getsignal(signal.SIGINT)
-        try:
-            trainer.fit(module, *loaders, ckpt_path=str(last) if last.is_file() else None, weights_only=True)
-        except SystemExit:
-            # Lightning exits and goes deaf to Ctrl-C; what happens next is the caller's to decide
-            signal.signal(signal.SIGINT, on_interrupt)
-            raise KeyboardInterrupt from None
+    shared = set(train.trial) & set(validation.trial)
+    if shared:
+        raise InputError(f"trial {min(shared)} is in both training and validation; split by trial")
+    return share
 
 
-@contextmanager
-def _quiet_lightning() -> Iterator[None]:
-    """Keep Lightning's notes on hardware, loggers and its own deprecations from the user's terminal."""
-    logger = logging.getLogger("lightning.pytorch.utilities.rank_zero")
-    level = logger.level
-    logger.setLevel(logging.WARNING)
-    try:
-        with warnings.catch_warnings():
-            # the frames lie in memory: worker processes would only copy them
-            warnings.filterwarnings("ignore", message=".*does not have many workers.*")
-            # going on in a folder that holds a checkpoint is what resuming means
-            warnings.filterwarnings("ignore", message=".*Checkpoint directory.*exists and is not empty.*")
-            # Lightning 2.6 calls what torch 2.13 deprecates
-            warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
-            yield
-    finally:
-        logger.setLevel(level)
+def _name(frames: FrameSet, row: int) -> str:
+    frame = frames.frame[row]
+    return f"the reference frame of {frames.trial[row]}" if frame < 0 else f"frame {frame} of {frames.trial[row]}"

@@ -1,8 +1,10 @@
 """The Lightning module and the callbacks around it."""
 
 import math
+import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,13 +14,16 @@ import torch
 from jaxtyping import Float
 from lightning.pytorch.callbacks import Callback
 from pytorch_optimizer import Ranger21
-from torch import Tensor, nn
-from torch.nn import functional
+from torch import Tensor, distributed, nn
+from torchmetrics import MeanSquaredError
 
 from sliplens.datasets import Augmentation
 from sliplens.errors import ModelError
 from sliplens.models.heads import margin_loss
 from sliplens.training.config import TrainConfig
+
+_NAMED_ROWS = 3
+"""Frames of a batch that a message names."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +34,10 @@ class TrainProgress:
     epoch: int
     train_mse: float
     validation_mse: float
+
+
+class DivergedError(ModelError):
+    """A loss or an error is no longer finite; every process of a training raises it together."""
 
 
 class Regressor(lightning.LightningModule):
@@ -46,6 +55,7 @@ class Regressor(lightning.LightningModule):
         augmentation: Augmentation | None,
         steps: int,
         fraction_done: Callable[[], float],
+        batch_rows: Callable[[int, int], Sequence[str]],
     ) -> None:
         super().__init__()
         self.model = model
@@ -53,6 +63,10 @@ class Regressor(lightning.LightningModule):
         self.augmentation = augmentation
         self.steps = steps
         self.fraction_done = fraction_done
+        self.batch_rows = batch_rows
+        # sums and counts, added up over the processes: exact however the frames are shared
+        self.train_mse = MeanSquaredError()
+        self.validation_mse = MeanSquaredError()
 
     def forward(self, images: Float[Tensor, "batch 3 size size"]) -> Float[Tensor, " batch"]:
         """Predict the safety margin."""
@@ -62,30 +76,41 @@ class Regressor(lightning.LightningModule):
         """One step; a loss that is not finite stops the training."""
         images, labels = batch
         if self.augmentation is not None:
-            # seeded by the step, so that a resumed training draws what it would have drawn
-            generator = torch.Generator(device=images.device).manual_seed(
-                self.config.seed * 1_000_003 + self.global_step
-            )
+            # seeded by the step, so that a resumed training draws what it would have drawn; and by the process
+            seed = self.config.seed * 1_000_003 + self.global_step + (self.global_rank << 40)
+            generator = torch.Generator(device=images.device).manual_seed(seed)
             images = self.augmentation(images, generator=generator)
         loss, margins = margin_loss(self.model, images, labels)
-        if not torch.isfinite(loss):
-            raise ModelError(
-                f"the training loss is {loss.item()} at step {self.global_step}; lower the learning rate and try again"
-            )
-        self.log(
-            "train_mse",
-            functional.mse_loss(margins.detach(), labels),
-            on_step=False,
-            on_epoch=True,
-            batch_size=len(images),
-        )
+        finite = bool(torch.isfinite(loss))
+        # all stop or none: a process that goes on alone waits for ever
+        if not self.trainer.strategy.reduce_boolean_decision(finite):
+            self._refuse(loss.item(), batch_idx, finite=finite)
+        self.train_mse.update(margins.detach(), labels)
+        self.log("train_mse", self.train_mse, on_step=False, on_epoch=True)
+        if self.trainer.loggers:
+            rate = self.trainer.optimizers[0].param_groups[0]["lr"]
+            self.log("learning_rate", rate, on_step=True, on_epoch=False)
         return loss
+
+    def _refuse(self, loss: float, batch_idx: int, *, finite: bool) -> None:
+        """Stop, and say which frames of which process brought a loss that is not finite."""
+        mine: tuple[float, Sequence[str]] = (loss, () if finite else self.batch_rows(self.current_epoch, batch_idx))
+        found = [mine]
+        if self.trainer.world_size > 1:
+            found = [mine] * self.trainer.world_size
+            distributed.all_gather_object(found, mine)
+        value, rows = next(one for one in found if one[1])
+        more = f" and {len(rows) - _NAMED_ROWS} more" if len(rows) > _NAMED_ROWS else ""
+        raise DivergedError(
+            f"the training loss is {value} in epoch {self.current_epoch + 1}, at step {self.global_step}, for a batch "
+            f"of {', '.join(rows[:_NAMED_ROWS])}{more}; lower the learning rate, or look at these frames, and try again"
+        )
 
     def validation_step(self, batch: tuple[Tensor, Tensor], batch_idx: int) -> None:
         """Log the validation error."""
         images, labels = batch
-        loss = functional.mse_loss(self(images), labels)
-        self.log("validation_mse", loss, on_epoch=True, batch_size=len(images))
+        self.validation_mse.update(self(images), labels)
+        self.log("validation_mse", self.validation_mse, on_epoch=True)
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         """Set the learning rate for the share of the training that is done; Ranger21 sets its own."""
@@ -114,7 +139,8 @@ class Regressor(lightning.LightningModule):
 class Clock(Callback):
     """Stops when the epochs or the minutes are used up, and writes a table row after each epoch.
 
-    Its state is part of the checkpoint: a training that was interrupted goes on with the minutes that are left.
+    Its state is part of the checkpoint: a training that was interrupted goes on with the minutes that are left. With a
+    time limit all processes go by the clock of the first: the learning rate follows it too.
     """
 
     def __init__(
@@ -122,7 +148,7 @@ class Clock(Callback):
         *,
         steps: int,
         max_minutes: float | None,
-        metrics_file: Path,
+        metrics_file: Path | None,
         on_progress: Callable[[TrainProgress], None] | None,
     ) -> None:
         self.steps = steps
@@ -134,6 +160,7 @@ class Clock(Callback):
         self.rows: list[list[float]] = []
         self.stopped_by = "epochs"
         self._started = time.perf_counter()
+        self._time_share = 0.0
 
     @property
     def seconds(self) -> float:
@@ -142,9 +169,7 @@ class Clock(Callback):
 
     def fraction(self) -> float:
         """Share of the training that is done."""
-        by_steps = self.step / self.steps
-        by_time = 0.0 if self.max_seconds is None else self.seconds / self.max_seconds
-        return min(1.0, max(by_steps, by_time))
+        return min(1.0, max(self.step / self.steps, self._time_share))
 
     def state_dict(self) -> dict[str, Any]:
         """What a checkpoint keeps of the clock."""
@@ -155,9 +180,20 @@ class Clock(Callback):
         self.seconds_before, self.rows = state_dict["seconds"], state_dict["rows"]
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Start the clock."""
+        """Start the clock; from now on a request to end is an interruption."""
         self._started = time.perf_counter()
         self.step = trainer.global_step
+        if threading.current_thread() is threading.main_thread():
+            # Lightning 2.6 would ask the other processes from within its handler, and all would wait for ever; what was
+            # there before comes back when the training is over
+            signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+    def on_train_batch_start(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, batch: Any, batch_idx: int
+    ) -> None:
+        """Look at the clock, which the module's learning rate follows."""
+        if self.max_seconds is not None:
+            self._time_share = trainer.strategy.broadcast(self.seconds) / self.max_seconds
 
     def on_train_batch_end(
         self,
@@ -169,20 +205,31 @@ class Clock(Callback):
     ) -> None:
         """Stop when the time is up."""
         self.step = trainer.global_step
-        if self.max_seconds is not None and self.seconds >= self.max_seconds and self.step < self.steps:
-            self.stopped_by = "time limit"
-            trainer.should_stop = True
+        if self.max_seconds is not None and self.step < self.steps:
+            late = self.seconds >= self.max_seconds
+            # one that stopped alone would leave the others waiting
+            if trainer.strategy.reduce_boolean_decision(late, all=False):
+                self.stopped_by, self._time_share = "time limit", 1.0
+                trainer.should_stop = True
         self._report(trainer)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Write the epoch's row; the validation has run by now."""
         metrics = trainer.callback_metrics
         epoch = self.step / self.steps * (trainer.max_epochs or 1)
-        row = [epoch, metrics["train_mse"].item(), metrics["validation_mse"].item(), self.seconds / 60]
-        self.rows.append(row)
-        lines = ["epoch,train_mse,validation_mse,minutes"]
-        lines += [f"{r[0]:.3f},{r[1]:.6g},{r[2]:.6g},{r[3]:.4f}" for r in self.rows]
-        self.metrics_file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        train, validation = metrics["train_mse"].item(), metrics["validation_mse"].item()
+        if not math.isfinite(validation):
+            raise DivergedError(
+                f"the validation error is {validation} after epoch {trainer.current_epoch + 1}; "
+                "lower the learning rate and try again"
+            )
+        self.rows.append([epoch, train, validation, self.seconds / 60])
+        if self.metrics_file is not None:
+            lines = ["epoch,train_mse,validation_mse,minutes"]
+            lines += [f"{r[0]:.3f},{r[1]:.6g},{r[2]:.6g},{r[3]:.4f}" for r in self.rows]
+            part = self.metrics_file.with_name(self.metrics_file.name + ".part")
+            part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+            part.replace(self.metrics_file)
         self._report(trainer)
 
     def _report(self, trainer: lightning.Trainer) -> None:
