@@ -108,19 +108,15 @@ class Train:
         from sliplens.cli.curves import draw_learning_curve
         from sliplens.training.loggers import open_logger
 
-        recipe = {
-            "input": self.input,
-            "condition": self.condition,
-            "training": job.config,
-            "data_hash": job.data.hash,
-        }
+        told = {"input": self.input, "condition": self.condition, "data_hash": job.data.hash}
+        recipe = {**told, "training": job.config}
         with output_folder(self.output, stage="train", config=recipe, overwrite=self.overwrite) as out:
             if out.complete:
                 unchanged(self.output)
                 return
-            told = {**asdict(job.config), "input": self.input, "condition": self.condition, "data_hash": job.data.hash}
             with progress_bar(f"Reading trials ({self.input})") as bar:
                 frames, validation = job.load(scratch=out.folder, on_trial=bar)
+            told = {**asdict(job.config), **told}
             with open_logger(self.logger, out.folder, run_name=self.output.name, recipe=told) as logger:
                 result = self._show_training(job, frames, validation, out.folder, logger)
             info = job.train_trials[0]

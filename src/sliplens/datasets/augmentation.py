@@ -64,9 +64,10 @@ class Augmentation:
         if float(uniform(1)) < self.blur_probability:
             images = transforms.gaussian_blur(images, [3, 3], [0.1 + (self.blur_sd_px - 0.1) * float(uniform(1))])
         scale = 1 + self.colour * (2 * uniform(batch, 3, 1, 1) - 1)
-        images = (images - self.neutral) * scale + self.neutral
+        # in place: images of a batch are large, and the sampled ones are ours
+        images.sub_(self.neutral).mul_(scale).add_(self.neutral)
         noise = torch.randn(images.shape, generator=generator, device=device)
-        return (images + uniform(batch, 1, 1, 1) * self.noise_sd * noise).clamp(0, 1)
+        return images.add_(noise.mul_(uniform(batch, 1, 1, 1) * self.noise_sd)).clamp_(0, 1)
 
 
 AUGMENTATIONS = {

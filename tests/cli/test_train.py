@@ -1,0 +1,195 @@
+"""`sliplens train`: what it refuses, and what a crash leaves."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from sliplens.cli import main
+from sliplens.models import load_checkpoint
+from sliplens.recordings import Dataset
+from sliplens.recordings.dataset import trial_path, write_dataset_table
+
+SMALL = ("--image-size", "32", "--epochs", "3", "--batch-size", "11", "--head", "point", "--untouched-share", "0")
+
+
+def train(data: Path, output: Path, *more: str) -> int:
+    return main(["train", str(data), "-o", str(output), *SMALL, *more])
+
+
+def refused(capsys: pytest.CaptureFixture[str], data: Path, output: Path, *more: str) -> str:
+    """A training that must fail with exit code 2 and one line, and leave nothing; returns the line."""
+    assert train(data, output, *more) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert not output.exists()
+    return lines[0]
+
+
+def divided(data: Dataset, folder: Path, **changes: dict[str, object]) -> Path:
+    """The small data set with another table: changes by split, `split=None` leaves it out."""
+    folder.mkdir()
+    (folder / "trials").symlink_to(data.folder / "trials")
+    table = [replace(info, **changes.get(info.split, {})) for info in data.trials]  # pyright: ignore[reportArgumentType]
+    write_dataset_table(folder, [info for info in table if info.split], simulated=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory, small_dataset: Dataset) -> Path:
+    """A training that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    assert train(small_dataset.folder, folder, "--logger", "tensorboard") == 0
+    return folder
+
+
+def test_a_run_holds_its_learning_curve_and_what_its_logger_kept(finished: Path):
+    names = {path.name for path in finished.iterdir()}
+    expected = {"model.safetensors", "manifest.json", "metrics.csv", "result.json", "run.json", "curves.png"}
+    assert names == expected | {"tensorboard"}
+    with Image.open(finished / "curves.png") as picture:
+        assert np.asarray(picture).std() > 0  # not blank
+    assert len((finished / "metrics.csv").read_text().splitlines()) == 4
+
+
+def test_the_logger_tells_what_the_table_tells(finished: Path):
+    events = EventAccumulator(str(finished / "tensorboard")).Reload()
+    assert set(events.Tags()["scalars"]) >= {"train_mse", "validation_mse", "learning_rate"}
+    rows = [row.split(",") for row in (finished / "metrics.csv").read_text().splitlines()[1:]]
+    for column, name in ((1, "train_mse"), (2, "validation_mse")):
+        told = [one.value for one in events.Scalars(name)]
+        # the table keeps six digits
+        assert told == pytest.approx([float(row[column]) for row in rows], rel=1e-5)
+    recipe = yaml.safe_load((finished / "tensorboard" / "hparams.yaml").read_text())
+    assert recipe["batch_size"] == 11
+    assert recipe["input"] == "difference"
+
+
+def test_hardware_and_logger_are_no_part_of_the_recipe(finished: Path, small_dataset: Dataset, capsys):
+    assert train(small_dataset.folder, finished, "--accelerator", "cpu", "--devices", "11", "--batch-size", "11") == 2
+    assert "leaves one image to each of 11 processes" in capsys.readouterr().err
+    assert train(small_dataset.folder, finished, "--accelerator", "cpu") == 0
+    assert "made before with the same settings" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_training_killed_in_an_epoch_goes_on_to_the_same_end(finished: Path, small_dataset: Dataset, tmp_path: Path):
+    script = """
+import os, signal, sys
+from sliplens.cli import main
+from sliplens.training.module import Regressor
+
+step = Regressor.training_step
+
+def killed(self, batch, batch_idx):
+    if self.global_step == 6:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return step(self, batch, batch_idx)
+
+Regressor.training_step = killed
+main(sys.argv[1:])
+"""
+    words = ["train", str(small_dataset.folder), "-o", str(tmp_path / "run"), *SMALL]
+    done = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, timeout=300, check=False)
+    assert done.returncode == -signal.SIGKILL
+    # four steps an epoch: the second epoch was half done
+    assert (tmp_path / ".run.partial" / "checkpoints" / "last.ckpt").exists()
+    assert train(small_dataset.folder, tmp_path / "run") == 0
+    assert (tmp_path / "run" / "model.safetensors").read_bytes() == (finished / "model.safetensors").read_bytes()
+
+    def errors(folder: Path) -> list[list[str]]:
+        return [row.split(",")[:3] for row in (folder / "metrics.csv").read_text().splitlines()]
+
+    assert errors(tmp_path / "run") == errors(finished)
+
+
+def test_a_full_disk_leaves_the_last_whole_epoch(
+    small_dataset: Dataset, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
+):
+    sync, saved = os.fsync, []
+
+    def full(file: int) -> None:
+        saved.append(file)
+        if len(saved) > 2:  # the best and the last of the first epoch
+            raise OSError(28, "No space left on device")
+        sync(file)
+
+    monkeypatch.setattr("os.fsync", full)
+    line = refused(capsys, small_dataset.folder, tmp_path / "run")
+    assert "checkpoints/best.ckpt (No space left on device); make room and give the same command again" in line
+    monkeypatch.undo()
+    assert train(small_dataset.folder, tmp_path / "run") == 0
+    assert len((tmp_path / "run" / "metrics.csv").read_text().splitlines()) == 4
+
+
+def test_a_loss_that_diverges_leaves_the_best_network_to_use(
+    small_dataset: Dataset, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
+):
+    from sliplens.training import module  # noqa: PLC0415 (as the command line imports it)
+
+    margin_loss, calls = module.margin_loss, []
+
+    def diverge(*inputs: object) -> tuple:
+        calls.append(1)
+        loss, margins = margin_loss(*inputs)  # pyright: ignore[reportArgumentType]
+        return (loss * float("inf") if len(calls) == 6 else loss), margins
+
+    monkeypatch.setattr(module, "margin_loss", diverge)
+    line = refused(capsys, small_dataset.folder, tmp_path / "run")
+    assert "the training loss is inf in epoch 2, at step 5, for a batch of frame " in line
+    assert "lower the learning rate" in line
+    kept = load_checkpoint(tmp_path / ".run.partial")
+    assert f"the best network so far, of validation MSE {kept.manifest.metrics['validation_mse']:.4g}, is in" in line
+
+
+def test_one_condition_alone(small_dataset: Dataset, tmp_path: Path, capsys):
+    data = divided(small_dataset, tmp_path / "data", test={"split": "train"})
+    assert train(data, tmp_path / "run", "--condition", "dry") == 0
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["train_frames"] == 5 * 11  # six but the wet one
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["config"]["condition"] == "dry"
+    capsys.readouterr()
+    assert train(data, tmp_path / "run") == 2
+    assert "other settings" in capsys.readouterr().err
+
+
+def test_a_condition_that_no_trial_has(small_dataset: Dataset, tmp_path: Path, capsys):
+    line = refused(capsys, small_dataset.folder, tmp_path / "run", "--condition", "oily")
+    assert (
+        "has no trial with split train and condition oily; it has test/dry, test/wet, train/dry, validation/dry" in line
+    )
+    assert line.endswith("name another --condition, or divide it with `sliplens split`")
+
+
+def test_no_validation_split(small_dataset: Dataset, tmp_path: Path, capsys):
+    data = divided(small_dataset, tmp_path / "data", validation={"split": ""})
+    line = refused(capsys, data, tmp_path / "run")
+    assert "has no trial with split validation and condition any" in line
+    assert line.endswith("divide it with `sliplens split`")
+
+
+def test_frames_of_two_sizes(small_dataset: Dataset, tmp_path: Path, capsys):
+    data = divided(small_dataset, tmp_path / "data", validation={"height": 60, "width": 80})
+    line = refused(capsys, data, tmp_path / "run")
+    assert "mixes frames of 48 x 48 and 60 x 80 pixels; train on one sensor at a time" in line
+
+
+def test_no_label(small_dataset: Dataset, tmp_path: Path, capsys):
+    from sliplens.recordings.store import save_recording  # noqa: PLC0415 (used here alone)
+
+    (tmp_path / "data").mkdir()
+    for info in small_dataset.trials:
+        recording = small_dataset.load(info)
+        unknown = replace(recording, safety_margin=np.full(len(recording.time_s), np.nan))
+        save_recording(unknown, trial_path(tmp_path / "data", info.trial))
+    write_dataset_table(tmp_path / "data", small_dataset.trials, simulated=True)
+    line = refused(capsys, tmp_path / "data", tmp_path / "run")
+    assert "no frame of the 4 trials has a label; label them first" in line
+    assert not (tmp_path / ".run.partial").exists()

@@ -1,0 +1,104 @@
+import importlib.util
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+import yaml
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from sliplens.errors import InputError
+from sliplens.training import TrainConfig
+from sliplens.training.loggers import LOGGERS, open_logger
+
+RECIPE = {**asdict(TrainConfig()), "input": "difference", "condition": None}
+
+
+def needs(name: str) -> None:
+    for package in LOGGERS[name][0]:
+        pytest.importorskip(package, reason=f"{package} is not installed")
+
+
+def test_csv_needs_no_logger(tmp_path: Path):
+    with open_logger("csv", tmp_path, run_name="run", recipe=RECIPE) as logger:
+        assert logger is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_tensorboard_reads_back_what_was_logged(tmp_path: Path):
+    needs("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator  # noqa: PLC0415 (an extra)
+
+    with open_logger("tensorboard", tmp_path, run_name="run", recipe=RECIPE) as logger:
+        assert isinstance(logger, TensorBoardLogger)
+        for step, error in enumerate((0.25, 0.125)):
+            logger.log_metrics({"validation_mse": error}, step=step)
+        logger.finalize("success")
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [(one.step, one.value) for one in events.Scalars("validation_mse")] == [(0, 0.25), (1, 0.125)]
+    recipe = yaml.safe_load((tmp_path / "tensorboard" / "hparams.yaml").read_text())
+    assert recipe == RECIPE
+
+
+def test_wandb_stays_on_this_machine_unless_told_otherwise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    needs("wandb")
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    with open_logger("wandb", tmp_path, run_name="run", recipe=RECIPE) as logger:
+        assert logger is not None
+        logger.log_metrics({"validation_mse": 0.25}, step=1)
+    folders = [path.name for path in (tmp_path / "wandb").iterdir() if path.is_dir()]
+    assert len([name for name in folders if name.startswith("offline-run-")]) == 1
+    assert not [name for name in folders if name.startswith("run-")]
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # mlflow calls what SQLAlchemy deprecates
+def test_mlflow_keeps_its_runs_in_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    needs("mlflow")
+    from mlflow.tracking import MlflowClient  # noqa: PLC0415 (an extra)
+
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    with open_logger("mlflow", tmp_path, run_name="run", recipe=RECIPE) as logger:
+        assert logger is not None
+        logger.log_metrics({"validation_mse": 0.25}, step=1)
+        logger.finalize("success")
+    client = MlflowClient(f"sqlite:///{tmp_path / 'mlflow' / 'mlflow.db'}")
+    experiment = client.get_experiment_by_name("sliplens")
+    assert experiment is not None
+    (run,) = client.search_runs([experiment.experiment_id])
+    assert run.data.metrics == {"validation_mse": 0.25}
+    assert run.data.params["learning_rate"] == json.dumps(RECIPE["learning_rate"])
+
+
+@pytest.mark.parametrize("name", list(LOGGERS))
+def test_a_package_that_is_missing_is_named_with_its_cure(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    find = importlib.util.find_spec
+    gone = LOGGERS[name][0]
+    monkeypatch.setattr(
+        sys.modules[open_logger.__module__], "find_spec", lambda package: None if package in gone else find(package)
+    )
+    with (
+        pytest.raises(InputError, match=rf'--logger {name} needs {name}, .*`pip install "sliplens\[tracking\]"`'),
+        open_logger(name, tmp_path, run_name="run", recipe=RECIPE),
+    ):
+        pass
+
+
+def test_a_logger_that_does_not_start_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def refuse(*_: object) -> None:
+        raise ConnectionError("no route to host\nand a page of hints")
+
+    monkeypatch.setitem(LOGGERS, "mlflow", ((), refuse))
+    with (
+        pytest.raises(InputError, match=r"^--logger mlflow does not start \(no route to host\); mend that, or leave"),
+        open_logger("mlflow", tmp_path, run_name="run", recipe=RECIPE),
+    ):
+        pass
+
+
+def test_an_unknown_logger_is_refused(tmp_path: Path):
+    with (
+        pytest.raises(InputError, match="no logger named 'neptune'; choose one of csv, tensorboard, wandb, mlflow"),
+        open_logger("neptune", tmp_path, run_name="run", recipe=RECIPE),
+    ):
+        pass
