@@ -16,7 +16,7 @@ def test_a_label_becomes_the_share_of_a_gaussian_in_each_bin():
     told = histogram_targets(labels, edges).numpy()
     # the Gaussian of scipy, cut off at the ends of the histogram
     for row, label in zip(told, labels.tolist(), strict=True):
-        below = stats.norm.cdf(edges.numpy(), loc=label, scale=0.75 * 0.02)
+        below = np.asarray(stats.norm.cdf(edges.numpy(), loc=label, scale=0.75 * 0.02))
         np.testing.assert_allclose(row, np.diff(below) / (below[-1] - below[0]), atol=1e-12)
     np.testing.assert_allclose(told.sum(axis=1), 1)
 
@@ -48,7 +48,7 @@ class Says(torch.nn.Module):
         super().__init__()
         self.logits = logits
 
-    def forward(self, images: torch.Tensor) -> torch.Tensor:
+    def forward(self, _: torch.Tensor) -> torch.Tensor:
         return self.logits
 
 
@@ -112,7 +112,7 @@ def test_an_estimate_tells_its_spread_and_its_interval():
     edges = np.linspace(0, 1, 11)
     probabilities = np.zeros((1, 10))
     probabilities[0, [4, 5]] = 0.5
-    calibration = Calibration(temperature=1.0, offsets={"0.9": 0.05}, frames=10)
+    calibration = Calibration(temperature=1.0, offsets={"0.9": 0.05}, frames=10, mse=0.01)
     estimate = Estimate(margin=np.array([0.5]), probabilities=probabilities, edges=edges, calibration=calibration)
     assert estimate.sigma is not None
     assert estimate.sigma[0] == pytest.approx(0.05)

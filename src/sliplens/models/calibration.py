@@ -35,6 +35,8 @@ class Calibration:
     """By level, in margin units; negative where quantiles were too far apart."""
     frames: int
     """Validation frames."""
+    mse: float
+    """Of the answers to them, at this temperature, which moves the mean of a distribution a little."""
 
     def offset(self, level: float) -> float:
         """Offset of a level.
@@ -59,10 +61,15 @@ class Calibration:
         """
         try:
             offsets = {str(level): float(offset) for level, offset in values["offsets"].items()}
-            made = cls(temperature=float(values["temperature"]), offsets=offsets, frames=int(values["frames"]))
+            made = cls(
+                temperature=float(values["temperature"]),
+                offsets=offsets,
+                frames=int(values["frames"]),
+                mse=float(values["mse"]),
+            )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ModelError(f"the calibration is damaged ({error}); train the network again") from None
-        if not (np.isfinite([made.temperature, *offsets.values()]).all() and made.temperature > 0):
+        if not (np.isfinite([made.temperature, made.mse, *offsets.values()]).all() and made.temperature > 0):
             raise ModelError("the calibration holds no usable numbers; train the network again")
         return made
 

@@ -35,7 +35,8 @@ def calibrate(model: nn.Module, validation: FrameSet, *, batch_size: int) -> Cal
     if not isinstance(model, HistogramRegressor):
         told = outputs.reshape(-1).double().numpy()
         offsets = {str(level): conformal_offset(told, told, margins, level=level) for level in LEVELS}
-        return Calibration(temperature=1.0, offsets=offsets, frames=len(margins))
+        mse = float(np.mean((told - margins) ** 2))
+        return Calibration(temperature=1.0, offsets=offsets, frames=len(margins), mse=mse)
     edges = model.edges.cpu()
     temperature = fit_temperature(outputs, histogram_targets(labels, edges))
     model.temperature.fill_(temperature)
@@ -46,4 +47,6 @@ def calibrate(model: nn.Module, validation: FrameSet, *, batch_size: int) -> Cal
             quantiles(probabilities, edges.double().numpy(), share) for share in ((1 - level) / 2, (1 + level) / 2)
         )
         offsets[str(level)] = conformal_offset(np.asarray(low), np.asarray(high), margins, level=level)
-    return Calibration(temperature=temperature, offsets=offsets, frames=len(margins))
+    told = probabilities @ model.centres.double().cpu().numpy()
+    mse = float(np.mean((told - margins) ** 2))
+    return Calibration(temperature=temperature, offsets=offsets, frames=len(margins), mse=mse)

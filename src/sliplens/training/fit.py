@@ -153,7 +153,7 @@ def fit(
                 sensor=sensor,
                 data_hash=data_hash,
                 trained_on=tuple(trained_on),
-                metrics={"validation_mse": best_mse},
+                metrics={"validation_mse": calibration.mse},
                 calibration=asdict(calibration),
                 versions=versions(),
             ),
