@@ -133,7 +133,7 @@ def test_the_noise_is_not_counted_again_as_an_effect_of_the_lag(trial: Trial, rn
     more = np.mean((unsure.safety_margin_sigma**2 - sure.safety_margin_sigma**2)[pulled])
     # the margin falls by 1 in 3 s; over a chord of 0.2 s the noise adds half a per cent of its variance, and may double
     noise = 0.01 * np.mean(sure.safety_margin_sigma[pulled] ** 2)
-    assert more == pytest.approx((0.01 / (SLIP_S - PULL_S)) ** 2, abs=noise)
+    assert more == pytest.approx((0.01 / (SLIP_S - PULL_S)) ** 2, abs=float(noise))
 
 
 def test_a_doubtful_lag_is_not_applied(trial: Trial):
