@@ -128,6 +128,15 @@ def test_changed_force_samples_are_found(tmp_path: Path, trial: Recording, relab
     assert run("check", tmp_path / "data") == 2
 
 
+def test_force_samples_that_no_trial_lists_are_found(
+    tmp_path: Path, trial: Recording, relabelled: Path, capsys: pytest.CaptureFixture[str]
+):
+    shutil.copytree(relabelled, tmp_path / "data")
+    shutil.copy(forces_path(relabelled, trial.trial), forces_path(tmp_path / "data", "stray"))
+    assert run("check", tmp_path / "data") == 2
+    assert "forces/stray.parquet" in capsys.readouterr().out.replace("\n", "")
+
+
 @pytest.fixture
 def thesis_lists(tmp_path: Path, rng: np.random.Generator) -> Path:
     """Ten frames and their reference, in the lists of the thesis."""

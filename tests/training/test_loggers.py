@@ -55,7 +55,7 @@ def test_wandb_stays_on_this_machine_unless_told_otherwise(tmp_path: Path, monke
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # mlflow calls what SQLAlchemy deprecates
 def test_mlflow_keeps_its_runs_in_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     needs("mlflow")
-    from mlflow.tracking import MlflowClient  # noqa: PLC0415 (an extra)
+    from mlflow.tracking import MlflowClient  # noqa: PLC0415 (an extra)  # pyright: ignore[reportMissingImports]
 
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     with open_logger("mlflow", tmp_path, run_name="run", recipe=RECIPE) as logger:

@@ -61,9 +61,10 @@ def check_dataset(folder: Path, *, on_trial: Callable[[int, int], None] | None =
             splits = sorted({info.split for info in data.trials if info.trial == trial})
             findings.append(Finding(where=trial, what=f"is listed {count} times, in split {' and '.join(splits)}"))
     listed = {trial_path(folder, info.trial) for info in data.trials}
+    listed |= {forces_path(folder, info.trial) for info in data.trials if info.forces_sha256}
     findings += [
         Finding(where=str(path.relative_to(folder)), what="is not in the table of the data set")
-        for path in sorted((folder / "trials").glob("*"))
+        for path in sorted([*(folder / "trials").glob("*"), *(folder / "forces").glob("*")])
         if path not in listed
     ]
     for done, info in enumerate(data.trials, start=1):

@@ -25,7 +25,7 @@ def _wandb(folder: Path, run_name: str) -> Logger:
     offline = "WANDB_MODE" not in os.environ
     os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
     os.environ.setdefault("WANDB_SILENT", "true")
-    from wandb import Settings  # noqa: PLC0415 (an extra)
+    from wandb import Settings  # noqa: PLC0415 (an extra)  # pyright: ignore[reportMissingImports]
 
     settings = Settings(console="off", disable_git=True, x_disable_stats=True, x_disable_meta=True)
     return WandbLogger(name=run_name, save_dir=folder, project=PROJECT, offline=offline, settings=settings)
