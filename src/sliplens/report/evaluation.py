@@ -144,7 +144,8 @@ def _plot_typical(columns: Mapping[str, np.ndarray], trials: Mapping[str, Any], 
     ax.plot(time, 100 * columns["prediction"][rows], color=VERMILLION, label="predicted")
     ax.plot(time, 100 * columns["safety_margin"][rows], color=BLACK, linestyle="--", label="true")
     ax.set(xlabel="Time (s)", ylabel="Γ (%)")
-    ax.set_title(f"The trial of median error: {trial}", parse_math=False)
+    shown = trial if len(trial) <= 18 else f"…{trial[-17:]}"
+    ax.set_title(f"Median error: {shown}", parse_math=False)
     ax.legend(fontsize=8)
 
 
