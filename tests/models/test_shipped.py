@@ -19,7 +19,7 @@ def test_every_network_of_the_package_loads_and_says_what_it_learned_from():
 def test_a_network_that_is_not_there_is_refused():
     with pytest.raises(InputError, match="no network named 'gelsight' comes with sliplens; choose"):
         sliplens.load("gelsight")
-    with pytest.raises(InputError, match="the run nowhere does not exist; check the path, or name"):
+    with pytest.raises(InputError, match="the run nowhere does not exist; check the path"):
         find_run(Path("nowhere"))
 
 

@@ -44,7 +44,8 @@ def find_run(run: Path) -> Path:
         return run
     if str(run) in shipped_names():
         return _weights() / str(run)
-    raise InputError(f"the run {run} does not exist; check the path, or name {_choices()}, which come with sliplens")
+    shipped = f", or name {_choices()}, which comes with sliplens" if shipped_names() else ""
+    raise InputError(f"the run {run} does not exist; check the path{shipped}")
 
 
 def _weights() -> Path:
