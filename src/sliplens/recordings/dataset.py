@@ -5,12 +5,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from sliplens.errors import RecordingError
 from sliplens.provenance import hash_file, hash_json, read_json, require_folder, write_json
 from sliplens.recordings.headers import read_header
+from sliplens.recordings.parquet import reading
 from sliplens.recordings.recording import Recording
 from sliplens.recordings.samples import forces_path
 from sliplens.recordings.store import SCHEMA_VERSION, load_recording
@@ -116,13 +116,9 @@ def count_labelled(path: Path) -> int:
     RecordingError
         If the file is missing or damaged.
     """
-    try:
+    with reading(path):
         names = [name for name in ("safety_margin", "valid") if name in pq.read_schema(path).names]
         table = pq.read_table(path, columns=names)
-    except FileNotFoundError:
-        raise RecordingError(f"{path} does not exist; make the data set again") from None
-    except (pa.ArrowException, OSError) as error:
-        raise RecordingError(f"{path} is not a readable Parquet file ({error}); make the data set again") from None
     columns = {name: table.column(name).to_numpy() for name in names}
     present = np.isfinite(columns["safety_margin"].astype(np.float64))
     return int(np.sum(present & columns["valid"] if "valid" in columns else present))

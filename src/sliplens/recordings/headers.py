@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.images.files import decode_png
+from sliplens.recordings.parquet import reading
 
 DESCRIPTION = ("trial", "sensor", "day", "condition")
 """What every trial tells in its metadata."""
@@ -154,7 +154,6 @@ def require_labelling(labelling: object, *, where: str) -> None:
         **dict.fromkeys(("slip_s", "contact_threshold_n", "window_s", "gap_s", "force_range_n"), number),
     }
     if not fits(labelling, parts):
-        assert isinstance(parts, dict)
         wrong = [
             name for name, kind in parts.items() if not (isinstance(labelling, dict) and fits(labelling, {name: kind}))
         ]
@@ -164,11 +163,7 @@ def require_labelling(labelling: object, *, where: str) -> None:
 
 
 def _read_metadata(path: Path) -> dict[str, bytes]:
-    try:
+    with reading(path):
         file = pq.read_metadata(path)
-    except FileNotFoundError:
-        raise RecordingError(f"{path} does not exist; make the data set again") from None
-    except (pa.ArrowInvalid, OSError) as error:
-        raise RecordingError(f"{path} is not a readable Parquet file ({error}); make the data set again") from None
     metadata = {key.decode(): value for key, value in (file.metadata or {}).items()}
     return {**metadata, "frames": str(file.num_rows).encode()}

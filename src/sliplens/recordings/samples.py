@@ -8,6 +8,7 @@ import pyarrow.parquet as pq
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
+from sliplens.recordings.parquet import DAMAGED_PARQUET, one_line
 
 _AXES = ("x_n", "y_n", "z_n")
 
@@ -41,7 +42,8 @@ def load_forces(path: Path) -> Forces:
         values = [table.column(name).to_numpy().astype(np.float64) for name in ("time_s", *_AXES)]
     except FileNotFoundError:
         raise RecordingError(f"{path} does not exist; make the data set again") from None
-    except (pa.ArrowException, OSError, KeyError, ValueError) as error:
-        said = str(error).splitlines()[0]
-        raise RecordingError(f"{path} does not hold samples of forces ({said}); make the data set again") from None
+    except (*DAMAGED_PARQUET, TypeError) as error:  # the latter of values that are missing
+        raise RecordingError(
+            f"{path} does not hold samples of forces ({one_line(error)}); make the data set again"
+        ) from None
     return Forces(time_s=values[0], force_n=np.stack(values[1:], axis=-1), source=source)

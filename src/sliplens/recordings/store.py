@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 from sliplens.errors import RecordingError
 from sliplens.images.files import decode_png, encode_png
 from sliplens.recordings.headers import DESCRIPTION, OBJECT, read_header
+from sliplens.recordings.parquet import reading
 from sliplens.recordings.pixels import CODEC, decode_pixels, encode_frames
 from sliplens.recordings.recording import SIGNALS, ContactState, Recording
 from sliplens.recordings.truth import GroundTruth
@@ -123,21 +124,15 @@ def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Re
     ImageError
         If an image inside is damaged.
     """
-    try:
+    with reading(path):
         stored = pq.read_schema(path)
         left_out = (set() if truth and pixels else _TRUTH_COLUMNS) | (set() if pixels else {"image"})
         table = pq.read_table(path, columns=[name for name in stored.names if name not in left_out])
-    except FileNotFoundError:
-        raise RecordingError(f"{path} does not exist; make the data set again") from None
-    except (pa.ArrowInvalid, OSError) as error:
-        raise RecordingError(f"{path} is not a readable Parquet file ({error}); make the data set again") from None
     metadata = {key.decode(): value for key, value in (table.schema.metadata or {}).items()}
     missing = ({"reference", *DESCRIPTION} - set(metadata)) | ({"image", "contact_state", *SIGNALS} - set(stored.names))
     if missing:
         raise RecordingError(f"{path} lacks {', '.join(sorted(missing))}; write it with save_recording")
-    codec = metadata.get("codec", b"png").decode()
-    if codec != CODEC:
-        raise RecordingError(f"{path} keeps its images as {codec}, {CODEC} is needed; make the data set again")
+    _require_codec(table.schema, path)
     reference = decode_png(metadata["reference"], where=f"the reference frame of {path}")
     trial = metadata["trial"].decode()
     if table.num_rows == 0:
@@ -171,14 +166,14 @@ def stream_frames(path: Path) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     ImageError
         If an image inside is damaged.
     """
-    header, first = read_header(path), 0
-    file = pq.ParquetFile(path, memory_map=True)
-    for group in range(file.num_row_groups):
-        images = file.read_row_group(group, columns=["image"]).column("image")
-        for at, image in enumerate(images):
-            where = f"frame {first + at} of {path}"
-            yield decode_pixels(image.as_buffer(), size=(header.height, header.width, 3), where=where)
-        first += len(images)
+    header, file, first = read_header(path), _open_images(path), 0
+    with file:
+        for group in range(file.num_row_groups):
+            images = _read_images(file, group, path)
+            for at, image in enumerate(images):
+                where = f"frame {first + at} of {path}"
+                yield decode_pixels(image.as_buffer(), size=(header.height, header.width, 3), where=where)
+            first += len(images)
 
 
 def read_frames(path: Path, places: Sequence[int]) -> UInt8[np.ndarray, "frames height width 3"]:
@@ -203,17 +198,35 @@ def read_frames(path: Path, places: Sequence[int]) -> UInt8[np.ndarray, "frames 
     if strange:
         raise RecordingError(f"{path} has no frame {strange[0]}; name one from 0 to {header.frames - 1}")
     found = np.empty((len(places), header.height, header.width, 3), dtype=np.uint8)
-    with pq.ParquetFile(path, memory_map=True) as file:
+    with _open_images(path) as file:
         for group in range(file.num_row_groups):
             end = first + file.metadata.row_group(group).num_rows
             inside = [(at, place) for at, place in enumerate(places) if first <= place < end]
-            images = file.read_row_group(group, columns=["image"]).column("image") if inside else None
+            images = _read_images(file, group, path) if inside else None
             for at, place in inside:
                 assert images is not None
                 where = f"frame {place} of {path}"
                 found[at] = decode_pixels(images[place - first].as_buffer(), size=found.shape[1:], where=where)
             first = end
     return found
+
+
+def _open_images(path: Path) -> pq.ParquetFile:
+    with reading(path):
+        file = pq.ParquetFile(path, memory_map=True)
+    _require_codec(file.schema_arrow, path)
+    return file
+
+
+def _read_images(file: pq.ParquetFile, group: int, path: Path) -> pa.ChunkedArray:
+    with reading(path):
+        return file.read_row_group(group, columns=["image"]).column("image")
+
+
+def _require_codec(schema: pa.Schema, path: Path) -> None:
+    codec = (schema.metadata or {}).get(b"codec", b"png").decode()
+    if codec != CODEC:
+        raise RecordingError(f"{path} keeps its images as {codec}, {CODEC} is needed; make the data set again")
 
 
 def _read_truth(table: pa.Table, description: dict[str, Any], size: tuple[int, ...], path: Path) -> GroundTruth:

@@ -1,15 +1,18 @@
 """What a simulator knows of a trial, over its camera frames in the Rerun viewer."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float, Float32
 
 from sliplens.recordings import Recording
+from sliplens.recordings.parquet import reading
 from sliplens.recordings.pixels import decode_pixels
 from sliplens.recordings.truth import OUTSIDE, SLIPS, STICKS
 from sliplens.report.style import ORANGE, SKY, YELLOW
@@ -37,11 +40,12 @@ class StoredTruth:
 
 def read_truth(path: Path) -> StoredTruth | None:
     """Read the truth of a trial without its markers and maps; None where there is none."""
-    metadata = pq.read_schema(path).metadata or {}
-    if b"truth" not in metadata:
-        return None
-    told = json.loads(metadata[b"truth"])
-    friction = pq.read_table(path, columns=["static_friction"]).column("static_friction")
+    with reading(path):
+        metadata = pq.read_schema(path).metadata or {}
+        if b"truth" not in metadata:
+            return None
+        told = json.loads(metadata[b"truth"])
+        friction = pq.read_table(path, columns=["static_friction"]).column("static_friction")
     return StoredTruth(
         displacement=told["displacement"],
         marker_rest_px=np.array(told["marker_rest_px"], dtype=np.float32).reshape(-1, 2),
@@ -61,8 +65,7 @@ def log_truth(stream: "RecordingStream", path: Path, trial: Recording, truth: St
     stream.log("camera/markers", dots, static=True)
     arrows = rerun.Arrows2D.from_fields(colors=[rgba(YELLOW)], radii=[rerun.Radius.ui_points(1.0)])
     stream.log("camera/displacements", arrows, static=True)
-    file = pq.ParquetFile(path)
-    for rows in file.iter_batches(_TOGETHER, columns=["marker_px", "contact_map"]):
+    for rows in _stored_rows(path):
         places = np.arange(done, done + rows.num_rows)
         times, lengths = clock(trial.time_s[places], places), [len(rest_px)] * rows.num_rows
         markers = rows.column("marker_px").flatten().to_numpy().reshape(rows.num_rows, len(rest_px), 2)
@@ -78,3 +81,8 @@ def log_truth(stream: "RecordingStream", path: Path, trial: Recording, truth: St
         ]
         stream.send_columns("camera/zones", times, rerun.SegmentationImage.columns(buffer=maps))
         done += rows.num_rows
+
+
+def _stored_rows(path: Path) -> Iterator[pa.RecordBatch]:
+    with reading(path), pq.ParquetFile(path) as file:
+        yield from file.iter_batches(_TOGETHER, columns=["marker_px", "contact_map"])

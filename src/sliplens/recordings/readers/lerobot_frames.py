@@ -18,7 +18,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.readers.lerobot_layout import DAMAGED_PARQUET, Episode, one_line
+from sliplens.recordings.parquet import DAMAGED_PARQUET, one_line
+from sliplens.recordings.readers.lerobot_layout import Episode
 
 # what FFmpeg would guess from the content may be a play list that leads to other files and hosts
 _CONTAINERS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska", ".webm": "webm"}

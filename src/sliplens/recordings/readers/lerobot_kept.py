@@ -13,7 +13,7 @@ from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.given import GivenLabels
 from sliplens.recordings.readers.lerobot_frames import decode_image, image_frames
-from sliplens.recordings.readers.lerobot_layout import DAMAGED_PARQUET, Episode, Layout, one_line, read_episodes
+from sliplens.recordings.readers.lerobot_layout import Episode, Layout, read_episodes
 from sliplens.recordings.readers.lerobot_rows import EpisodeRows
 from sliplens.recordings.recording import ContactState, require_unit_interval
 from sliplens.recordings.samples import load_forces
@@ -158,10 +158,7 @@ def _labels(rows: EpisodeRows, table: pa.Table, episode: Episode, trial: TrialTe
 
 
 def _forces(path: Path, trial: TrialText) -> Forces:
-    try:
-        forces = load_forces(path)
-    except (*DAMAGED_PARQUET, TypeError) as error:
-        raise RecordingError(f"{path} is damaged ({one_line(error)}); copy the data set again") from None
+    forces = load_forces(path)
     if len(forces.time_s) != trial.force_samples:
         raise RecordingError(
             f"{path} has {len(forces.time_s)} samples of {trial.trial}, {trial.force_samples} were exported; "

@@ -11,9 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from sliplens.errors import RecordingError
-
-DAMAGED_PARQUET = (pa.ArrowException, OSError, ValueError, LookupError)
-"""What Arrow raises of a damaged file: names, too, may be no text."""
+from sliplens.recordings.parquet import DAMAGED_PARQUET, one_line
 
 _VERSION = re.compile(r"v3\.\d+")
 _FIELD = re.compile(r"\{(video_key|chunk_index|file_index)(?::0?([1-9])d)?\}")
@@ -165,11 +163,6 @@ def read_columns(path: Path, columns: list[str]) -> pa.Table:
         if table.column(name).null_count:
             raise RecordingError(f"{path} has rows without {name}; finish writing the data set, or copy it again")
     return table
-
-
-def one_line(error: Exception) -> str:
-    """What an error says, without the line breaks and stacks of Arrow."""
-    return " ".join(str(error).split())[:200]
 
 
 def _is_feature(feature: Any) -> bool:

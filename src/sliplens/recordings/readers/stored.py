@@ -4,14 +4,13 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 
-from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Capture, Forces, Told
 from sliplens.recordings.dataset import Dataset, TrialInfo, trial_path
 from sliplens.recordings.given import GIVEN_SIGNALS, GivenLabels
 from sliplens.recordings.headers import read_labelling, read_reference
+from sliplens.recordings.parquet import reading
 from sliplens.recordings.recording import ContactState
 from sliplens.recordings.samples import forces_path, load_forces
 from sliplens.recordings.store import stream_frames
@@ -43,14 +42,10 @@ def read_stored_trial(data: Dataset, info: TrialInfo) -> Capture:
     """Read one trial of a data set as `read_stored` does."""
     folder = data.folder
     path = trial_path(folder, info.trial)
-    try:
+    with reading(path):
         present = set(pq.read_schema(path).names)
         names = ("time_s", *GIVEN_SIGNALS, "contact_state", *(name for name in _OPTIONAL if name in present))
         table = pq.read_table(path, columns=list(names))
-    except FileNotFoundError:
-        raise RecordingError(f"{path} does not exist; make the data set again") from None
-    except (pa.ArrowException, OSError) as error:
-        raise RecordingError(f"{path} is not a readable Parquet file ({error}); make the data set again") from None
     columns = {name: table.column(name).to_numpy() for name in names}
     states, reasons = columns["contact_state"], columns.get("invalid_reason")
     sigma, valid = columns.get("safety_margin_sigma"), columns.get("valid")

@@ -1,0 +1,60 @@
+"""A trial whose file was damaged after it was written: every command says so in one sentence."""
+
+import shutil
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from tests.helpers.command_line import refused
+
+from sliplens.recordings import Dataset
+from sliplens.recordings.dataset import trial_path
+from sliplens.simulation import SimulationRecipe, simulate_dataset
+
+
+def damage_page(path: Path, column: str) -> None:
+    """Overwrite the head of a column's first page: what it holds can no longer be read."""
+    group = pq.read_metadata(path).row_group(0)
+    chunks = [group.column(index) for index in range(group.num_columns)]
+    place = next(chunk.data_page_offset for chunk in chunks if chunk.path_in_schema == column)
+    with path.open("r+b") as file:
+        file.seek(place)
+        file.write(b"\xff" * 40)
+
+
+@pytest.fixture
+def damaged(tmp_path: Path, small_dataset: Dataset) -> Path:
+    folder = tmp_path / "data"
+    shutil.copytree(small_dataset.folder, folder)
+    return folder
+
+
+def test_a_damaged_page_is_told_by_every_command(
+    capsys: pytest.CaptureFixture[str], damaged: Path, difference_run: Path, tmp_path: Path
+):
+    data = Dataset.open(damaged)
+    for split in ("train", "test"):
+        damage_page(trial_path(damaged, data.select(split=split)[0].trial), "image")
+    trial = data.select(split="test")[0].trial
+    commands = (
+        ("train", damaged, "-o", tmp_path / "run", "--image-size", "32", "--batch-size", "4"),
+        ("predict", difference_run, damaged, "-o", tmp_path / "margins.parquet"),
+        ("evaluate", difference_run, damaged, "-o", tmp_path / "scores"),
+        ("export", damaged, "--mcap", "-o", tmp_path / "bags"),
+        ("view", damaged, "--trial", trial, "-o", tmp_path / "trial.rrd"),
+    )
+    for words in commands:
+        line = refused(capsys, *words)
+        assert "is not a readable Parquet file" in line
+        assert line.endswith("make the data set again")
+        assert not Path(words[words.index("-o") + 1]).exists()
+
+
+@pytest.mark.parametrize("column", ["contact_map", "static_friction"])
+def test_a_damaged_truth_is_told_by_the_viewer(capsys: pytest.CaptureFixture[str], tmp_path: Path, column: str):
+    data = simulate_dataset(tmp_path / "data", SimulationRecipe(dry_trials=3, wet_trials=0, frames_per_trial=20))
+    trial = data.trials[0].trial
+    damage_page(trial_path(data.folder, trial), column)
+    line = refused(capsys, "view", data.folder, "--trial", trial, "-o", tmp_path / "trial.rrd")
+    assert "is not a readable Parquet file" in line
+    assert not (tmp_path / "trial.rrd").exists()
