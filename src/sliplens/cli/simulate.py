@@ -30,8 +30,8 @@ class Simulate:
     """Folder to make. Not needed for --preview and --video alone."""
     preset: Literal["small", "thesis", "varied"] = "small"
     """small: 104 short trials on 12 days, for a laptop. thesis: the days, splits and 160,757 frames of the thesis, some
-    14 GB. varied: 40 days, 8 sensors and objects from slippery to rough, for a network that is to meet others. The
-    options below change it."""
+    14 GB. varied: 2,520 short trials on 820 days, 200 sensors and objects from slippery to rough, for a network that is
+    to meet others. The options below change it."""
     sensor: Literal["chromatouch", "flat-gel"] = "chromatouch"
     """chromatouch: a dome with a fisheye inside, fitted to real images. flat-gel: a flat gel with dots, lit from three
     sides, like a GelSight; not fitted to one device."""
@@ -41,11 +41,13 @@ class Simulate:
     dry_trials: int | None = None
     """Trials on the dry object, dealt to all days."""
     wet_trials: int | None = None
-    """Trials on the wet object, all on the last day."""
+    """Trials on the wet object, all on the days that test."""
     frames_per_trial: int | None = None
     """Frames of each trial; the thesis has about 800."""
     days: int | None = None
     """Days, each with its own friction, stiffness, light and camera; the last one tests."""
+    test_days: int | None = None
+    """How many of the last days test."""
     dry_friction: tuple[float, float] | None = None
     """Least and largest coefficient of friction of the dry object; a wider range makes a network rely on it less."""
     release: bool = False
@@ -82,7 +84,12 @@ class Simulate:
         from sliplens.simulation import PRESETS, SENSORS
 
         preset = PRESETS[self.preset]
-        counts = {"dry_trials": self.dry_trials, "wet_trials": self.wet_trials, "days": self.days}
+        counts = {
+            "dry_trials": self.dry_trials,
+            "wet_trials": self.wet_trials,
+            "days": self.days,
+            "test_days": self.test_days,
+        }
         changes: dict[str, Any] = {name: value for name, value in counts.items() if value is not None}
         if "days" in changes and "dry_trials" not in changes and isinstance(preset.dry_trials, tuple):
             changes["dry_trials"] = sum(preset.dry_trials)

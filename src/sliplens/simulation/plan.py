@@ -12,7 +12,6 @@ from sliplens.simulation.loading import MINIMUM_FRAMES
 from sliplens.simulation.nuisances import Day, Nuisances, draw_day
 from sliplens.simulation.sensor import CHROMATOUCH, Sensor
 
-_VALIDATION_SHARE = 0.25
 # branches of the seed: what is drawn for one never moves what is drawn for another
 _DAYS, _UNITS, _TRIALS = range(3)
 
@@ -31,7 +30,7 @@ class SimulationRecipe:
     """All that shapes a simulated data set; the same recipe gives the same bytes on the same machine.
 
     The days and splits follow the thesis: the first day and three quarters of the dry trials of the days between train,
-    the other quarter validates, the test day tests. Wet trials are all of the test day.
+    the other quarter validates, the test day tests. Wet trials are all of the test day, or dealt to the test days.
 
     Raises
     ------
@@ -50,6 +49,11 @@ class SimulationRecipe:
     days: int = 4
     test_day: int | None = None
     """The last day if None."""
+    test_days: int = 1
+    """How many of the last days test, where no `test_day` is named: with one alone, one friction and one light decide
+    the score."""
+    validation_share: float = 0.25
+    """Of the dry trials of the days between."""
     sensor: Sensor = CHROMATOUCH
     displacement: str | None = None
     """How the markers move; see `move_markers`. The sensor's default if None."""
@@ -78,6 +82,13 @@ class SimulationRecipe:
                 f"test_day is {self.test_day}, but the first of {self.days} days trains; "
                 f"name a day from 2 to {self.days}"
             )
+        if not 1 <= self.test_days < self.days or (self.test_day is not None and self.test_days > 1):
+            raise InputError(
+                f"test_days is {self.test_days}, but of {self.days} days the first trains, and one that is named as "
+                "test_day tests alone; ask for fewer"
+            )
+        if not 0 < self.validation_share < 1:
+            raise InputError(f"validation_share must lie between 0 and 1, got {self.validation_share:g}")
         if self.displacement is not None and self.displacement not in self.sensor.displacements:
             raise InputError(
                 f"displacement is {self.displacement!r}, which sensor {self.sensor.name} does not have; "
@@ -89,15 +100,20 @@ class SimulationRecipe:
             raise InputError(f"dry_trials names {len(dry_trials)} days but there are {self.days}; give one a day")
         if min(dry_trials) < 0:
             raise InputError(f"dry_trials is {dry_trials}, but no day has fewer than 0 trials")
-        test_day = self.resolved_test_day
-        others = sum(dry_trials) - dry_trials[0] - (dry_trials[test_day - 1] if 1 < test_day <= self.days else 0)
+        others = sum(trials for day, trials in enumerate(dry_trials, start=1) if day not in (1, *self.tested))
         if dry_trials[0] < (1 if others else 2):
             raise InputError(f"dry_trials is {dry_trials}, but the first day trains; give it more trials")
 
     @property
     def resolved_test_day(self) -> int:
-        """The day that tests."""
+        """The day that tests, the last of them if there are more."""
         return self.days if self.test_day is None else self.test_day
+
+    @property
+    def tested(self) -> range:
+        """The days that test."""
+        last = self.resolved_test_day
+        return range(last - self.test_days + 1, last + 1)
 
     @property
     def resolved_displacement(self) -> str:
@@ -146,26 +162,27 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
     tuple of TrialPlan
         Dry before wet within a day; the same for the same recipe.
     """
-    test_day, recipe_hash = recipe.resolved_test_day, recipe.hash
+    tested, recipe_hash = recipe.tested, recipe.hash
     days = _draw_days(recipe)
     if isinstance(recipe.dry_trials, tuple):
         dry = dict(enumerate(recipe.dry_trials, start=1))
     else:
-        dry = _spread(recipe.dry_trials, days=recipe.days, test_day=test_day)
-    between = [(number, day) for day in dry if day not in (1, test_day) for number in range(1, dry[day] + 1)]
+        dry = _spread(recipe.dry_trials, days=recipe.days, tested=tested)
+    wet = {day: len(range(index, recipe.wet_trials, len(tested))) for index, day in enumerate(tested)}
+    between = [(number, day) for day in dry if day not in (1, *tested) for number in range(1, dry[day] + 1)]
     # without days between, the first day has to give up some of its own
     candidates = sorted(between or [(number, 1) for number in range(1, dry[1] + 1)])
-    count = max(1, round(_VALIDATION_SHARE * len(candidates)))
+    count = max(1, round(recipe.validation_share * len(candidates)))
     validation = {(day, number) for number, day in _every_few(candidates, count)}
 
     plans = []
     for day in range(1, recipe.days + 1):
-        wet = recipe.wet_trials if day == test_day else 0
-        for condition, trials in (("dry", dry[day]), ("wet", wet)):
+        for condition, trials in (("dry", dry[day]), ("wet", wet.get(day, 0))):
             for number in range(1, trials + 1):
                 held_out = condition == "dry" and (day, number) in validation
-                split = "test" if day == test_day else "validation" if held_out else "train"
-                unit = (number - 1) % recipe.sensors
+                split = "test" if day in tested else "validation" if held_out else "train"
+                # each day begins with another sensor: where days have few trials, all sensors still come to be used
+                unit = (number + day - 2) % recipe.sensors
                 plans.append(
                     TrialPlan(
                         trial=f"day{day}-{condition}-{number:03d}",
@@ -201,17 +218,17 @@ def _with_totals(plans: Sequence[TrialPlan], totals: FrameTotals) -> tuple[Trial
     return tuple(replace(plan, frames=lengths[plan.trial]) for plan in plans)
 
 
-def _spread(trials: int, *, days: int, test_day: int) -> dict[int, int]:
-    """Deal dry trials to the days in turn, the first and the test day served first so that no split goes without."""
-    between = [day for day in range(2, days + 1) if day != test_day]
-    order = [1, test_day, *between]
+def _spread(trials: int, *, days: int, tested: range) -> dict[int, int]:
+    """Deal dry trials to the days in turn, the first and a test day served first so that no split goes without."""
+    between = [day for day in range(2, days + 1) if day not in tested]
+    order = [1, tested[-1], *between, *tested[:-1]]
     dealt = dict.fromkeys(order, 0)
     for index in range(trials):
         dealt[order[index % len(order)]] += 1
     if not between:
         # the first day has to feed two splits
         while dealt[1] < 2:
-            dealt[test_day] -= 1
+            dealt[tested[-1]] -= 1
             dealt[1] += 1
     return dealt
 

@@ -14,11 +14,14 @@ PRESETS = {
         days=4,
     ),
     "varied": SimulationRecipe(
-        dry_trials=400,
-        wet_trials=20,
-        frames_per_trial=64,
-        days=40,
-        sensors=8,
+        # many short trials, each day with three: of long ones a network learns the trials by heart
+        dry_trials=2460,
+        wet_trials=60,
+        frames_per_trial=20,
+        days=820,
+        test_days=20,
+        validation_share=0.1,
+        sensors=200,
         nuisances=Nuisances(dry_friction=(0.15, 1.2)),
     ),
 }
