@@ -193,3 +193,19 @@ def test_no_label(small_dataset: Dataset, tmp_path: Path, capsys):
     line = refused(capsys, tmp_path / "data", tmp_path / "run")
     assert "no frame of the 4 trials has a label; label them first" in line
     assert not (tmp_path / ".run.partial").exists()
+
+
+def test_it_goes_on_from_a_network_at_another_size(finished: Path, small_dataset: Dataset, tmp_path: Path):
+    assert train(small_dataset.folder, tmp_path / "more", "--start-from", str(finished), "--image-size", "48") == 0
+    start, more = load_checkpoint(finished).manifest, load_checkpoint(tmp_path / "more").manifest
+    assert more.started_from == start.weights_sha256
+    assert more.image_size == 48
+    recipe = json.loads((tmp_path / "more" / "run.json").read_text())["config"]
+    assert recipe["started_from"] == start.weights_sha256
+
+
+def test_a_network_to_start_from_must_fit(finished: Path, small_dataset: Dataset, tmp_path: Path, capsys):
+    line = refused(capsys, small_dataset.folder, tmp_path / "run", "--start-from", str(finished), "--input", "raw")
+    assert "has the input difference, and raw is to be trained" in line
+    line = refused(capsys, small_dataset.folder, tmp_path / "run", "--start-from", str(tmp_path / "none"))
+    assert "none does not exist; check the path" in line

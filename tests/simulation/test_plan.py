@@ -22,6 +22,33 @@ def test_splits_are_disjoint_and_none_is_empty(dry, wet, days, data):
     assert any(plan.split == "test" and plan.condition == "dry" for plan in plans)
 
 
+@settings(max_examples=30, deadline=None)
+@given(st.integers(3, 40), st.integers(0, 9), st.integers(2, 9), st.data())
+def test_several_days_may_test(dry, wet, days, data):
+    test_days = data.draw(st.integers(1, days - 1))
+    plans = plan_trials(SimulationRecipe(dry_trials=dry, wet_trials=wet, days=days, test_days=test_days))
+    assert len({plan.trial for plan in plans}) == len(plans) == dry + wet
+    assert {plan.split for plan in plans} == {"train", "validation", "test"}
+    tested = range(days - test_days + 1, days + 1)
+    assert all((plan.split == "test") == (plan.day in tested) for plan in plans)
+    count = [sum(plan.day == day for plan in plans if plan.condition == "wet") for day in tested]
+    assert sum(count) == wet
+    assert max(count) - min(count) <= 1
+    if dry >= days:
+        assert {plan.day for plan in plans if plan.condition == "dry"} == set(range(1, days + 1))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.25, 0.5])
+def test_so_many_trials_validate(share: float):
+    plans = plan_trials(SimulationRecipe(dry_trials=82, days=41, validation_share=share))
+    assert sum(plan.split == "validation" for plan in plans) == round(share * 78)  # two days of two trials do not
+
+
+def test_all_sensors_are_used_where_days_have_few_trials():
+    plans = plan_trials(SimulationRecipe(dry_trials=60, wet_trials=0, days=30, sensors=20))
+    assert {plan.unit for plan in plans} == set(range(20))
+
+
 def test_days_and_splits_follow_the_thesis():
     plans = plan_trials(SimulationRecipe(dry_trials=32, wet_trials=4))
     split = {day: [plan.split for plan in plans if plan.day == day] for day in (1, 2, 3, 4)}
@@ -150,6 +177,10 @@ def test_days_are_spread_over_the_range_of_friction():
         ({"frames_per_trial": 5}, "frames_per_trial is 5, at least 20 is needed"),
         ({"days": 1}, "days is 1, at least 2 is needed: the test needs a day of its own"),
         ({"test_day": 1}, "test_day is 1, but the first of 4 days trains; name a day from 2 to 4"),
+        ({"test_days": 4}, "test_days is 4, but of 4 days the first trains"),
+        ({"test_days": 0}, "test_days is 0, but of 4 days"),
+        ({"test_days": 2, "test_day": 3}, "one that is named as test_day tests alone; ask for fewer"),
+        ({"validation_share": 1.0}, "validation_share must lie between 0 and 1, got 1"),
         ({"seed": -1}, "seed is -1, at least 0"),
     ],
 )

@@ -9,7 +9,7 @@ from sliplens.errors import InputError, ModelError
 from sliplens.models import load_checkpoint
 from sliplens.recordings import Dataset
 from sliplens.training import TrainConfig, TrainProgress, evaluate, fit
-from sliplens.training.fit import TrainResult
+from sliplens.training.fit import TrainResult, require_same_kind
 from sliplens.training.samplers import EpochShuffle
 
 CONFIG = TrainConfig(image_size=32, epochs=3, batch_size=11, seed=3)
@@ -122,3 +122,33 @@ def test_fewer_frames_than_a_batch_are_refused(tmp_path: Path, frames: tuple[Fra
 def test_impossible_recipes_are_refused(change: dict, message: str):
     with pytest.raises(InputError, match=message):
         replace(CONFIG, **change)
+
+
+def test_a_training_may_start_from_another_network(
+    tmp_path: Path, frames: tuple[FrameSet, FrameSet], trained_run: Path
+):
+    start = load_checkpoint(trained_run)
+    before = {name: value.clone() for name, value in start.model.state_dict().items()}
+    # so low a rate leaves the weights as they were, whatever else is done to them
+    run(tmp_path / "still", frames, replace(CONFIG, epochs=1, learning_rate=1e-12), start=start, trained_on=["abc"])
+    after = load_checkpoint(tmp_path / "still")
+    weights = dict(after.model.named_parameters())
+    for name, value in start.model.named_parameters():
+        torch.testing.assert_close(weights[name], value, rtol=0, atol=1e-9)
+    assert after.manifest.started_from == start.manifest.weights_sha256
+    assert after.manifest.trained_on == ("abc", *start.manifest.trained_on)
+    assert start.manifest.started_from == ""
+    for name, value in start.model.state_dict().items():
+        assert torch.equal(value, before[name])
+
+
+def test_it_does_not_start_from_a_network_of_another_kind(
+    tmp_path: Path, frames: tuple[FrameSet, FrameSet], trained_run: Path
+):
+    start = load_checkpoint(trained_run)
+    with pytest.raises(ModelError, match="has the head point, and histogram is to be trained; train point, or start"):
+        run(tmp_path / "a", frames, replace(CONFIG, head="histogram"), start=start)
+    with pytest.raises(ModelError, match="has the backbone shufflenet_v2_x1_0, and resnet18 is to be trained"):
+        run(tmp_path / "b", frames, replace(CONFIG, backbone="resnet18"), start=start)
+    with pytest.raises(ModelError, match="has the input difference, and raw is to be trained"):
+        require_same_kind(start, CONFIG, "raw")

@@ -1,10 +1,6 @@
 """`sliplens train`."""
 
-import tempfile
-from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,17 +8,15 @@ import tyro
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from sliplens.cli.console import OUT, progress_bar, unchanged, wrote
-from sliplens.errors import RecordingError
+from sliplens.cli.training import TrainingJob, choose_trials
 from sliplens.provenance import output_folder, write_json
 
 if TYPE_CHECKING:
     from lightning.pytorch.loggers import Logger
 
     from sliplens.datasets import FrameSet
-    from sliplens.recordings import Dataset, TrialInfo
-    from sliplens.training import TrainConfig, TrainProgress
+    from sliplens.training import TrainProgress
     from sliplens.training.fit import TrainResult
-    from sliplens.training.hardware import Hardware
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +36,9 @@ class Train:
     input: Literal["difference", "raw", "signed", "amplitude"] = "difference"
     """What the network sees: |T_n - T_0| divided by its own maximum, the frame itself, T_n - T_0, or |T_n - T_0| with
     its amplitude."""
+    start_from: Path | None = None
+    """Network whose weights to start from, a run or one that comes with sliplens: to teach it your own sensor, or to go
+    on at another image size. Its input, backbone and head must be those asked for."""
     condition: str | None = None
     """Train and validate on the trials of one condition alone, such as dry."""
     backbone: str | None = None
@@ -80,8 +77,11 @@ class Train:
 
     def run(self) -> None:
         """Train and write the run; of several processes the first writes and speaks, the others help."""
+        from sliplens.models import load_checkpoint
+        from sliplens.models.shipped import find_run
         from sliplens.recordings import Dataset
         from sliplens.training import TrainConfig, get_recipe
+        from sliplens.training.fit import require_same_kind
         from sliplens.training.hardware import Hardware, follow_folder
 
         hardware = Hardware(accelerator=self.accelerator, devices=self.devices, num_nodes=self.num_nodes)
@@ -89,12 +89,16 @@ class Train:
         said = {name: value for name in names if (value := getattr(self, name, None)) is not None}
         config = replace(get_recipe(self.recipe), **said)
         hardware.share(config.batch_size)
+        start = None if self.start_from is None else load_checkpoint(find_run(self.start_from))
+        if start is not None:
+            require_same_kind(start, config, self.input)
         data = Dataset.open(self.data)
-        train_trials, validation_trials = _choose_trials(data, self.condition)
-        job = _Job(
-            command=self,
+        train_trials, validation_trials = choose_trials(data, self.condition)
+        job = TrainingJob(
+            input=self.input,
             config=config,
             hardware=hardware,
+            start=start,
             data=data,
             train_trials=train_trials,
             validation_trials=validation_trials,
@@ -104,11 +108,13 @@ class Train:
         elif (folder := follow_folder(self.output, overwrite=self.overwrite)) is not None:
             job.follow(folder)
 
-    def _lead(self, job: "_Job") -> None:
+    def _lead(self, job: "TrainingJob") -> None:
         from sliplens.cli.curves import draw_learning_curve
         from sliplens.training.loggers import open_logger
 
         told = {"input": self.input, "condition": self.condition, "data_hash": job.data.hash}
+        if job.start is not None:
+            told["started_from"] = job.start.manifest.weights_sha256
         recipe = {**told, "training": job.config}
         with output_folder(self.output, stage="train", config=recipe, overwrite=self.overwrite) as out:
             if out.complete:
@@ -146,7 +152,7 @@ class Train:
         )
 
     def _show_training(
-        self, job: "_Job", frames: "FrameSet", validation: "FrameSet", folder: Path, logger: "Logger | None"
+        self, job: "TrainingJob", frames: "FrameSet", validation: "FrameSet", folder: Path, logger: "Logger | None"
     ) -> "TrainResult":
         columns = (TextColumn("{task.description}"), BarColumn(bar_width=30), TaskProgressColumn(), TimeElapsedColumn())
         with Progress(*columns, TextColumn("{task.fields[status]}"), console=OUT) as progress:
@@ -159,88 +165,3 @@ class Train:
             result = job.fit(frames, validation, folder, logger=logger, on_progress=show)
         assert result is not None  # this is the first process
         return result
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Job:
-    """What every process of a training does alike."""
-
-    command: Train
-    config: "TrainConfig"
-    hardware: "Hardware"
-    data: "Dataset"
-    train_trials: tuple["TrialInfo", ...]
-    validation_trials: tuple["TrialInfo", ...]
-
-    def load(
-        self, *, scratch: Path, on_trial: Callable[[int, int], None] | None = None
-    ) -> tuple["FrameSet", "FrameSet"]:
-        """Frames to train and to validate on."""
-        from sliplens.datasets import get_encoding, load_frames
-
-        plan = ((self.train_trials, self.config.untouched_share), (self.validation_trials, 0.0))
-        total, loaded = sum(len(trials) for trials, _ in plan), []
-        for trials, share in plan:
-            before = sum(len(trials) for trials, _ in plan[: len(loaded)])
-            loaded.append(
-                load_frames(
-                    self.data,
-                    trials,
-                    encoding=get_encoding(self.command.input),
-                    image_size=self.config.image_size,
-                    untouched_share=share,
-                    scratch=scratch,
-                    on_trial=None if on_trial is None else partial(_count_on, on_trial, before, total),
-                )
-            )
-        return loaded[0], loaded[1]
-
-    def fit(
-        self,
-        frames: "FrameSet",
-        validation: "FrameSet",
-        folder: Path,
-        *,
-        logger: "Logger | None" = None,
-        on_progress: "Callable[[TrainProgress], None] | None" = None,
-    ) -> "TrainResult | None":
-        from sliplens.training import fit
-
-        info = self.train_trials[0]
-        return fit(
-            self.config,
-            frames,
-            validation,
-            folder,
-            frame_size=(info.height, info.width),
-            sensor=info.sensor,
-            data_hash=self.data.hash,
-            trained_on=[one.sha256[:12] for one in (*self.train_trials, *self.validation_trials)],
-            hardware=self.hardware,
-            logger=logger,
-            on_progress=on_progress,
-        )
-
-    def follow(self, folder: Path) -> None:
-        """Help the first process, in silence."""
-        # the output folder is the first one's to write, and on a cluster this disk is nearer
-        frames, validation = self.load(scratch=Path(tempfile.gettempdir()))
-        with suppress(KeyboardInterrupt):  # the first says what there is to say
-            self.fit(frames, validation, folder)
-
-
-def _count_on(on_trial: Callable[[int, int], None], before: int, total: int, done: int, _: int) -> None:
-    on_trial(before + done, total)
-
-
-def _choose_trials(data: "Dataset", condition: str | None) -> tuple[tuple["TrialInfo", ...], tuple["TrialInfo", ...]]:
-    try:
-        train, validation = (data.select(split=split, condition=condition) for split in ("train", "validation"))
-    except RecordingError as error:
-        cure = "divide it" if condition is None else "name another --condition, or divide it"
-        raise RecordingError(f"{error}; {cure} with `sliplens split`") from None
-    sizes = sorted({(info.height, info.width) for info in (*train, *validation)})
-    if len(sizes) > 1:
-        shown = " and ".join(f"{height} x {width}" for height, width in sizes)
-        raise RecordingError(f"{data.folder} mixes frames of {shown} pixels; train on one sensor at a time")
-    return train, validation

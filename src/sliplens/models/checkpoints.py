@@ -44,7 +44,9 @@ class Manifest:
     """See `Calibration`; None where none was found."""
     versions: dict[str, str] = field(default_factory=dict)
     trained_on: tuple[str, ...] = ()
-    """First 12 hex digits of the hash of every trial that trained or validated it."""
+    """First 12 hex digits of the hash of every trial that trained or validated it, or what it started from."""
+    started_from: str = ""
+    """Hash of the weights it started from; empty for random ones."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from lightning.pytorch.loggers import Logger
 
 from sliplens.datasets import FrameSet, get_augmentation
 from sliplens.errors import InputError, ModelError
-from sliplens.models import Manifest, build_model, save_checkpoint
+from sliplens.models import Manifest, TrainedModel, build_model, save_checkpoint
 from sliplens.provenance import versions
 from sliplens.training.calibrate import calibrate
 from sliplens.training.config import TrainConfig
@@ -46,6 +46,7 @@ def fit(
     sensor: str,
     data_hash: str,
     trained_on: Sequence[str] = (),
+    start: TrainedModel | None = None,
     hardware: Hardware | None = None,
     logger: Logger | None = None,
     on_progress: Callable[[TrainProgress], None] | None = None,
@@ -67,6 +68,9 @@ def fit(
     frame_size, sensor, data_hash, trained_on
         Kept in the manifest: height and width of the sensor's frames, its name, the data set's hash, and those of the
         trials.
+    start
+        Network whose weights it starts from, instead of random ones: to go on at another image size, or to teach a
+        network a sensor that is like the one it knows. It is left as it is.
     hardware
         One device, a GPU if there is one, unless told otherwise.
     logger
@@ -85,7 +89,8 @@ def fit(
         If the training set is smaller than one batch, a trial is in both sets, the batch does not divide among the
         processes, the machine has not the devices, or a checkpoint cannot be saved.
     ModelError
-        If the loss is no longer finite, or the backbone is unknown. The best network so far is saved before.
+        If the network to start from has another input, backbone or head, the backbone is unknown, or the loss is no
+        longer finite. The best network so far is saved before.
     """
     hardware = hardware or Hardware()
     share = _check(config, train, validation, hardware)
@@ -93,6 +98,9 @@ def fit(
         torch.manual_seed(config.seed)  # the initial weights; forked, so that the caller's random state is untouched
         # channels last: depthwise convolutions run up to half as fast again on a CPU
         model = build_model(config.backbone, head=config.head).to(memory_format=torch.channels_last)
+    if start is not None:
+        require_same_kind(start, config, train.encoding.name)
+        model.load_state_dict(start.model.state_dict())
     first = hardware.rank() == 0
     per_epoch = len(train) // config.batch_size
     clock = Clock(
@@ -152,7 +160,8 @@ def fit(
                 frame_size=frame_size,
                 sensor=sensor,
                 data_hash=data_hash,
-                trained_on=tuple(trained_on),
+                trained_on=(*trained_on, *(start.manifest.trained_on if start else ())),
+                started_from=start.manifest.weights_sha256 if start else "",
                 metrics={"validation_mse": calibration.mse},
                 calibration=asdict(calibration),
                 versions=versions(),
@@ -198,6 +207,24 @@ def _check(config: TrainConfig, train: FrameSet, validation: FrameSet, hardware:
     if shared:
         raise InputError(f"trial {min(shared)} is in both training and validation; split by trial")
     return share
+
+
+def require_same_kind(start: TrainedModel, config: TrainConfig, encoding: str) -> None:
+    """Refuse to start from a network whose weights would mean something else.
+
+    Raises
+    ------
+    ModelError
+        If its input, backbone or head is another.
+    """
+    kept = start.manifest
+    asked = {"input": encoding, "backbone": config.backbone, "head": config.head}
+    for name, value in asked.items():
+        if getattr(kept, name) != value:
+            raise ModelError(
+                f"the network to start from has the {name} {getattr(kept, name)}, and {value} is to be trained; "
+                f"train {getattr(kept, name)}, or start from another network"
+            )
 
 
 def _name(frames: FrameSet, row: int) -> str:
