@@ -42,6 +42,18 @@ def test_an_interrupted_folder_keeps_its_pieces_for_the_same_recipe_only(tmp_pat
     assert interrupted({"seed": 2}) == []
 
 
+def test_an_interrupted_replacement_goes_on_too(tmp_path: Path):
+    target = tmp_path / "result"
+    make(target, {"seed": 1})
+    with pytest.raises(KeyboardInterrupt), output_folder(target, stage="test", config={}, overwrite=True) as out:  # noqa: PT012
+        (out.folder / "piece").write_text("x")
+        raise KeyboardInterrupt
+    assert (target / "data.txt").read_text() == "x"
+    with output_folder(target, stage="test", config={}, overwrite=True) as out:
+        assert (out.folder / "piece").read_text() == "x"
+    assert not (target / "data.txt").exists()
+
+
 def test_a_mistake_before_the_first_piece_leaves_nothing_behind(tmp_path: Path):
     with pytest.raises(InputError), output_folder(tmp_path / "result", stage="test", config={}):
         raise InputError("the data are broken")

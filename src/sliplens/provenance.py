@@ -162,7 +162,7 @@ def output_folder(target: Path, *, stage: str, config: Mapping[str, Any], overwr
         raise InputError(f"{target} was not made by sliplens and will not be overwritten; choose another output folder")
     partial = target.with_name(f".{target.name}.partial")
     state = partial / ".recipe"
-    if partial.exists() and (overwrite or not state.is_file() or state.read_text() != config_hash):
+    if partial.exists() and (not state.is_file() or state.read_text() != config_hash):
         shutil.rmtree(partial)
     try:
         partial.mkdir(parents=True, exist_ok=True)

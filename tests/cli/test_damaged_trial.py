@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-from tests.helpers.command_line import refused
+from command_line import refused
 
 from sliplens.recordings import Dataset
 from sliplens.recordings.dataset import trial_path

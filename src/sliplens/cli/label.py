@@ -1,5 +1,6 @@
 """`sliplens label`."""
 
+import shutil
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -39,6 +40,7 @@ class Label:
         from sliplens.recordings import Dataset
         from sliplens.recordings.importing import About
         from sliplens.recordings.readers.stored import read_stored
+        from sliplens.recordings.splits import SPLITS_FILE
 
         data = Dataset.open(self.data)
         if self.audit_only:
@@ -60,12 +62,15 @@ class Label:
             if out.complete:
                 unchanged(target)
                 return
-            bare = [replace(one, labels=None) for one in captures]
+            bare = [_without_labels(one) for one in captures]
             abouts = [
                 About(sensor=info.sensor, day=info.day, condition=info.condition, object=info.object)
                 for info in data.trials
             ]
-            found = write_trials(out.folder, bare, abouts, [info.split for info in data.trials], self.labels)
+            splits = [info.split for info in data.trials]
+            found = write_trials(out.folder, bare, abouts, splits, self.labels, title="Labelling frames")
+            if (self.data / SPLITS_FILE).is_file():
+                shutil.copyfile(self.data / SPLITS_FILE, out.folder / SPLITS_FILE)
             write_json(out.folder / "result.json", {"trials": summary(found)})
         show_found("Labelled", found)
         wrote(target, f"{len(found)} trials, {sum(info.frames for info in data.trials):,} frames")
@@ -99,3 +104,11 @@ class Label:
                 f"{bare[0]} of {self.data} has no forces, and without them there is no label; "
                 "import it again with its table of forces"
             )
+
+
+def _without_labels(capture: "Capture") -> "Capture":
+    """A stored trial as if it came from where it was recorded, with what was noted then."""
+    kept = capture.labels.labelling if capture.labels else None
+    if kept is None:
+        return replace(capture, labels=None)
+    return replace(capture, labels=None, source=kept["source"], notes=tuple(kept["notes"]))

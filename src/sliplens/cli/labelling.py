@@ -70,6 +70,8 @@ def write_trials(
     abouts: "Sequence[About]",
     splits: Sequence[str],
     options: LabelOptions,
+    *,
+    title: str = "Importing frames",
 ) -> dict[str, dict[str, Any]]:
     """Write the trials of a data set that are not there yet; give what the labels of each rest on."""
     import numpy as np
@@ -82,7 +84,7 @@ def write_trials(
     found, table, done = {}, [], 0
     settings = options.settings()
     total = sum(len(capture.frame_time_s) for capture in captures)
-    with progress_bar("Importing frames") as bar:
+    with progress_bar(title) as bar:
         for number, (capture, about, split) in enumerate(zip(captures, abouts, splits, strict=True)):
             path = trial_path(folder, capture.name)
             # a trial is there whole or not at all, and the folder is of this very command
