@@ -66,6 +66,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, help="simulated data set; made with --preset if not given")
     parser.add_argument("--preset", default="thesis", choices=sorted(PRESETS))
+    parser.add_argument("--frames-per-trial", type=int, help="fewer than the preset has")
     parser.add_argument("--recipe", default="thesis", choices=["thesis", "default"])
     parser.add_argument("--epochs", type=int)
     parser.add_argument("--image-size", type=int)
@@ -79,6 +80,8 @@ def main() -> None:
         if options.data is None:
             folder = work / "data"
             recipe = replace(PRESETS[options.preset], seed=options.seed)
+            if options.frames_per_trial is not None:
+                recipe = replace(recipe, frames_per_trial=options.frames_per_trial, frame_totals=None)
             data = simulate_dataset(folder, recipe)
         else:
             data = Dataset.open(options.data)
