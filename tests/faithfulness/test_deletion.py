@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from sliplens.errors import InputError, SaliencyError
 from sliplens.faithfulness import (
     deletion_curves,
-    deletion_images,
     deletion_order,
     deletion_score,
     get_fill,
+    pixels_gone,
     random_order,
     summarise_deletion,
 )
@@ -45,16 +45,13 @@ def test_impossible_numbers_of_steps_are_refused():
         deletion_steps((4, 4), steps=17)
 
 
-def test_masked_images_are_the_image_where_pixels_stay_and_the_fill_where_they_go(rng: np.random.Generator):
-    image, fill = torch.rand(3, 6, 5), torch.full((3, 6, 5), 0.5)
+def test_so_many_pixels_of_an_order_are_gone(rng: np.random.Generator):
     order = random_order((6, 5), rng=rng)
-    images = deletion_images(image, fill, order, pixels_removed=np.array([0, 7, 30]))
-    assert torch.equal(images[0], image)
-    assert torch.equal(images[2], fill)
+    gone = pixels_gone(order, pixels_removed=np.array([0, 7, 30]), shape=(6, 5))
+    assert not gone[0].any()
+    assert gone[2].all()
     for flat in range(30):  # one pixel at a time, the slow way
-        row, column = divmod(flat, 5)
-        expected = fill if flat in order[:7] else image
-        assert torch.equal(images[1, :, row, column], expected[:, row, column])
+        assert bool(gone[1][divmod(flat, 5)]) == (flat in order[:7])
 
 
 def test_curves_of_a_network_that_averages_pixels_have_a_closed_form(rng: np.random.Generator):
@@ -95,23 +92,3 @@ def test_nan_in_a_map_is_refused():
     saliency[1, 0, 0] = np.nan
     with pytest.raises(SaliencyError, match="saliency map 1 holds NaN or infinity in 1 of 64 pixels"):
         saliency_orders(saliency, (8, 8))
-
-
-@pytest.mark.parametrize(("name", "level"), [("grey", 0.5), ("black", 0.0), ("white", 1.0)])
-def test_constant_fills(name: str, level: float):
-    assert torch.equal(get_fill(name)(torch.rand(2, 3, 8, 8)), torch.full((2, 3, 8, 8), level))
-
-
-def test_blurring_keeps_a_constant_image_and_wipes_out_a_dot():
-    blur = get_fill("blur")
-    constant = torch.full((1, 3, 40, 40), 0.3)
-    torch.testing.assert_close(blur(constant), constant)  # a kernel that sums to 1
-    dot = torch.zeros(1, 3, 40, 40)
-    dot[..., 20, 20] = 1
-    # peak of a Gaussian of 2 pixels: 1 / (2 pi 4), a little more for the cut tails
-    assert blur(dot).max() < 1.1 / (2 * np.pi * 4)
-
-
-def test_an_unknown_fill_lists_those_there_are():
-    with pytest.raises(InputError, match="no fill named 'pink'; choose one of grey, black, white, blur"):
-        get_fill("pink")

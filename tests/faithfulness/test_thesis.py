@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sliplens.faithfulness import deletion_images, deletion_order, deletion_score, get_fill, summarise_deletion
+from sliplens.faithfulness import deletion_order, deletion_score, get_fill, pixels_gone, summarise_deletion
 from sliplens.images import read_image
 
 pytestmark = pytest.mark.real
@@ -48,9 +48,8 @@ def test_deletion_reproduces_the_recorded_masks_to_the_pixel(chromatouch_folder:
     pixels = read_image(chromatouch_folder / "difference" / "image_547.tiff_0.png")
     saliency = np.load(chromatouch_folder / "poly_cam_saliency.npz")["image_547.tiff"][0, 0]
     image = torch.from_numpy(pixels / pixels.max()).permute(2, 0, 1)
-    masked = deletion_images(
-        image, get_fill("grey")(image[None])[0], deletion_order(saliency), pixels_removed=np.array([224 * (step + 1)])
-    )[0]
+    gone = pixels_gone(deletion_order(saliency), pixels_removed=np.array([224 * (step + 1)]), shape=(224, 224))
+    masked = get_fill("grey")(image[None], None, 0)(torch.tensor([0]), gone)[0]
     # the authors' pictures: times 255, cut off to whole levels
     picture = (255 * masked).permute(1, 2, 0).numpy().astype(np.uint8)
     recorded = read_image(chromatouch_folder / "deletion_masks" / f"step_{step:03d}.png")

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from sliplens.report.compare import agreement, bootstrap_difference, compare_deletion, compare_errors
+from sliplens.faithfulness.intervals import bootstrap_difference
+from sliplens.report.compare import agreement, compare_deletion, compare_errors
 from sliplens.report.records import DeletionCurve, Predictions
 
 

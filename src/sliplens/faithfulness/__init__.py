@@ -4,9 +4,9 @@ from sliplens.faithfulness.deletion import (
     DeletionCurves,
     DeletionSummary,
     deletion_curves,
-    deletion_images,
     deletion_order,
     deletion_score,
+    pixels_gone,
     random_order,
     summarise_deletion,
 )
@@ -17,10 +17,10 @@ __all__ = [
     "DeletionCurves",
     "DeletionSummary",
     "deletion_curves",
-    "deletion_images",
     "deletion_order",
     "deletion_score",
     "get_fill",
+    "pixels_gone",
     "random_order",
     "summarise_deletion",
 ]

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from sliplens.arrays import require_saliency
 from sliplens.errors import InputError
+from sliplens.faithfulness.fills import Fill
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,28 +88,23 @@ def random_order(shape: tuple[int, int], *, rng: np.random.Generator) -> Int[np.
     return rng.permutation(shape[0] * shape[1])
 
 
-def deletion_images(
-    image: Float[Tensor, "3 height width"],
-    fill: Float[Tensor, "3 height width"],
-    order: Int[np.ndarray, " pixels"],
-    *,
-    pixels_removed: Int[np.ndarray, " steps"],
-) -> Float[Tensor, "steps 3 height width"]:
-    """Images with the first pixels of an order replaced by the fill.
+def pixels_gone(
+    order: Int[np.ndarray, " pixels"], *, pixels_removed: Int[np.ndarray, " steps"], shape: tuple[int, int]
+) -> Bool[Tensor, "steps height width"]:
+    """Which pixels of an image are gone when so many of an order are removed.
 
     Parameters
     ----------
-    image, fill
-        The network's input, and what a removed pixel becomes.
     order
         Flat pixel indices, first to be removed first.
     pixels_removed
-        How many pixels are gone in each image returned.
+        How many pixels are gone at each step.
+    shape
+        Height and width of the image.
     """
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
-    gone = torch.from_numpy(rank.reshape(image.shape[1:]) < np.asarray(pixels_removed)[:, None, None])
-    return torch.where(gone[:, None].to(image.device), fill, image)
+    return torch.from_numpy(rank.reshape(shape) < np.asarray(pixels_removed)[:, None, None])
 
 
 def deletion_steps(shape: tuple[int, int], *, steps: int | None = None) -> Int[np.ndarray, " steps"]:
@@ -130,8 +126,10 @@ def deletion_curves(
     images: Float[Tensor, "images 3 height width"],
     orders: Int[np.ndarray, "images pixels"],
     *,
-    fill: Callable[[Tensor], Tensor],
+    fill: Fill,
+    references: Float[Tensor, "images 3 height width"] | None = None,
     steps: int | None = None,
+    seed: int = 0,
     batch_size: int = 128,
     on_image: Callable[[int, int], None] | None = None,
 ) -> DeletionCurves:
@@ -146,23 +144,29 @@ def deletion_curves(
     orders
         Flat pixel indices for each image, first to be removed first (`deletion_order`, `random_order`).
     fill
-        From inputs to what their removed pixels become (`get_fill`).
+        What removed pixels become (`get_fill`).
+    references
+        Inputs of the untouched sensor, for the fill that needs them.
     steps
         Number of steps; the image's height if None, as in the thesis.
+    seed
+        For the fill that adds noise.
     batch_size
         Masked images that are made and answered at a time: bounds the memory.
     on_image
         Called with the number of images done and the number of all.
     """
-    removed = deletion_steps((images.shape[-2], images.shape[-1]), steps=steps)
+    shape = (images.shape[-2], images.shape[-1])
+    removed = deletion_steps(shape, steps=steps)
     base = predict(images).double().cpu().numpy()
-    fills = fill(images)
+    paint = fill(images, references, seed)
     curves = []
-    for index, (image, image_fill, order) in enumerate(zip(images, fills, orders, strict=True)):
-        answers = [
-            predict(deletion_images(image, image_fill, order, pixels_removed=chunk)).double().cpu().numpy()
-            for chunk in np.split(removed, range(batch_size, len(removed), batch_size))
-        ]
+    for index, order in enumerate(orders):
+        answers = []
+        for chunk in np.split(removed, range(batch_size, len(removed), batch_size)):
+            gone = pixels_gone(order, pixels_removed=chunk, shape=shape).to(images.device)
+            rows = torch.full((len(chunk),), index, device=images.device)
+            answers.append(predict(paint(rows, gone)).double().cpu().numpy())
         curves.append(np.concatenate(answers))
         if on_image is not None:
             on_image(index + 1, len(images))

@@ -3,17 +3,36 @@
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torchvision.transforms.v2 import functional as transforms
 
 from sliplens.errors import InputError
+from sliplens.faithfulness.noisy_linear import noisy_linear
 
-Images = Float[Tensor, "batch 3 height width"]
+Images = Float[Tensor, "images 3 height width"]
+Painter = Callable[[Int[Tensor, " batch"], Bool[Tensor, "batch height width"]], Float[Tensor, "batch 3 height width"]]
+"""From numbers of images, and the pixels that are gone of each, to the images without them."""
+Fill = Callable[[Images, Images | None, int], Painter]
+"""From inputs in [0, 1], their references (the untouched sensor) if they are known, and a seed, to a painter."""
 
 
-def _constant(level: float) -> Callable[[Images], Images]:
-    return lambda images: torch.full_like(images, level)
+def _static(fill: Callable[[Images], Images]) -> Fill:
+    """The same filled image whatever is removed."""
+
+    def prepare(images: Images, _references: Images | None, _seed: int) -> Painter:
+        filled = fill(images)
+        return lambda rows, gone: torch.where(gone[:, None], filled[rows], images[rows])
+
+    return prepare
+
+
+def _constant(level: float) -> Fill:
+    return _static(lambda images: torch.full_like(images, level))
+
+
+def _background(images: Images) -> Images:
+    return images.flatten(2).median(dim=2).values[..., None, None].expand_as(images)
 
 
 def _blurred(images: Images) -> Images:
@@ -23,16 +42,34 @@ def _blurred(images: Images) -> Images:
     return transforms.gaussian_blur(images, [kernel, kernel], [sigma, sigma])
 
 
-FILLS: dict[str, Callable[[Images], Images]] = {
+def _reference(images: Images, references: Images | None, _seed: int) -> Painter:
+    if references is None:
+        raise InputError("the fill reference needs the input of the untouched sensor; give it, or choose another fill")
+    return _static(lambda _: references)(images, None, 0)
+
+
+def _noisy_linear(images: Images, _references: Images | None, seed: int) -> Painter:
+    # one field of noise for each image, so that its curve does not jitter from step to step
+    noise = torch.randn(images.shape, generator=torch.Generator().manual_seed(seed)).to(images)
+    return lambda rows, gone: noisy_linear(images[rows], gone, noise=noise[rows])
+
+
+FILLS: dict[str, Fill] = {
     "grey": _constant(0.5),
     "black": _constant(0.0),
     "white": _constant(1.0),
-    "blur": _blurred,
+    "background": _static(_background),
+    "blur": _static(_blurred),
+    "reference": _reference,
+    "noisy-linear": _noisy_linear,
 }
+"""`background` is the median colour of the image, what most of it shows; `reference` puts the untouched sensor in
+place; `noisy-linear` (ROAD) blends the pixels around, with a little noise, so that the shape of what was removed tells
+less."""
 
 
-def get_fill(name: str) -> Callable[[Images], Images]:
-    """Look up a fill by name: a function from inputs in [0, 1] to what their removed pixels become.
+def get_fill(name: str) -> Fill:
+    """Look up a fill by name.
 
     Raises
     ------

@@ -1,0 +1,71 @@
+"""Paired differences with their uncertainty."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+FEWEST_UNITS = 5
+"""Resampling fewer trials or frames says little."""
+_RESAMPLES = 2000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference:
+    """Mean of the first minus mean of the second, with a 95 % interval over `units` resampled trials or frames."""
+
+    estimate: float
+    low: float
+    high: float
+    units: int
+
+    @property
+    def sure(self) -> bool:
+        """Whether the interval leaves zero out, and rests on enough units."""
+        return self.units >= FEWEST_UNITS and (self.low > 0 or self.high < 0)
+
+
+def bootstrap_difference(
+    first: Float[np.ndarray, " units"],
+    second: Float[np.ndarray, " units"],
+    counts: Float[np.ndarray, " units"],
+    *,
+    rng: np.random.Generator,
+) -> Difference:
+    """Difference of two means over the same units, resampled together.
+
+    Parameters
+    ----------
+    first, second
+        Sum of each unit: the squared errors of a trial's frames, or one frame's score.
+    counts
+        Terms in each of those sums.
+    """
+    gap = first - second
+    rows = rng.integers(0, len(gap), size=(_RESAMPLES, len(gap)))
+    means = gap[rows].sum(axis=1) / counts[rows].sum(axis=1)
+    low, high = np.quantile(means, [0.025, 0.975])
+    return Difference(estimate=float(gap.sum() / counts.sum()), low=float(low), high=float(high), units=len(gap))
+
+
+def paired_difference(
+    first: Float[np.ndarray, " images"],
+    second: Float[np.ndarray, " images"],
+    *,
+    trials: np.ndarray | None = None,
+    rng: np.random.Generator,
+) -> Difference:
+    """Difference of two scores of the same images; whole trials are resampled where they are named.
+
+    Frames of one trial resemble one another: resampled one by one they would feign more evidence than there is.
+
+    Parameters
+    ----------
+    first, second
+        Scores, image by image.
+    trials
+        Trial of each image.
+    """
+    _, member = np.unique(np.arange(len(first)) if trials is None else trials, return_inverse=True)
+    sums = [np.bincount(member, weights=values) for values in (first, second, np.ones(len(first)))]
+    return bootstrap_difference(sums[0], sums[1], sums[2], rng=rng)

@@ -1,0 +1,90 @@
+"""Localisation: whether a map lies where the truth lies, which a simulator knows."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.stats import spearmanr
+
+from sliplens.arrays import require_saliency
+from sliplens.errors import InputError
+from sliplens.faithfulness.units import Units, unit_means
+
+
+def relevance_mass(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "height width"]) -> float:
+    """Share of a map's sum that lies inside the truth; NaN for a map that is zero.
+
+    A map that knows nothing has the share of the image that the truth covers.
+
+    Parameters
+    ----------
+    saliency
+        Map of what matters, not negative.
+    truth
+        Where it ought to lie.
+
+    Raises
+    ------
+    SaliencyError
+        If the map has another shape, or holds NaN.
+    InputError
+        If the truth is nowhere, or the map is negative somewhere.
+
+    References
+    ----------
+    Arras, Osman and Samek, *CLEVR-XAI* (2022): relevance mass accuracy.
+    """
+    _require(saliency, truth)
+    if saliency.min() < 0:
+        raise InputError("relevance mass needs a map without negative values; take its positive part or its size")
+    total = float(saliency.sum())
+    return float(saliency[truth].sum()) / total if total > 0 else float("nan")
+
+
+def relevance_rank(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "height width"]) -> float:
+    """Share of the K highest pixels that lie inside the truth, which has K pixels; ties count by chance.
+
+    References
+    ----------
+    Arras, Osman and Samek, *CLEVR-XAI* (2022): relevance rank accuracy.
+    """
+    _require(saliency, truth)
+    size = int(truth.sum())
+    values, inside = saliency.ravel(), truth.ravel()
+    cut = np.partition(values, -size)[-size]
+    above, level = values > cut, values == cut
+    # of the pixels at the cut, as many as are still wanted: on average their share inside
+    wanted = size - int(above.sum())
+    return float((inside[above].sum() + wanted * inside[level].mean()) / size)
+
+
+def marker_agreement(
+    relevance: Float[np.ndarray, "_ _"], units: Units, effects: Float[np.ndarray, " markers"]
+) -> float:
+    """Spearman's rank correlation between a map's mean over each marker and what moving that marker really does.
+
+    Parameters
+    ----------
+    relevance
+        Signed map or saliency.
+    units
+        Number of each pixel's marker (`marker_units`); units beyond the markers are left out.
+    effects
+        Change of the answer, or of the true margin, when this marker alone is put back where it rested.
+
+    Returns
+    -------
+    float
+        Between -1 and 1; NaN where one of the two does not vary.
+    """
+    require_saliency(relevance, units.shape, where="the map")
+    means = unit_means(relevance, units)[: len(effects)]
+    # a marker outside the image has no pixel
+    seen = np.isfinite(means)
+    if seen.sum() < 2 or np.ptp(means[seen]) == 0 or np.ptp(effects[seen]) == 0:
+        return float("nan")
+    return float(np.asarray(spearmanr(means[seen], effects[seen]))[0])
+
+
+def _require(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "height width"]) -> None:
+    require_saliency(saliency, truth.shape, where="the map")
+    if not truth.any():
+        raise InputError("the truth is nowhere in this frame; choose a frame in contact")

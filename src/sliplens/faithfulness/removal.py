@@ -1,0 +1,226 @@
+"""Removal curves: how far the answer moves as the most, the least, and random parts of an image are removed."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64, Int
+from torch import Tensor
+
+from sliplens.errors import InputError
+from sliplens.faithfulness.deletion import pixels_gone
+from sliplens.faithfulness.fills import Fill
+from sliplens.faithfulness.units import Units, random_unit_order, unit_order
+
+AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+"""Shares of the image that are removed; dense where maps differ most."""
+RANDOM_ORDERS = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class RemovalCurves:
+    """Answers of a network while parts of an image are removed in several orders.
+
+    Attributes
+    ----------
+    areas
+        Share of the image that is gone at each step, from 0 to 1.
+    answers
+        In margin units, by order, image and step; at step 0 the answers on the whole images.
+    """
+
+    areas: Float64[np.ndarray, " steps"]
+    answers: Float64[np.ndarray, "orders images steps"]
+
+    @property
+    def changes(self) -> Float64[np.ndarray, "orders images steps"]:
+        """How far each answer lies from that on the whole image, in margin units."""
+        return np.abs(self.answers - self.answers[..., :1])
+
+    @property
+    def mean_changes(self) -> Float64[np.ndarray, "orders images"]:
+        """Area under each curve of changes: the mean change over all shares of the image, by trapezoids from 0."""
+        return np.trapezoid(self.changes, self.areas, axis=-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Faithfulness:
+    """What the removal of parts says of the maps of one method, image by image, in margin units.
+
+    Attributes
+    ----------
+    most_first, least_first, random
+        Mean change of the answer when the most, the least influential parts, and random ones are removed first.
+    at_areas
+        Change by order of `most_first`, `least_first`, `random`, when equal shares of the image are gone.
+    curves
+        Mean changes at every area: most first, least first, random; for figures.
+    """
+
+    areas: Float64[np.ndarray, " steps"]
+    most_first: Float64[np.ndarray, " images"]
+    least_first: Float64[np.ndarray, " images"]
+    random: Float64[np.ndarray, " images"]
+    curves: Float64[np.ndarray, "3 images steps"]
+
+    @property
+    def symmetric_gain(self) -> Float64[np.ndarray, " images"]:
+        """Symmetric relevance gain: most less least influential first; 0 for a map that tells nothing.
+
+        References
+        ----------
+        Bluecher, Vielhaben and Strodthoff, *Decoupling Pixel Flipping and Occlusion Strategy* (2024): SRG.
+        """
+        return self.most_first - self.least_first
+
+    @property
+    def gain_over_random(self) -> Float64[np.ndarray, " images"]:
+        """Most influential first less random orders."""
+        return self.most_first - self.random
+
+    def at(self, area: float) -> Float64[np.ndarray, "3 images"]:
+        """Changes where a share of the image is gone: most first, least first, random.
+
+        Raises
+        ------
+        InputError
+            If the curves have no such step.
+        """
+        step = np.flatnonzero(np.isclose(self.areas, area))
+        if not len(step):
+            raise InputError(f"there is no step at {area:g} of the image; choose one of {self.areas.tolist()}")
+        return self.curves[:, :, step[0]]
+
+
+def removal_curves(
+    predict: Callable[[Tensor], Tensor],
+    images: Float[Tensor, "images 3 height width"],
+    orders: Int[np.ndarray, "orders images pixels"],
+    *,
+    fill: Fill,
+    references: Float[Tensor, "images 3 height width"] | None = None,
+    areas: Sequence[float] = AREAS,
+    seed: int = 0,
+    batch_size: int = 64,
+    on_image: Callable[[int, int], None] | None = None,
+) -> RemovalCurves:
+    """Answers of a network while parts of its input are removed, in several orders each.
+
+    Parameters
+    ----------
+    predict
+        From inputs (batch, 3, height, width) to answers (batch,), in margin units.
+    images, references
+        Inputs in [0, 1], and those of the untouched sensor where the fill needs them.
+    orders
+        Flat pixel indices, first to be removed first (`unit_order`, `random_unit_order`).
+    fill
+        What removed pixels become (`get_fill`).
+    areas
+        Shares of the image to remove, rising from 0 to 1.
+    seed
+        For the fill that adds noise.
+    batch_size
+        Images that are made and answered at a time: bounds the memory.
+    on_image
+        Called with the number of images done and the number of all.
+
+    Raises
+    ------
+    InputError
+        If the areas do not rise from 0 to 1.
+    """
+    shares = np.asarray(areas, dtype=np.float64)
+    if shares[0] != 0 or shares[-1] != 1 or np.any(np.diff(shares) <= 0):
+        raise InputError(f"areas must rise from 0 to 1, got {list(areas)}")
+    shape = (images.shape[-2], images.shape[-1])
+    removed = np.round(shares * shape[0] * shape[1]).astype(np.int64)
+    paint = fill(images, references, seed)
+    answers = np.empty((orders.shape[0], len(images), len(shares)))
+    answers[:, :, 0] = predict(images).double().cpu().numpy()
+    for index in range(len(images)):
+        # what is left of the image when all is gone depends on no order: answered once
+        jobs = [(order, step) for order in range(len(orders)) for step in range(1, len(shares) - 1)]
+        jobs.append((0, len(shares) - 1))
+        for first in range(0, len(jobs), batch_size):
+            some = jobs[first : first + batch_size]
+            gone = torch.cat(
+                [pixels_gone(orders[order, index], pixels_removed=removed[[step]], shape=shape) for order, step in some]
+            ).to(images.device)
+            rows = torch.full((len(some),), index, device=images.device)
+            told = predict(paint(rows, gone)).double().cpu().numpy()
+            for (order, step), value in zip(some, told, strict=True):
+                answers[order, index, step] = value
+        answers[:, index, -1] = answers[0, index, -1]
+        if on_image is not None:
+            on_image(index + 1, len(images))
+    return RemovalCurves(areas=shares, answers=answers)
+
+
+def faithfulness(
+    predict: Callable[[Tensor], Tensor],
+    images: Float[Tensor, "images 3 height width"],
+    influence: dict[str, Float[np.ndarray, "images height width"]],
+    units: Sequence[Units],
+    *,
+    fill: Fill,
+    rng: np.random.Generator,
+    references: Float[Tensor, "images 3 height width"] | None = None,
+    random_orders: int = RANDOM_ORDERS,
+    areas: Sequence[float] = AREAS,
+    seed: int = 0,
+    batch_size: int = 64,
+    on_image: Callable[[int, int], None] | None = None,
+) -> dict[str, Faithfulness]:
+    """Score the maps of several methods on the same images, against the same random orders.
+
+    Parameters
+    ----------
+    predict, images, references, fill, areas, seed, batch_size, on_image
+        As `removal_curves` takes them.
+    influence
+        Maps by method, larger where a method says that a part matters more. Of signed relevance give the part that
+        works towards the target, `relevance * sign(target)`.
+    units
+        What is removed at once, for each image (`pixel_units`, `tile_units`, `marker_units`).
+    rng
+        Source of the random orders.
+    random_orders
+        How many of them.
+
+    References
+    ----------
+    Section 3 of the notes on faithfulness; Samek et al., *Evaluating the Visualization of What a Deep Neural Network
+    Has Learned* (2017), most and least relevant first.
+    """
+    orders = [
+        np.stack([unit_order(one, unit, least_first=least) for one, unit in zip(maps, units, strict=True)])
+        for maps in influence.values()
+        for least in (False, True)
+    ]
+    orders += [np.stack([random_unit_order(unit, rng=rng) for unit in units]) for _ in range(random_orders)]
+    found = removal_curves(
+        predict,
+        images,
+        np.stack(orders),
+        fill=fill,
+        references=references,
+        areas=areas,
+        seed=seed,
+        batch_size=batch_size,
+        on_image=on_image,
+    )
+    changes, means = found.changes, found.mean_changes
+    first_random = 2 * len(influence)
+    by_chance = changes[first_random:].mean(axis=0)
+    return {
+        name: Faithfulness(
+            areas=found.areas,
+            most_first=means[2 * number],
+            least_first=means[2 * number + 1],
+            random=means[first_random:].mean(axis=0),
+            curves=np.stack([changes[2 * number], changes[2 * number + 1], by_chance]),
+        )
+        for number, name in enumerate(influence)
+    }

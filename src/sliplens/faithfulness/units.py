@@ -1,0 +1,92 @@
+"""Units: what is removed at once, a pixel, a tile or a marker."""
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from sliplens.arrays import require_saliency
+from sliplens.errors import InputError
+
+Units = Int[np.ndarray, "height width"]
+"""Number of the unit that each pixel belongs to, from 0."""
+
+
+def pixel_units(shape: tuple[int, int]) -> Units:
+    """Each pixel by itself."""
+    return np.arange(shape[0] * shape[1]).reshape(shape)
+
+
+def tile_units(shape: tuple[int, int], *, size: int) -> Units:
+    """Square tiles; those at the right and lower border are smaller where the image does not divide.
+
+    Raises
+    ------
+    InputError
+        If the tiles have no size.
+    """
+    if size < 1:
+        raise InputError(f"tiles of {size} pixels are impossible; choose 1 or more")
+    rows, columns = (np.arange(side) // size for side in shape)
+    return rows[:, None] * (columns[-1] + 1) + columns
+
+
+def marker_units(shape: tuple[int, int], centres_px: Float[np.ndarray, "markers 2"], *, reach_px: float) -> Units:
+    """Each pixel goes to the nearest marker; those farther from all than `reach_px` are one unit, the last.
+
+    Parameters
+    ----------
+    shape
+        Height and width of the image.
+    centres_px
+        Markers as x, y.
+    reach_px
+        How far a marker's unit reaches: its radius, and as far as it moves.
+
+    Raises
+    ------
+    InputError
+        If there is no marker.
+    """
+    if not len(centres_px):
+        raise InputError("there is no marker to remove; choose pixels or tiles")
+    rows, columns = np.indices(shape)
+    distance, nearest = KDTree(centres_px).query(np.stack([columns.ravel(), rows.ravel()], axis=1))
+    return np.where(distance <= reach_px, nearest, len(centres_px)).reshape(shape)
+
+
+def unit_means(values: Float[np.ndarray, "height width"], units: Units) -> Float[np.ndarray, " units"]:
+    """Mean of a map over each unit; NaN for one that no pixel belongs to."""
+    count = np.bincount(units.ravel())
+    with np.errstate(invalid="ignore"):
+        return np.bincount(units.ravel(), weights=values.ravel()) / count
+
+
+def unit_order(
+    influence: Float[np.ndarray, "_ _"], units: Units, *, least_first: bool = False
+) -> Int[np.ndarray, " pixels"]:
+    """Flat pixel indices, unit by unit, from the most to the least influential.
+
+    Parameters
+    ----------
+    influence
+        Map to rank by: the mean of a unit counts, so that large units have no advantage.
+    units
+        Number of each pixel's unit.
+    least_first
+        From the least to the most influential.
+
+    Raises
+    ------
+    SaliencyError
+        If the map has another shape than the units, or holds NaN.
+    """
+    require_saliency(influence, units.shape, where="the map to rank by")
+    means = unit_means(influence, units)[units.ravel()]
+    # units in order, the pixels of each in reading order: lexsort is stable, its last key counts first
+    return np.lexsort((units.ravel(), means if least_first else -means))
+
+
+def random_unit_order(units: Units, *, rng: np.random.Generator) -> Int[np.ndarray, " pixels"]:
+    """Flat pixel indices, unit by unit, in random order: the control that every map has to beat."""
+    rank = rng.permutation(int(units.max()) + 1)
+    return np.argsort(rank[units.ravel()], kind="stable")

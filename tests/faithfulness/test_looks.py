@@ -1,0 +1,54 @@
+import numpy as np
+import pytest
+
+from sliplens.errors import InputError
+from sliplens.faithfulness.looks import gini, resolution, stability, total_variation
+
+
+def test_total_variation_has_its_closed_forms(rng: np.random.Generator):
+    assert total_variation(np.ones((5, 5))) == 0
+    ramp = np.tile(np.arange(11.0), (11, 1))
+    assert total_variation(ramp) == pytest.approx((0.1 + 0) / 2)  # a tenth of the range across, nothing down
+    # two independent even numbers differ by 1/3 on average, with a standard deviation of 1/sqrt(18); neighbours share
+    # numbers, so four standard errors are doubled
+    noise = total_variation(rng.uniform(size=(100, 100)))
+    assert noise == pytest.approx(1 / 3, abs=8 / np.sqrt(18 * 2 * 9900) + 0.001)
+    assert total_variation(7 * ramp - 3) == pytest.approx(total_variation(ramp))
+
+
+def test_gini_runs_from_even_to_one_pixel():
+    assert gini(np.ones((10, 10))) == pytest.approx(0)
+    one = np.zeros((10, 10))
+    one[3, 4] = -2.0
+    assert gini(one) == pytest.approx(0.99)
+    assert gini(np.zeros((3, 3))) == 0
+    assert gini(np.arange(1.0, 101).reshape(10, 10)) == pytest.approx(0.33)  # (n - 1) / (3 n) of 1 to n
+    assert gini(5 * one) == gini(one)
+
+
+@pytest.mark.parametrize("spread", [2.0, 5.0, 40.0])
+def test_blobs_are_told_apart_as_far_as_they_are_narrow(spread: float):
+    rows, columns = np.indices((60, 80))
+    markers = np.array([[30.0, 30.0], [46.0, 30.0]])
+    square = [(columns - x) ** 2 + (rows - y) ** 2 for x, y in markers]
+    saliency = np.exp(-np.stack(square) / (2 * spread**2)).sum(axis=0)
+    # two Gaussians 16 px apart: in the middle 2 exp(-32 / s^2), at a centre 1 + exp(-128 / s^2)
+    expected = 1 - 2 * np.exp(-32 / spread**2) / (1 + np.exp(-128 / spread**2))
+    # the highest of a third of the way is the centre itself, or a little beside it for wide blobs
+    assert resolution(saliency, markers) == pytest.approx(max(expected, 0), abs=0.02)
+
+
+def test_resolution_needs_markers_and_relevance():
+    with pytest.raises(InputError, match="two markers or more"):
+        resolution(np.ones((5, 5)), np.array([[1.0, 1.0]]))
+    assert np.isnan(resolution(np.zeros((9, 9)), np.array([[1.0, 1.0], [5.0, 5.0]])))
+    assert resolution(np.ones((9, 9)), np.array([[1.0, 1.0], [5.0, 5.0]])) == 0
+
+
+def test_stability_is_pearsons_correlation(rng: np.random.Generator):
+    maps = rng.uniform(size=(3, 8, 8))
+    others = maps + rng.normal(size=maps.shape)
+    expected = [np.corrcoef(one.ravel(), other.ravel())[0, 1] for one, other in zip(maps, others, strict=True)]
+    np.testing.assert_allclose(stability(maps, others), expected)
+    np.testing.assert_allclose(stability(maps, 3 * maps - 1), 1)
+    assert np.isnan(stability(np.zeros((1, 4, 4)), np.ones((1, 4, 4))))[0]

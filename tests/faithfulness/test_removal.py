@@ -1,0 +1,105 @@
+"""Removal curves against closed forms: a linear network, whose every pixel counts for itself."""
+
+import numpy as np
+import pytest
+import torch
+
+from sliplens.errors import InputError
+from sliplens.faithfulness import get_fill
+from sliplens.faithfulness.removal import AREAS, faithfulness, removal_curves
+from sliplens.faithfulness.units import pixel_units, random_unit_order, tile_units, unit_order
+
+SIZE = 20
+IMAGES = 3
+EVERY = tuple(np.linspace(0, 1, SIZE * SIZE + 1))
+
+
+@pytest.fixture
+def images() -> torch.Tensor:
+    return torch.rand(IMAGES, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+
+
+@pytest.fixture
+def weights() -> torch.Tensor:
+    """Positive: with a black fill each pixel that goes lowers the answer."""
+    return torch.rand(3, SIZE, SIZE, generator=torch.Generator().manual_seed(6), dtype=torch.float64) / (3 * SIZE**2)
+
+
+def linear(weights: torch.Tensor):
+    return lambda batch: (batch * weights).sum(dim=(1, 2, 3))
+
+
+def contributions(images: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
+    return (images * weights).sum(dim=1).numpy()
+
+
+def test_the_curve_of_a_linear_network_is_the_sum_of_what_went(images: torch.Tensor, weights: torch.Tensor):
+    values = contributions(images, weights)
+    units = pixel_units((SIZE, SIZE))
+    orders = np.stack([[unit_order(one, units, least_first=least) for one in values] for least in (False, True)])
+    curves = removal_curves(linear(weights), images, orders, fill=get_fill("black"), areas=EVERY, batch_size=37)
+    for index, one in enumerate(values):
+        falling = np.sort(one.ravel())[::-1]
+        np.testing.assert_allclose(curves.changes[0, index], np.append(0, np.cumsum(falling)), atol=1e-12)
+        np.testing.assert_allclose(curves.changes[1, index], np.append(0, np.cumsum(falling[::-1])), atol=1e-12)
+
+
+def test_what_contributes_is_the_best_map_there_is(images: torch.Tensor, weights: torch.Tensor, rng):
+    values = contributions(images, weights)
+    units = [pixel_units((SIZE, SIZE))] * IMAGES
+    maps = {"truth": values, "noisy": values + rng.normal(0, values.std(), values.shape), "opposite": -values}
+    scores = faithfulness(linear(weights), images, maps, units, fill=get_fill("black"), rng=rng, areas=EVERY)
+    truth, noisy, opposite = (scores[name] for name in maps)
+    assert np.all(truth.symmetric_gain > noisy.symmetric_gain)
+    assert np.all(noisy.symmetric_gain > 0)
+    # turned round, the curves change places
+    np.testing.assert_allclose(opposite.symmetric_gain, -truth.symmetric_gain, atol=1e-12)
+    # in every random order the answer falls evenly, on average: half of all that there is to lose
+    total = values.sum(axis=(1, 2))
+    # 20 orders of pixels whose contributions vary: standard error of each mean below total / sqrt(12 * 400 * 20)
+    np.testing.assert_allclose(truth.random, total / 2, atol=5 * float(total.max()) / np.sqrt(12 * 400 * 20))
+    assert np.all(truth.gain_over_random > 0)
+    # the two halves of the gain are the same for a linear network: what goes first on one side goes last on the other
+    np.testing.assert_allclose(truth.most_first - total / 2, total / 2 - truth.least_first, atol=1e-12)
+
+
+def test_at_equal_areas_the_curves_can_be_read(images: torch.Tensor, weights: torch.Tensor, rng):
+    maps = {"truth": contributions(images, weights)}
+    units = [tile_units((SIZE, SIZE), size=2)] * IMAGES
+    score = faithfulness(linear(weights), images, maps, units, fill=get_fill("black"), rng=rng)["truth"]
+    np.testing.assert_array_equal(score.areas, AREAS)
+    most, least, random = score.at(0.05)
+    assert np.all(most > random)
+    assert np.all(random > least)
+    np.testing.assert_allclose(score.at(1.0)[0], maps["truth"].sum(axis=(1, 2)), atol=1e-12)
+    with pytest.raises(InputError, match=r"no step at 0\.03 of the image"):
+        score.at(0.03)
+
+
+def test_the_batch_size_changes_nothing(images: torch.Tensor, weights: torch.Tensor, rng):
+    orders = np.stack([[random_unit_order(pixel_units((SIZE, SIZE)), rng=rng)] * IMAGES for _ in range(3)])
+    found = [
+        removal_curves(
+            lambda batch: linear(weights)(batch).sin(), images, orders, fill=get_fill(fill), batch_size=size, seed=4
+        )
+        for fill in ("grey", "noisy-linear")
+        for size in (1, 7, 64)
+    ]
+    for one in found[1:3]:
+        np.testing.assert_allclose(one.answers, found[0].answers, atol=1e-12)
+    # solved by iterations that stop when all of a batch are done: within their tolerance, times the weights
+    for one in found[4:]:
+        np.testing.assert_allclose(one.answers, found[3].answers, atol=1e-3)
+
+
+def test_a_network_that_answers_always_alike_moves_by_nothing(images: torch.Tensor, rng):
+    orders = np.stack([[random_unit_order(pixel_units((SIZE, SIZE)), rng=rng)] * IMAGES])
+    curves = removal_curves(lambda batch: torch.full((len(batch),), 0.3), images, orders, fill=get_fill("grey"))
+    assert np.all(curves.mean_changes == 0)
+
+
+@pytest.mark.parametrize("areas", [(0.1, 1.0), (0.0, 0.5), (0.0, 0.5, 0.5, 1.0)])
+def test_areas_rise_from_nothing_to_all(areas: tuple[float, ...], images: torch.Tensor):
+    orders = np.zeros((1, IMAGES, SIZE * SIZE), dtype=np.int64)
+    with pytest.raises(InputError, match="areas must rise from 0 to 1"):
+        removal_curves(lambda batch: batch.mean(dim=(1, 2, 3)), images, orders, fill=get_fill("grey"), areas=areas)
