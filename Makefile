@@ -13,7 +13,7 @@ export OMP_WAIT_POLICY := passive
 export SLIPLENS_REFERENCE ?= ../shared/reference
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test check format bench docs lock clean
+.PHONY: help install demo test check format bench docs weights lock clean
 
 help: ## list these targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -41,6 +41,18 @@ bench: $(INSTALLED) ## run every benchmark
 
 docs: $(INSTALLED) ## build the documentation: docs/_build/index.html
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build
+
+weights: $(INSTALLED) ## train the networks that come with the package: some two hours each on one core
+	$(BIN)/sliplens simulate runs/weights/varied --preset varied
+	@set -e; for input in difference raw; do \
+		$(BIN)/sliplens train runs/weights/varied -o runs/weights/small-$$input --input $$input \
+			--image-size 112 --epochs 7; \
+		$(BIN)/sliplens train runs/weights/varied -o runs/weights/chromatouch-$$input --input $$input \
+			--start-from runs/weights/small-$$input --epochs 2 --learning-rate 1e-3; \
+		mkdir -p src/sliplens/weights/chromatouch-$$input; \
+		cp runs/weights/chromatouch-$$input/model.safetensors runs/weights/chromatouch-$$input/manifest.json \
+			src/sliplens/weights/chromatouch-$$input; \
+	done
 
 lock: $(UV) ## pin the newest packages that fit, for every supported Python
 	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --extra dev --extra docs \

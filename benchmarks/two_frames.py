@@ -1,8 +1,8 @@
 """What a second frame, or a short sequence, adds to what a network reads from one.
 
 The network stays as it is: a small perceptron gets its answers and its uncertainty at several frames of a trial, and is
-taught the margin of the last of them. It learns from one evaluation (`sliplens evaluate RUN DATA --split validation`)
-and is tried on another. One frame alone goes through such a perceptron too: the difference is what the others add.
+taught the margin of the last of them, on trials from slippery to rough; it is tried on fresh days, dry (friction 0.5 to
+1.2) and wet (0.15 to 0.7). One frame alone goes through such a perceptron too: the difference is what the others add.
 
 All frames lie at fixed times: the speed of the pull is the same in all trials of the simulator, and a sequence tells
 the margin in part by how fast it falls. On a robot that grips at a speed of its own, expect less; docs/limit.md says
@@ -13,16 +13,24 @@ import argparse
 import json
 import os
 import sys
+import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # must be set before torch is imported
 
 import numpy as np
-import pyarrow.parquet as pq
+import pyarrow as pa
 import torch
 from jaxtyping import Float
 from torch import nn
 
+from sliplens.datasets import load_frames
+from sliplens.errors import SliplensError
+from sliplens.models import TrainedModel, load_checkpoint
+from sliplens.models.shipped import find_run
+from sliplens.simulation import PRESETS, SimulationRecipe, simulate_dataset
+from sliplens.training import evaluate
 from sliplens.training.evaluate import regression_scores
 
 VIEWS = {"one frame": (0.0,), "and one 0.5 s earlier": (0.0, 0.5), "8 frames over 2.2 s": tuple(np.linspace(0, 2.2, 8))}
@@ -34,11 +42,7 @@ STEPS, BATCH, WIDTH, SEEDS = 1500, 512, 64, 3
 class Answers:
     """What a network answered to the frames of some trials."""
 
-    def __init__(self, folder: Path) -> None:
-        path = folder / "predictions.parquet"
-        if not path.is_file():
-            sys.exit(f"{Path(__file__).name}: {path} does not exist; make it with `sliplens evaluate`")
-        table = pq.read_table(path)
+    def __init__(self, table: pa.Table) -> None:
         table = table.sort_by([("trial", "ascending"), ("time_s", "ascending")])
         self.trial, self.condition = (np.array(table[name].to_pylist()) for name in ("trial", "condition"))
         self.time_s, self.margin = (table[name].to_numpy() for name in ("time_s", "safety_margin"))
@@ -88,16 +92,36 @@ def r2_by_condition(answers: Answers, margin: Float[np.ndarray, " frames"]) -> d
     }
 
 
+def answered(trained: TrainedModel, recipe: SimulationRecipe, folder: Path, *, split: str) -> Answers:
+    """What the network answers to the trials of one split."""
+    data = simulate_dataset(folder, recipe)
+    frames = load_frames(
+        data, data.select(split=split), encoding=trained.encoding, image_size=trained.manifest.image_size
+    )
+    return Answers(evaluate(trained, frames).predictions)
+
+
 def main() -> None:
     """Print R2 by condition and view, as a table or as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("learn", type=Path, help="folder of `sliplens evaluate` on trials to learn from")
-    parser.add_argument("test", type=Path, help="folder of `sliplens evaluate` on other trials")
+    parser.add_argument("--run", type=Path, default=Path("chromatouch-difference"), help="a trained network")
+    parser.add_argument("--days", type=int, default=40, help="that teach, and as many that test")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    learn, test = Answers(options.learn), Answers(options.test)
-    if set(learn.trial) & set(test.trial) and options.learn.resolve() == options.test.resolve():
-        sys.exit(f"{Path(__file__).name}: {options.learn} cannot both teach and test; name two evaluations")
+    try:
+        trained = load_checkpoint(find_run(options.run))
+    except SliplensError as error:
+        sys.exit(f"{Path(__file__).name}: {error}")
+    varied, days = PRESETS["varied"], options.days
+    learned_from = replace(
+        varied, seed=101, frames_per_trial=40, days=days + 1, test_days=1, dry_trials=3 * (days + 1), wet_trials=0
+    )
+    tried_on = replace(
+        learned_from, seed=102, test_days=days, wet_trials=3 * days, nuisances=PRESETS["thesis"].nuisances
+    )
+    with tempfile.TemporaryDirectory() as scratch:
+        learn = answered(trained, learned_from, Path(scratch) / "learn", split="train")
+        test = answered(trained, tried_on, Path(scratch) / "test", split="test")
     found = {"as the network answers": r2_by_condition(test, test.signals[:, 0])}
     for name, before_s in VIEWS.items():
         inputs, tried = learn.view(before_s), torch.from_numpy(test.view(before_s)).float()

@@ -10,7 +10,6 @@ from sliplens.faithfulness import (
     deletion_order,
     deletion_score,
     get_fill,
-    pixels_gone,
     random_order,
     summarise_deletion,
 )
@@ -47,11 +46,19 @@ def test_impossible_numbers_of_steps_are_refused():
 
 def test_so_many_pixels_of_an_order_are_gone(rng: np.random.Generator):
     order = random_order((6, 5), rng=rng)
-    gone = pixels_gone(order, pixels_removed=np.array([0, 7, 30]), shape=(6, 5))
-    assert not gone[0].any()
-    assert gone[2].all()
-    for flat in range(30):  # one pixel at a time, the slow way
-        assert bool(gone[1][divmod(flat, 5)]) == (flat in order[:7])
+    images = torch.rand(1, 3, 6, 5)
+    seen: list[torch.Tensor] = []
+
+    def look(batch: torch.Tensor) -> torch.Tensor:
+        seen.extend(batch)
+        return batch.mean(dim=(1, 2, 3))
+
+    deletion_curves(look, images, order[None], fill=get_fill("black"), steps=30, batch_size=7)
+    for step, image in enumerate(seen[:30], start=1):
+        for flat in range(30):  # one pixel at a time, the slow way
+            row, column = divmod(flat, 5)
+            expected = torch.zeros(3) if flat in order[:step] else images[0, :, row, column]
+            assert torch.equal(image[:, row, column], expected)
 
 
 def test_curves_of_a_network_that_averages_pixels_have_a_closed_form(rng: np.random.Generator):

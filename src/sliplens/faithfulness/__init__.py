@@ -6,7 +6,6 @@ from sliplens.faithfulness.deletion import (
     deletion_curves,
     deletion_order,
     deletion_score,
-    pixels_gone,
     random_order,
     summarise_deletion,
 )
@@ -20,7 +19,6 @@ __all__ = [
     "deletion_order",
     "deletion_score",
     "get_fill",
-    "pixels_gone",
     "random_order",
     "summarise_deletion",
 ]

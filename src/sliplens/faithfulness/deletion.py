@@ -4,12 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float, Float64, Int
+from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from sliplens.arrays import require_saliency
 from sliplens.errors import InputError
+from sliplens.faithfulness.answering import Predict, Removal, answer_removals, answer_whole
 from sliplens.faithfulness.fills import Fill
 
 
@@ -88,25 +88,6 @@ def random_order(shape: tuple[int, int], *, rng: np.random.Generator) -> Int[np.
     return rng.permutation(shape[0] * shape[1])
 
 
-def pixels_gone(
-    order: Int[np.ndarray, " pixels"], *, pixels_removed: Int[np.ndarray, " steps"], shape: tuple[int, int]
-) -> Bool[Tensor, "steps height width"]:
-    """Which pixels of an image are gone when so many of an order are removed.
-
-    Parameters
-    ----------
-    order
-        Flat pixel indices, first to be removed first.
-    pixels_removed
-        How many pixels are gone at each step.
-    shape
-        Height and width of the image.
-    """
-    rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order))
-    return torch.from_numpy(rank.reshape(shape) < np.asarray(pixels_removed)[:, None, None])
-
-
 def deletion_steps(shape: tuple[int, int], *, steps: int | None = None) -> Int[np.ndarray, " steps"]:
     """Pixels removed at each step: as many steps as the image is high, the last of which removes all.
 
@@ -122,7 +103,7 @@ def deletion_steps(shape: tuple[int, int], *, steps: int | None = None) -> Int[n
 
 
 def deletion_curves(
-    predict: Callable[[Tensor], Tensor],
+    predict: Predict,
     images: Float[Tensor, "images 3 height width"],
     orders: Int[np.ndarray, "images pixels"],
     *,
@@ -138,7 +119,7 @@ def deletion_curves(
     Parameters
     ----------
     predict
-        From inputs (batch, 3, height, width) to answers (batch,), in margin units.
+        From inputs (batch, 3, height, width) to answers (batch,), in margin units; or an engine made ready.
     images
         Inputs in [0, 1].
     orders
@@ -158,19 +139,25 @@ def deletion_curves(
     """
     shape = (images.shape[-2], images.shape[-1])
     removed = deletion_steps(shape, steps=steps)
-    base = predict(images).double().cpu().numpy()
-    paint = fill(images, references, seed)
-    curves = []
-    for index, order in enumerate(orders):
-        answers = []
-        for chunk in np.split(removed, range(batch_size, len(removed), batch_size)):
-            gone = pixels_gone(order, pixels_removed=chunk, shape=shape).to(images.device)
-            rows = torch.full((len(chunk),), index, device=images.device)
-            answers.append(predict(paint(rows, gone)).double().cpu().numpy())
-        curves.append(np.concatenate(answers))
-        if on_image is not None:
-            on_image(index + 1, len(images))
-    return DeletionCurves(pixels_removed=removed, base=base, predictions=np.stack(curves))
+    steps = len(removed)
+    answers = answer_removals(
+        predict,
+        fill(images, references, seed),
+        (
+            Removal(image=index, order=order, pixels=int(count))
+            for index, order in enumerate(orders)
+            for count in removed
+        ),
+        shape=shape,
+        device=images.device,
+        batch_size=batch_size,
+        on_answers=None if on_image is None else lambda done: on_image(done // steps, len(images)),
+    )
+    return DeletionCurves(
+        pixels_removed=removed,
+        base=answer_whole(predict, images, batch_size=batch_size),
+        predictions=answers.reshape(len(images), steps),
+    )
 
 
 def saliency_orders(saliency: Float[np.ndarray, "images height width"], shape: tuple[int, int]) -> np.ndarray:

@@ -1,15 +1,14 @@
 """Removal curves: how far the answer moves as the most, the least, and random parts of an image are removed."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.faithfulness.deletion import pixels_gone
+from sliplens.faithfulness.answering import Predict, Removal, answer_removals, answer_whole
 from sliplens.faithfulness.fills import Fill
 from sliplens.faithfulness.units import Units, random_unit_order, unit_order
 
@@ -94,7 +93,7 @@ class Faithfulness:
 
 
 def removal_curves(
-    predict: Callable[[Tensor], Tensor],
+    predict: Predict,
     images: Float[Tensor, "images 3 height width"],
     orders: Int[np.ndarray, "orders images pixels"],
     *,
@@ -110,7 +109,7 @@ def removal_curves(
     Parameters
     ----------
     predict
-        From inputs (batch, 3, height, width) to answers (batch,), in margin units.
+        From inputs (batch, 3, height, width) to answers (batch,), in margin units; or an engine made ready.
     images, references
         Inputs in [0, 1], and those of the untouched sensor where the fill needs them.
     orders
@@ -136,30 +135,38 @@ def removal_curves(
         raise InputError(f"areas must rise from 0 to 1, got {list(areas)}")
     shape = (images.shape[-2], images.shape[-1])
     removed = np.round(shares * shape[0] * shape[1]).astype(np.int64)
-    paint = fill(images, references, seed)
-    answers = np.empty((orders.shape[0], len(images), len(shares)))
-    answers[:, :, 0] = predict(images).double().cpu().numpy()
-    for index in range(len(images)):
-        # what is left of the image when all is gone depends on no order: answered once
-        jobs = [(order, step) for order in range(len(orders)) for step in range(1, len(shares) - 1)]
-        jobs.append((0, len(shares) - 1))
-        for first in range(0, len(jobs), batch_size):
-            some = jobs[first : first + batch_size]
-            gone = torch.cat(
-                [pixels_gone(orders[order, index], pixels_removed=removed[[step]], shape=shape) for order, step in some]
-            ).to(images.device)
-            rows = torch.full((len(some),), index, device=images.device)
-            told = predict(paint(rows, gone)).double().cpu().numpy()
-            for (order, step), value in zip(some, told, strict=True):
-                answers[order, index, step] = value
-        answers[:, index, -1] = answers[0, index, -1]
-        if on_image is not None:
-            on_image(index + 1, len(images))
+    jobs = list(_jobs(orders, removed))
+    told = answer_removals(
+        predict,
+        fill(images, references, seed),
+        (Removal(image=image, order=orders[order, image], pixels=int(removed[step])) for image, order, step in jobs),
+        shape=shape,
+        device=images.device,
+        batch_size=batch_size,
+        on_answers=None if on_image is None else lambda done: on_image(done * len(images) // len(jobs), len(images)),
+    )
+    answers = np.empty((len(orders), len(images), len(shares)))
+    answers[:, :, 0] = answer_whole(predict, images, batch_size=batch_size)
+    for (image, order, step), value in zip(jobs, told, strict=True):
+        answers[order, image, step] = value
+    answers[:, :, -1] = answers[0, :, -1]
     return RemovalCurves(areas=shares, answers=answers)
 
 
+def _jobs(
+    orders: Int[np.ndarray, "orders images pixels"], removed: Int[np.ndarray, " steps"]
+) -> Iterator[tuple[int, int, int]]:
+    """What to answer, as image, order and step."""
+    last = len(removed) - 1
+    for image in range(orders.shape[1]):
+        for order in range(len(orders)):
+            yield from ((image, order, step) for step in range(1, last))
+        # what is left of the image when all is gone depends on no order: answered once
+        yield image, 0, last
+
+
 def faithfulness(
-    predict: Callable[[Tensor], Tensor],
+    predict: Predict,
     images: Float[Tensor, "images 3 height width"],
     influence: dict[str, Float[np.ndarray, "images height width"]],
     units: Sequence[Units],

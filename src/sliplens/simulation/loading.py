@@ -80,7 +80,10 @@ def load_grasp(grasp: Grasp, *, frames: int, rng: np.random.Generator, release: 
     progress = index / (frames - 1)
     time_s = index * (TRIAL_S / frames)
 
-    normal = grasp.normal_force_n * _smooth((index - touch + 1) / (pressed - touch))
+    # the camera knows nothing of the touch: the first frame of contact comes anywhere within its period, and where
+    # frames are few, some trials show the lightest touch and some do not
+    since_touch = index - touch + 1 - rng.uniform()
+    normal = grasp.normal_force_n * _smooth(since_touch / (pressed - touch))
     normal *= 1 + grasp.normal_force_drift * (progress - 0.5) * 2
     if release:
         normal *= 1 - _smooth((index - let_go + 1) / (gone - let_go))
