@@ -50,8 +50,8 @@ weights: $(INSTALLED) ## train the networks that come with the package: some two
 		$(BIN)/sliplens train runs/weights/varied -o runs/weights/chromatouch-$$input --input $$input \
 			--start-from runs/weights/small-$$input --epochs 2 --learning-rate 1e-3; \
 		mkdir -p src/sliplens/weights/chromatouch-$$input; \
-		cp runs/weights/chromatouch-$$input/model.safetensors runs/weights/chromatouch-$$input/manifest.json \
-			src/sliplens/weights/chromatouch-$$input; \
+		cd runs/weights/chromatouch-$$input && cp model.safetensors manifest.json run.json result.json \
+			$(CURDIR)/src/sliplens/weights/chromatouch-$$input && cd $(CURDIR); \
 	done
 
 lock: $(UV) ## pin the newest packages that fit, for every supported Python

@@ -1,7 +1,8 @@
 """Time the explainers on an untrained ShuffleNetV2 with one output.
 
 Two ratios say what an explainer adds to the passes it cannot do without: Grad-CAM against one forward and backward
-pass, Integrated Gradients at 50 steps against 50 of them. With `--json` the last line is one JSON object.
+pass, Integrated Gradients at 50 steps against 50 of them, both one image at a time and in batches of the same size.
+With `--json` the last line is one JSON object.
 """
 
 import argparse
@@ -15,9 +16,11 @@ from torch import Tensor, nn
 from torchvision import models
 
 from sliplens.explain import EXPLAINERS, GradCam, IntegratedGradients
+from sliplens.export.extras import missing_packages
 from sliplens.provenance import machine, versions
 
 STEPS = 50
+INSTALLED = [name for name in EXPLAINERS if name != "lrp" or not missing_packages("zennit")]
 
 
 def median_seconds(work: Callable[[], object], *, repeats: int, device: torch.device) -> float:
@@ -57,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--size", type=int, default=224, help="height and width of the images in pixels")
     parser.add_argument("--batch", type=int, default=1, help="images in a call")
     parser.add_argument("--repeats", type=int, default=5, help="timed calls after one warm-up; the median counts")
-    parser.add_argument("--methods", nargs="+", choices=EXPLAINERS, default=list(EXPLAINERS))
+    parser.add_argument("--methods", nargs="+", choices=EXPLAINERS, default=INSTALLED)
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
     parser.add_argument("--json", action="store_true", help="end with one line of JSON")
     options = parser.parse_args(arguments)
@@ -75,10 +78,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     one = timed(lambda: forward_and_backward(model, images))
     many = timed(lambda: [forward_and_backward(model, images) for _ in range(STEPS)])
+    block = images[:1].expand(IntegratedGradients().batch_size, -1, -1, -1).contiguous()
+    batched = options.batch * STEPS / len(block) * timed(lambda: forward_and_backward(model, block))
     grad_cam = timed(lambda: GradCam()(model, images))
     fifty = timed(lambda: IntegratedGradients(steps=STEPS, max_steps=STEPS)(model, images))
     print(f"{'Grad-CAM':<22} {grad_cam / one:9.3f} x one forward and backward pass ({one:.4f} s)")
     print(f"{'IG, 50 steps':<22} {fifty / many:9.3f} x 50 forward and backward passes ({many:.4f} s)")
+    print(f"{'':<22} {fifty / batched:9.3f} x the same in batches of {len(block)} ({batched:.4f} s)")
     if options.json:
         result = {
             "seconds": seconds,
@@ -86,6 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "forward_backward_seconds": one,
             "grad_cam_ratio": grad_cam / one,
             "ig_ratio": fifty / many,
+            "ig_batched_ratio": fifty / batched,
             "size": options.size,
             "batch": options.batch,
             "threads": torch.get_num_threads(),

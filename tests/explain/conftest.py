@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Callable
 from functools import cache
+from itertools import pairwise
 
 import pytest
 import torch
@@ -27,19 +28,31 @@ class GapNet(nn.Module):
         return self.fc(features.mean(dim=(2, 3)))[:, 0]
 
 
+class Vgg(nn.Module):
+    """The layers of VGG-11, a quarter as wide, and one linear output on the mean over space."""
+
+    def __init__(self, features: nn.Sequential) -> None:
+        super().__init__()
+        self.features = features
+        self.classifier = nn.Linear(128, 1)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.classifier(self.features(images).mean(dim=(2, 3)))
+
+
 def blobs(count: int, *, seed: int, size: int = SIZE) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     coarse = torch.rand(count, 3, 8, 8, generator=generator, dtype=torch.float64)
     return functional.interpolate(coarse, size=(size, size), mode="bilinear")
 
 
-def as_trained(network: nn.Module, head: nn.Linear) -> nn.Module:
+def as_trained(network: nn.Module, head: nn.Linear, *, count: int = 32) -> nn.Module:
     """Give an untrained network what training gives: matching statistics, and outputs that spread over [0, 1]."""
     network.double().train()
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.momentum = None  # a plain average over the batches
-    images = blobs(32, seed=1)
+    images = blobs(count, seed=1)
     with torch.no_grad():
         network(images)
         network.eval()
@@ -62,6 +75,23 @@ def mobilenet() -> nn.Module:
     return as_trained(network, head)
 
 
+def resnet() -> nn.Module:
+    network = models.resnet18(weights=None, num_classes=1)
+    return as_trained(network, network.fc, count=4)
+
+
+def vgg() -> nn.Module:
+    # TorchVision's has 9 million weights in its layers, and 120 million in its classifier
+    features: list[nn.Module]
+    features = [nn.Conv2d(3, 16, 3, padding=1), nn.ReLU(inplace=True), nn.MaxPool2d(2)]
+    for inputs, *outputs in ((16, 32), (32, 64, 64), (64, 128, 128), (128, 128, 128)):
+        for before, width in pairwise((inputs, *outputs)):
+            features += [nn.Conv2d(before, width, 3, padding=1), nn.ReLU(inplace=True)]
+        features.append(nn.MaxPool2d(2))
+    network = Vgg(nn.Sequential(*features))
+    return as_trained(network, network.classifier, count=4)
+
+
 def gap() -> nn.Module:
     network = GapNet()
     return as_trained(network, network.fc)
@@ -72,6 +102,8 @@ NETWORKS: dict[str, Callable[[], nn.Module]] = {
     "half shufflenet": lambda: shufflenet(models.shufflenet_v2_x0_5(weights=None)),
     "small shufflenet": lambda: shufflenet(models.ShuffleNetV2([1, 1, 1], [8, 8, 16, 16, 24])),
     "mobilenet": mobilenet,  # its maps have both signs
+    "resnet": resnet,
+    "vgg": vgg,
     "gap": gap,
 }
 

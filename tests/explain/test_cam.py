@@ -1,11 +1,12 @@
 import pytest
 import torch
+from captum import attr
 from torch import nn
-from torchcam.methods import GradCAM
+from torchcam.methods import GradCAM, LayerCAM
 
 from sliplens.errors import InputError, ModelError
-from sliplens.explain import GradCam, capture
-from sliplens.explain.cam import grad_cam_map
+from sliplens.explain import GradCam, HiResCam, LayerCam, capture
+from sliplens.explain.cells import grad_cam_map, layer_cam_map
 
 
 def captured(model: nn.Module, images, layer: str):
@@ -15,11 +16,14 @@ def captured(model: nn.Module, images, layer: str):
     return outputs[layer].detach(), gradients, prediction.detach()
 
 
-@pytest.mark.parametrize(("name", "layer"), [("shufflenet", "conv5"), ("gap", "second")])
+@pytest.mark.parametrize(
+    ("name", "layer"), [("shufflenet", "conv5"), ("resnet", "layer4"), ("vgg", "features"), ("gap", "second")]
+)
 def test_a_pooled_linear_head_is_the_sum_of_the_map_and_its_bias(name, layer, network, images):
     model = network(name)
     activations, gradients, prediction = captured(model, images, layer)
-    total = grad_cam_map(activations, gradients).sum(dim=(1, 2)) + model.fc.bias
+    bias = (model.classifier if name == "vgg" else model.fc).bias
+    total = grad_cam_map(activations, gradients).sum(dim=(1, 2)) + bias
     tolerance = 1e-4 * torch.maximum(prediction.abs(), torch.tensor(1.0))
     assert bool(((total - prediction).abs() <= tolerance).all())
 
@@ -32,16 +36,22 @@ def test_upsampling_keeps_that_sum(size, network, images):
     torch.testing.assert_close(total, explanation.prediction, atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize(("name", "layer"), [("shufflenet", "conv5"), ("shufflenet", "stage3"), ("mobilenet", None)])
-def test_equals_torch_cam_after_the_same_relu_and_normalisation(name, layer, network, images):
+@pytest.mark.parametrize(
+    ("name", "layer"),
+    [
+        ("shufflenet", "conv5"),
+        ("shufflenet", "stage3"),
+        ("mobilenet", "features"),
+        ("resnet", "layer3"),
+        ("vgg", "features.10"),
+    ],
+)
+def test_equals_torch_cam_after_the_same_relu(name, layer, network, images):
     model = network(name)
-    layer = layer or "features"
     activations, gradients, _ = captured(model, images, layer)
-    ours = torch.relu(grad_cam_map(activations, gradients))
-    low, high = ours.amin(dim=(1, 2), keepdim=True), ours.amax(dim=(1, 2), keepdim=True)
     with GradCAM(model, target_layer=layer) as extractor:
-        oracle = extractor(0, model(images.clone().requires_grad_()))[0]
-    torch.testing.assert_close((ours - low) / (high - low), oracle, atol=1e-6, rtol=0)
+        oracle = extractor(0, model(images.clone().requires_grad_()), normalized=False)[0]
+    torch.testing.assert_close(torch.relu(grad_cam_map(activations, gradients)), oracle, atol=1e-6, rtol=0)
 
 
 def test_equals_torch_cam_on_the_image(network, images):
@@ -55,6 +65,86 @@ def test_equals_torch_cam_on_the_image(network, images):
     torch.testing.assert_close(torch.relu(cells), oracle, atol=1e-6, rtol=0)
     upsampled = nn.functional.interpolate(cells[None], size=(64, 64), mode="bilinear", align_corners=False)[0]
     torch.testing.assert_close(explanation.relevance, (upsampled / 16**2).float(), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(("name", "layer"), [("shufflenet", "stage3"), ("resnet", "layer3"), ("vgg", "features.10")])
+def test_equals_captum_with_its_sign(name, layer, network, images):
+    model = network(name)
+    activations, gradients, _ = captured(model, images, layer)
+    oracle = torch.as_tensor(
+        attr.LayerGradCam(lambda x: model(x).flatten(), model.get_submodule(layer)).attribute(images)
+    )
+    torch.testing.assert_close(grad_cam_map(activations, gradients), oracle[:, 0].detach(), atol=1e-9, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "layer"), [("shufflenet", "stage3"), ("mobilenet", "features.3"), ("resnet", "layer2")]
+)
+def test_layer_cam_equals_torch_cam(name, layer, network, images):
+    model = network(name)
+    activations, gradients, _ = captured(model, images, layer)
+    with LayerCAM(model, target_layer=layer) as extractor:
+        oracle = extractor(0, model(images.clone().requires_grad_()), normalized=False)[0]
+    torch.testing.assert_close(torch.relu(layer_cam_map(activations, gradients)), oracle, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "layer"), [("shufflenet", "conv5"), ("resnet", "layer4"), ("vgg", None), ("gap", None)]
+)
+def test_hires_cam_is_grad_cam_before_a_pooled_linear_head(name, layer, network, images, reference):
+    model = network(name)
+    hires = HiResCam(layer=layer)(model, images, reference=reference)
+    plain = GradCam(layer=layer)(model, images, reference=reference)
+    if name == "vgg":
+        # the maximum of 2 x 2 cells hands its gradient to one of them
+        assert not torch.allclose(hires.relevance, plain.relevance, atol=1e-6)
+    else:
+        torch.testing.assert_close(hires.relevance, plain.relevance, atol=1e-7, rtol=1e-5)
+
+
+def test_hires_and_layer_cam_weigh_each_cell_by_its_own_gradient(network, images, reference):
+    model = network("shufflenet")
+    activations, gradients, prediction = captured(model, images, "stage3")
+    references, _, empty = captured(model, reference.expand_as(images), "stage3")
+    sign = torch.sign(prediction - empty)
+    hires, layered = torch.zeros(2, len(images), 4, 4, dtype=torch.float64)
+    for image, channel, row, column in torch.cartesian_prod(*map(torch.arange, activations.shape)).tolist():
+        slope = gradients[image, channel, row, column]
+        added = activations[image, channel, row, column] - references[image, channel, row, column]
+        hires[image, row, column] += slope * added
+        layered[image, row, column] += max(sign[image] * slope, 0) * sign[image] * added
+    for explain, cells in ((HiResCam(layer="stage3"), hires), (LayerCam(layer="stage3"), layered)):
+        upsampled = nn.functional.interpolate(cells[None], size=(64, 64), mode="bilinear", align_corners=False)[0]
+        relevance = explain(model, images, reference=reference).relevance
+        torch.testing.assert_close(relevance, (upsampled / 16**2).float(), atol=1e-7, rtol=1e-5)
+
+
+def test_images_and_references_share_a_pass(network, images):
+    class Count(nn.Module):
+        def __init__(self, inner: nn.Module) -> None:
+            super().__init__()
+            self.inner, self.batches = inner, []
+
+        def forward(self, images):
+            self.batches.append(len(images))
+            return self.inner(images)
+
+    counted = Count(network("small shufflenet"))
+    GradCam()(counted, images)
+    assert counted.batches == [1, 3 + 1]  # the search for layers; the images and the reference that all share
+    counted.batches.clear()
+    GradCam(batch_size=2)(counted, images)
+    GradCam(batch_size=2)(counted, images, reference=images)
+    assert counted.batches == [2 + 1, 1, 2 + 2, 1 + 1]
+
+
+def test_a_network_that_was_changed_is_searched_anew(network, images):
+    model = network("small shufflenet")
+    GradCam()(model, images[:1])
+    model.conv5 = nn.Sequential()  # hands its input on
+    model.fc = nn.Linear(16, 1).double()
+    assert "through layer stage4" in GradCam()(model, images[:1]).target
+    assert "through layer stage2" in GradCam(layer="stage2")(model, images[:1]).target
 
 
 def test_last_layer_is_the_default(network, images):
@@ -126,5 +216,5 @@ def test_refuses_a_layer_that_the_output_ignores(images):
 
 
 def test_rejects_a_batch_size_of_zero():
-    with pytest.raises(InputError, match="Grad-CAM's batch_size is 0; give at least 1"):
+    with pytest.raises(InputError, match="GradCam's batch_size is 0; give at least 1"):
         GradCam(batch_size=0)

@@ -7,11 +7,31 @@ import torch
 from torch import nn
 
 from sliplens.errors import ImageError, ModelError
-from sliplens.explain import EXPLAINERS, Explanation, GradCam, IntegratedGradients, PolyCam
+from sliplens.explain import (
+    EXPLAINERS,
+    ExpectedGradients,
+    Explanation,
+    GradCam,
+    HiResCam,
+    IntegratedGradients,
+    LayerCam,
+    PolyCam,
+    SmoothGrad,
+)
 
-every_explainer = pytest.mark.parametrize("name", EXPLAINERS)
+# LRP has laws of its own, in test_lrp.py
+NAMES = [name for name in EXPLAINERS if name != "lrp"]
+every_explainer = pytest.mark.parametrize("name", NAMES)
 # an untrained network is so rough that integrated gradients would go to their most steps in every test
-QUICK = EXPLAINERS | {"integrated-gradients": IntegratedGradients(steps=4, max_steps=8)}
+SHORT = IntegratedGradients(steps=4, max_steps=8)
+QUICK = EXPLAINERS | {
+    "integrated-gradients": SHORT,
+    "expected-gradients": ExpectedGradients(integrated=SHORT),
+    "smooth-grad": SmoothGrad(samples=3),
+}
+CAMS = ["grad-cam", "hires-cam", "layer-cam", "poly-cam"]
+# what adds up to f(x) - f(reference), for some networks at least
+COMPLETE = ["grad-cam", "hires-cam", "poly-cam", "integrated-gradients", "expected-gradients"]
 
 HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 
@@ -69,9 +89,9 @@ def test_model_is_given_back_as_it_was(name, network, images):
 
 @pytest.mark.parametrize(
     ("name", "call"),
-    [(name, call) for name in QUICK for call in (1, 2)]  # predicting the image, the reference
-    + [("grad-cam", 3), ("poly-cam", 3)]  # looking for layers
-    + [("grad-cam", 4), ("integrated-gradients", 3), ("poly-cam", 4), ("poly-cam", 5)],  # explaining
+    [(name, call) for name in NAMES for call in (1, 2)]  # predicting, or looking for layers, or explaining
+    + [(name, 3) for name in NAMES if name not in CAMS[:3]]
+    + [("poly-cam", 4), ("poly-cam", 5), ("occlusion", 4)],
 )
 def test_model_is_given_back_as_it_was_after_an_exception(name, call, network, images):
     model = in_use(network("small shufflenet"))
@@ -144,8 +164,10 @@ def test_map_moves_with_the_image(name, network):
         return images
 
     model = network("gap")
-    one = QUICK[name](model, with_patch(24)).relevance[0, 16:56, 16:56]
-    other = QUICK[name](model, with_patch(40)).relevance[0, 32:72, 32:72]
+    # noise does not move with the image
+    explain = SmoothGrad(samples=1, noise=0.0) if name == "smooth-grad" else QUICK[name]
+    one = explain(model, with_patch(24)).relevance[0, 16:56, 16:56]
+    other = explain(model, with_patch(40)).relevance[0, 32:72, 32:72]
     correlation = torch.corrcoef(torch.stack([one.flatten(), other.flatten()]))[0, 1]
     assert float(correlation) >= 0.99
 
@@ -190,12 +212,30 @@ def test_record_says_what_was_explained(name, network, images, reference):
     model = network("small shufflenet")
     explanation = QUICK[name](model, images, reference=reference)
     assert explanation.method == name
-    assert explanation.target.startswith("f(x)")
+    assert "f(x)" in explanation.target or "f at x" in explanation.target
     with torch.no_grad():
         torch.testing.assert_close(explanation.prediction, model(images)[:, 0].float())
         torch.testing.assert_close(explanation.reference_prediction, model(reference[None])[:, 0].float().expand(3))
     assert explanation.seconds > 0
-    assert explanation.completeness_gap is not None
+    assert (explanation.completeness_gap is not None) == (name in COMPLETE)
+
+
+@every_explainer
+def test_half_precision_of_the_caller_changes_nothing(name, network, images):
+    model = network("small shufflenet").float()
+    expected = QUICK[name](model, images[:1].float())
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        inside = QUICK[name](model, images[:1].float())
+    torch.testing.assert_close(inside.relevance, expected.relevance, atol=1e-7, rtol=1e-4)
+
+
+@every_explainer
+def test_a_reference_without_a_margin_is_told(name, network, images):
+    model = Affine(network("small shufflenet"), scale=1.0, shift=0.0)
+    assert not any("no safety margin" in text for text in QUICK[name](model, images[:1], reference=images[1]).warnings)
+    model.shift = 5.0
+    warnings = QUICK[name](model, images[:1], reference=images[1]).warnings
+    assert any("is no safety margin, so the reference lies far from the data" in text for text in warnings)
 
 
 @every_explainer
@@ -295,13 +335,15 @@ def test_rejects_models(name, make, message):
         QUICK[name](Returns(make), filled(0.5))
 
 
-@pytest.mark.parametrize("name", ["grad-cam", "poly-cam"])
+@pytest.mark.parametrize("name", CAMS)
 def test_cams_need_a_layer_with_a_map(name):
     with pytest.raises(ModelError, match="Returns has no layer with a spatial map for images of 8 x 8 pixels"):
         QUICK[name](Returns(lambda x: x.mean(dim=(1, 2, 3))), filled(0.5))
 
 
-@pytest.mark.parametrize("explainer", [GradCam(layer="conv9"), PolyCam(layers=("conv9",))])
+@pytest.mark.parametrize(
+    "explainer", [GradCam(layer="conv9"), HiResCam(layer="conv9"), LayerCam(layer="conv9"), PolyCam(layers=("conv9",))]
+)
 def test_cams_name_the_layers_there_are(explainer, network, images):
     with pytest.raises(ModelError, match="has no layer 'conv9'; choose among conv1, stage2, stage3, stage4, conv5"):
         explainer(network("small shufflenet"), images[:1])

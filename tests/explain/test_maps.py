@@ -3,7 +3,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from sliplens.explain.maps import percentile_bounds, resize, spread, to_masks
+from sliplens.explain.maps import pearson_r, percentile_bounds, resize, spread, to_masks, top_overlap
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (7, 7), (5, 9), (112, 112)])
@@ -59,3 +59,20 @@ def test_mask_keeps_nan():
 
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
+
+
+def test_correlation_is_that_of_numpy_and_blind_to_scale(rng):
+    one, other = (torch.from_numpy(rng.normal(size=(5, 7))) for _ in range(2))
+    assert pearson_r(one, other) == pytest.approx(np.corrcoef(one.flatten(), other.flatten())[0, 1])
+    assert pearson_r(one, 3 * one + 2) == pytest.approx(1)
+    assert np.isnan(pearson_r(one, torch.zeros(5, 7)))
+
+
+def test_overlap_counts_the_strongest_pixels_that_are_shared():
+    one = torch.arange(20.0).reshape(4, 5)
+    # of 20 pixels the strongest tenth are two, 18 and 19; the other map's are 19 and 0
+    other = torch.where(one == 0, 50.0, one)
+    assert top_overlap(one, other) == 0.5
+    assert top_overlap(one, one) == 1
+    assert top_overlap(one, -one) == 0
+    assert top_overlap(one, other, share=1.0) == 1

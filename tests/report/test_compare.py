@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sliplens.faithfulness.intervals import bootstrap_difference
+from sliplens.intervals import bootstrap_difference
 from sliplens.report.compare import agreement, compare_deletion, compare_errors
 from sliplens.report.records import DeletionCurve, Predictions
 

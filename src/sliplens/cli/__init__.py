@@ -21,6 +21,7 @@ from sliplens.cli.report import Report
 from sliplens.cli.score import Score
 from sliplens.cli.simulate import Simulate
 from sliplens.cli.split import Split
+from sliplens.cli.track import Track
 from sliplens.cli.train import Train
 from sliplens.cli.view import View
 from sliplens.errors import SliplensError
@@ -33,6 +34,7 @@ Command = (
     | Annotated[Split, tyro.conf.subcommand("split")]
     | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[View, tyro.conf.subcommand("view")]
+    | Annotated[Track, tyro.conf.subcommand("track")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Predict, tyro.conf.subcommand("predict")]

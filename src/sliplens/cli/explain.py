@@ -1,33 +1,39 @@
 """`sliplens explain`."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sliplens.cli.console import progress_bar, say, unchanged, wrote
+from sliplens.cli.console import print_table, progress_bar, say, unchanged, wrote
 from sliplens.errors import InputError
 from sliplens.provenance import output_folder, read_json
 
 if TYPE_CHECKING:
+    from sliplens.explain import Explainer
     from sliplens.models import TrainedModel
-    from sliplens.study import ChosenFrames
+    from sliplens.study import ChosenFrames, Explained
+
+_FULL_STICK = 0.9
+"""Safety margin from which a labelled frame counts as one without slip."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Explain:
     """Show which parts of a frame made the network answer as it did, rather than as for the untouched sensor.
 
-    Explains frames of a data set along the safety margin, or a folder of images (`--frames`).
+    Explains frames of a data set along the safety margin, or a folder of images (`--frames`). The folder holds the maps
+    without loss (maps.npz), an overlay of each (overlays/METHOD/FRAME.png) and all of them side by side (panel.png).
     """
 
-    model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="RUN")]
-    """Folder of a trained network."""
+    model: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="RUN")] = None
+    """Folder of a trained network, or the name of one that comes with sliplens."""
     data: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[DATA]")] = None
     """Data set to take frames from; leave out with --frames."""
-    output: Annotated[Path, tyro.conf.arg(aliases=("-o",))]
-    """Folder to make: maps, inputs, table."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None
+    """Folder to make: maps, inputs, table, pictures."""
     frames: Path | None = None
     """Folder of 8-bit RGB images: difference images, or camera frames together with --reference."""
     reference: Path | None = None
@@ -35,7 +41,13 @@ class Explain:
     labels_in_names: bool = False
     """Read the safety margin in percent from names such as image_433_20.png."""
     method: tuple[str, ...] = ("grad-cam", "integrated-gradients", "poly-cam")
-    """Explainers to run."""
+    """Explainers to run; --list-methods tells which there are."""
+    list_methods: bool = False
+    """Print the table of explainers and do nothing else."""
+    budget: float = 1.0
+    """Share of the channels that poly-cam measures; below 1 it is faster, and tells what its maps may have lost."""
+    colours: Literal["inferno", "jet"] = "inferno"
+    """Of the pictures: perceptually uniform, or as the thesis's figures have them."""
     split: str = "test"
     """Trials of the data set to take frames from."""
     condition: str = "dry"
@@ -54,6 +66,11 @@ class Explain:
         from sliplens.study import explain_frames
         from sliplens.study.explaining import require_methods
 
+        if self.list_methods:
+            _print_methods()
+            return
+        if self.model is None or self.output is None:
+            raise InputError("name the network and the folder to make: sliplens explain RUN DATA -o FOLDER")
         if (self.data is None) == (self.frames is None):
             raise InputError("name either a data set or --frames FOLDER, to say which frames to explain")
         if self.trials < 1:
@@ -68,7 +85,10 @@ class Explain:
             "ids": chosen.ids,
             "images_sha256": _hash_images(chosen),
             "method": self.method,
+            "budget": self.budget,
+            "colours": self.colours,
         }
+        explainers = self._table(trained, chosen)
         with output_folder(self.output, stage="explain", config=recipe, overwrite=self.overwrite) as out:
             if out.complete:
                 unchanged(self.output)
@@ -76,11 +96,50 @@ class Explain:
             with progress_bar(
                 f"Explaining {len(chosen.ids)} frames ({trained.manifest.input}, {chosen.source})"
             ) as bar:
-                explain_frames(trained, chosen, out.folder, methods=self.method, on_map=bar)
+                explained = explain_frames(
+                    trained, chosen, out.folder, methods=self.method, explainers=explainers, on_map=bar
+                )
+            self._draw(explained, trained, out.folder)
         for name, notes in read_json(self.output / "result.json")["methods"].items():
             for warning in notes["warnings"]:
                 say(f"  note, {name}: {warning}")
-        wrote(self.output, f"{len(self.method)} maps of each of {len(chosen.ids)} frames")
+        wrote(self.output, f"{len(self.method)} maps of each of {len(chosen.ids)} frames, panel.png")
+
+    def _table(self, trained: "TrainedModel", chosen: "ChosenFrames") -> "Mapping[str, Explainer]":
+        """The explainers with the options that were asked for."""
+        from sliplens.explain import EXPLAINERS, ExpectedGradients, PolyCam
+
+        free = [index for index, margin in enumerate(chosen.safety_margin) if margin >= _FULL_STICK]
+        background = trained.encoding.normalise(chosen.images[free]) if free else None
+        return {
+            **EXPLAINERS,
+            "poly-cam": PolyCam(budget=self.budget),
+            "expected-gradients": ExpectedGradients(background=background),
+        }
+
+    def _draw(self, explained: "Explained", trained: "TrainedModel", folder: Path) -> None:
+        import numpy as np
+
+        from sliplens.explain.pictures import draw_panel, overlay_jet
+        from sliplens.images import write_png
+        from sliplens.report.overlay import overlay_saliency, stretch_saliency
+        from sliplens.report.style import drawing_style, method_name, percent
+
+        lay = overlay_jet if self.colours == "jet" else lambda one, two: overlay_saliency(one, stretch_saliency(two))
+        inputs = 255 * trained.encoding.normalise(explained.images)
+        pictures = list(inputs.round().byte().permute(0, 2, 3, 1).contiguous().numpy())
+        rows = {"Input": pictures}
+        for method in self.method:
+            (overlays := folder / "overlays" / method).mkdir(parents=True, exist_ok=True)
+            row = rows[method_name(method)] = []
+            for frame, picture, saliency in zip(explained.frames, pictures, explained.saliency[method], strict=True):
+                # a map that holds NaN is named in the notes, and is not shown
+                row.append(lay(picture, saliency) if np.isfinite(saliency).all() else None)
+                if row[-1] is not None:
+                    write_png(overlays / f"{frame.id}.png", row[-1])
+        titles = [f"{percent(frame.safety_margin)}, read {percent(frame.prediction)}" for frame in explained.frames]
+        with drawing_style():
+            draw_panel(rows, titles=titles).savefig(folder / "panel.png")
 
     def _choose(self, trained: "TrainedModel") -> "ChosenFrames":
         from sliplens.recordings import Dataset
@@ -105,3 +164,13 @@ def _hash_images(chosen: "ChosenFrames") -> str:
     import hashlib
 
     return hashlib.sha256(chosen.images.numpy().tobytes() + chosen.references.numpy().tobytes()).hexdigest()
+
+
+def _print_methods() -> None:
+    from sliplens.explain import EXPLAINERS
+
+    rows = []
+    for name, explainer in EXPLAINERS.items():
+        summary = (type(explainer).__doc__ or "").strip().splitlines()[0].rstrip(".")
+        rows.append((name, summary))
+    print_table("Explainers", ("method", "what it does"), rows)

@@ -1,55 +1,131 @@
 """Class activation maps that keep their sign."""
 
+from abc import abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Shaped
 from torch import Tensor, nn
 
 from sliplens.errors import InputError, ModelError
+from sliplens.explain.cells import grad_cam_map, hires_cam_map, layer_cam_map
 from sliplens.explain.clock import Clock
 from sliplens.explain.explanation import Explanation, Progress
-from sliplens.explain.health import check_maps
-from sliplens.explain.layers import capture, find_layers
+from sliplens.explain.layers import Layer, recall_layers
+from sliplens.explain.listening import capture
 from sliplens.explain.maps import spread
-from sliplens.explain.subject import Subject, explaining
-
-
-def grad_cam_map(
-    activations: Float[Tensor, "batch channels rows columns"],
-    gradients: Float[Tensor, "batch channels rows columns"],
-) -> Float[Tensor, "batch rows columns"]:
-    """Grad-CAM before any ReLU: sum over c of alpha_c A_c, alpha_c the mean over space of df/dA_c.
-
-    In margin units for each cell: for a head f = bias + w . mean over space of A, alpha_c = w_c / (rows x columns), so
-    the cells add up to f - bias without any further normalisation.
-
-    Parameters
-    ----------
-    activations
-        A, the output of a layer.
-    gradients
-        df/dA in margin units over the activation's.
-
-    References
-    ----------
-    Selvaraju et al., *Grad-CAM: Visual explanations from deep networks via gradient-based localization*, ICCV 2017,
-    eqs. 1 and 2, without the ReLU of eq. 2: a regressor's negative evidence is evidence.
-    """
-    return (gradients.mean(dim=(2, 3), keepdim=True) * activations).sum(dim=1)
+from sliplens.explain.subject import Held, holding
 
 
 @dataclass(frozen=True, kw_only=True)
-class GradCam:
+class _Cam:
+    """One layer's cells, weighted by the gradient at the image.
+
+    The published maps weigh the activations A(x). They add up to f(x) less what the layers behind it add on their own:
+    for a classifier's logit that is evidence, for a regressor it is mostly the level that every image has. What sets x
+    apart from the reference is the contrast A(x) - A(b), weighted by the same gradient.
+    The map is bilinear between the layer's cells and keeps their total.
+    """
+
+    layer: str | None = None
+    contrast: bool = True
+    batch_size: int = 32
+
+    method: ClassVar[str]
+    complete: ClassVar[bool]
+    """Whether the contrast adds up to f(x) - f(b) for a head linear in the mean over space."""
+
+    def __post_init__(self) -> None:
+        if self.batch_size < 1:
+            raise InputError(f"{type(self).__name__}'s batch_size is {self.batch_size}; give at least 1")
+
+    @abstractmethod
+    def _cells(self, activations: Tensor, gradients: Tensor, *, change: Tensor) -> Tensor:
+        """Relevance of the layer's cells in margin units."""
+
+    def __call__(
+        self,
+        model: nn.Module,
+        images: Shaped[Tensor, "*batch channels height width"],
+        *,
+        reference: Shaped[Tensor, "..."] | None = None,
+        on_progress: Progress | None = None,
+    ) -> Explanation:
+        """Explain a batch; see `Explainer` for the arguments and errors. Progress counts images."""
+        clock = Clock()
+        with holding(model, images, reference=reference) as held:
+            layer = self._find_layer(held)
+            parts, predictions, empty_predictions = [], [], []
+            empty = empty_prediction = None
+            for part in torch.arange(len(held.images)).split(self.batch_size):
+                # images and references in one pass; one reference for all is looked at once
+                shared = held.references[: 0 if parts else 1]
+                references = held.references[part] if len(held.references) > 1 else shared
+                seen = _differentiate(held, torch.cat([held.images[part], references]), count=len(part), layer=layer)
+                activations, prediction = seen.activations[: len(part)], seen.predictions[: len(part)]
+                if len(references):
+                    empty, empty_prediction = seen.activations[len(part) :], seen.predictions[len(part) :]
+                assert empty is not None  # the first pass has references
+                assert empty_prediction is not None
+                change = (prediction - empty_prediction)[:, None, None, None]
+                contrast = activations - empty if self.contrast else activations
+                cells = self._cells(contrast, seen.gradients, change=change)
+                parts.append(spread(cells, (images.shape[-2], images.shape[-1])))
+                predictions.append(prediction)
+                empty_predictions.append(empty_prediction.expand_as(prediction))
+                if on_progress is not None:
+                    on_progress(sum(map(len, parts)), len(held.images))
+            subject = held.predicted(torch.cat(predictions), torch.cat(empty_predictions))
+            relevance = torch.cat(parts)
+        return subject.explanation(
+            relevance,
+            method=self.method,
+            clock=clock,
+            complete=self.contrast and self.complete,
+            target=f"{'f(x) - f(reference)' if self.contrast else 'f(x)'}, through layer {layer.name}",
+        )
+
+    def _find_layer(self, held: Held) -> Layer:
+        names = None if self.layer is None else (self.layer,)
+        try:
+            return recall_layers(held.model, held.images[:1], names=names)[-1]
+        except ModelError:
+            held.predict_all()  # a model that gives no number has a greater fault than one without layers
+            raise
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Seen:
+    """One pass of images, followed by references, and the gradients at the images."""
+
+    activations: Tensor
+    gradients: Tensor
+    predictions: Tensor
+
+
+def _differentiate(held: Held, batch: Tensor, *, count: int, layer: Layer) -> _Seen:
+    """Activations and predictions of a batch, and the gradients of the first `count` predictions in them."""
+    with capture(held.model, [layer.name], differentiable=True) as outputs:
+        predictions = held.predict(batch)
+    if not predictions.requires_grad:
+        raise ModelError(
+            f"the output does not depend on layer {layer.name!r}; choose a layer on the path to the output"
+        )
+    (gradients,) = torch.autograd.grad(predictions[:count].sum(), outputs[layer.name])
+    return _Seen(
+        activations=outputs[layer.name].detach(), gradients=gradients[:count], predictions=predictions.detach()
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class GradCam(_Cam):
     """Grad-CAM of one layer against the reference, signed, in margin units.
 
-    The published map, sum over c of alpha_c A_c(x), adds up to f(x) less the head's bias: for a classifier's logit that
-    is evidence, for a regressor it is mostly the level that every image has. What sets x apart is the contrast
-
-        sum over c of alpha_c (A_c(x) - A_c(b)),   alpha_c at x,
-
-    which for a head linear in the mean over space adds up to f(x) - f(b) exactly, whatever the bias.
-    The map is bilinear between the layer's cells and keeps their total.
+    The relevance of a cell is sum over c of alpha_c (A_c(x) - A_c(b)), alpha_c at x (`grad_cam_map`), which for a head
+    linear in the mean over space adds up to f(x) - f(b) exactly, whatever the bias. It takes one pass of the image
+    and the reference together, a backward pass from the output to the layer, and, the first time, one pass to find the
+    layer.
 
     Parameters
     ----------
@@ -62,64 +138,51 @@ class GradCam:
         Images in one pass.
     """
 
-    layer: str | None = None
-    contrast: bool = True
-    batch_size: int = 32
+    method: ClassVar[str] = "grad-cam"
+    complete: ClassVar[bool] = True
 
-    def __post_init__(self) -> None:
-        if self.batch_size < 1:
-            raise InputError(f"Grad-CAM's batch_size is {self.batch_size}; give at least 1")
+    def _cells(self, activations: Tensor, gradients: Tensor, *, change: Tensor) -> Tensor:  # noqa: ARG002 (a slot)
+        return grad_cam_map(activations, gradients)
 
-    def __call__(
-        self,
-        model: nn.Module,
-        images: Shaped[Tensor, "*batch channels height width"],
-        *,
-        reference: Shaped[Tensor, "..."] | None = None,
-        on_progress: Progress | None = None,
-    ) -> Explanation:
-        """Explain a batch; see `Explainer` for the arguments and errors. Progress counts images."""
-        clock = Clock()
-        with explaining(model, images, reference=reference) as subject:
-            names = None if self.layer is None else (self.layer,)
-            layer = find_layers(model, subject.images[:1], names=names)[-1].name
-            parts = []
-            done = 0
-            pairs = zip(subject.images.split(self.batch_size), subject.reference.split(self.batch_size), strict=True)
-            for part, references in pairs:
-                parts.append(self._explain(subject, part, references, layer=layer))
-                done += len(part)
-                if on_progress is not None:
-                    on_progress(done, len(subject.images))
-            exact = torch.cat(parts)
-            gap = (exact.sum(dim=(1, 2)) - subject.change).abs().float() if self.contrast else None
-            relevance = exact.float()
-        return Explanation(
-            relevance=relevance,
-            method="grad-cam",
-            target=f"{'f(x) - f(reference)' if self.contrast else 'f(x)'}, through layer {layer}",
-            prediction=subject.prediction.float(),
-            reference_prediction=subject.reference_prediction.float(),
-            completeness_gap=gap,
-            seconds=clock.seconds(relevance),
-            warnings=check_maps(
-                relevance,
-                prediction=subject.prediction,
-                reference_prediction=subject.reference_prediction,
-                completeness_gap=gap,
-            ),
-        )
 
-    def _explain(self, subject: Subject, images: Tensor, references: Tensor, *, layer: str) -> Tensor:
-        with capture(subject.model, [layer], differentiable=True) as outputs:
-            prediction = subject.predict(images)
-        if not prediction.requires_grad:
-            raise ModelError(f"the output does not depend on layer {layer!r}; choose a layer on the path to the output")
-        (gradients,) = torch.autograd.grad(prediction.sum(), outputs[layer])
-        activations = outputs[layer].detach()
-        if self.contrast:
-            with capture(subject.model, [layer]) as outputs, torch.no_grad():
-                subject.predict(references)
-            activations = activations - outputs[layer]
-        cells = grad_cam_map(activations, gradients)
-        return spread(cells, (images.shape[-2], images.shape[-1]))
+@dataclass(frozen=True, kw_only=True)
+class HiResCam(_Cam):
+    """HiResCAM of one layer against the reference, signed, in margin units.
+
+    As Grad-CAM, but each cell is weighted by its own gradient (`hires_cam_map`), so that the map shows where the layers
+    behind look. With the mean over space as head the two are the same.
+
+    Parameters
+    ----------
+    layer, contrast, batch_size
+        As for `GradCam`.
+    """
+
+    method: ClassVar[str] = "hires-cam"
+    complete: ClassVar[bool] = True
+
+    def _cells(self, activations: Tensor, gradients: Tensor, *, change: Tensor) -> Tensor:  # noqa: ARG002 (a slot)
+        return hires_cam_map(activations, gradients)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayerCam(_Cam):
+    """LayerCAM of one layer against the reference, signed, in margin units.
+
+    The published map keeps the cells and channels whose gradient is positive, those that raise a class. A regressor's
+    prediction may have fallen, so kept are those whose gradient points the way the prediction went: with
+    s = sign(f(x) - f(b)) the map is s sum over c of relu(s df/dA_c) (A_c(x) - A_c(b)). The rest is left out, so the map
+    adds up to nothing in particular and has no completeness gap.
+
+    Parameters
+    ----------
+    layer, contrast, batch_size
+        As for `GradCam`.
+    """
+
+    method: ClassVar[str] = "layer-cam"
+    complete: ClassVar[bool] = False
+
+    def _cells(self, activations: Tensor, gradients: Tensor, *, change: Tensor) -> Tensor:
+        sign = change.sign()
+        return sign[:, 0] * layer_cam_map(activations, sign * gradients)

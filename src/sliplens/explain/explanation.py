@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Shaped
@@ -21,7 +21,21 @@ class Level:
     saliency: Float[Tensor, "batch height width"]
     """Map in [0, 1] as it stood at this layer, resized to the image."""
     weights: Float[Tensor, "batch channels"]
-    """Weight of each channel, >= 0, as a share of f(x) - f(reference)."""
+    """Weight of each channel, >= 0: for the regression score a share of f(x) - f(reference)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Approximation:
+    """What an approximate map has in common with the exact one, as far as its own measurements tell."""
+
+    measured: int
+    """Channels whose effect was measured."""
+    channels: int
+    """Channels that an exact map would measure."""
+    pearson_r: float
+    """Expected correlation with the exact map over the pixels; NaN where the map is constant."""
+    top_overlap: float
+    """Expected share of the strongest tenth of the pixels that is the exact map's too."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +60,10 @@ class Explanation:
     """What a reader should know before trusting the maps, one sentence each."""
     levels: tuple[Level, ...] = ()
     """The map layer by layer, fine to coarse, where the method has levels and was asked to keep them."""
+    approximations: tuple[Approximation, ...] = ()
+    """For each image what its map has in common with the exact one; empty where the map is exact."""
+    engine: str = "plain"
+    """What ran the network: as it is (`plain`), or an engine of `passes` that was found to answer as it does."""
 
     @property
     def change(self) -> Float[Tensor, " batch"]:
@@ -66,6 +84,7 @@ class Explanation:
         return supporting / torch.where(peak > 0, peak, torch.ones_like(peak))
 
 
+@runtime_checkable
 class Explainer(Protocol):
     """A frozen dataclass whose fields are the options of a method and whose call explains a batch."""
 

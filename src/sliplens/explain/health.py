@@ -1,11 +1,17 @@
 """Sentences that tell a reader when a map should not be trusted."""
 
+from collections.abc import Iterator, Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sliplens.explain.explanation import Approximation
+
 CLOSE = 0.02  # margin units; a difference below the regressor's own error explains nothing
 GAP = 0.01  # share of |f(x) - f(reference)| that may stay unexplained
+LOWEST, HIGHEST = -0.1, 1.1  # margins that a regressor tells of data like its own, with its error
+ALIKE_R, ALIKE_TOP = 0.99, 0.9  # what an approximate map should have in common with the exact one
 
 
 def check_maps(
@@ -36,6 +42,11 @@ def check_maps(
                 f"image {index}: f(x) = {high:.3g} is within {CLOSE} of f(reference) = {low:.3g}, "
                 "so there is next to nothing to explain"
             )
+        if not LOWEST <= low <= HIGHEST:
+            findings.append(
+                f"image {index}: f(reference) = {low:.3g} is no safety margin, so the reference lies far from the data "
+                "and the map shows the way from there"
+            )
         if not torch.isfinite(image_map).all():
             findings.append(f"image {index}: the map holds NaN or infinity and must not be shown or scored")
         elif not image_map.any():
@@ -48,3 +59,45 @@ def check_maps(
                     f"more than {GAP:.0%}"
                 )
     return tuple(findings)
+
+
+def check_weights(
+    layers: Sequence[str], weights: Sequence[Sequence[Float[Tensor, " _channels"]]], *, change: Sequence[float]
+) -> Iterator[str]:
+    """List what is wrong with the weights of the channels, one sentence for each image and layer.
+
+    Parameters
+    ----------
+    layers
+        Names.
+    weights
+        For each image those of each layer.
+    change
+        f(x) - f(reference) of each image in margin units.
+    """
+    for index, (shares, difference) in enumerate(zip(weights, change, strict=True)):
+        for layer, weight in zip(layers, shares, strict=True):
+            bad = int((~weight.isfinite()).sum())
+            if bad:
+                yield (
+                    f"image {index}: {bad} of {len(weight)} channels of layer {layer} have no finite weight, "
+                    "so the model cannot predict every masked image"
+                )
+            elif difference and not weight.any():
+                yield (f"image {index}: no channel of layer {layer} supports f(x) - f(reference), so the map is zero")
+            elif difference and len(weight) > 1 and bool((weight == weight[0]).all()):
+                yield (
+                    f"image {index}: every channel of layer {layer} has the weight {float(weight[0]):.3g}, "
+                    "so the masked passes chose nothing and the map shows activity only"
+                )
+
+
+def check_approximations(approximations: Sequence[Approximation]) -> Iterator[str]:
+    """Say where an approximate map is not expected to be like the exact one."""
+    for index, one in enumerate(approximations):
+        if not (one.pearson_r >= ALIKE_R and one.top_overlap >= ALIKE_TOP):
+            yield (
+                f"image {index}: with {one.measured} of {one.channels} channels measured the map is expected to "
+                f"correlate with the exact one at {one.pearson_r:.3f} and to share {one.top_overlap:.0%} of its "
+                "strongest pixels; raise the budget"
+            )

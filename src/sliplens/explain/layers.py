@@ -1,7 +1,8 @@
-"""The layers of a network whose maps are explained: found by running it, and captured without a trace."""
+"""The layers of a network whose maps are explained, found by running it."""
 
+import weakref
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from itertools import groupby
@@ -14,6 +15,8 @@ from sliplens.errors import ModelError
 from sliplens.explain.still import still
 
 _MAP_AXES = 4
+Shape = tuple[int, int, int]
+"""Channels, rows and columns of a map."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +38,8 @@ class _Call:
 
     name: str
     module: nn.Module
-    input_shape: tuple[int, ...] | None
-    output_shape: tuple[int, ...] | None = None
+    input_shape: Shape | None
+    output_shape: Shape | None = None
     inner: list["_Call"] = field(default_factory=list)
 
 
@@ -45,7 +48,7 @@ class _Step:
     """A module on the network's main path."""
 
     name: str
-    shape: tuple[int, ...]
+    shape: Shape
     has_parameters: bool
 
 
@@ -88,40 +91,51 @@ def find_layers(
     return layers
 
 
-@contextmanager
-def capture(model: nn.Module, names: Sequence[str], *, differentiable: bool = False) -> Iterator[dict[str, Tensor]]:
-    """Keep the output of each named module of every forward pass made inside, and always take the hooks off again.
+def recall_layers(
+    model: nn.Module, images: Float[Tensor, "batch 3 height width"], *, names: Sequence[str] | None = None
+) -> tuple[Layer, ...]:
+    """What `find_layers` found the last time for this network, these names and images of this size, else find them.
+
+    A search costs a pass with hooks on every module, as much as a whole Grad-CAM. It is made again when a module was
+    added, taken away or replaced.
+
+    Parameters
+    ----------
+    model, images, names
+        As for `find_layers`.
+
+    Raises
+    ------
+    ModelError
+        As `find_layers`.
+    """
+    modules = tuple((name, weakref.ref(module)) for name, module in model.named_modules())
+    key = (modules, tuple(images.shape[1:]), None if names is None else tuple(names))
+    known = _FOUND.get(model)
+    if known is None or known[0] != key:
+        _FOUND[model] = known = (key, find_layers(model, images, names=names))
+    return known[1]
+
+
+_FOUND: weakref.WeakKeyDictionary[nn.Module, tuple[object, tuple[Layer, ...]]] = weakref.WeakKeyDictionary()
+
+
+def map_calls(model: nn.Module, images: Float[Tensor, "batch 3 height width"]) -> list[tuple[str, Shape | None]]:
+    """Names of all modules in the order in which their calls end, with the shape of their output.
 
     Parameters
     ----------
     model
-        Network to listen to.
-    names
-        Modules, by their names in `model.named_modules()`. Of a module called twice the last output is kept.
-    differentiable
-        Start the graph anew at each kept output, so that the gradient of the prediction with respect to it can be
-        taken and the backward pass stops there. With several modules only the last one's gradient is whole.
+        Network; it is held `still` for the pass.
+    images
+        Images to run it on; one is enough.
 
-    Yields
-    ------
-    dict[str, Tensor]
-        Outputs by name, filled by the forward pass.
+    Returns
+    -------
+    list
+        Name, and (channels, height, width) of the output where it is a map, else None.
     """
-    outputs: dict[str, Tensor] = {}
-    modules = dict(model.named_modules())
-
-    def listen(name: str):  # noqa: ANN202 (a hook, typed by torch)
-        def hook(_module: nn.Module, _arguments: object, output: Tensor) -> Tensor:
-            outputs[name] = output.detach().requires_grad_(differentiable)
-            # the rest of the network gets a copy: an in-place ReLU would overwrite what is kept
-            return outputs[name].clone()
-
-        return hook
-
-    with ExitStack() as stack:
-        for name in names:
-            stack.callback(modules[name].register_forward_hook(listen(name)).remove)
-        yield outputs
+    return [(call.name, call.output_shape) for call in _finished(_record(model, images))]
 
 
 def _record(model: nn.Module, images: Tensor) -> _Call:
@@ -148,12 +162,15 @@ def _record(model: nn.Module, images: Tensor) -> _Call:
     return top.inner[0]
 
 
-def _map_shape(value: object) -> tuple[int, ...] | None:
+def _map_shape(value: object) -> Shape | None:
     """(channels, height, width) of a map, else None."""
-    return tuple(value.shape[1:]) if isinstance(value, Tensor) and value.ndim == _MAP_AXES else None
+    if not isinstance(value, Tensor) or value.ndim != _MAP_AXES:
+        return None
+    channels, height, width = value.shape[1:]
+    return channels, height, width
 
 
-def _is_spatial(shape: tuple[int, ...] | None) -> bool:
+def _is_spatial(shape: Shape | None) -> bool:
     return shape is not None and shape[1] * shape[2] > 1
 
 
@@ -184,13 +201,13 @@ def _distinct(steps: list[_Step]) -> tuple[Layer, ...]:
     return tuple(layers)
 
 
-def _layer(name: str, shape: tuple[int, ...]) -> Layer:
+def _layer(name: str, shape: Shape) -> Layer:
     return Layer(name=name, channels=shape[0], height=shape[1], width=shape[2])
 
 
 def _named(model: nn.Module, root: _Call, names: Sequence[str], *, found: tuple[Layer, ...]) -> tuple[Layer, ...]:
     known = [name for name, _ in model.named_modules() if name]
-    shapes: dict[str, tuple[int, ...] | None] = {}
+    shapes: dict[str, Shape | None] = {}
     for call in _finished(root):
         shapes.pop(call.name, None)  # a module called twice counts where it ended last
         shapes[call.name] = call.output_shape

@@ -54,11 +54,13 @@ def _at_rank(ordered: Tensor, rank: float) -> Tensor:
     return torch.lerp(ordered[..., below], ordered[..., above], rank - below)
 
 
-def to_masks(maps: Float[Tensor, "*maps rows columns"]) -> Float[Tensor, "*maps rows columns"]:
+def to_masks(
+    maps: Float[Tensor, "*maps rows columns"], *, as_published: bool = False
+) -> Float[Tensor, "*maps rows columns"]:
     """Turn each map into a mask in [0, 1]: clip((a - lo) / max(hi, 1e-12), 0, 1), lo and hi its extreme percentiles.
 
     A map below zero all over (hi < 0) gives the empty mask: the formula as it stands would divide by 1e-12 and make
-    a channel that is nowhere active a mask of ones.
+    a channel that is nowhere active a mask of ones, which `as_published` keeps.
 
     References
     ----------
@@ -67,4 +69,28 @@ def to_masks(maps: Float[Tensor, "*maps rows columns"]) -> Float[Tensor, "*maps 
     """
     low, high = (bound[..., None, None] for bound in percentile_bounds(maps))
     masks = ((maps - low) / high.clamp_min(FLOOR)).clamp(0, 1)
-    return torch.where(high < 0, torch.zeros_like(masks), masks)
+    return masks if as_published else torch.where(high < 0, torch.zeros_like(masks), masks)
+
+
+def pearson_r(one: Float[Tensor, "height width"], other: Float[Tensor, "height width"]) -> float:
+    """Correlation of two maps over their pixels; NaN where one of them is constant."""
+    one, other = (values.flatten().double() - values.double().mean() for values in (one, other))
+    return float(one @ other / (one.norm() * other.norm()))
+
+
+def top_overlap(
+    one: Float[Tensor, "height width"], other: Float[Tensor, "height width"], *, share: float = 0.1
+) -> float:
+    """Share of the strongest pixels of one map that are among the strongest of another.
+
+    Parameters
+    ----------
+    one, other
+        Maps of one size.
+    share
+        Of the pixels, that count as strongest.
+    """
+    count = max(1, round(share * one.numel()))
+    strongest = torch.zeros(one.numel(), dtype=torch.bool, device=one.device)
+    strongest[one.flatten().topk(count).indices] = True
+    return float(strongest[other.flatten().topk(count).indices].double().mean())

@@ -1,19 +1,23 @@
 """Poly-CAM for a regressor: channel masks, scored by what they keep and what they remove."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
 
 from sliplens.errors import InputError
+from sliplens.explain.budget import estimate_effects
 from sliplens.explain.clock import Clock
-from sliplens.explain.explanation import Explanation, Level, Progress
-from sliplens.explain.health import check_maps
-from sliplens.explain.layers import Layer, capture, find_layers
-from sliplens.explain.maps import FLOOR, resize, to_masks
-from sliplens.explain.scores import SCORES, VARIANTS, Predictions, Variant
+from sliplens.explain.effects import Regions, as_predictions, measure
+from sliplens.explain.explanation import Approximation, Explanation, Level, Progress
+from sliplens.explain.health import check_approximations, check_weights
+from sliplens.explain.layers import Layer, find_layers
+from sliplens.explain.levels import combine, scale_to
+from sliplens.explain.listening import capture
+from sliplens.explain.passes import Passes, prepare
+from sliplens.explain.sampling import mask_kernel
+from sliplens.explain.scores import SCORES, VARIANTS, channel_effects, supporting_share
 from sliplens.explain.subject import Subject, explaining
 
 
@@ -28,8 +32,7 @@ class PolyCam:
         removed  f(x) - f(b + (x - b) (1 - M))          "-"
 
     and their mean is "+/-": 0 for the empty mask, f(x) - f(b) for the full one. A channel's weight is
-    relu(effect / (f(x) - f(b))), which is the supporting part relu(sign(f(x) - f(b)) effect) over |f(x) - f(b)|; the
-    division changes no map, since each is normalised, and keeps the numbers clear of the floor of 1e-12 below.
+    relu(effect / (f(x) - f(b))), the part that supports the change.
 
     A layer's map is relu(sum of weight x activation). From the last layer to the first it is divided by itself
     resized to the coarser result and back, then multiplied by that result. The finest product, normalised like a
@@ -43,33 +46,52 @@ class PolyCam:
     variant
         "+", "-" or "+/-"; the last costs two passes a channel, the others one.
     score
-        What the masked predictions are turned into, a key of `SCORES`.
+        What the masked predictions are turned into, a key of `SCORES`: `thesis` is what the public code did to a
+        network with one output, for comparison with old figures; it takes no reference, and explains nothing.
     layers
-        Names of the layers; by default those that `find_layers` finds.
+        Names of the layers; by default those that belong to the score.
+    level
+        Which level's map is the relevance, counted from the finest, 0. The thesis displayed the finest of its ten, and
+        scored the fifth from the coarsest, `level=5`.
+    budget
+        Share of the channels to measure, in (0, 1]; 1 for the exact map. Below 1 the other channels' effects are
+        estimated, and `Explanation.approximations` says what the map is expected to have in common with the exact one.
+    engine
+        What runs the masked images; see `passes.prepare`.
     batch_size
-        Masked images in one pass.
+        Masked images in one pass; None for what suits the engine.
     levels
         Keep the saliency and the weights of each layer in the explanation.
+    seed
+        Of the draws that tell the error of a map with a budget.
 
     References
     ----------
     Englebert, Cornu and De Vleeschouwer, *Poly-CAM: High resolution class activation map for convolutional neural
-    networks*, ICPR 2022. The regression score is ours.
+    networks*, ICPR 2022. The regression score and the budget are ours.
     """
 
     variant: str = "+/-"
     score: str = "regression"
     layers: tuple[str, ...] | None = None
-    batch_size: int = 64
+    level: int = 0
+    budget: float = 1.0
+    engine: str = "auto"
+    batch_size: int | None = None
     levels: bool = False
+    seed: int = 0
 
     def __post_init__(self) -> None:
         if self.variant not in VARIANTS:
             raise InputError(f"Poly-CAM has no variant {self.variant!r}; choose among {', '.join(VARIANTS)}")
         if self.score not in SCORES:
             raise InputError(f"Poly-CAM has no score {self.score!r}; choose among {', '.join(SCORES)}")
-        if self.batch_size < 1:
+        if self.batch_size is not None and self.batch_size < 1:
             raise InputError(f"Poly-CAM's batch_size is {self.batch_size}; give at least 1")
+        if not 0 < self.budget <= 1:
+            raise InputError(f"Poly-CAM's budget is {self.budget}; give a share of the channels, above 0 and at most 1")
+        if self.budget < 1 and self.score != "regression":
+            raise InputError(f"Poly-CAM has no budget for score={self.score!r}; leave the budget out")
 
     def __call__(
         self,
@@ -82,89 +104,105 @@ class PolyCam:
         """Explain a batch; see `Explainer` for the arguments and errors. Progress counts channels of every image."""
         clock = Clock()
         with explaining(model, images, reference=reference) as subject, torch.no_grad():
-            layers = find_layers(model, subject.images[:1], names=self.layers)
-            count = _Count(total=len(subject.images) * sum(layer.channels for layer in layers), report=on_progress)
-            findings: list[str] = []
-            results = []
+            layers = self._find_layers(subject)
+            channels = sum(layer.channels for layer in layers)
+            count = _Count(total=len(subject.images) * channels, report=on_progress)
+            passes = self._prepare(subject, round(self.budget * channels))
+            size = (subject.images.shape[-2], subject.images.shape[-1])
+            weights, saliencies, approximations = [], [], []
             for index in range(len(subject.images)):
                 activations = _activations(subject, index, layers)
-                weights = [self._weights(subject, index, a, count=count) for a in activations]
-                findings += _check_weights(index, layers, weights, change=float(subject.change[index]))
-                results.append((weights, combine(activations, weights, size=_size(subject.images))))
+                shares, approximation = self._weights(subject, index, activations, passes=passes, count=count)
+                weights.append(shares)
+                approximations += approximation
+                saliencies.append(combine(activations, shares, size=size))
             levels = tuple(
                 Level(
                     layer=layer.name,
-                    saliency=torch.stack([saliencies[depth] for _, saliencies in results]).float(),
-                    weights=torch.stack([weights[depth] for weights, _ in results]).float(),
+                    saliency=torch.stack([maps[depth] for maps in saliencies]).float(),
+                    weights=torch.stack([shares[depth] for shares in weights]).float(),
                 )
                 for depth, layer in enumerate(layers)
             )
-            exact = _scale(torch.stack([saliencies[0] for _, saliencies in results]), total=subject.change)
-            gap = (exact.sum(dim=(1, 2)) - subject.change).abs().float()
-            relevance = exact.float()
-        return Explanation(
-            relevance=relevance,
+            exact = scale_to(torch.stack([maps[self.level] for maps in saliencies]), total=subject.change)
+        return subject.explanation(
+            exact,
             method="poly-cam",
-            target="f(x) - f(reference)",
-            prediction=subject.prediction.float(),
-            reference_prediction=subject.reference_prediction.float(),
-            completeness_gap=gap,
-            seconds=clock.seconds(relevance),
-            warnings=(
-                *check_maps(
-                    relevance,
-                    prediction=subject.prediction,
-                    reference_prediction=subject.reference_prediction,
-                    completeness_gap=gap,
-                ),
-                *findings,
+            clock=clock,
+            complete=True,
+            findings=(
+                *check_weights([layer.name for layer in layers], weights, change=subject.change.tolist()),
+                *check_approximations(approximations),
             ),
             levels=levels if self.levels else (),
+            approximations=tuple(approximations),
+            engine=passes.engine,
+        )
+
+    def _find_layers(self, subject: Subject) -> tuple[Layer, ...]:
+        image = subject.images[:1]
+        if self.layers is None:
+            layers = SCORES[self.score].layers(subject.model, image)
+        else:
+            layers = find_layers(subject.model, image, names=self.layers)
+        if not 0 <= self.level < len(layers):
+            raise InputError(f"Poly-CAM has no level {self.level} for {len(layers)} layers; count from 0, the finest")
+        return layers
+
+    def _prepare(self, subject: Subject, channels: int) -> Passes:
+        return prepare(
+            subject.model,
+            torch.cat([subject.images[:1], subject.reference[:1]]),
+            torch.stack([subject.prediction[0], subject.reference_prediction[0]]),
+            passes=len(subject.images) * channels * VARIANTS[self.variant].passes,
+            engine=self.engine,
+            batch_size=self.batch_size,
         )
 
     def _weights(
-        self, subject: Subject, index: int, activations: Float[Tensor, "channels rows columns"], *, count: "_Count"
-    ) -> Float[Tensor, " channels"]:
-        """Share of f(x) - f(b) that each channel's region supports, >= 0."""
-        masks = to_masks(activations)
-        # an empty mask keeps nothing and removes nothing, so its effect is 0 without a pass; NaN is kept
-        active = torch.nonzero((masks != 0).flatten(1).any(dim=1)).flatten()
-        count.add(len(masks) - len(active))
-        effects = masks.new_zeros(len(masks))
-        variant = VARIANTS[self.variant]
-        for part in active.split(max(1, self.batch_size // variant.passes)):
-            effects[part] = SCORES[self.score](_predictions(subject, index, masks[part], variant=variant))
-            count.add(len(part))
-        change = subject.change[index]
-        return torch.relu(effects / change) if change else torch.zeros_like(effects)
+        self, subject: Subject, index: int, activations: list[Tensor], *, passes: Passes, count: "_Count"
+    ) -> tuple[list[Tensor], list[Approximation]]:
+        """Weight >= 0 of each channel, layer by layer, and how far they are estimates."""
+        score, variant = SCORES[self.score], VARIANTS[self.variant]
+        image, empty, change = subject.prediction[index], subject.reference_prediction[index], subject.change[index]
+        black = torch.zeros_like(subject.images[index])
+        if score.as_published:
+            empty = subject.predict(black[None])[0]
+        regions = Regions.of(
+            activations,
+            image=subject.images[index],
+            empty=black if score.as_published else subject.reference[index],
+            as_published=score.as_published,
+        )
 
+        def points(channels: Int[Tensor, " some"]) -> Float[Tensor, "points some"]:
+            return measure(regions, channels, passes=passes, variant=variant, on_channels=count.add)
 
-def combine(
-    activations: list[Float[Tensor, "_channels _rows _columns"]],
-    weights: list[Float[Tensor, " _channels"]],
-    *,
-    size: tuple[int, int],
-) -> list[Float[Tensor, "height width"]]:
-    """Turn the channel weights of every layer into one saliency a layer, in [0, 1], resized to the image.
+        def effects(channels: Int[Tensor, " some"]) -> Float[Tensor, " some"]:
+            return channel_effects(as_predictions(points(channels), variant=variant, image=image, empty=empty))
 
-    Parameters
-    ----------
-    activations, weights
-        Those of each layer, fine to coarse.
-    size
-        Height and width of the image in pixels.
-    """
-    saliencies = []
-    coarser: Tensor | None = None
-    for activation, weight in zip(reversed(activations), reversed(weights), strict=True):
-        product = torch.relu(torch.einsum("c,chw->hw", weight, activation))
-        if coarser is not None:
-            here, there = _size(product), _size(coarser)
-            local = product / resize(resize(product, there), here).clamp_min(FLOOR)
-            product = torch.relu(local * resize(coarser, here))
-        saliencies.append(resize(to_masks(product), size))
-        coarser = product
-    return saliencies[::-1]
+        active = regions.active()
+        count.add(sum(regions.layer_sizes) - len(active))
+        if self.budget < 1 and len(active):
+            found = estimate_effects(
+                activations,
+                mask_kernel(regions, active),
+                active=active,
+                budget=self.budget,
+                change=change,
+                measure=effects,
+                size=(black.shape[-2], black.shape[-1]),
+                seed=self.seed,
+            )
+            count.add(len(active) - found.approximation.measured)
+            shares = supporting_share(found.effects, change=change)
+            return list(shares.split(regions.layer_sizes)), [found.approximation]
+        # an empty mask keeps nothing and removes nothing, which needs no pass
+        known = torch.stack([empty] * variant.keep + [image] * variant.remove)
+        every = known[:, None].repeat(1, sum(regions.layer_sizes))
+        every[:, active] = points(active)
+        shares = score.weigh(as_predictions(every, variant=variant, image=image, empty=empty))
+        return list(shares.split(regions.layer_sizes)), []
 
 
 def _activations(subject: Subject, index: int, layers: tuple[Layer, ...]) -> list[Tensor]:
@@ -173,58 +211,12 @@ def _activations(subject: Subject, index: int, layers: tuple[Layer, ...]) -> lis
     return [outputs[layer.name][0] for layer in layers]
 
 
-def _predictions(subject: Subject, index: int, masks: Tensor, *, variant: Variant) -> Predictions:
-    image, reference = subject.images[index], subject.reference[index]
-    masked = (image - reference) * resize(masks, _size(image))[:, None]
-    blends = [reference + masked] * variant.keep + [image - masked] * variant.remove
-    # channels last: convolutions on a CPU then need no reordering, about a fifth faster with the same result
-    batch = torch.cat(blends).contiguous(memory_format=torch.channels_last)
-    outputs = iter(subject.predict(batch).split(len(masks)))
-    return Predictions(
-        image=subject.prediction[index],
-        reference=subject.reference_prediction[index],
-        kept=next(outputs) if variant.keep else None,
-        removed=next(outputs) if variant.remove else None,
-    )
-
-
-def _scale(saliencies: Tensor, *, total: Tensor) -> Tensor:
-    sums = saliencies.sum(dim=(1, 2))
-    factor = torch.where(sums == 0, torch.zeros_like(sums), total / sums)
-    return saliencies * factor[:, None, None]
-
-
-def _check_weights(index: int, layers: tuple[Layer, ...], weights: list[Tensor], *, change: float) -> list[str]:
-    findings = []
-    for layer, weight in zip(layers, weights, strict=True):
-        bad = int((~weight.isfinite()).sum())
-        if bad:
-            findings.append(
-                f"image {index}: {bad} of {len(weight)} channels of layer {layer.name} have no finite weight, "
-                "so the model cannot predict every masked image"
-            )
-        elif change and not weight.any():
-            findings.append(
-                f"image {index}: no channel of layer {layer.name} supports f(x) - f(reference), so the map is zero"
-            )
-        elif change and len(weight) > 1 and bool((weight == weight[0]).all()):
-            findings.append(
-                f"image {index}: every channel of layer {layer.name} has the weight {float(weight[0]):.3g}, "
-                "so the masked passes chose nothing and the map shows activity only"
-            )
-    return findings
-
-
-def _size(images: Tensor) -> tuple[int, int]:
-    return images.shape[-2], images.shape[-1]
-
-
 @dataclass
 class _Count:
     """Channels done, reported as they are."""
 
     total: int
-    report: Callable[[int, int], None] | None
+    report: Progress | None
     done: int = 0
 
     def add(self, channels: int) -> None:

@@ -1,11 +1,14 @@
-"""How Poly-CAM turns the predictions of masked images into the effect of a channel."""
+"""How Poly-CAM turns the predictions of masked images into the weight of a channel."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
+
+from sliplens.explain.layers import Layer, find_layers
+from sliplens.explain.thesis import find_published_layers, thesis_weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,15 +39,15 @@ class Predictions:
 
     image: Float[Tensor, ""]
     """f(x)."""
-    reference: Float[Tensor, ""]
-    """f(b)."""
+    empty: Float[Tensor, ""]
+    """f(b), the image with everything removed."""
     kept: Float[Tensor, " channels"] | None
     """f(b + (x - b) M) for each channel's mask M, or None where the variant has no such pass."""
     removed: Float[Tensor, " channels"] | None
     """f(b + (x - b)(1 - M)), or None."""
 
 
-def regression_score(predictions: Predictions) -> Float[Tensor, " channels"]:
+def channel_effects(predictions: Predictions) -> Float[Tensor, " channels"]:
     """Effect of each channel's region in margin units: 0 for the empty mask, f(x) - f(b) for the full one.
 
     The mean of what the region adds to the reference, f(b + (x - b) M) - f(b), and of what the image loses without it,
@@ -53,10 +56,44 @@ def regression_score(predictions: Predictions) -> Float[Tensor, " channels"]:
     """
     effects = []
     if predictions.kept is not None:
-        effects.append(predictions.kept - predictions.reference)
+        effects.append(predictions.kept - predictions.empty)
     if predictions.removed is not None:
         effects.append(predictions.image - predictions.removed)
     return torch.stack(effects).mean(dim=0)
 
 
-SCORES: dict[str, Callable[[Predictions], Tensor]] = {"regression": regression_score}
+def supporting_share(effects: Float[Tensor, " channels"], *, change: Float[Tensor, ""]) -> Float[Tensor, " channels"]:
+    """The part of each effect that supports f(x) - f(b), as a share of it: relu(effect / (f(x) - f(b))).
+
+    That is relu(sign(f(x) - f(b)) effect) over |f(x) - f(b)|. The division changes no map, since each is normalised,
+    and keeps the numbers clear of the floor of 1e-12 in `combine`.
+    """
+    return torch.relu(effects / change) if change else torch.zeros_like(effects)
+
+
+def regression_weights(predictions: Predictions) -> Float[Tensor, " channels"]:
+    """Weight of each channel by the regression score: `supporting_share` of `channel_effects`."""
+    return supporting_share(channel_effects(predictions), change=predictions.image - predictions.empty)
+
+
+def _sigmoid_weights(predictions: Predictions) -> Float[Tensor, " channels"]:
+    return thesis_weights(predictions.image, kept=predictions.kept, removed=predictions.removed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Score:
+    """A way to weigh channels, with what belongs to it."""
+
+    weigh: Callable[[Predictions], Tensor]
+    """Weights >= 0 of the channels."""
+    layers: Callable[[nn.Module, Tensor], tuple[Layer, ...]]
+    """Layers of a network, fine to coarse or as they run, found with one image."""
+    as_published: bool
+    """Masks as the public code makes them, blended with black; otherwise empty for what is nowhere active, blended
+    with the reference."""
+
+
+SCORES = {
+    "regression": Score(weigh=regression_weights, layers=find_layers, as_published=False),
+    "thesis": Score(weigh=_sigmoid_weights, layers=find_published_layers, as_published=True),
+}

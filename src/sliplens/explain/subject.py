@@ -1,14 +1,18 @@
 """What is explained: a network held still, its images, their reference, and both predictions."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
 from sliplens.errors import ModelError
+from sliplens.explain.clock import Clock
+from sliplens.explain.explanation import Explanation
+from sliplens.explain.health import check_maps
 from sliplens.explain.inputs import require_images, require_reference
 from sliplens.explain.still import still
 
@@ -16,23 +20,14 @@ _FORWARD_BATCH = 32  # bounds the memory of the plain predictions, whatever the 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Subject:
-    """A network in evaluation mode with checked images; made by `explaining` and valid inside it only."""
+class Held:
+    """A network in evaluation mode with checked images; made by `holding` and valid inside it only."""
 
     model: nn.Module
     images: Float[Tensor, "batch 3 height width"]
     """Images x in the network's own type and on its device."""
-    reference: Float[Tensor, "batch 3 height width"]
-    """Reference b, one for each image."""
-    prediction: Float[Tensor, " batch"]
-    """f(x)."""
-    reference_prediction: Float[Tensor, " batch"]
-    """f(b)."""
-
-    @property
-    def change(self) -> Float[Tensor, " batch"]:
-        """f(x) - f(b) in margin units."""
-        return self.prediction - self.reference_prediction
+    references: Float[Tensor, "batch_or_one 3 height width"]
+    """Reference b, one for each image or one for all."""
 
     def predict(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, " batch"]:
         """Run the network and return one margin an image, with the graph where gradients are on.
@@ -44,17 +39,116 @@ class Subject:
         """
         return _predict(self.model, images)
 
+    def predict_all(self) -> "Subject":
+        """The subject, its predictions made without gradients.
+
+        Raises
+        ------
+        ModelError
+            If the network does not give one finite number an image.
+        """
+        with torch.no_grad():
+            return self.predicted(*(_predict_all(self.model, part) for part in (self.images, self.references)))
+
+    def predicted(
+        self, prediction: Float[Tensor, " batch"], reference_prediction: Float[Tensor, " batch_or_one"]
+    ) -> "Subject":
+        """The subject whose predictions these are, checked.
+
+        Raises
+        ------
+        ModelError
+            If one of them is not finite.
+        """
+        return Subject(
+            model=self.model,
+            images=self.images,
+            references=self.references,
+            prediction=_finite(prediction, what="image"),
+            reference_prediction=_finite(reference_prediction, what="reference").expand_as(prediction),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subject(Held):
+    """What is explained: f(x) - f(b)."""
+
+    prediction: Float[Tensor, " batch"]
+    """f(x)."""
+    reference_prediction: Float[Tensor, " batch"]
+    """f(b)."""
+
+    @property
+    def reference(self) -> Float[Tensor, "batch 3 height width"]:
+        """Reference b of each image."""
+        return self.references.expand_as(self.images)
+
+    @property
+    def change(self) -> Float[Tensor, " batch"]:
+        """f(x) - f(b) in margin units."""
+        return self.prediction - self.reference_prediction
+
+    def explanation(
+        self,
+        relevance: Float[Tensor, "batch height width"],
+        *,
+        method: str,
+        clock: Clock,
+        complete: bool,
+        target: str = "f(x) - f(reference)",
+        findings: Iterable[str] = (),
+        **more: Any,
+    ) -> Explanation:
+        """The record of a finished explanation, with its warnings.
+
+        Parameters
+        ----------
+        relevance
+            Signed maps in margin units, in the network's type.
+        method
+            Key of the explainer.
+        clock
+            Started when the call began.
+        complete
+            Whether the relevance of an image is meant to add up to f(x) - f(b).
+        target
+            What it adds up to, in words.
+        findings
+            Warnings of the method itself.
+        more
+            Further fields of `Explanation`.
+        """
+        gap = (relevance.sum(dim=(1, 2)) - self.change).abs().float() if complete else None
+        single = relevance.float()
+        warnings = check_maps(
+            single,
+            prediction=self.prediction,
+            reference_prediction=self.reference_prediction,
+            completeness_gap=gap,
+        )
+        return Explanation(
+            relevance=single,
+            method=method,
+            target=target,
+            prediction=self.prediction.float(),
+            reference_prediction=self.reference_prediction.float(),
+            completeness_gap=gap,
+            seconds=clock.seconds(single),
+            warnings=(*warnings, *findings),
+            **more,
+        )
+
 
 @contextmanager
-def explaining(
+def holding(
     model: nn.Module,
     images: Shaped[Tensor, "..."],
     *,
     reference: Shaped[Tensor, "..."] | None,
-) -> Iterator[Subject]:
-    """Check the images, hold the network still, and predict the images and the reference.
+) -> Iterator[Held]:
+    """Check the images and hold the network still.
 
-    Inside, the network is held `still` and gradients are on, whatever the caller's mode.
+    Inside, the network is held `still`, gradients are on and autocast is off, whatever the caller's mode.
 
     Parameters
     ----------
@@ -67,15 +161,13 @@ def explaining(
 
     Yields
     ------
-    Subject
-        The network, images, reference and predictions.
+    Held
+        The network, images and reference.
 
     Raises
     ------
     ImageError
         If the images or the reference cannot be used.
-    ModelError
-        If the network does not give one finite number an image.
     """
     images = require_images(images)
     reference = require_reference(reference, images=images)
@@ -86,16 +178,29 @@ def explaining(
         stack.enter_context(still(model))
         # clone: tensors made in inference mode cannot enter a graph
         images, reference = (_like_model(model, tensor).detach().clone() for tensor in (images, reference))
-        with torch.no_grad():
-            prediction = _finite(_predict_all(model, images), what="image")
-            reference_prediction = _finite(_predict_all(model, reference), what="reference")
-        yield Subject(
-            model=model,
-            images=images,
-            reference=reference.expand_as(images),
-            prediction=prediction,
-            reference_prediction=reference_prediction.expand_as(prediction),
-        )
+        # differences of predictions are explained, of which half precision leaves two digits
+        stack.enter_context(torch.autocast(images.device.type, enabled=False))
+        yield Held(model=model, images=images, references=reference)
+
+
+@contextmanager
+def explaining(
+    model: nn.Module,
+    images: Shaped[Tensor, "..."],
+    *,
+    reference: Shaped[Tensor, "..."] | None,
+) -> Iterator[Subject]:
+    """Hold the network still as `holding` does, and predict the images and the reference.
+
+    Raises
+    ------
+    ImageError
+        If the images or the reference cannot be used.
+    ModelError
+        If the network does not give one finite number an image.
+    """
+    with holding(model, images, reference=reference) as held:
+        yield held.predict_all()
 
 
 def _predict(model: nn.Module, images: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from sliplens.faithfulness.intervals import Difference, bootstrap_difference
+from sliplens.intervals import Difference, bootstrap_difference
 from sliplens.report.records import DeletionCurve, Predictions
 
 

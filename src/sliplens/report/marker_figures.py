@@ -36,7 +36,7 @@ class MarkedFrame:
     title: str
     frame: UInt8[np.ndarray, "height width 3"]
     field: DisplacementField
-    saliency: Float[np.ndarray, "height width"]
+    saliency: Float[np.ndarray, "_ _"]
     """In [0, 1]."""
 
 
@@ -63,7 +63,7 @@ def plot_arrows(
     magnified
         Length of an arrow over the displacement.
     """
-    known = np.isfinite(displacement_px).all(axis=1) & np.isfinite(rest_px).all(axis=1)
+    known = np.all(np.isfinite(displacement_px), axis=1) & np.all(np.isfinite(rest_px), axis=1)
     place, way = rest_px[known], displacement_px[known]
     ax.imshow(frame)
     ax.quiver(
@@ -100,7 +100,8 @@ def plot_field(
     sure = field.confidence > _SURE
     length = np.linalg.norm(field.displacement_px, axis=-1)
     top = longest_px or max(float(np.nanmax(np.where(sure, length, 0))), _STILL_PX)
-    extent = (*_ends(field.x_px), *_ends(field.y_px)[::-1])
+    (left, right), (top_edge, bottom) = _ends(field.x_px), _ends(field.y_px)
+    extent = (left, right, bottom, top_edge)
     ax.set_facecolor("#D1D5DB")
     norm = Normalize(0, top)
     ax.imshow(np.where(sure, length, np.nan), cmap=FIELD_COLOURS, norm=norm, extent=extent, interpolation="nearest")

@@ -22,6 +22,12 @@ METHOD_NAMES = {
     "grad-cam": "Grad-CAM",
     "integrated-gradients": "Integrated Gradients",
     "poly-cam": "Poly-CAM",
+    "hires-cam": "HiResCAM",
+    "layer-cam": "LayerCAM",
+    "expected-gradients": "Expected Gradients",
+    "smooth-grad": "SmoothGrad",
+    "occlusion": "Occlusion",
+    "lrp": "LRP",
     CONTROL: "Random order (control)",
 }
 METHOD_COLOURS = {"grad-cam": VERMILLION, "integrated-gradients": SKY, "poly-cam": GREEN, CONTROL: BLACK}

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from sliplens.faithfulness.intervals import Difference
+from sliplens.intervals import Difference
 from sliplens.report.compare import compare_deletion
 from sliplens.report.records import Results, Scored
 from sliplens.report.style import (

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from sliplens.faithfulness.intervals import FEWEST_UNITS
+from sliplens.intervals import FEWEST_UNITS
 from sliplens.report.compare import agreement, compare_errors
 from sliplens.report.records import Explained, Results, Scored
 from sliplens.report.style import (

@@ -1,7 +1,7 @@
 """Explain frames, one piece at a time, so that an interrupted run loses at most one map."""
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from sliplens.errors import InputError
-from sliplens.explain import EXPLAINERS, Explanation
+from sliplens.explain import EXPLAINERS, Explainer, Explanation
 from sliplens.models import TrainedModel
 from sliplens.study.frames import ChosenFrames
 from sliplens.study.saved import Explained, ExplainedFrame, save_explained
@@ -38,6 +38,7 @@ def explain_frames(
     folder: Path,
     *,
     methods: Sequence[str] = DEFAULT_METHODS,
+    explainers: Mapping[str, Explainer] = EXPLAINERS,
     on_map: Progress | None = None,
 ) -> Explained:
     """Explain frames with several methods and write the result.
@@ -54,6 +55,8 @@ def explain_frames(
         Where the result is written; must exist.
     methods
         Names in the table of explainers.
+    explainers
+        The table, where their options are not the default ones.
     on_map
         Called with the number of maps done and the number of all.
 
@@ -76,7 +79,7 @@ def explain_frames(
             part = parts / f"{method}-{index:05d}.npz"
             if not part.is_file():
                 one = slice(index, index + 1)
-                explanation = EXPLAINERS[method](trained.model, inputs[one], reference=chosen.references[one])
+                explanation = explainers[method](trained.model, inputs[one], reference=chosen.references[one])
                 _save_part(part, explanation)
             with np.load(part, allow_pickle=False) as archive:
                 pieces.append({name: archive[name] for name in archive.files})

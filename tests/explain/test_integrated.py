@@ -60,6 +60,26 @@ def test_each_image_takes_the_steps_that_it_needs(network, images):
     assert short < sum(counted.batches)
 
 
+def test_the_steps_go_where_the_network_changes():
+    class Steep(nn.Module):
+        """Rises from 0 to 1 within a twentieth of the way."""
+
+        def forward(self, images):
+            return torch.sigmoid(400 * (images.mean(dim=(1, 2, 3)) - 0.21))
+
+    images = torch.ones(1, 3, 4, 4, dtype=torch.float64)
+    spread = IntegratedGradients(steps=64, max_steps=64)(Steep(), images)
+    counted = Count(Steep())
+    refined = IntegratedGradients(steps=16)(counted, images)
+    assert spread.completeness_gap is not None
+    assert refined.completeness_gap is not None
+    assert float(spread.completeness_gap) > 0.01
+    assert float(refined.completeness_gap) <= 0.01
+    assert sum(counted.batches) < 2 * 64
+    # a function of the mean alone: each pixel has the same share, within the tolerance
+    torch.testing.assert_close(refined.relevance, torch.full((1, 4, 4), 1 / 16), atol=0, rtol=0.01)
+
+
 def test_stops_at_the_most_steps_and_says_so():
     class Jump(nn.Module):
         """A step that no gradient sees."""
@@ -68,11 +88,12 @@ def test_stops_at_the_most_steps_and_says_so():
             return (images.mean(dim=(1, 2, 3)) > 0.5).double() + 0 * images.sum(dim=(1, 2, 3))
 
     counted = Count(Jump())
-    explanation = IntegratedGradients(steps=4, max_steps=10)(counted, torch.ones(1, 3, 4, 4, dtype=torch.float64))
+    explanation = IntegratedGradients(steps=4, max_steps=13)(counted, torch.ones(1, 3, 4, 4, dtype=torch.float64))
     assert explanation.completeness_gap is not None
     assert explanation.completeness_gap.tolist() == [1]
     assert any("leaves 1 of f(x) - f(reference) = 1 unexplained" in sentence for sentence in explanation.warnings)
-    assert sum(counted.batches) == 2 + 4 + 10  # the predictions, then fourfold up to the most
+    # the predictions and one piece of four; then its halves, and the predictions at its start and middle
+    assert sum(counted.batches) == 2 + 4 + 2 * 4 + 2
 
 
 def test_one_pass_is_bounded(network, images):
@@ -90,7 +111,7 @@ def test_progress_counts_images(network, images):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"steps": 0}, "steps = 0 and max_steps = 512; give 1 <= steps <= max_steps"),
+        ({"steps": 0}, "steps = 0 and max_steps = 1024; give 1 <= steps <= max_steps"),
         ({"steps": 64, "max_steps": 32}, "steps = 64 and max_steps = 32; give 1 <= steps <= max_steps"),
         ({"batch_size": 0}, "batch_size is 0; give at least 1"),
         ({"tolerance": 0.0}, "tolerance is 0.0; give a share above 0"),

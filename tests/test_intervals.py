@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sliplens.faithfulness.intervals import FEWEST_UNITS, paired_difference
+from sliplens.intervals import FEWEST_UNITS, paired_difference
 
 
 def test_the_interval_of_a_mean_is_that_of_the_central_limit_theorem(rng: np.random.Generator):

@@ -1,0 +1,193 @@
+"""Poly-CAM against a plain loop of one masked image at a time, on trained networks and frames of their own kind.
+
+The exact map must be that of the loop; the fast one, with a budget, must be like it. All times are taken in this run,
+on the same frames. The plain loop is timed on every n-th channel of each layer, `--loop-passes` in all, and its time
+scaled up to all channels: a pass costs the same whatever its mask.
+"""
+
+import argparse
+import json
+import math
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that spin take the cores from the engine's own
+
+import torch
+from torch import Tensor, nn
+
+from sliplens.errors import SliplensError
+from sliplens.explain import Explanation, PolyCam, capture, find_layers
+from sliplens.explain.maps import pearson_r, resize, to_masks, top_overlap
+from sliplens.models import TrainedModel, load_checkpoint
+from sliplens.models.shipped import find_run
+from sliplens.provenance import machine, versions
+from sliplens.recordings import Dataset
+from sliplens.simulation import SimulationRecipe, simulate_dataset
+from sliplens.study import frames_from_dataset, frames_from_folder
+
+NETWORKS = ("chromatouch-difference", "chromatouch-raw")
+REAL = Path(os.environ.get("SLIPLENS_REFERENCE", "../shared/reference")) / "chromatouch" / "difference"
+BUDGET = 0.25
+RECIPE = SimulationRecipe(dry_trials=8, wet_trials=0, frames_per_trial=24, seed=7)
+
+
+def choose_frames(trained: TrainedModel, data: Dataset, *, real: Path, count: int) -> tuple[Tensor, Tensor]:
+    """Inputs and references: real difference images where the network takes them, then simulated frames."""
+    chosen = [frames_from_dataset(trained, data, split="test")]
+    if trained.manifest.input == "difference" and real.is_dir():
+        chosen.insert(0, frames_from_folder(trained, real))
+    images = torch.cat([trained.encoding.normalise(one.images) for one in chosen])
+    references = torch.cat([one.references for one in chosen])
+    # first and last of each kind, and then between: small and large changes alike
+    order = torch.linspace(0, len(images) - 1, min(count, len(images))).round().long()
+    return images[order], references[order]
+
+
+@torch.no_grad()
+def plain_loop(
+    model: nn.Module, image: Tensor, reference: Tensor, *, passes: int
+) -> tuple[float, list[dict[int, float]]]:
+    """Seconds that a loop of one masked image at a time takes for all channels, and effects by layer and channel."""
+    model.eval()
+    names = [layer.name for layer in find_layers(model, image[None])]
+    with capture(model, names) as outputs:
+        whole = model(image[None])
+    nothing = model(reference[None])
+    masks = [to_masks(outputs[name][0]) for name in names]
+    total = sum(map(len, masks))
+    step = max(1, round(2 * total / passes)) if passes else 1
+    effects, started = [], time.perf_counter()
+    for layer in masks:
+        found = {}
+        for channel in range(0, len(layer), step):
+            added = (image - reference) * resize(layer[channel], (image.shape[-2], image.shape[-1]))
+            kept, removed = model((reference + added)[None]), model((image - added)[None])
+            found[channel] = float((kept - nothing + whole - removed) / 2)
+        effects.append(found)
+    return (time.perf_counter() - started) * total / sum(map(len, effects)), effects
+
+
+def check_effects(explanation: Explanation, effects: list[dict[int, float]], *, change: float) -> float:
+    """Largest difference between weights of the exact map and of the loop, as a share of the layer's largest weight."""
+    worst = 0.0
+    for level, found in zip(explanation.levels, effects, strict=True):
+        weights = level.weights[0].tolist()
+        largest = max(weights) or 1.0
+        worst = max(worst, *(abs(weights[channel] - max(e / change, 0)) / largest for channel, e in found.items()))
+    return worst
+
+
+def measure(
+    trained: TrainedModel, images: Tensor, references: Tensor, *, options: argparse.Namespace
+) -> dict[str, Any]:
+    """Times, errors and likeness on the frames of one network, frame by frame."""
+    model, rows = trained.model, []
+    # torch alone and in batches: the loop's own map where its passes are too many to make them all
+    plain = PolyCam(engine="plain")
+    exact = PolyCam(levels=True)
+    fast = PolyCam(budget=options.budget)
+    with_engine = exact(model, images[:1], reference=references[:1])  # prepares the engine, as the first frame does
+    preparation = with_engine.seconds
+    for image, reference in zip(images, references, strict=True):
+        loop_s, effects = plain_loop(model, image, reference, passes=options.loop_passes)
+        whole = exact(model, image[None], reference=reference[None])
+        quick = fast(model, image[None], reference=reference[None])
+        oracle = plain(model, image[None], reference=reference[None]) if options.oracle else None
+        (told,) = quick.approximations
+        rows.append(
+            {
+                "prediction": float(whole.prediction),
+                "change": float(whole.change),
+                "loop_s": loop_s,
+                "exact_s": whole.seconds,
+                "fast_s": quick.seconds,
+                "exact_error": float((whole.saliency - oracle.saliency).abs().max()) if oracle else math.nan,
+                "weight_error": check_effects(whole, effects, change=float(whole.change)),
+                "pearson_r": pearson_r(whole.saliency[0], quick.saliency[0]),
+                "top10_overlap": top_overlap(whole.saliency[0], quick.saliency[0]),
+                "told_pearson_r": told.pearson_r,
+                "told_top10_overlap": told.top_overlap,
+            }
+        )
+        print(" ".join(f"{key} {value:.4g}" for key, value in rows[-1].items()), flush=True)
+    return {
+        "exact_speedup": sum(row["loop_s"] for row in rows) / sum(row["exact_s"] for row in rows),
+        "fast_speedup": sum(row["loop_s"] for row in rows) / sum(row["fast_s"] for row in rows),
+        "exact_max_error": max(row["exact_error"] for row in rows) if options.oracle else None,
+        "exact_max_weight_error": max(row["weight_error"] for row in rows),
+        "fast_pearson_r": min(row["pearson_r"] for row in rows),
+        "fast_top10_overlap": min(row["top10_overlap"] for row in rows),
+        "first_frame_s": preparation,
+        "engine": with_engine.engine,
+        "image_size": trained.manifest.image_size,
+        "frames": rows,
+    }
+
+
+def gpu_milliseconds(trained: TrainedModel, image: Tensor, reference: Tensor, *, budget: float) -> float | None:
+    """Milliseconds an image on a graphics card, warmed up and waited for; None without one."""
+    if not torch.cuda.is_available():
+        return None
+    model, explain = trained.model.to("cuda"), PolyCam(budget=budget)
+    seconds = [explain(model, image[None], reference=reference[None]).seconds for _ in range(4)]
+    trained.model.to("cpu")
+    return 1000 * min(seconds[1:])
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the benchmark from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--run", type=Path, nargs="+", default=[Path(name) for name in NETWORKS], help="networks")
+    parser.add_argument("--data", type=Path, help="data set with test trials; simulated if not given")
+    parser.add_argument("--real", type=Path, default=REAL, help="folder of real difference images")
+    parser.add_argument("--frames", type=int, default=6, help="for each network")
+    parser.add_argument("--budget", type=float, default=BUDGET)
+    parser.add_argument("--loop-passes", type=int, default=600, help="of the plain loop for each frame; 0 for all")
+    parser.add_argument(
+        "--no-oracle", dest="oracle", action="store_false", help="leave out the exact map by torch alone"
+    )
+    parser.add_argument("--json", action="store_true", help="end with one line of JSON")
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as scratch:
+        try:
+            if options.data is None:
+                data = simulate_dataset(Path(scratch) / "data", RECIPE)
+            else:
+                data = Dataset.open(options.data)
+            found, gpu = {}, []
+            for run in options.run:
+                trained = load_checkpoint(find_run(run))
+                images, references = choose_frames(trained, data, real=options.real, count=options.frames)
+                found[str(run)] = measure(trained, images, references, options=options)
+                gpu.append(
+                    [gpu_milliseconds(trained, images[-1], references[-1], budget=one) for one in (1.0, options.budget)]
+                )
+        except SliplensError as error:
+            sys.exit(f"{Path(__file__).name}: {error}")
+    result: dict[str, Any] = {
+        key: None if None in (values := [one[key] for one in found.values()]) else least(values)
+        for key, least in (
+            ("exact_speedup", min),
+            ("exact_max_error", max),
+            ("fast_speedup", min),
+            ("fast_pearson_r", min),
+            ("fast_top10_overlap", min),
+        )
+    }
+    exact_ms, fast_ms = ([times[place] for times in gpu if times[place] is not None] for place in (0, 1))
+    result |= {"gpu_exact_ms": max(exact_ms, default=None), "gpu_fast_ms": max(fast_ms, default=None)}
+    for key, value in result.items():
+        print(f"{key:20} {'not measured' if value is None else format(value, '.4g')}")
+    if options.json:
+        more = {"budget": options.budget, "threads": torch.get_num_threads(), "networks": found}
+        print(json.dumps({**result, **more, "machine": machine(), "versions": versions()}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,129 @@
+"""Occlusion: what the prediction loses when a part of the image is replaced by the reference."""
+
+from dataclasses import dataclass
+
+import torch
+from captum import attr
+from jaxtyping import Float, Int, Shaped
+from torch import Tensor, nn
+
+from sliplens.errors import InputError
+from sliplens.explain.clock import Clock
+from sliplens.explain.explanation import Explanation, Progress
+from sliplens.explain.subject import explaining
+
+
+def tile_regions(size: tuple[int, int], *, tile_px: int) -> Int[Tensor, "height width"]:
+    """Number of the square tile in which each pixel lies; tiles at the right and lower border may be smaller."""
+    rows, columns = (torch.arange(length) // tile_px for length in size)
+    return rows[:, None] * (int(columns.max()) + 1) + columns
+
+
+def marker_regions(
+    size: tuple[int, int], centres_px: Float[Tensor, "markers 2"], *, radius_px: float | None = None
+) -> Int[Tensor, "height width"]:
+    """Number of the marker that each pixel belongs to, and one number more for the pixels between the markers.
+
+    Parameters
+    ----------
+    size
+        Height and width of the image in pixels.
+    centres_px
+        x and y of the markers in the image that the network sees; pixel centres lie at whole numbers.
+    radius_px
+        How far a marker reaches; by default half of the median distance between neighbours. A pixel within reach of
+        two belongs to the nearer.
+    """
+    rows, columns = (torch.arange(length, dtype=torch.float64) for length in size)
+    pixels = torch.stack(torch.broadcast_tensors(columns, rows[:, None]), dim=-1).reshape(-1, 2)
+    centres = centres_px.double()
+    if radius_px is None:
+        between = torch.cdist(centres, centres).fill_diagonal_(torch.inf).amin(dim=1)
+        radius_px = float(between.median()) / 2
+    distance, nearest = torch.cdist(pixels, centres).min(dim=1)
+    return torch.where(distance <= radius_px, nearest, len(centres)).reshape(size)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Occlusion:
+    """Occlusion by tile, or by marker where the markers' places are given, signed, in margin units.
+
+    The relevance of a region is f(x) - f(x with the region as in the reference), spread evenly over its pixels. Nothing
+    is assumed of the network, and nothing outside its data is shown to it as far as the reference is one of them. For a
+    linear network the regions add up to f(x) - f(b); where they work together, or stand in for each other, they do not,
+    so there is no completeness gap.
+
+    Parameters
+    ----------
+    tile_px
+        Side of a tile in pixels.
+    markers_px
+        x and y of the markers in the image that the network sees, (markers, 2); they are then the regions, and what
+        lies between them is one more.
+    radius_px
+        How far a marker reaches; see `marker_regions`.
+    batch_size
+        Occluded images in one pass.
+
+    References
+    ----------
+    Zeiler and Fergus, *Visualizing and understanding convolutional networks*, ECCV 2014, section 4.2; by Captum.
+    """
+
+    tile_px: int = 16
+    markers_px: Float[Tensor, "markers 2"] | None = None
+    radius_px: float | None = None
+    batch_size: int = 32
+
+    def __post_init__(self) -> None:
+        if self.tile_px < 1:
+            raise InputError(f"occlusion's tile_px is {self.tile_px}; give at least 1 pixel")
+        if self.batch_size < 1:
+            raise InputError(f"occlusion's batch_size is {self.batch_size}; give at least 1")
+        if self.markers_px is not None and self.radius_px is None and len(self.markers_px) < 2:
+            raise InputError(
+                f"occlusion has {len(self.markers_px)} marker(s) and no radius_px; a single one's reach must be given"
+            )
+        if self.radius_px is not None and not self.radius_px > 0:
+            raise InputError(f"occlusion's radius_px is {self.radius_px}; give a radius above 0 pixels")
+
+    def __call__(
+        self,
+        model: nn.Module,
+        images: Shaped[Tensor, "*batch channels height width"],
+        *,
+        reference: Shaped[Tensor, "..."] | None = None,
+        on_progress: Progress | None = None,
+    ) -> Explanation:
+        """Explain a batch; see `Explainer` for the arguments and errors. Progress counts images."""
+        clock = Clock()
+        with explaining(model, images, reference=reference) as subject, torch.no_grad():
+            regions = self._regions((images.shape[-2], images.shape[-1])).to(subject.images.device)
+            areas = regions.flatten().bincount()[regions]
+            captum = attr.FeatureAblation(subject.predict)
+            maps = []
+            for index in range(len(subject.images)):
+                effects = captum.attribute(
+                    subject.images[index, None],
+                    baselines=subject.reference[index, None],
+                    feature_mask=regions[None, None],
+                    perturbations_per_eval=self.batch_size,
+                )
+                # Captum gives every pixel and channel the whole effect of its region
+                maps.append(effects[0, 0] / areas)
+                if on_progress is not None:
+                    on_progress(index + 1, len(subject.images))
+            relevance = torch.stack(maps)
+        unit = f"tiles of {self.tile_px} px" if self.markers_px is None else "markers"
+        return subject.explanation(
+            relevance,
+            method="occlusion",
+            clock=clock,
+            complete=False,
+            target=f"f(x) - f(x with one region as in the reference), {unit}",
+        )
+
+    def _regions(self, size: tuple[int, int]) -> Tensor:
+        if self.markers_px is None:
+            return tile_regions(size, tile_px=self.tile_px)
+        return marker_regions(size, self.markers_px, radius_px=self.radius_px)

@@ -1,0 +1,222 @@
+"""Following markers from the untouched sensor through a trial."""
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from sliplens.errors import ImageError, RecordingError
+from sliplens.markers.consistency import drop_contradicting, drop_strays, match_left_over
+from sliplens.markers.detect import Markers, detect_markers
+from sliplens.markers.kinds import MarkerKind
+from sliplens.markers.linking import Usual, link
+from sliplens.markers.matching import Pairing
+from sliplens.markers.neighbours import find_neighbours
+from sliplens.markers.newcomers import Newcomers
+from sliplens.markers.tracks import MarkerStatus, TrackedFrame, Tracks, stack_tracks
+
+_FEWEST = 4
+_RADIUS_CHANGE = (0.6, 1.6)  # of its own at rest, over what all markers changed by
+_CONTRAST_LEFT = 0.45
+_ROUNDNESS_LEFT, _ROUND = 0.75, 0.7
+
+
+class Tracker:
+    """Follows the markers of one sensor, frame by frame; identity is that of the reference frame.
+
+    Parameters
+    ----------
+    reference
+        The sensor untouched, T_0: RGB.
+    kind
+        Row of `KINDS`, or a kind of one's own.
+
+    Raises
+    ------
+    InputError
+        If the kind is not known, or OpenCV is missing.
+    ImageError
+        If the reference is over- or underexposed, or shows fewer than 4 whole markers.
+    """
+
+    def __init__(self, reference: UInt8[np.ndarray, "height width 3"], kind: str | MarkerKind = "auto") -> None:
+        found = detect_markers(reference, kind)
+        self.rest = _only(found, found.whole)
+        if len(self.rest) < _FEWEST:
+            raise ImageError(
+                f"the reference shows {len(self.rest)} whole markers, at least {_FEWEST} are needed; name another kind"
+            )
+        self._size = reference.shape[:2]
+        self._neighbours = find_neighbours(self.rest.centre_px)
+        self._shift = np.zeros_like(self.rest.centre_px)
+        self._usual, self._lost = Usual(), False
+        self._newcomers = Newcomers(pitch_px=float(np.median(self._neighbours.pitch_px)))
+
+    def update(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> TrackedFrame:
+        """Follow the markers into the next frame T_n.
+
+        Raises
+        ------
+        ImageError
+            If the frame has another size than the reference.
+        """
+        if frame.shape[:2] != self._size:
+            raise ImageError(
+                f"frame of {frame.shape[0]} x {frame.shape[1]} pixels against a reference of {self._size[0]} x "
+                f"{self._size[1]}; record the reference with the same camera settings"
+            )
+        found = detect_markers(frame, appearance=self.rest.appearance)
+        rest = self.rest.centre_px
+        pairing = link(
+            [rest + self._shift, rest] if self._lost else [rest + self._shift],
+            found.centre_px,
+            neighbours=self._neighbours,
+            frame_size=self._size,
+            usual=self._usual,
+            lost=self._lost,
+        )
+        self._lost = pairing is None
+        if pairing is None:
+            return self._nothing()
+        self._usual = self._usual.after(pairing)
+        return self._judge(found, pairing)
+
+    def _nothing(self) -> TrackedFrame:
+        count = len(self.rest) + self._newcomers.forget()
+        return TrackedFrame(
+            position_px=np.full((count, 2), np.nan),
+            radius_px=np.full(count, np.nan),
+            deviation_px=np.full(count, np.nan),
+            status=np.full(count, MarkerStatus.LOST, dtype=np.uint8),
+        )
+
+    def _judge(self, found: Markers, pairing: Pairing) -> TrackedFrame:
+        rest, spot = self.rest.centre_px, pairing.spot
+        changed, cut = self._spoiled(found, spot)
+        shift = _taken(found.centre_px, spot) - rest
+        sound, told = self._believable(shift, (spot >= 0) & ~changed & ~cut)
+        if not sound.all():
+            spot = match_left_over(
+                self._neighbours, spot, sound | changed | cut, told, rest_px=rest, found_px=found.centre_px
+            )
+            changed, cut = self._spoiled(found, spot)
+            shift = _taken(found.centre_px, spot) - rest
+            sound, told = self._believable(shift, (spot >= 0) & ~changed & ~cut)
+        place = rest + shift
+        deviation = np.linalg.norm(shift - told, axis=1)
+        status = np.full(len(rest), MarkerStatus.MISSING, dtype=np.uint8)
+        status[spot >= 0] = MarkerStatus.BROKEN
+        status[sound] = MarkerStatus.FOLLOWED
+        # what was not seen goes on as its neighbours do, so that it is known when it comes back
+        self._shift = np.where(sound[:, None], shift, np.where(np.isfinite(told), told, self._shift))
+        status[cut | ((spot < 0) & self._leaves_view())] = MarkerStatus.OUTSIDE
+        hidden = ~np.isin(status, (MarkerStatus.FOLLOWED, MarkerStatus.BROKEN))
+        place[hidden] = np.nan
+        new = self._newcomers.update(_only(found, found.whole & ~_used(spot, len(found))), self._expected(place))
+        return TrackedFrame(
+            position_px=np.concatenate([place, new.place_px]),
+            radius_px=np.concatenate([np.where(hidden, np.nan, _taken(found.radius_px, spot)), new.radius_px]),
+            deviation_px=np.concatenate([np.where(hidden, np.nan, deviation), np.full(len(new.status), np.nan)]),
+            status=np.concatenate([status, new.status]),
+        )
+
+    def _believable(
+        self, shift: Float[np.ndarray, "markers 2"], sound: Bool[np.ndarray, " markers"]
+    ) -> tuple[Bool[np.ndarray, " markers"], Float[np.ndarray, "markers 2"]]:
+        sound = drop_contradicting(self._neighbours, shift, sound)
+        return drop_strays(self._neighbours, shift, sound)
+
+    def _spoiled(
+        self, found: Markers, spot: Int[np.ndarray, " markers"]
+    ) -> tuple[Bool[np.ndarray, " markers"], Bool[np.ndarray, " markers"]]:
+        """Markers whose spot has changed too much to be measured, and those that the edge cuts."""
+        paired = spot >= 0
+        cut = np.zeros_like(paired)
+        cut[paired] = ~found.whole[spot[paired]]
+        return paired & _changed(self.rest, found, spot), cut
+
+    def _leaves_view(self) -> Bool[np.ndarray, " markers"]:
+        place, edge = self.rest.centre_px + self._shift, (self.rest.radius_px + 1.5)[:, None]
+        far = np.array([self._size[1] - 1, self._size[0] - 1])
+        return np.any((place < edge) | (place > far - edge), axis=1)
+
+    def _expected(self, place: Float[np.ndarray, "markers 2"]) -> Float[np.ndarray, "markers 2"]:
+        return np.where(np.isfinite(place), place, self.rest.centre_px + self._shift)
+
+
+def track_markers(
+    frames: Iterable[UInt8[np.ndarray, "_ _ 3"]],
+    reference: UInt8[np.ndarray, "height width 3"],
+    kind: str | MarkerKind = "auto",
+    *,
+    on_frame: Callable[[int], None] | None = None,
+) -> Tracks:
+    """Follow markers from the untouched sensor through a sequence of frames.
+
+    Each marker keeps the identity it has in the reference frame. Every step is checked forwards (a spot belongs to the
+    marker that is nearest, and the marker to the spot) and backwards (moved back as its neighbours moved, a spot must
+    lead to where its own marker was). After a jump the pattern is found anew by its shape as a whole; where a regular
+    grid fits in two ways, all markers are LOST until it can be told again.
+
+    Parameters
+    ----------
+    frames
+        T_1 to T_n: RGB, of the reference's size.
+    reference
+        T_0.
+    kind
+        Row of `KINDS`, or a kind of one's own.
+    on_frame
+        Called with the frames done, after each.
+
+    Raises
+    ------
+    InputError
+        If the kind is not known, or OpenCV is missing.
+    ImageError
+        If the reference is over- or underexposed or shows fewer than 4 whole markers, or a frame has another size.
+    RecordingError
+        If there is no frame.
+    """
+    tracker = Tracker(reference, kind)
+    done: list[TrackedFrame] = []
+    for frame in frames:
+        done.append(tracker.update(frame))
+        if on_frame is not None:
+            on_frame(len(done))
+    if not done:
+        raise RecordingError("there is no frame to follow markers into; give one or more beside the reference")
+    return stack_tracks(done, rest_px=tracker.rest.centre_px, rest_radius_px=tracker.rest.radius_px)
+
+
+def _only(markers: Markers, chosen: Bool[np.ndarray, " markers"]) -> Markers:
+    names = ("centre_px", "radius_px", "contrast", "roundness", "whole")
+    return Markers(**{name: getattr(markers, name)[chosen] for name in names}, appearance=markers.appearance)
+
+
+def _taken(values: np.ndarray, spot: Int[np.ndarray, " markers"]) -> np.ndarray:
+    """Values of each marker's spot; NaN without one."""
+    taken = np.full((len(spot), *values.shape[1:]), np.nan)
+    taken[spot >= 0] = values[spot[spot >= 0]]
+    return taken
+
+
+def _used(spot: Int[np.ndarray, " markers"], spots: int) -> Bool[np.ndarray, " spots"]:
+    used = np.zeros(spots, dtype=bool)
+    used[spot[spot >= 0]] = True
+    return used
+
+
+def _changed(rest: Markers, found: Markers, spot: Int[np.ndarray, " markers"]) -> Bool[np.ndarray, " markers"]:
+    """Markers that differ from what they were, beyond what all of them do."""
+    low, high = _RADIUS_CHANGE
+    radius, contrast = (
+        ratio / np.nanmedian(ratio) if np.isfinite(ratio).any() else ratio
+        for ratio in (
+            _taken(found.radius_px, spot) / rest.radius_px,
+            _taken(found.contrast, spot) / rest.contrast,
+        )
+    )
+    roundness = _taken(found.roundness, spot)
+    flat = (roundness < _ROUNDNESS_LEFT * rest.roundness) & (roundness < _ROUND)
+    return (radius < low) | (radius > high) | (contrast < _CONTRAST_LEFT) | flat

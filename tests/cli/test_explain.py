@@ -1,0 +1,109 @@
+"""`sliplens explain`: the folder it makes, and what is said to mistakes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tyro
+from PIL import Image
+
+from sliplens.cli.explain import Explain
+from sliplens.errors import InputError, SliplensError
+from sliplens.explain import EXPLAINERS
+from sliplens.images import read_image
+from sliplens.provenance import read_json
+from sliplens.recordings import Dataset
+from sliplens.study import load_explained
+
+QUICK = ("--method", "grad-cam", "occlusion")
+
+
+def run(*words: object) -> None:
+    tyro.cli(Explain, args=[str(word) for word in words]).run()
+
+
+def refused(message: str, *words: object) -> None:
+    with pytest.raises(SliplensError, match=message):
+        run(*words)
+
+
+def test_maps_overlays_and_a_panel(difference_run: Path, small_dataset: Dataset, tmp_path: Path, capsys):
+    output = tmp_path / "maps"
+    run(difference_run, small_dataset.folder, "-o", output, *QUICK, "--levels", 1, 0)
+    explained = load_explained(output)
+    assert list(explained.relevance) == ["grad-cam", "occlusion"]
+    for method in explained.relevance:
+        assert explained.relevance[method].dtype == np.float32
+        overlays = output / "overlays" / method
+        assert {path.stem for path in overlays.iterdir()} == {frame.id for frame in explained.frames}
+        for frame, saliency in zip(explained.frames, explained.saliency[method], strict=True):
+            picture = read_image(overlays / f"{frame.id}.png")
+            assert picture.shape == (32, 32, 3)
+            # colour is saliency: where there is none the picture is grey
+            spread = picture.max(axis=2).astype(int) - picture.min(axis=2)
+            assert (spread[saliency == 0] == 0).all()
+    # a row for the input and for each method, a column for each frame
+    with Image.open(output / "panel.png") as panel:
+        assert panel.height > panel.width
+    told = capsys.readouterr().out
+    notes = [note for one in read_json(output / "result.json")["methods"].values() for note in one["warnings"]]
+    assert told.count("note, ") == len(notes)
+    run(difference_run, small_dataset.folder, "-o", output, *QUICK, "--levels", 1, 0)
+    assert "kept" in capsys.readouterr().out
+
+
+def test_colours_of_the_thesis(difference_run: Path, difference_folder: Path, tmp_path: Path):
+    output = tmp_path / "maps"
+    run(difference_run, "--frames", difference_folder, "-o", output, "--method", "grad-cam", "--colours", "jet")
+    explained = load_explained(output)
+    frame, saliency = explained.frames[0], explained.saliency["grad-cam"][0]
+    picture = read_image(output / "overlays" / "grad-cam" / f"{frame.id}.png").astype(int)
+    row, column = np.unravel_index(saliency.argmax(), saliency.shape)
+    red, _, blue = picture[row, column]
+    assert red > blue  # the top of Jet is red, its bottom blue
+    dark = picture[saliency == 0]
+    assert len(dark) == 0 or (dark[:, 2] >= dark[:, 0]).all()
+
+
+def test_a_budget_reaches_poly_cam(difference_run: Path, difference_folder: Path, tmp_path: Path, monkeypatch):
+    seen = []
+
+    def explain(trained, chosen, folder, *, methods, explainers, on_map):
+        seen.append(explainers["poly-cam"].budget)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sliplens.study.explain_frames", explain)
+    with pytest.raises(KeyboardInterrupt):
+        run(difference_run, "--frames", difference_folder, "-o", tmp_path / "maps", "--budget", 0.25)
+    assert seen == [0.25]
+
+
+def test_expected_gradients_take_the_frames_without_slip(
+    difference_run: Path, small_dataset: Dataset, tmp_path: Path, capsys
+):
+    common = ("--method", "expected-gradients", "--levels")
+    run(difference_run, small_dataset.folder, "-o", tmp_path / "with", *common, 1, 0)
+    assert "no background" not in capsys.readouterr().out
+    run(difference_run, small_dataset.folder, "-o", tmp_path / "without", *common, 0)
+    assert "no background was given" in capsys.readouterr().out.replace("\n", " ")
+
+
+def test_the_table_of_methods(capsys):
+    run("--list-methods")
+    told = capsys.readouterr().out
+    assert all(name in told for name in EXPLAINERS)
+
+
+def test_mistakes_are_told_before_anything_is_written(
+    difference_run: Path, difference_folder: Path, small_dataset: Dataset, tmp_path: Path
+):
+    here = ("-o", tmp_path / "maps")
+    refused("name the network and the folder to make", difference_run)
+    refused("name either a data set or --frames", difference_run, *here)
+    refused("name either a data set or", difference_run, small_dataset.folder, "--frames", difference_folder, *here)
+    refused("--trials must be at least 1, got 0", difference_run, small_dataset.folder, *here, "--trials", 0)
+    refused("no explainer named 'lime'; choose", difference_run, small_dataset.folder, *here, "--method", "lime")
+    refused("budget is 2.0; give a share", difference_run, small_dataset.folder, *here, "--budget", 2)
+    assert not (tmp_path / "maps").exists()
+    with pytest.raises(InputError, match="does not exist"):
+        run(tmp_path / "nothing", small_dataset.folder, *here)

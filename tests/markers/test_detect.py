@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sliplens.errors import ImageError, InputError
+from sliplens.markers import KINDS, MarkerKind, detect_markers
+from sliplens.markers.refine import measure_spots
+
+KIND = {"chromatouch": "chromatouch", "flat-gel": "gelsight-mini"}
+
+
+def nearest(found, places):
+    return np.linalg.norm(found[:, None] - places[None], axis=-1).argmin(axis=0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "colours"),
+    [
+        ("gelsight-mini", {"background": (150, 140, 160), "marker": (30, 30, 30)}),
+        ("tactip", {"background": (20, 20, 20), "marker": (230, 230, 230)}),
+        ("chromatouch", {"background": (212, 208, 128), "marker": (83, 42, 53)}),
+        ("auto", {"background": (150, 140, 160), "marker": (30, 30, 30)}),
+        ("auto", {"background": (20, 20, 20), "marker": (230, 230, 230)}),
+        # as bright as what surrounds it: only its colour tells it
+        ("auto", {"background": (120, 120, 120), "marker": (180, 60, 120)}),
+    ],
+)
+def test_every_contrast_is_found_and_measured(kind, colours, dots, grid, rng):
+    places = grid(jitter=0.5, rng=rng)
+    found = detect_markers(dots(places, **colours, noise=3.0, rng=rng), kind)
+    assert len(found) == len(places)
+    error = found.centre_px[nearest(found.centre_px, places)] - places
+    assert np.sqrt(np.mean(error**2)) < 0.06
+    np.testing.assert_allclose(found.radius_px, 5.0, rtol=0.06)
+
+
+@given(x=st.floats(-0.5, 0.5), y=st.floats(-0.5, 0.5))
+def test_a_clean_dot_moved_by_a_fraction_is_found_moved_by_it(x, y):
+    rows, columns = np.mgrid[:41, :41]
+    signal = 100 / (1 + np.exp((np.hypot(columns - 20 - x, rows - 20 - y) - 5) / 0.6))
+    shape = measure_spots(signal.astype(np.float32), np.array([[20.0, 20.0]]), radius_px=5.0)
+    np.testing.assert_allclose(shape.centre_px[0], (20 + x, 20 + y), atol=0.02)
+
+
+def test_a_slope_of_the_light_does_not_move_a_dot():
+    rows, columns = np.mgrid[:41, :41]
+    signal = 100 / (1 + np.exp((np.hypot(columns - 20.3, rows - 19.8) - 5) / 0.6)) + 1.5 * columns - 0.7 * rows
+    shape = measure_spots(signal.astype(np.float32), np.array([[20.0, 20.0]]), radius_px=5.0)
+    np.testing.assert_allclose(shape.centre_px[0], (20.3, 19.8), atol=0.02)
+
+
+@pytest.mark.parametrize("name", ["chromatouch", "flat-gel"])
+def test_simulated_centres_are_within_the_goal_and_none_is_missed_or_invented(name, trials):
+    trial = trials[name]
+    appearance = detect_markers(trial.reference, KIND[name]).appearance
+    errors = []
+    for frame, places in zip(trial.frames[::4], trial.truth.marker_px[::4], strict=True):
+        found = detect_markers(frame, appearance=appearance)
+        distance = np.linalg.norm(found.centre_px[:, None] - places[None], axis=-1)
+        inside = ((places > 9) & (places < 214)).all(axis=1)
+        assert np.all(distance.min(axis=0)[inside] < 2)
+        assert np.all(distance.min(axis=1)[found.whole] < 2)
+        errors.append((found.centre_px[distance.argmin(axis=0)] - places)[inside])
+    assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.15
+
+
+def test_markers_that_the_edge_cuts_are_marked(dots, grid):
+    # discs of 5 px whose blurred edges the frame cuts, and the next ones far from it
+    found = detect_markers(dots(grid(at=(5.0, 26.0))), "gelsight-mini")
+    np.testing.assert_array_equal(found.whole, found.centre_px[:, 0] > 15.0)
+    assert (~found.whole).sum() == 5
+
+
+def test_a_frame_without_markers_is_answered_with_none_once_their_look_is_known(dots, grid):
+    appearance = detect_markers(dots(grid()), "gelsight-mini").appearance
+    assert len(detect_markers(dots(np.zeros((0, 2))), appearance=appearance)) == 0
+
+
+@pytest.mark.parametrize(
+    ("frame", "told"),
+    [
+        (np.full((80, 90, 3), 255, dtype=np.uint8), "saturated"),
+        (np.zeros((80, 90, 3), dtype=np.uint8), "black"),
+        (np.full((80, 90, 3), 120, dtype=np.uint8), "fewer than 4 markers"),
+    ],
+)
+def test_frames_without_markers_are_refused_in_one_sentence(frame, told):
+    with pytest.raises(ImageError, match=told):
+        detect_markers(frame, "auto")
+
+
+def test_three_dots_are_no_pattern(dots):
+    with pytest.raises(ImageError, match="fewer than 4 markers"):
+        detect_markers(dots([(40, 40), (80, 80), (120, 60)]), "auto")
+
+
+def test_noise_is_not_taken_for_markers(rng):
+    with pytest.raises(ImageError, match="markers"):
+        detect_markers(np.clip(rng.normal(120, 20, (120, 160, 3)), 0, 255).astype(np.uint8), "auto")
+
+
+def test_kinds_that_cannot_be_are_refused(dots, grid):
+    with pytest.raises(InputError, match="choose chromatouch, gelsight-mini, tactip, auto"):
+        detect_markers(dots(grid()), "digit")
+    with pytest.raises(InputError, match="radii from 5 to 2"):
+        MarkerKind(name="mine", contrasts=("dark",), radius_px=(5.0, 2.0))
+    with pytest.raises(InputError, match="channels"):
+        MarkerKind(name="mine", contrasts=("dark",), channels=(0.0, -1.0, 0.0))
+    assert set(KINDS) == {"chromatouch", "gelsight-mini", "tactip", "auto"}

@@ -1,0 +1,124 @@
+import csv
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sliplens.errors import ImageError, InputError
+from sliplens.images import absolute_difference, read_image
+from sliplens.markers import compute_field, fit_doublets, interpolate_field, track_markers
+
+AFFINE = st.tuples(*[st.floats(-0.2, 0.2) for _ in range(4)])
+
+
+@given(gradient=AFFINE, shift=st.tuples(st.floats(-5, 5), st.floats(-5, 5)))
+def test_an_even_deformation_comes_back_exactly(gradient, shift):
+    matrix = np.array(gradient).reshape(2, 2)
+    places = np.random.default_rng(1).uniform(0, 100, (40, 2))
+    field = interpolate_field(places, places @ matrix.T + shift, size=(100, 100))
+    x, y = np.meshgrid(field.x_px, field.y_px)
+    np.testing.assert_allclose(field.displacement_px, np.stack([x, y], axis=-1) @ matrix.T + shift, atol=1e-4)
+    np.testing.assert_allclose(field.divergence, matrix[0, 0] + matrix[1, 1], atol=1e-5)
+    np.testing.assert_allclose(field.curl, matrix[1, 0] - matrix[0, 1], atol=1e-5)
+    shear = np.hypot(matrix[0, 0] - matrix[1, 1], matrix[0, 1] + matrix[1, 0])
+    np.testing.assert_allclose(field.shear, shear, atol=1e-5)
+
+
+@given(angle=st.floats(0, np.pi))
+def test_divergence_curl_and_shear_do_not_depend_on_the_axes(angle):
+    rng = np.random.default_rng(2)
+    matrix, places = rng.normal(0, 0.1, (2, 2)), rng.uniform(0, 100, (30, 2))
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    plain = interpolate_field(places, places @ matrix.T, size=(100, 100))
+    turned = interpolate_field(places @ turn.T, places @ matrix.T @ turn.T, size=(100, 100))
+    for name in ("divergence", "curl", "shear"):
+        np.testing.assert_allclose(getattr(plain, name)[5, 5], getattr(turned, name)[5, 5], atol=1e-5)
+
+
+def test_confidence_is_that_of_a_mean_of_many_and_falls_to_none_far_away():
+    angle = np.arange(9) * 2 * np.pi / 9
+    places = np.stack([49.5 + 3 * np.cos(angle), 49.5 + 3 * np.sin(angle)], axis=-1)
+    field = interpolate_field(places, np.ones((9, 2)), size=(100, 100), step_px=100.0, reach_px=1000.0)
+    # nine values of one variance, averaged
+    assert field.confidence[0, 0] == pytest.approx(1 / (1 + 1 / 9), abs=1e-3)
+    far = interpolate_field(places, np.ones((9, 2)), size=(1000, 1000), step_px=900.0, reach_px=5.0)
+    assert far.confidence[0, 0] < 0.01
+
+
+def test_markers_without_a_displacement_play_no_part():
+    rng = np.random.default_rng(3)
+    places, values = rng.uniform(0, 60, (20, 2)), rng.normal(0, 1, (20, 2))
+    gone = values.copy()
+    gone[:5] = np.nan
+    kept = interpolate_field(places[5:], values[5:], size=(60, 60), reach_px=15.0)
+    np.testing.assert_allclose(
+        interpolate_field(places, gone, size=(60, 60), reach_px=15.0).displacement_px, kept.displacement_px
+    )
+
+
+def test_fields_that_cannot_be_are_refused(dots, grid):
+    places = grid()
+    with pytest.raises(InputError, match="2 markers have a displacement"):
+        interpolate_field(places[:2], places[:2], size=(50, 50))
+    with pytest.raises(InputError, match="must be positive"):
+        interpolate_field(places, places, size=(50, 50), step_px=0.0)
+    tracks = track_markers([dots(places)], dots(places), "gelsight-mini")
+    with pytest.raises(InputError, match="no frame 3"):
+        compute_field(tracks, 3, size=(160, 200))
+
+
+def test_a_press_opens_the_field_and_full_slip_drags_it_down(trials):
+    trial = trials["chromatouch"]
+    tracks = track_markers(trial.frames, trial.reference, "chromatouch")
+    pressed = int(np.flatnonzero(trial.safety_margin == 1)[-1])
+    slips = int(np.nanargmin(trial.safety_margin))
+    press, slip = (compute_field(tracks, frame, size=(224, 224)) for frame in (pressed, slips))
+    centre = press.confidence > 0.5
+    assert press.divergence[centre].mean() > 0.02
+    assert (slip.displacement_px - press.displacement_px)[centre][:, 1].mean() > 1.5
+
+
+def test_doublets_of_drawn_dots_give_their_displacement_and_sign(dots, grid):
+    places = grid(pitch=32.0, columns=6, rows=5)
+    middle = places.mean(axis=0)
+    moved = places + 0.06 * (places - middle) + (0.5, 2.0)
+    settings = {"radius": 6.3, "edge": 0.9, "size": (180, 230)}
+    difference = absolute_difference(dots(moved, **settings), dots(places, **settings))
+    found = fit_doublets(difference)
+    order = np.linalg.norm(found.rest_px[:, None] + found.displacement_px[:, None] - moved[None], axis=-1).argmin(
+        axis=1
+    )
+    long = np.linalg.norm(moved - places, axis=1)[order] > 2
+    assert long.sum() > 20
+    np.testing.assert_allclose(found.displacement_px[long], (moved - places)[order][long], atol=0.1)
+    np.testing.assert_allclose(found.rest_px[long], places[order][long], atol=0.1)
+
+
+def test_an_image_without_doublets_is_refused(rng):
+    with pytest.raises(ImageError, match=r"doublets|marker seen twice"):
+        fit_doublets(rng.integers(0, 8, (120, 120, 3), dtype=np.uint8))
+
+
+@pytest.mark.real
+def test_real_differences_give_the_measured_displacements(chromatouch_folder):
+    with (chromatouch_folder / "measured_markers.csv").open() as stream:
+        rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(stream)]
+    errors = []
+    for path in sorted((chromatouch_folder / "difference").glob("*.png")):
+        label = path.stem.rsplit("_", 1)[1]
+        if path.stem.startswith("image_51."):
+            continue  # taken before contact: the table's 100 % is the other one
+        found = fit_doublets(read_image(path))
+        middle = found.rest_px + found.displacement_px / 2
+        for row in rows:
+            place = np.array([row["x_ref"], row["y_ref"]])
+            if not 1 <= row["ring"] <= 3 or place.min() < 14 or place.max() > 209 or row[f"corr_{label}"] <= 0.85:
+                continue
+            told = np.array([row[f"dx_{label}"], row[f"dy_{label}"]])
+            distance = np.linalg.norm(middle - place - told / 2, axis=1)
+            assert distance.min() < 6
+            errors.append(found.displacement_px[distance.argmin()] - told)
+    assert len(errors) > 100
+    # the goal of the project: 1 px, over both coordinates
+    assert np.sqrt(np.mean(np.sum(np.square(errors), axis=1))) < 1.0

@@ -1,0 +1,83 @@
+import numpy as np
+import pytest
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.quiver import Quiver
+
+from sliplens.errors import InputError, SaliencyError
+from sliplens.markers import compute_field, interpolate_field, track_markers
+from sliplens.recordings import ContactState
+from sliplens.report.marker_figures import (
+    MarkedFrame,
+    choose_states,
+    draw_contact_states,
+    draw_fields_beside_saliency,
+    plot_arrows,
+    plot_field,
+)
+
+
+@pytest.fixture(scope="module")
+def tracked(trials):
+    trial = trials["chromatouch"]
+    return trial, track_markers(trial.frames, trial.reference, "chromatouch")
+
+
+def test_arrows_start_at_rest_and_markers_without_a_displacement_have_none():
+    places, ways = np.array([[5.0, 6.0], [20.0, 8.0]]), np.array([[1.0, 2.0], [np.nan, np.nan]])
+    axes = plot_arrows(np.zeros((30, 40, 3), dtype=np.uint8), places, ways, ax=Figure().subplots())
+    arrows = next(one for one in axes.collections if isinstance(one, Quiver))
+    np.testing.assert_array_equal(arrows.get_offsets(), [[5.0, 6.0]])
+    np.testing.assert_array_equal(np.stack([np.asarray(arrows.U), np.asarray(arrows.V)]), [[1.0], [2.0]])
+    assert axes.get_xlabel() == "x (px)"
+    # y runs down, as in the image
+    assert axes.get_ylim() == (29.5, -0.5)
+
+
+def test_a_field_is_coloured_by_its_length_and_a_still_one_has_no_streamlines():
+    places = np.random.default_rng(0).uniform(0, 60, (30, 2))
+    moving = interpolate_field(places, np.tile([3.0, 4.0], (30, 1)), size=(60, 60))
+    axes = Figure().subplots()
+    mappable = plot_field(moving, size=(60, 60), ax=axes)
+    assert mappable.get_clim() == pytest.approx((0, 5), abs=1e-3)
+    assert any(isinstance(one, LineCollection) for one in axes.collections)
+    still = Figure().subplots()
+    plot_field(interpolate_field(places, np.zeros((30, 2)), size=(60, 60)), size=(60, 60), ax=still)
+    assert not still.collections
+
+
+def test_states_are_shown_in_their_order_by_frames_of_their_own(tracked):
+    trial, tracks = tracked
+    chosen = choose_states(trial)
+    assert list(chosen) == [
+        ContactState.NO_CONTACT,
+        ContactState.CONTACT,
+        ContactState.INCIPIENT_SLIP,
+        ContactState.FULL_SLIP,
+    ]
+    assert list(chosen.values()) == sorted(chosen.values())
+    assert all(trial.contact_state[at] == state for state, at in chosen.items())
+    figure = draw_contact_states(trial, tracks)
+    titles = [axes.get_title(loc="left") for axes in figure.axes[:4]]
+    assert [title.split(",")[0] for title in titles] == ["No contact", "Contact", "Incipient slip", "Full slip"]
+    assert figure.axes[-1].get_ylabel() == "Displacement (px)"
+
+
+def test_frame_field_and_map_stand_side_by_side(tracked):
+    trial, tracks = tracked
+    field = compute_field(tracks, 10, size=(224, 224))
+    rows = [MarkedFrame(title="10", frame=trial.frames[10], field=field, saliency=np.full((224, 224), 0.5))] * 2
+    figure = draw_fields_beside_saliency(rows)
+    assert len(figure.axes) == 2 * 3 + 2
+    with pytest.raises(SaliencyError):
+        draw_fields_beside_saliency(
+            [MarkedFrame(title="10", frame=trial.frames[10], field=field, saliency=np.zeros((10, 10)))]
+        )
+
+
+def test_what_does_not_belong_together_is_refused(tracked, dots, grid):
+    trial, _ = tracked
+    with pytest.raises(InputError, match="1 frames were tracked but the trial has 40"):
+        draw_contact_states(trial, track_markers([dots(grid())], dots(grid()), "gelsight-mini"))
+    with pytest.raises(InputError, match="no frame to draw"):
+        draw_fields_beside_saliency([])

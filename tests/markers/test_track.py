@@ -1,0 +1,133 @@
+import numpy as np
+import pytest
+
+from sliplens.errors import ImageError, RecordingError
+from sliplens.markers import MarkerStatus, Tracker, track_markers
+
+KIND = {"chromatouch": "chromatouch", "flat-gel": "gelsight-mini"}
+
+
+def truth_of(tracks, rest):
+    """Which true marker each track began on."""
+    distance = np.linalg.norm(tracks.rest_px[tracks.from_reference][:, None] - rest[None], axis=-1)
+    assert np.all(distance.min(axis=1) < 1)
+    return distance.argmin(axis=1)
+
+
+def never_wrong(tracks, places):
+    """Followed markers lie where their own truth is; gives the share of markers followed."""
+    followed = tracks.followed[:, tracks.from_reference]
+    error = np.linalg.norm(tracks.position_px[:, tracks.from_reference] - places, axis=-1)
+    assert np.all(error[followed] < 1)
+    return followed.mean()
+
+
+@pytest.mark.parametrize("name", ["chromatouch", "flat-gel"])
+def test_markers_are_followed_to_full_slip_and_back(name, trials):
+    trial = trials[name]
+    tracks = track_markers(trial.frames, trial.reference, KIND[name])
+    places = trial.truth.marker_px[:, truth_of(tracks, trial.truth.marker_rest_px)]
+    followed = tracks.followed[:, tracks.from_reference]
+    inside = np.all((places > 9) & (places < 214), axis=-1)
+    assert never_wrong(tracks, places) > 0.9
+    assert followed[inside].mean() > 0.995
+
+
+def test_displacement_is_what_moved_and_nan_where_nothing_was_followed(dots, grid, rng):
+    places = grid(jitter=0.5, rng=rng)
+    shift = np.array([3.3, -2.1])
+    tracks = track_markers([dots(places + shift)], dots(places), "gelsight-mini")
+    assert tracks.followed.all()
+    np.testing.assert_allclose(tracks.displacement_px, np.broadcast_to(shift, (1, 30, 2)), atol=0.1)
+
+
+def test_a_marker_that_goes_is_missing_and_comes_back_as_itself(dots, grid, rng):
+    places = grid(jitter=0.5, rng=rng)
+    frames = [dots(np.delete(places + np.array([0.5 * step, 0]), 14, axis=0)) for step in range(1, 5)]
+    tracks = track_markers([*frames, dots(places + np.array([2.5, 0]))], dots(places), "gelsight-mini")
+    own = int(np.linalg.norm(tracks.rest_px - places[14], axis=1).argmin())
+    np.testing.assert_array_equal(tracks.status[:, own], [MarkerStatus.MISSING] * 4 + [MarkerStatus.FOLLOWED])
+    assert np.isnan(tracks.displacement_px[:4, own]).all()
+    np.testing.assert_allclose(tracks.displacement_px[4, own], (2.5, 0), atol=0.1)
+    assert np.all(np.delete(tracks.status, own, axis=1) == MarkerStatus.FOLLOWED)
+
+
+def test_a_marker_that_changes_its_size_is_broken_and_has_no_displacement(dots, grid, rng):
+    places, radius = grid(jitter=0.5, rng=rng), np.full(30, 5.0)
+    radius[8] = 8.5
+    tracks = track_markers([dots(places, radius=radius)], dots(places), "gelsight-mini")
+    own = int(np.linalg.norm(tracks.rest_px - places[8], axis=1).argmin())
+    assert tracks.status[0, own] in {MarkerStatus.BROKEN, MarkerStatus.MISSING}
+    assert np.isnan(tracks.displacement_px[0, own]).all()
+    assert np.delete(tracks.followed[0], own).all()
+
+
+def test_a_marker_that_appears_is_new_and_never_gets_a_displacement(dots, grid, rng):
+    places = grid(jitter=0.5, rng=rng)
+    fewer = np.delete(places, 14, axis=0)
+    tracks = track_markers([dots(places)] * 5, dots(fewer), "gelsight-mini")
+    assert tracks.status.shape == (5, 30)
+    np.testing.assert_array_equal(
+        tracks.status[:, 29], [MarkerStatus.UNSEEN, MarkerStatus.UNSEEN, *[MarkerStatus.NEW] * 3]
+    )
+    np.testing.assert_allclose(tracks.position_px[4, 29], places[14], atol=0.1)
+    assert np.isnan(tracks.displacement_px[:, 29]).all()
+    assert not tracks.from_reference[29]
+
+
+@pytest.mark.parametrize("pitches", [0.6, 0.8, 1.0])
+@pytest.mark.parametrize("jitter", [0.0, 0.5])
+def test_a_jump_of_more_than_half_a_pitch_is_never_matched_wrongly(pitches, jitter, dots, grid, rng):
+    places = grid(jitter=jitter, rng=rng)
+    jump = np.array([26.0 * pitches, 0])
+    frames = [dots(places + jump + 0.2 * step) for step in range(4)]
+    tracks = track_markers(frames, dots(places), "gelsight-mini")
+    truth = np.stack([places + jump + 0.2 * step for step in range(4)])
+    never_wrong(tracks, truth[:, truth_of(tracks, places)])
+
+
+@pytest.mark.parametrize("pitches", [0.6, 0.8, 1.0])
+def test_a_printed_grid_that_fills_the_view_is_found_again_after_a_jump(pitches, dots, grid, rng):
+    # it goes on beyond the view: only the print's small irregularities tell which marker is which
+    places = grid(columns=12, rows=9, at=(-36.0, -32.0), jitter=0.5, rng=rng)
+    jump = np.array([26.0 * pitches, 0])
+    tracks = track_markers([dots(places), *[dots(places + jump)] * 2], dots(places), "gelsight-mini")
+    truth = np.stack([places, places + jump, places + jump])
+    mine = truth[:, truth_of(tracks, places)]
+    never_wrong(tracks, mine)
+    inside = np.all((mine > 8) & (mine < np.array([191, 151])), axis=-1)
+    assert tracks.followed[:, tracks.from_reference][2][inside[2]].mean() > 0.95
+
+
+def test_a_frame_full_of_light_loses_all_and_the_next_finds_all_again(dots, grid, rng):
+    places = grid(jitter=0.5, rng=rng)
+    blind = np.full((160, 200, 3), 255, dtype=np.uint8)
+    tracks = track_markers([blind, dots(places + np.array([1.0, 0.0]))], dots(places), "gelsight-mini")
+    assert np.all(tracks.status[0] == MarkerStatus.LOST)
+    assert tracks.followed[1].all()
+
+
+def test_what_cannot_be_followed_is_refused_in_one_sentence(dots, grid):
+    reference = dots(grid())
+    with pytest.raises(ImageError, match="frame of 100 x 120 pixels against a reference of 160 x 200"):
+        Tracker(reference, "gelsight-mini").update(np.zeros((100, 120, 3), dtype=np.uint8))
+    with pytest.raises(RecordingError, match="there is no frame"):
+        track_markers([], reference, "gelsight-mini")
+    with pytest.raises(ImageError, match="saturated"):
+        track_markers([reference], np.full((160, 200, 3), 255, dtype=np.uint8))
+
+
+@pytest.mark.real
+def test_dots_of_a_real_gel_stay_where_they_are_while_nothing_moves(reference_folder):
+    from sliplens.recordings.readers.gelsight import read_gelsight_clip  # noqa: PLC0415 (decoding comes with it)
+
+    path = reference_folder / "gelsight_mini_slip" / "noslip" / "tennis_ball__exp_num_6" / "camera_0.avi"
+    if not path.is_file():
+        pytest.skip(f"the real clip is not at {path}")
+    clip = read_gelsight_clip(path)
+    frames = [frame for _, frame in zip(range(12), clip.capture.read_frames(), strict=False)]
+    tracks = track_markers(frames[1:], frames[0], "gelsight-mini")
+    assert tracks.from_reference.sum() > 50
+    assert tracks.followed[:, tracks.from_reference].mean() > 0.99
+    step = np.diff(tracks.position_px[:, tracks.from_reference], axis=0)
+    assert np.sqrt(np.nanmean(step**2)) < 0.15

@@ -1,0 +1,110 @@
+import av
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from sliplens.cli.track import Track
+from sliplens.errors import ImageError, InputError
+from sliplens.images import write_png
+from sliplens.markers import track_markers
+from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.store import save_recording
+
+
+@pytest.fixture
+def moving(dots, grid, rng):
+    """A reference and four frames in which a printed grid moves by 0.5 px each."""
+    places = grid(jitter=0.5, rng=rng)
+    return dots(places), [dots(places + np.array([0.5 * step, 0.0])) for step in range(1, 5)]
+
+
+@pytest.fixture
+def folder(tmp_path, moving):
+    path = tmp_path / "frames"
+    path.mkdir()
+    for number, frame in enumerate(moving[1]):
+        write_png(path / f"frame{number}.png", frame)
+    write_png(tmp_path / "untouched.png", moving[0])
+    return path
+
+
+def test_a_folder_of_images_becomes_a_table_of_displacements(folder, tmp_path):
+    output = tmp_path / "tracks.parquet"
+    Track(source=folder, output=output, reference=tmp_path / "untouched.png").run()
+    table = pq.read_table(output)
+    assert table.num_rows == 4 * 30
+    assert set(table["status"].to_pylist()) == {"followed"}
+    for frame in range(4):
+        rows = np.array(table["frame"]) == frame
+        np.testing.assert_allclose(np.array(table["dx_px"])[rows], 0.5 * (frame + 1), atol=0.15)
+        np.testing.assert_allclose(np.array(table["dy_px"])[rows], 0.0, atol=0.15)
+    assert table["time_s"].null_count == table.num_rows
+    assert table.schema.metadata[b"sliplens.markers"] == b"auto"
+
+
+def test_without_a_reference_the_first_frame_stands_for_it_and_says_so(folder, tmp_path, capsys):
+    output = tmp_path / "tracks.parquet"
+    Track(source=folder, output=output).run()
+    table = pq.read_table(output)
+    first = np.array(table["frame"]) == 0
+    np.testing.assert_allclose(np.array(table["dx_px"])[first], 0.0, atol=1e-5)
+    assert "displacements count from the first frame" in capsys.readouterr().out
+
+
+def test_a_data_set_gives_what_the_tracker_gives(trials, tmp_path):
+    trial = trials["chromatouch"]
+    data = tmp_path / "data"
+    save_recording(trial, trial_path(data, trial.trial))
+    write_dataset_table(data, [trial_info(trial_path(data, trial.trial), split="test")], simulated=True)
+    output, clip = tmp_path / "tracks.parquet", tmp_path / "clip.mp4"
+    Track(source=data, output=output, markers="chromatouch", video=clip).run()
+    table = pq.read_table(output)
+    tracks = track_markers(trial.frames, trial.reference, "chromatouch")
+    known = np.array(table["marker"]) < tracks.from_reference.sum()
+    moved = table["dx_px"].to_numpy()[known]
+    expected = tracks.displacement_px[:, tracks.from_reference, 0].ravel()
+    np.testing.assert_allclose(moved, expected.astype(np.float32), atol=1e-4)
+    np.testing.assert_allclose(np.unique(table["time_s"].to_numpy()), trial.time_s)
+    with av.open(str(clip)) as container:
+        assert sum(1 for _ in container.decode(video=0)) == len(trial)
+
+
+def test_what_cannot_be_followed_is_refused_and_leaves_no_file(folder, tmp_path, rng):
+    output = tmp_path / "tracks.parquet"
+    with pytest.raises(InputError, match=r"does not end in \.parquet"):
+        Track(source=folder, output=tmp_path / "tracks.csv").run()
+    with pytest.raises(InputError, match="markers 'digit' are not known"):
+        Track(source=folder, output=output, markers="digit").run()
+    with pytest.raises(InputError, match="named twice"):
+        Track(source=folder, output=output, reference=tmp_path / "untouched.png", reference_frame=1).run()
+    with pytest.raises(InputError, match="has no frame 9"):
+        Track(source=folder, output=output, reference_frame=9).run()
+    with pytest.raises(InputError, match="does not exist"):
+        Track(source=tmp_path / "nothing", output=output).run()
+    with pytest.raises(InputError, match="no trial other"):
+        Track(source=folder, output=output, trial="other").run()
+    with pytest.raises(InputError, match=r"does not end in \.mp4"):
+        Track(source=folder, output=output, video=tmp_path / "clip.avi").run()
+    small = tmp_path / "small.png"
+    write_png(small, rng.integers(0, 255, (40, 40, 3), dtype=np.uint8))
+    with pytest.raises(ImageError):
+        Track(source=folder, output=output, reference=small).run()
+    assert not output.exists()
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_one_frame_alone_has_nothing_to_move_against(tmp_path, moving):
+    path = tmp_path / "one"
+    path.mkdir()
+    write_png(path / "frame.png", moving[1][0])
+    with pytest.raises(InputError, match="one frame only"):
+        Track(source=path, output=tmp_path / "tracks.parquet").run()
+
+
+def test_a_result_is_not_overwritten_unless_asked(folder, tmp_path):
+    output = tmp_path / "tracks.parquet"
+    output.write_text("mine")
+    with pytest.raises(InputError, match="exists"):
+        Track(source=folder, output=output).run()
+    Track(source=folder, output=output, overwrite=True).run()
+    assert pq.read_table(output).num_rows == 120
