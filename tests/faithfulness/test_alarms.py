@@ -19,10 +19,7 @@ from sliplens.faithfulness.removal import Faithfulness
 def score(gain: float, images: int = 4) -> Faithfulness:
     return Faithfulness(
         areas=np.array([0.0, 1.0]),
-        most_first=np.full(images, 0.3 + gain),
-        least_first=np.full(images, 0.3),
-        random=np.full(images, 0.3),
-        curves=np.zeros((3, images, 2)),
+        curves=np.stack([np.full((images, 2), 0.3 + gain), np.full((images, 2), 0.3), np.full((images, 2), 0.3)]),
     )
 
 

@@ -120,8 +120,8 @@ class Explain:
     def _draw(self, explained: "Explained", trained: "TrainedModel", folder: Path) -> None:
         import numpy as np
 
-        from sliplens.explain.pictures import draw_panel, overlay_jet
         from sliplens.images import write_png
+        from sliplens.report.explained_pictures import draw_panel, overlay_jet
         from sliplens.report.overlay import overlay_saliency, stretch_saliency
         from sliplens.report.style import drawing_style, method_name, percent
 

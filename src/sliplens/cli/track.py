@@ -57,10 +57,10 @@ class Track:
 
     def run(self) -> None:
         """Follow and write."""
-        from sliplens.markers.clip import clip_writer
         from sliplens.markers.kinds import get_kind
         from sliplens.markers.opencv import import_cv2
         from sliplens.markers.table import track_writer
+        from sliplens.report.marker_clip import clip_writer
 
         self._check()
         get_kind(self.markers)

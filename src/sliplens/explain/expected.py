@@ -64,17 +64,14 @@ class ExpectedGradients:
                     heights = held.predict_all().prediction.expand(len(alone.images), -1)
                     frames = held.images.expand(len(alone.images), -1, -1, -1, -1)
             subject = alone.predicted(alone.prediction, heights.mean(dim=1))
-            maps = []
-            for index, image in enumerate(subject.images):
+
+            def mean_over(index: int) -> Tensor:
+                image, end = subject.images[index], subject.prediction[index]
                 pairs = zip(frames[index], heights[index], strict=True)
-                lines = [
-                    self.integrated.integrate(subject, image, frame, ends=(height, subject.prediction[index]))
-                    for frame, height in pairs
-                ]
-                maps.append(torch.stack(lines).mean(dim=0))
-                if on_progress is not None:
-                    on_progress(index + 1, len(subject.images))
-            relevance = torch.stack(maps)
+                lines = [self.integrated.integrate(subject, image, frame, ends=(start, end)) for frame, start in pairs]
+                return torch.stack(lines).mean(dim=0)
+
+            relevance = subject.each_image(mean_over, on_progress=on_progress)
         only = ("no background was given, so the reference alone stands for it, as in integrated gradients",)
         return subject.explanation(
             relevance,

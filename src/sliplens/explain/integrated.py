@@ -75,19 +75,13 @@ class IntegratedGradients:
         """Explain a batch; see `Explainer` for the arguments and errors. Progress counts images."""
         clock = Clock()
         with explaining(model, images, reference=reference) as subject:
-            maps = []
-            for index in range(len(subject.images)):
-                maps.append(
-                    self.integrate(
-                        subject,
-                        subject.images[index],
-                        subject.reference[index],
-                        ends=(subject.reference_prediction[index], subject.prediction[index]),
-                    )
-                )
-                if on_progress is not None:
-                    on_progress(index + 1, len(subject.images))
-            relevance = torch.stack(maps)
+            ends = torch.stack([subject.reference_prediction, subject.prediction], dim=1)
+            relevance = subject.each_image(
+                lambda index: self.integrate(
+                    subject, subject.images[index], subject.reference[index], ends=(ends[index, 0], ends[index, 1])
+                ),
+                on_progress=on_progress,
+            )
         return subject.explanation(relevance, method="integrated-gradients", clock=clock, complete=True)
 
     def integrate(

@@ -101,8 +101,8 @@ class Occlusion:
             regions = self._regions((images.shape[-2], images.shape[-1])).to(subject.images.device)
             areas = regions.flatten().bincount()[regions]
             captum = attr.FeatureAblation(subject.predict)
-            maps = []
-            for index in range(len(subject.images)):
+
+            def lost(index: int) -> Tensor:
                 effects = captum.attribute(
                     subject.images[index, None],
                     baselines=subject.reference[index, None],
@@ -110,10 +110,9 @@ class Occlusion:
                     perturbations_per_eval=self.batch_size,
                 )
                 # Captum gives every pixel and channel the whole effect of its region
-                maps.append(effects[0, 0] / areas)
-                if on_progress is not None:
-                    on_progress(index + 1, len(subject.images))
-            relevance = torch.stack(maps)
+                return effects[0, 0] / areas
+
+            relevance = subject.each_image(lost, on_progress=on_progress)
         unit = f"tiles of {self.tile_px} px" if self.markers_px is None else "markers"
         return subject.explanation(
             relevance,

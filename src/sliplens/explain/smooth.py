@@ -64,8 +64,8 @@ class SmoothGrad:
         clock = Clock()
         with explaining(model, images, reference=reference) as subject:
             tunnel = attr.NoiseTunnel(attr.Saliency(subject.predict))
-            maps = []
-            for index in range(len(subject.images)):
+
+            def smoothed(index: int) -> Tensor:
                 image, empty = subject.images[index, None], subject.reference[index, None]
                 # Captum draws from the global state, which is given back as it was
                 with torch.random.fork_rng(devices=[image.device] if image.is_cuda else []):
@@ -78,10 +78,9 @@ class SmoothGrad:
                         stdevs=float(self.noise),
                         abs=False,
                     )
-                maps.append((gradient.detach() * (image - empty)).sum(dim=1)[0])
-                if on_progress is not None:
-                    on_progress(index + 1, len(subject.images))
-            relevance = torch.stack(maps)
+                return (gradient.detach() * (image - empty)).sum(dim=1)[0]
+
+            relevance = subject.each_image(smoothed, on_progress=on_progress)
         return subject.explanation(
             relevance, method="smooth-grad", clock=clock, complete=False, target="the linear model of f at x"
         )

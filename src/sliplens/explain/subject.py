@@ -1,6 +1,6 @@
 """What is explained: a network held still, its images, their reference, and both predictions."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from sliplens.errors import ModelError
 from sliplens.explain.clock import Clock
-from sliplens.explain.explanation import Explanation
+from sliplens.explain.explanation import Explanation, Progress
 from sliplens.explain.health import check_maps
 from sliplens.explain.inputs import require_images, require_reference
 from sliplens.explain.still import still
@@ -87,6 +87,17 @@ class Subject(Held):
     def change(self) -> Float[Tensor, " batch"]:
         """f(x) - f(b) in margin units."""
         return self.prediction - self.reference_prediction
+
+    def each_image(
+        self, relevance: Callable[[int], Float[Tensor, "height width"]], *, on_progress: Progress | None
+    ) -> Float[Tensor, "batch height width"]:
+        """The maps of all images, made one after another, each from its place in the batch."""
+        maps = []
+        for index in range(len(self.images)):
+            maps.append(relevance(index))
+            if on_progress is not None:
+                on_progress(index + 1, len(self.images))
+        return torch.stack(maps)
 
     def explanation(
         self,

@@ -49,19 +49,30 @@ class Faithfulness:
 
     Attributes
     ----------
-    most_first, least_first, random
-        Mean change of the answer when the most, the least influential parts, and random ones are removed first.
-    at_areas
-        Change by order of `most_first`, `least_first`, `random`, when equal shares of the image are gone.
+    areas
+        Share of the image that is gone at each step, from 0 to 1.
     curves
-        Mean changes at every area: most first, least first, random; for figures.
+        Change of the answer at each step: the most, the least influential parts, and random ones removed first (the
+        mean over the random orders).
     """
 
     areas: Float64[np.ndarray, " steps"]
-    most_first: Float64[np.ndarray, " images"]
-    least_first: Float64[np.ndarray, " images"]
-    random: Float64[np.ndarray, " images"]
     curves: Float64[np.ndarray, "3 images steps"]
+
+    @property
+    def most_first(self) -> Float64[np.ndarray, " images"]:
+        """Mean change over all shares of the image, the most influential parts first."""
+        return np.trapezoid(self.curves[0], self.areas, axis=-1)
+
+    @property
+    def least_first(self) -> Float64[np.ndarray, " images"]:
+        """The same, the least influential parts first."""
+        return np.trapezoid(self.curves[1], self.areas, axis=-1)
+
+    @property
+    def random(self) -> Float64[np.ndarray, " images"]:
+        """The same, mean over the random orders."""
+        return np.trapezoid(self.curves[2], self.areas, axis=-1)
 
     @property
     def symmetric_gain(self) -> Float64[np.ndarray, " images"]:
@@ -218,16 +229,11 @@ def faithfulness(
         batch_size=batch_size,
         on_image=on_image,
     )
-    changes, means = found.changes, found.mean_changes
-    first_random = 2 * len(influence)
-    by_chance = changes[first_random:].mean(axis=0)
+    changes = found.changes
+    by_chance = changes[2 * len(influence) :].mean(axis=0)
     return {
         name: Faithfulness(
-            areas=found.areas,
-            most_first=means[2 * number],
-            least_first=means[2 * number + 1],
-            random=means[first_random:].mean(axis=0),
-            curves=np.stack([changes[2 * number], changes[2 * number + 1], by_chance]),
+            areas=found.areas, curves=np.stack([changes[2 * number], changes[2 * number + 1], by_chance])
         )
         for number, name in enumerate(influence)
     }

@@ -1,11 +1,12 @@
 """Units: what is removed at once, a pixel, a tile or a marker."""
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 
 from sliplens.arrays import require_saliency
 from sliplens.errors import InputError
+from sliplens.explain.occlusion import marker_regions, tile_regions
 
 Units = Int[np.ndarray, "height width"]
 """Number of the unit that each pixel belongs to, from 0."""
@@ -26,8 +27,7 @@ def tile_units(shape: tuple[int, int], *, size: int) -> Units:
     """
     if size < 1:
         raise InputError(f"tiles of {size} pixels are impossible; choose 1 or more")
-    rows, columns = (np.arange(side) // size for side in shape)
-    return rows[:, None] * (columns[-1] + 1) + columns
+    return tile_regions(shape, tile_px=size).numpy()
 
 
 def marker_units(shape: tuple[int, int], centres_px: Float[np.ndarray, "markers 2"], *, reach_px: float) -> Units:
@@ -49,9 +49,7 @@ def marker_units(shape: tuple[int, int], centres_px: Float[np.ndarray, "markers 
     """
     if not len(centres_px):
         raise InputError("there is no marker to remove; choose pixels or tiles")
-    rows, columns = np.indices(shape)
-    distance, nearest = KDTree(centres_px).query(np.stack([columns.ravel(), rows.ravel()], axis=1))
-    return np.where(distance <= reach_px, nearest, len(centres_px)).reshape(shape)
+    return marker_regions(shape, torch.from_numpy(centres_px), radius_px=reach_px).numpy()
 
 
 def unit_means(values: Float[np.ndarray, "height width"], units: Units) -> Float[np.ndarray, " units"]:
