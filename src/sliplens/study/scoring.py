@@ -16,13 +16,13 @@ from sliplens.faithfulness import (
     random_order,
     summarise_deletion,
 )
+from sliplens.faithfulness.alarms import fill_decides
 from sliplens.faithfulness.deletion import saliency_orders
 from sliplens.models import TrainedModel
 from sliplens.provenance import write_json
 from sliplens.study.saved import RESULT_FILE, Explained
 
 CONTROL = "random"
-_FILL_DECIDES = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,14 +163,8 @@ def _alarms(curves: dict[str, DeletionCurves], fill: str) -> list[str]:
     Section 3 of the notes on faithfulness: the fill decides where the filled image is answered like the whole one; an
     explanation that does not beat a random order has shown nothing.
     """
-    alarms = []
     control = curves[CONTROL]
-    near = int(np.sum(np.abs(control.base - control.predictions[:, -1]) < _FILL_DECIDES))
-    if near:
-        alarms.append(
-            f"the fill decides in {near} of {len(control.base)} frames: an image of nothing but {fill} is answered "
-            f"within {_FILL_DECIDES:.0%} of the whole frame"
-        )
+    alarms = fill_decides(control.base, control.predictions[:, -1], fill=fill)
     for method, curve in curves.items():
         if method != CONTROL and curve.auc.mean() >= control.auc.mean():
             alarms.append(
