@@ -35,7 +35,10 @@ def resolve_signs(
         pull = np.where(signs[:, None] != 0, signs[:, None] * bond, 0)
         pull[:, signs != 0] = 0
         told, at = np.unravel_index(np.argmax(np.abs(pull)), pull.shape)
-        signs[at] = np.sign(pull[told, at]) or 1
+        if not pull[told, at]:
+            signs[signs == 0] = 1  # nothing binds the rest: they did not move, or move athwart or far away
+            break
+        signs[at] = np.sign(pull[told, at])
     for _ in range(_SWEEPS):
         field = bond @ signs
         wrong = signs * field < 0
