@@ -97,6 +97,20 @@ def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return Dataset.open(folder)
 
 
+@pytest.fixture(scope="session")
+def fine_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Three dry trials and a wet one to test on, with a frame near every margin."""
+    folder = tmp_path_factory.mktemp("fine-data")
+    table = []
+    for index, condition in enumerate(("dry", "dry", "dry", "wet")):
+        recording = make_recording(f"test-{condition}-{index}", condition=condition, frames=40, seed=index)
+        path = trial_path(folder, recording.trial)
+        save_recording(recording, path)
+        table.append(trial_info(path, split="test"))
+    write_dataset_table(folder, table)
+    return Dataset.open(folder)
+
+
 def save_untrained(folder: Path, *, kind: str = "difference", seed: int = 0, frame_size: int = FRAME_SIZE) -> Path:
     """A checkpoint with random weights: enough to test everything around a network."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -21,6 +21,7 @@ from sliplens.cli.report import Report
 from sliplens.cli.score import Score
 from sliplens.cli.simulate import Simulate
 from sliplens.cli.split import Split
+from sliplens.cli.study import Study
 from sliplens.cli.track import Track
 from sliplens.cli.train import Train
 from sliplens.cli.view import View
@@ -41,6 +42,7 @@ Command = (
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Explain, tyro.conf.subcommand("explain")]
     | Annotated[Score, tyro.conf.subcommand("score")]
+    | Annotated[Study, tyro.conf.subcommand("study")]
     | Annotated[Report, tyro.conf.subcommand("report")]
 )
 

@@ -19,7 +19,7 @@ DEFAULT_METHODS = ("grad-cam", "integrated-gradients", "poly-cam")
 """The three methods the thesis compares."""
 
 
-def require_methods(methods: Sequence[str]) -> None:
+def require_methods(methods: Sequence[str], explainers: Mapping[str, Explainer] = EXPLAINERS) -> None:
     """Refuse a method that is not in the table.
 
     Raises
@@ -28,8 +28,8 @@ def require_methods(methods: Sequence[str]) -> None:
         Listing those there are.
     """
     for name in methods:
-        if name not in EXPLAINERS:
-            raise InputError(f"there is no explainer named {name!r}; choose from {', '.join(EXPLAINERS)}")
+        if name not in explainers:
+            raise InputError(f"there is no explainer named {name!r}; choose from {', '.join(explainers)}")
 
 
 def explain_frames(
@@ -65,7 +65,7 @@ def explain_frames(
     InputError
         If a method is unknown.
     """
-    require_methods(methods)
+    require_methods(methods, explainers)
     parts = folder / "parts"
     parts.mkdir(exist_ok=True)
     inputs = trained.encoding.normalise(chosen.images)

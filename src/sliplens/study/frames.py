@@ -1,13 +1,13 @@
 """Pick the frames to explain: along a trial from full stick to full slip, or a folder of images."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from sliplens.errors import InputError, RecordingError
@@ -78,24 +78,53 @@ def frames_from_dataset(
     """
     if any(not 0 <= level <= 1 for level in levels):
         raise InputError(f"levels must lie in [0, 1], got {', '.join(f'{level:g}' for level in levels)}")
-    images, references, labels, names = [], [], [], []
+    rows: dict[str, list[int]] = {}
     for info in data.select(split=split, condition=condition)[:trials]:
         recording = data.load(info, truth=False)
-        trained.require_frame_size(recording.reference.shape[:2])
         margin = np.where(recording.labelled, recording.safety_margin, np.nan)
         if not np.isfinite(margin).any():
             raise RecordingError(f"trial {recording.trial} has no labelled frame; label it first")
-        rows = [_nearest(margin, level) for level in levels]
-        compared = trained.encoding.compare(recording.frames[rows], recording.reference)
+        rows[info.trial] = [nearest_frame(margin, level) for level in levels]
+    return frames_at(trained, data, rows)
+
+
+def frames_at(trained: TrainedModel, data: Dataset, rows: Mapping[str, Sequence[int]]) -> ChosenFrames:
+    """Frames of a data set by trial and number.
+
+    Parameters
+    ----------
+    trained
+        The network: decides encoding and size.
+    data
+        The data set.
+    rows
+        Numbers of frames, by trial.
+
+    Raises
+    ------
+    RecordingError
+        If the data set has no such trial.
+    ImageError
+        If the frames are of another sensor.
+    """
+    infos = {info.trial: info for info in data.trials}
+    images, references, labels, names = [], [], [], []
+    for trial, frames in rows.items():
+        if trial not in infos:
+            raise RecordingError(f"{data.folder} has no trial {trial}; use the data set that the frames came from")
+        recording = data.load(infos[trial], truth=False)
+        trained.require_frame_size(recording.reference.shape[:2])
+        chosen = list(frames)
+        compared = trained.encoding.compare(recording.frames[chosen], recording.reference)
         images.append(trained.encoding.resize(compared, image_size=trained.manifest.image_size))
         empty = trained.encoding.empty(recording.reference, image_size=trained.manifest.image_size)
-        references.append(empty.expand(len(rows), -1, -1, -1))
-        labels.append(margin[rows])
-        names += [(f"{recording.trial}-f{row:04d}", recording.trial, recording.condition) for row in rows]
-    ids, trial, conditions = zip(*names, strict=True)
+        references.append(empty.expand(len(chosen), -1, -1, -1))
+        labels.append(np.where(recording.labelled, recording.safety_margin, np.nan)[chosen])
+        names += [(f"{trial}-f{row:04d}", trial, recording.condition) for row in chosen]
+    ids, trials, conditions = zip(*names, strict=True)
     return ChosenFrames(
         ids=ids,
-        trial=trial,
+        trial=trials,
         condition=conditions,
         safety_margin=np.concatenate(labels).astype(np.float32),
         images=torch.cat(images),
@@ -104,7 +133,16 @@ def frames_from_dataset(
     )
 
 
-def _nearest(margin: np.ndarray, level: float) -> int:
+def nearest_frame(margin: Float[np.ndarray, " frames"], level: float) -> int:
+    """Frame whose margin is nearest to a level, next to the change where many are: the last one above, the first below.
+
+    Parameters
+    ----------
+    margin
+        Label of each frame, NaN where there is none; one at least has one.
+    level
+        Safety margin asked for.
+    """
     distance = np.abs(margin - level)
     nearest = np.flatnonzero(distance == np.nanmin(distance))
     return int(nearest[-1] if level >= 0.5 else nearest[0])

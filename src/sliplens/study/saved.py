@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from sliplens.arrays import require_saliency
@@ -135,3 +135,9 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
         raise InputError(f"{path} is missing; explain the frames again") from None
     except (zipfile.BadZipFile, OSError, ValueError, EOFError) as error:
         raise InputError(f"{path} is damaged ({error}); explain the frames again") from None
+
+
+def mean_of_known(values: Float[np.ndarray, " values"]) -> float | None:
+    """Mean of what is defined; None where nothing is, since JSON knows no NaN."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else None

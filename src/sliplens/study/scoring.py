@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from sliplens.errors import CheckpointError
+from sliplens.explain.passes import prepare
 from sliplens.faithfulness import (
     DeletionCurves,
     deletion_curves,
@@ -16,13 +17,14 @@ from sliplens.faithfulness import (
     random_order,
     summarise_deletion,
 )
-from sliplens.faithfulness.alarms import fill_decides
-from sliplens.faithfulness.deletion import saliency_orders
+from sliplens.faithfulness.alarms import fill_decides, flat_maps, follows_last_step, saturated
+from sliplens.faithfulness.deletion import deletion_steps, saliency_orders
 from sliplens.models import TrainedModel
 from sliplens.provenance import write_json
 from sliplens.study.saved import RESULT_FILE, Explained
 
 CONTROL = "random"
+_PARITY_IMAGES = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +98,9 @@ def score_explanations(
     orders = {name: saliency_orders(maps, shape) for name, maps in explained.saliency.items()}
     orders[CONTROL] = np.stack([random_order(shape, rng=rng) for _ in explained.frames])
     count = len(inputs)
+    some = inputs[:_PARITY_IMAGES]
+    passes = len(orders) * count * len(deletion_steps(shape, steps=steps))
+    predict = prepare(trained.model, some, trained.predict(some), passes=passes)
     curves: dict[str, DeletionCurves] = {}
     for number, (name, order) in enumerate(orders.items()):
 
@@ -103,9 +108,7 @@ def score_explanations(
             if on_curve is not None:
                 on_curve(before + done, len(orders) * count)
 
-        curves[name] = deletion_curves(
-            trained.predict, inputs, order, fill=get_fill(fill), steps=steps, on_image=report
-        )
+        curves[name] = deletion_curves(predict, inputs, order, fill=get_fill(fill), steps=steps, on_image=report)
     names = [frame.id for frame in explained.frames]
     pq.write_table(
         pa.concat_tables([_table(method, curve, names) for method, curve in curves.items()]),
@@ -113,7 +116,7 @@ def score_explanations(
     )
     result = ScoreResult(
         methods={method: _method_score(curve) for method, curve in curves.items()},
-        alarms=tuple(_alarms(curves, fill)),
+        alarms=(*flat_maps(explained.saliency), *_alarms(curves, fill)),
     )
     some = curves[CONTROL]
     write_json(
@@ -164,9 +167,12 @@ def _alarms(curves: dict[str, DeletionCurves], fill: str) -> list[str]:
     explanation that does not beat a random order has shown nothing.
     """
     control = curves[CONTROL]
-    alarms = fill_decides(control.base, control.predictions[:, -1], fill=fill)
+    alarms = [*fill_decides(control.base, control.predictions[:, -1], fill=fill), *saturated(control.base)]
     for method, curve in curves.items():
-        if method != CONTROL and curve.auc.mean() >= control.auc.mean():
+        if method == CONTROL:
+            continue
+        alarms += follows_last_step(curve.auc, curve.scores[:, -1], name=f"D of {method}")
+        if curve.auc.mean() >= control.auc.mean():
             alarms.append(
                 f"{method} does not beat a random order ({curve.auc.mean():.3f} against {control.auc.mean():.3f})"
             )

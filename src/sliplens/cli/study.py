@@ -1,0 +1,120 @@
+"""`sliplens study`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from sliplens.cli.evaluate import Evaluate
+from sliplens.cli.report import Report
+from sliplens.cli.simulate import Simulate
+from sliplens.errors import InputError
+
+if TYPE_CHECKING:
+    from sliplens.models import TrainedModel
+
+_PRESET_FRAMES = 80
+"""Frames of each simulated trial; the thesis has about 800, which takes ten times as long and says the same."""
+_NONE = "none"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """Find out which explanation of a network can be believed: the experiment of the thesis, and the controls it lacks.
+
+    Picks trials that the networks read well, explains frames from full stick to full slip, scores the explanations by
+    removal under several fills against controls, by randomisation and, where the data are simulated, by the truth; then
+    draws the report. Interrupted, it goes on where it stopped when the same command is given again.
+    """
+
+    data: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[DATA]")] = None
+    """Data set with labels; leave out with --preset."""
+    output: Annotated[Path, tyro.conf.arg(aliases=("-o",))]
+    """Folder to make, one subfolder a stage; the page is report.html in it."""
+    difference: str = "chromatouch-difference"
+    """Network on difference images: a folder, or a name of one that comes with sliplens; none to leave it out."""
+    raw: str = "chromatouch-raw"
+    """The same on raw images."""
+    preset: Literal["thesis"] | None = None
+    """Simulate the data set first: the days and trials of the thesis, 80 frames each, some 1.5 GB. The networks of the
+    package never saw its trials, so the training trials are chosen from, as in the thesis."""
+    method: tuple[str, ...] | None = None
+    """Explainers to compare; poly-cam-thesis is Poly-CAM as the thesis ran it. If not given, the thesis's three,
+    Poly-CAM for a regressor, and occlusion."""
+    split: str | None = None
+    """Trials to choose from; test if not given, train with --preset."""
+    condition: str = "dry"
+    """Condition of those trials."""
+    trials: int = 14
+    """How many trials to look at."""
+    tolerance: float = 0.03
+    """Largest error of an answer in them, as a share of the margin; where too few qualify, the next best are taken."""
+    budget: float = 0.25
+    """Share of the channels that poly-cam measures at first."""
+    random_orders: int = 20
+    """Random orders that every method has to beat."""
+    seed: int = 0
+    """Seed of the random orders, of new weights and of noise."""
+    overwrite: bool = False
+    """Make every stage again."""
+
+    def run(self) -> None:
+        """Run every stage that is not there yet, and draw the report."""
+        from sliplens.cli.study_stages import Stages
+        from sliplens.recordings import Dataset
+        from sliplens.study.methods import STUDY_METHODS, study_explainers
+
+        if (self.data is None) == (self.preset is None):
+            raise InputError("name a data set, or --preset thesis to simulate one")
+        if self.random_orders < 1:
+            raise InputError(f"--random-orders must be at least 1, got {self.random_orders}")
+        explainers = study_explainers(self.method or STUDY_METHODS, budget=self.budget)
+        networks = self._load_networks()
+        folder = self.data or self._simulate()
+        for name, model in self._named().items():
+            Evaluate(model=model, data=folder, output=self.output / f"evaluate-{name}", overwrite=self.overwrite).run()
+        stages = Stages(
+            output=self.output,
+            data=Dataset.open(folder),
+            networks=networks,
+            explainers=explainers,
+            settings={"methods": list(explainers), "budget": self.budget, "seed": self.seed},
+            random_orders=self.random_orders,
+            seed=self.seed,
+            overwrite=self.overwrite,
+        )
+        stages.choose(
+            split=self.split or ("train" if self.preset else "test"),
+            condition=self.condition,
+            trials=self.trials,
+            tolerance=self.tolerance,
+        )
+        for name in networks:
+            stages.judge(name)
+        Report(workspace=self.output).run()
+
+    def _simulate(self) -> Path:
+        folder = self.output / "data"
+        assert self.preset is not None  # one of the two is given
+        Simulate(output=folder, preset=self.preset, frames_per_trial=_PRESET_FRAMES, overwrite=self.overwrite).run()
+        return folder
+
+    def _named(self) -> dict[str, Path]:
+        return {
+            name: Path(given) for name, given in (("difference", self.difference), ("raw", self.raw)) if given != _NONE
+        }
+
+    def _load_networks(self) -> "dict[str, TrainedModel]":
+        from sliplens.models import load_checkpoint
+        from sliplens.models.shipped import find_run
+
+        networks = {name: load_checkpoint(find_run(run)) for name, run in self._named().items()}
+        if not networks:
+            raise InputError("a study needs a network; leave out --difference none or --raw none")
+        for name, trained in networks.items():
+            if trained.manifest.input != name:
+                raise InputError(
+                    f"--{name} names a network on {trained.manifest.input} images; give one that was trained on {name}"
+                )
+        return networks

@@ -1,0 +1,168 @@
+"""The stages of a study, each a folder that is complete or absent."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sliplens.cli.console import progress_bar, say, unchanged, wrote
+from sliplens.explain import Explainer, IntegratedGradients
+from sliplens.models import TrainedModel
+from sliplens.provenance import hash_json, output_folder, read_json, to_jsonable
+from sliplens.recordings import Dataset
+from sliplens.study.choice import Choice, choose_frames, load_choice, save_choice
+from sliplens.study.curves import influences, score_curves
+from sliplens.study.explaining import explain_frames
+from sliplens.study.frames import frames_at
+from sliplens.study.judging import RANDOMISED
+from sliplens.study.looks import check_looks
+from sliplens.study.material import Material, gather
+from sliplens.study.remedies import score_remedies
+from sliplens.study.sanity import check_randomisation, explain_untrained
+from sliplens.study.saved import load_explained
+from sliplens.study.scoring import score_explanations
+from sliplens.study.states import load_markers, save_states
+from sliplens.study.timing import time_explainers
+
+Count = Callable[[int, int], None]
+Work = Callable[[Path, Count], object]
+
+
+@dataclass(kw_only=True)
+class Stages:
+    """Runs the stages of a study that are not there yet."""
+
+    output: Path
+    data: Dataset
+    networks: Mapping[str, TrainedModel]
+    explainers: Mapping[str, Explainer]
+    settings: Mapping[str, Any]
+    """What the maps depend on, beside the network and the frames."""
+    random_orders: int
+    seed: int
+    overwrite: bool
+    _choice: Choice | None = field(default=None, init=False)
+
+    def choose(self, *, split: str, condition: str, trials: int, tolerance: float) -> None:
+        """Choose the frames, and keep what the camera saw of them."""
+        config = {
+            "data_hash": self.data.hash,
+            "weights_sha256": {name: one.manifest.weights_sha256 for name, one in self.networks.items()},
+            "split": split,
+            "condition": condition,
+            "trials": trials,
+            "tolerance": tolerance,
+        }
+
+        def choose(folder: Path, bar: Count) -> None:
+            found = choose_frames(
+                self.networks,
+                self.data,
+                split=split,
+                condition=condition,
+                trials=trials,
+                tolerance=tolerance,
+                on_trial=bar,
+            )
+            save_choice(found, folder)
+
+        self._run("choice", "choice", config, "Choosing trials", choose)
+        self._choice = load_choice(self.output / "choice")
+        say(f"  {self._choice.told}")
+        self._run(
+            "states",
+            "states",
+            self._frames(),
+            "Following markers",
+            lambda folder, bar: save_states(self.choice, self.data, folder, on_frame=bar),
+        )
+
+    @property
+    def choice(self) -> Choice:
+        """What `choose` chose."""
+        assert self._choice is not None, "choose first"
+        return self._choice
+
+    def judge(self, name: str) -> None:
+        """Explain the frames with one network's methods, and judge the explanations in every way."""
+        trained = self.networks[name]
+        about = {**self._frames(), **self.settings, "weights_sha256": trained.manifest.weights_sha256}
+        rows: dict[str, list[int]] = {}
+        for pick in self.choice.frames:
+            rows.setdefault(pick.trial, []).append(pick.frame)
+        self._run(
+            f"explain-{name}",
+            "explain",
+            about,
+            f"Explaining {len(self.choice.frames)} frames ({name})",
+            lambda folder, bar: explain_frames(
+                trained,
+                frames_at(trained, self.data, rows),
+                folder,
+                methods=list(self.explainers),
+                explainers=self.explainers,
+                on_map=bar,
+            ),
+        )
+        explained = load_explained(self.output / f"explain-{name}")
+        material = gather(
+            trained,
+            explained,
+            self.data,
+            tuple(pick for pick in self.choice.frames if pick.scored),
+            markers=load_markers(self.output / "states"),
+            explainers=self.explainers,
+        )
+        works: dict[str, tuple[str, Mapping[str, Any], Work]] = {
+            "score": (
+                "Deleting pixels, as the thesis did",
+                # the report reads these of every score
+                {"input": name, "source": explained.source, "fill": "grey"},
+                lambda folder, bar: score_explanations(
+                    trained, material.explained, folder, seed=self.seed, on_curve=bar
+                ),
+            ),
+            "deletion": (
+                "Trying the thesis's remedies",
+                {},
+                lambda folder, bar: score_remedies(material, folder, seed=self.seed, on_curve=bar),
+            ),
+            "faithfulness": (
+                "Removing parts under every fill",
+                {"random_orders": self.random_orders},
+                lambda folder, bar: self._score_curves(material, folder, bar),
+            ),
+            "randomisation": (
+                "Explaining networks with new weights",
+                {},
+                lambda folder, bar: check_randomisation(material, folder, seed=self.seed, on_method=bar),
+            ),
+            "looks": (
+                "Measuring how maps look",
+                {},
+                lambda folder, bar: check_looks(material, self.data, folder, seed=self.seed, on_method=bar),
+            ),
+            "timing": ("Timing the methods", {}, lambda folder, bar: time_explainers(material, folder, on_method=bar)),
+        }
+        for stage, (title, more, work) in works.items():
+            self._run(f"{stage}-{name}", stage, {**about, **more}, f"{title} ({name})", work)
+
+    def _score_curves(self, material: Material, folder: Path, bar: Count) -> None:
+        maps = influences(material)
+        maps[RANDOMISED] = explain_untrained(material, IntegratedGradients(), seed=self.seed)
+        score_curves(material, folder, maps=maps, random_orders=self.random_orders, seed=self.seed, on_frame=bar)
+
+    def _frames(self) -> dict[str, Any]:
+        return {"data_hash": self.data.hash, "choice": hash_json(to_jsonable(self.choice))}
+
+    def _run(self, name: str, stage: str, config: Mapping[str, Any], title: str, work: Work) -> None:
+        target = self.output / name
+        with output_folder(target, stage=stage, config=config, overwrite=self.overwrite) as out:
+            if out.complete:
+                unchanged(target)
+                return
+            with progress_bar(title) as bar:
+                work(out.folder, bar)
+        for alarm in read_json(target / "result.json").get("alarms", []):
+            say(f"  alarm: {alarm}")
+        wrote(target, title[0].lower() + title[1:])

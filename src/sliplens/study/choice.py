@@ -1,0 +1,259 @@
+"""Choose what a study looks at: trials that the networks read well, and in each the frames along the margin."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sliplens.errors import InputError, RecordingError
+from sliplens.models import TrainedModel
+from sliplens.provenance import read_json, write_json
+from sliplens.recordings import Dataset
+from sliplens.study.frames import DEFAULT_LEVELS, nearest_frame
+from sliplens.study.saved import RESULT_FILE
+
+SCORED_LEVELS = (0.4, 0.2, 0.0)
+"""Margins at which the thesis scores: near slip, where there is much to explain."""
+_REACH = 0.05
+"""How far the frame nearest to a level may lie from it, in margin units."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChosenTrial:
+    """A trial that the study looks at."""
+
+    trial: str
+    qualified: bool
+    """Whether every network reads every chosen frame of it within the tolerance."""
+    worst_error: Mapping[str, float]
+    """By input: the largest error over the chosen frames, in margin units."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pick:
+    """A frame that the study looks at."""
+
+    id: str
+    trial: str
+    frame: int
+    level: float
+    safety_margin: float
+    scored: bool
+    """Whether it counts in the scores."""
+    shown: bool
+    """Whether the panels show it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """Trials and frames of a study, and how they came to be chosen."""
+
+    trials_wanted: int
+    tolerance: float
+    considered: int
+    """Trials that have a frame near every level."""
+    qualified: int
+    told: str
+    """What was done, for people."""
+    source: str
+    condition: str
+    inputs: tuple[str, ...]
+    levels: tuple[float, ...]
+    scored_levels: tuple[float, ...]
+    trials: tuple[ChosenTrial, ...]
+    frames: tuple[Pick, ...]
+
+
+def choose_frames(
+    networks: Mapping[str, TrainedModel],
+    data: Dataset,
+    *,
+    split: str = "test",
+    condition: str = "dry",
+    trials: int = 14,
+    tolerance: float = 0.03,
+    levels: Sequence[float] = DEFAULT_LEVELS,
+    scored_levels: Sequence[float] = SCORED_LEVELS,
+    shown_trials: int = 1,
+    on_trial: Callable[[int, int], None] | None = None,
+) -> Choice:
+    """Choose trials in which every network reads the frames along the margin within a tolerance.
+
+    An explanation of a wrong answer explains the error. Where fewer trials qualify than are wanted, those whose worst
+    error is smallest are taken too; where more do, the first of them in the data set's order.
+
+    Parameters
+    ----------
+    networks
+        By input.
+    data, split, condition
+        Trials to choose from.
+    trials
+        How many are wanted.
+    tolerance
+        Largest error of an answer, in margin units.
+    levels
+        Safety margins at which frames are shown; for each the nearest frame is taken.
+    scored_levels
+        Those of them that count in the scores.
+    shown_trials
+        How many trials the panels show, the best read first.
+    on_trial
+        Called with the trials looked at and the number of all.
+
+    Raises
+    ------
+    InputError
+        If a number is out of range, or a scored level is not among the levels.
+    RecordingError
+        If no trial has a frame near every level.
+
+    References
+    ----------
+    Polak, section 4: 14 trials read within 3 %, 6 levels, 42 frames to score.
+    """
+    _check(networks, trials=trials, tolerance=tolerance, levels=levels, scored_levels=scored_levels)
+    infos = data.select(split=split, condition=condition)
+    found: list[tuple[ChosenTrial, list[tuple[int, float]]]] = []
+    for number, info in enumerate(infos, start=1):
+        recording = data.load(info, truth=False)
+        margin = np.where(recording.labelled, recording.safety_margin, np.nan)
+        rows = [nearest_frame(margin, level) for level in levels] if np.isfinite(margin).any() else []
+        near = bool(rows) and all(abs(margin[row] - level) <= _REACH for row, level in zip(rows, levels, strict=True))
+        if near and len(set(rows)) == len(rows):
+            worst = {}
+            for name, trained in networks.items():
+                answers = trained.predict(trained.encode(recording.frames[rows], recording.reference)).numpy()
+                worst[name] = float(np.abs(answers - margin[rows]).max())
+            one = ChosenTrial(trial=info.trial, qualified=max(worst.values()) <= tolerance, worst_error=worst)
+            found.append((one, [(row, float(margin[row])) for row in rows]))
+        if on_trial is not None:
+            on_trial(number, len(infos))
+    if not found:
+        raise RecordingError(
+            f"none of the {len(infos)} {condition} trials of split {split!r} has a labelled frame within {_REACH:.0%} "
+            f"of each of {', '.join(f'{level:.0%}' for level in levels)}; choose other levels or another split"
+        )
+    # sorting is stable: those that qualify keep the data set's order, so that none is picked for its looks
+    taken = sorted(found, key=lambda item: 0.0 if item[0].qualified else max(item[0].worst_error.values()))[:trials]
+    best_read = sorted(taken, key=lambda item: max(item[0].worst_error.values()))[:shown_trials]
+    shown = {one.trial for one, _ in best_read}
+    picks = [
+        Pick(
+            id=f"{one.trial}-f{row:04d}",
+            trial=one.trial,
+            frame=row,
+            level=float(level),
+            safety_margin=label,
+            scored=level in scored_levels,
+            shown=one.trial in shown,
+        )
+        for one, rows in taken
+        for level, (row, label) in zip(levels, rows, strict=True)
+        if level in scored_levels or one.trial in shown
+    ]
+    qualified = sum(one.qualified for one, _ in found)
+    return Choice(
+        trials_wanted=trials,
+        tolerance=tolerance,
+        considered=len(found),
+        qualified=qualified,
+        told=_tell(
+            infos=len(infos),
+            found=len(found),
+            qualified=qualified,
+            taken=[one for one, _ in taken],
+            wanted=trials,
+            tolerance=tolerance,
+            condition=condition,
+            networks=len(networks),
+        ),
+        source="simulated" if data.simulated else "real",
+        condition=condition,
+        inputs=tuple(networks),
+        levels=tuple(float(level) for level in levels),
+        scored_levels=tuple(float(level) for level in scored_levels),
+        trials=tuple(one for one, _ in taken),
+        frames=tuple(picks),
+    )
+
+
+def _check(
+    networks: Mapping[str, TrainedModel],
+    *,
+    trials: int,
+    tolerance: float,
+    levels: Sequence[float],
+    scored_levels: Sequence[float],
+) -> None:
+    if not networks:
+        raise InputError("a study needs a network; name one for difference images, for raw ones, or both")
+    if trials < 1:
+        raise InputError(f"a study of {trials} trials is impossible; ask for 1 or more")
+    if not 0 <= tolerance <= 1:
+        raise InputError(f"the tolerance is {tolerance:g}; give a share of the margin between 0 and 1")
+    if any(not 0 <= level <= 1 for level in levels):
+        raise InputError(f"levels must lie in [0, 1], got {', '.join(f'{level:g}' for level in levels)}")
+    absent = [level for level in scored_levels if level not in levels]
+    if absent or not scored_levels:
+        raise InputError(
+            f"scored levels must be some of the levels {', '.join(f'{level:g}' for level in levels)}, got "
+            f"{', '.join(f'{level:g}' for level in scored_levels) or 'none'}"
+        )
+
+
+def _tell(
+    *,
+    infos: int,
+    found: int,
+    qualified: int,
+    taken: Sequence[ChosenTrial],
+    wanted: int,
+    tolerance: float,
+    condition: str,
+    networks: int,
+) -> str:
+    who = "the network reads" if networks == 1 else "both networks read" if networks == 2 else "all networks read"
+    told = f"Of {infos} {condition} trials {found} have a frame near every level, and in {qualified} of those {who} "
+    told += f"every such frame within {tolerance:.0%}."
+    others = [one for one in taken if not one.qualified]
+    if others:
+        worst = max(max(one.worst_error.values()) for one in others)
+        told += (
+            f" {wanted} were wanted, so the {len(others)} read best among the others were taken too; the worst of "
+            f"their answers is off by {worst:.0%}."
+        )
+    elif qualified > wanted:
+        told += f" The first {wanted} were taken."
+    if len(taken) < wanted:
+        told += f" There were no more: {len(taken)} instead of {wanted}."
+    return told
+
+
+def save_choice(choice: Choice, folder: Path) -> None:
+    """Write a choice as the `result.json` of a folder."""
+    write_json(folder / RESULT_FILE, choice)
+
+
+def load_choice(folder: Path) -> Choice:
+    """Read what `save_choice` wrote.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or is no choice.
+    """
+    values: dict[str, Any] = read_json(folder / RESULT_FILE)
+    try:
+        return Choice(
+            **{
+                **values,
+                **{name: tuple(values[name]) for name in ("inputs", "levels", "scored_levels")},
+                "trials": tuple(ChosenTrial(**one) for one in values["trials"]),
+                "frames": tuple(Pick(**one) for one in values["frames"]),
+            }
+        )
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{folder / RESULT_FILE} holds no choice of frames ({error}); make the study again") from None

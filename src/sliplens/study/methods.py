@@ -1,0 +1,36 @@
+"""The methods of a study: the thesis's three as they were run, and ours."""
+
+from collections.abc import Sequence
+
+from sliplens.explain import EXPLAINERS, Explainer, PolyCam
+from sliplens.study.explaining import require_methods
+
+THESIS_POLY_CAM = "poly-cam-thesis"
+STUDY_METHODS = ("grad-cam", "integrated-gradients", THESIS_POLY_CAM, "poly-cam", "occlusion")
+"""Grad-CAM, Integrated Gradients and Poly-CAM as the thesis ran it; Poly-CAM with the regression score, occlusion."""
+STUDY_BUDGET = 0.25
+"""Share of the channels that Poly-CAM with the regression score measures."""
+
+
+def study_explainers(methods: Sequence[str] = STUDY_METHODS, *, budget: float = STUDY_BUDGET) -> dict[str, Explainer]:
+    """Explainers of a study by name.
+
+    Parameters
+    ----------
+    methods
+        Rows of `EXPLAINERS`, or `poly-cam-thesis`: the public code's score, layers, and the map that the thesis scored.
+    budget
+        Of Poly-CAM with the regression score; see `PolyCam`.
+
+    Raises
+    ------
+    InputError
+        If a method is unknown; the message lists those there are.
+    """
+    table = {
+        **EXPLAINERS,
+        "poly-cam": PolyCam(budget=budget),
+        THESIS_POLY_CAM: PolyCam(score="thesis", level=5),
+    }
+    require_methods(methods, table)
+    return {name: table[name] for name in methods}

@@ -1,0 +1,134 @@
+"""Randomisation: what becomes of the maps, and of a control, when the network's weights are drawn anew."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sliplens.explain import Explainer
+from sliplens.faithfulness.randomisation import cascade, histogram_entropy, randomisation_scores, smooth_maps
+from sliplens.provenance import write_json
+from sliplens.study.material import Material
+from sliplens.study.saved import RESULT_FILE, mean_of_known
+
+STAGES = 3
+_SMOOTH_WITHIN_S = 1.0
+"""Methods that take longer a frame are not explained sixteen times over."""
+_STILL_SIMILAR = 0.5
+
+Maps = Float[np.ndarray, "frames height width"]
+Count = Callable[[int, int], None]
+
+
+def check_randomisation(
+    material: Material, folder: Path, *, frames: int = 2, seed: int = 0, on_method: Count | None = None
+) -> None:
+    """Explain networks whose weights are drawn anew from the output on, and write how far the maps change.
+
+    Parameters
+    ----------
+    material
+        The network, frames and methods.
+    folder
+        Gets `result.json`; must exist.
+    frames
+        How many of the frames, from the first on.
+    seed
+        Of the new weights.
+    on_method
+        Called with the methods done and their number.
+
+    References
+    ----------
+    See `sliplens.faithfulness.randomisation`.
+    """
+    inputs, references = material.inputs[:frames], material.references[:frames]
+    told: dict[str, Any] = {}
+    alarms = []
+    for number, (name, explainer) in enumerate(material.explainers.items(), start=1):
+
+        def explain(model: nn.Module, images: Tensor, explainer: Explainer = explainer) -> Maps:
+            return explainer(model, images, reference=references).relevance.double().cpu().numpy()
+
+        started = time.perf_counter()
+        found = randomisation_scores(explain, material.trained.model, inputs, seed=seed, stages=STAGES)
+        seconds = (time.perf_counter() - started) / (STAGES + 1) / len(inputs)
+        similarity = [mean_of_known(row) for row in found.similarity]
+        told[name] = {
+            "layers": found.layers,
+            "similarity": similarity,
+            "complexity_rise": mean_of_known(found.complexity_rise),
+            "smooth_complexity_rise": _smooth_rise(material, explain, inputs, seed=seed)
+            if seconds <= _SMOOTH_WITHIN_S
+            else None,
+        }
+        if similarity[-1] is not None and similarity[-1] > _STILL_SIMILAR:
+            alarms.append(
+                f"{name} still correlates by {similarity[-1]:.2f} with its maps when all weights are new: it shows the "
+                "image rather than what the network learned"
+            )
+        if on_method is not None:
+            on_method(number, len(material.explainers))
+    write_json(
+        folder / RESULT_FILE,
+        {
+            "input": material.explained.input,
+            "source": material.explained.source,
+            "frames": len(inputs),
+            "methods": told,
+            "alarms": alarms,
+        },
+    )
+
+
+def _smooth_rise(
+    material: Material, explain: Callable[[nn.Module, Tensor], Maps], inputs: Tensor, *, seed: int
+) -> float | None:
+    model = material.trained.model
+    before, after = (
+        np.array([histogram_entropy(one) for one in smooth_maps(explain, network, inputs, seed=seed)])
+        for network in (model, _untrained(model, seed=seed))
+    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return mean_of_known((after - before) / before)
+
+
+def explain_untrained(
+    material: Material, explainer: Explainer, *, seed: int = 0, on_frame: Count | None = None
+) -> Maps:
+    """Maps of the network with all weights drawn anew: a control that every map has to beat.
+
+    Parameters
+    ----------
+    material
+        The network and the frames.
+    explainer
+        What explains.
+    seed
+        Of the new weights.
+    on_frame
+        Called with the frames done and their number.
+
+    Returns
+    -------
+    maps
+        The part of the relevance that works towards that network's own target.
+    """
+    model = _untrained(material.trained.model, seed=seed)
+    maps = []
+    for index in range(len(material.inputs)):
+        one = slice(index, index + 1)
+        found = explainer(model, material.inputs[one], reference=material.references[one])
+        maps.append((found.relevance * found.change.sign()[:, None, None])[0].double().cpu().numpy())
+        if on_frame is not None:
+            on_frame(index + 1, len(material.inputs))
+    return np.stack(maps)
+
+
+def _untrained(model: nn.Module, *, seed: int) -> nn.Module:
+    *_, last = cascade(model, seed=seed, stages=1)
+    return last.model

@@ -1,0 +1,70 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from sliplens.explain import Explanation
+from sliplens.faithfulness.looks import gini, total_variation
+from sliplens.recordings import Dataset
+from sliplens.study.looks import check_looks
+from sliplens.study.material import Material
+from sliplens.study.sanity import check_randomisation, explain_untrained
+from sliplens.study.timing import time_explainers
+
+
+class ShowsTheImage:
+    """An explainer that never asks the network."""
+
+    def __call__(self, _model: nn.Module, images: Tensor, **_options: object) -> Explanation:
+        return Explanation(
+            relevance=images.mean(dim=1),
+            method="image",
+            target="nothing",
+            prediction=torch.ones(len(images)),
+            reference_prediction=torch.zeros(len(images)),
+            seconds=0.0,
+        )
+
+
+def test_a_map_that_ignores_the_network_is_found_out(material: Material, tmp_path: Path):
+    blind = replace(material, explainers={"image": ShowsTheImage(), **material.explainers})
+    check_randomisation(blind, tmp_path)
+    told = json.loads((tmp_path / "result.json").read_text())
+    assert told["methods"]["image"]["similarity"] == pytest.approx([1.0, 1.0, 1.0])
+    assert told["methods"]["image"]["complexity_rise"] == pytest.approx(0)
+    assert any(alarm.startswith("image still correlates by 1.00") for alarm in told["alarms"])
+    assert told["methods"]["grad-cam"]["similarity"][-1] != pytest.approx(1.0)
+
+
+def test_the_untrained_control_leaves_the_network_as_it_is(material: Material):
+    before = {name: value.clone() for name, value in material.trained.model.state_dict().items()}
+    first = explain_untrained(material, material.explainers["integrated-gradients"], seed=1)
+    again = explain_untrained(material, material.explainers["integrated-gradients"], seed=1)
+    other = explain_untrained(material, material.explainers["integrated-gradients"], seed=2)
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 0
+    assert all(torch.equal(value, before[name]) for name, value in material.trained.model.state_dict().items())
+
+
+def test_looks_are_those_of_the_saved_maps(material: Material, fine_dataset: Dataset, tmp_path: Path):
+    check_looks(material, fine_dataset, tmp_path)
+    told = json.loads((tmp_path / "result.json").read_text())
+    maps = material.explained.saliency["grad-cam"].astype(np.float64)
+    found = told["methods"]["grad-cam"]
+    assert found["total_variation"] == pytest.approx(np.mean([total_variation(one) for one in maps]))
+    assert found["gini"] == pytest.approx(np.mean([gini(one) for one in maps]))
+    # frames that follow each other share a reference without noise: nothing shakes, so the maps stay as they are
+    assert told["noise_sd"] == 0
+    assert found["noise_stability"] == pytest.approx(1.0, abs=1e-4)
+
+
+def test_the_time_without_the_forward_pass_is_shorter_by_that_pass(material: Material, tmp_path: Path):
+    time_explainers(material, tmp_path)
+    told = json.loads((tmp_path / "result.json").read_text())
+    for one in told["methods"].values():
+        assert one["low"] <= one["seconds"] <= one["high"]
+        assert one["seconds_without_forward"] == pytest.approx(max(0, one["seconds"] - told["forward_seconds"]))

@@ -1,0 +1,103 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from sliplens.errors import InputError, RecordingError
+from sliplens.models import TrainedModel
+from sliplens.recordings import Dataset
+from sliplens.study.choice import Choice, choose_frames, load_choice, save_choice
+
+
+class Says(nn.Module):
+    """A network that always gives the same answer, or the mean brightness of a trial's frames times a factor."""
+
+    def __init__(self, answer: float) -> None:
+        super().__init__()
+        self.answer = answer
+
+    def forward(self, images: Tensor) -> Tensor:
+        return torch.full((len(images),), self.answer)
+
+
+def says(network: TrainedModel, answer: float) -> TrainedModel:
+    return TrainedModel(model=Says(answer), manifest=network.manifest)
+
+
+def test_each_level_gets_the_frame_whose_label_is_nearest(choice: Choice, fine_dataset: Dataset):
+    labels = {info.trial: fine_dataset.load(info).safety_margin for info in fine_dataset.trials}
+    for pick in choice.frames:
+        margin = labels[pick.trial]
+        assert margin[pick.frame] == pytest.approx(pick.safety_margin)
+        assert abs(pick.safety_margin - pick.level) == pytest.approx(np.nanmin(np.abs(margin - pick.level)))
+
+
+def test_one_trial_is_shown_whole_and_every_trial_is_scored_at_three_levels(choice: Choice):
+    shown = [pick for pick in choice.frames if pick.shown]
+    assert [pick.level for pick in shown] == [1.0, 0.8, 0.6, 0.4, 0.2, 0.0]
+    assert len({pick.trial for pick in shown}) == 1
+    scored = [pick for pick in choice.frames if pick.scored]
+    assert len(scored) == 3 * len(choice.trials) == 6
+    assert len({pick.id for pick in choice.frames}) == len(choice.frames) == 9
+
+
+# at levels 1 and 0 a constant answer c is wrong by about max(1 - c, c): 0.5 by half, 0.9 by nine tenths
+@pytest.mark.parametrize(("answer", "worst"), [(0.5, 0.5), (0.9, 0.9), (0.2, 0.8)])
+def test_a_trial_qualifies_when_its_worst_answer_is_within_the_tolerance(
+    network: TrainedModel, fine_dataset: Dataset, answer: float, worst: float
+):
+    # labels lie within 1/39 of a level
+    for tolerance, expected in ((worst + 0.03, 3), (worst - 0.03, 0)):
+        found = choose_frames({"difference": says(network, answer)}, fine_dataset, trials=3, tolerance=tolerance)
+        assert (found.considered, found.qualified) == (3, expected)
+        assert all(abs(one.worst_error["difference"] - worst) < 0.03 for one in found.trials)
+
+
+def test_of_two_networks_the_worse_decides(network: TrainedModel, fine_dataset: Dataset):
+    networks = {"difference": says(network, 0.5), "raw": says(network, 0.9)}
+    assert choose_frames(networks, fine_dataset, tolerance=0.6).qualified == 0
+    assert choose_frames(networks, fine_dataset, tolerance=0.95).qualified == 3
+
+
+def test_where_too_few_qualify_the_text_says_what_was_done(network: TrainedModel, fine_dataset: Dataset):
+    found = choose_frames({"difference": says(network, 0.5)}, fine_dataset, trials=5, tolerance=0.01)
+    assert "in 0 of those" in found.told
+    assert "the 3 read best among the others were taken too" in found.told
+    assert "3 instead of 5" in found.told
+    enough = choose_frames({"difference": says(network, 0.5)}, fine_dataset, trials=2, tolerance=0.9)
+    assert [one.trial for one in enough.trials] == ["test-dry-0", "test-dry-1"]
+    assert "The first 2 were taken" in enough.told
+
+
+def test_a_choice_comes_back_as_it_was(choice: Choice, tmp_path: Path):
+    save_choice(choice, tmp_path)
+    assert load_choice(tmp_path) == choice
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"trials": 0}, "0 trials is impossible"),
+        ({"tolerance": 2.0}, "between 0 and 1"),
+        ({"levels": (1.2,)}, r"in \[0, 1\]"),
+        ({"scored_levels": (0.3,)}, "must be some of the levels"),
+    ],
+)
+def test_impossible_wishes_are_refused(
+    network: TrainedModel, fine_dataset: Dataset, change: dict[str, object], sentence: str
+):
+    with pytest.raises(InputError, match=sentence):
+        choose_frames({"difference": network}, fine_dataset, **change)  # pyright: ignore[reportArgumentType]
+
+
+def test_data_without_frames_near_the_levels_are_refused(network: TrainedModel, small_dataset: Dataset):
+    # its labels are elevenths: none lies within 5 % of full stick
+    with pytest.raises(RecordingError, match="choose other levels"):
+        choose_frames({"difference": network}, small_dataset)
+
+
+def test_a_study_without_a_network_is_refused(fine_dataset: Dataset):
+    with pytest.raises(InputError, match="needs a network"):
+        choose_frames({}, fine_dataset)

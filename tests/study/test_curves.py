@@ -1,0 +1,157 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from sliplens.faithfulness import get_fill
+from sliplens.faithfulness.removal import Faithfulness
+from sliplens.intervals import paired_difference
+from sliplens.study.curves import STUDY_AREAS, influences, score_curves
+from sliplens.study.judging import EQUAL_AREAS, RANDOMISED, Setting, judge_curves, ranking_alarms
+from sliplens.study.material import Material
+
+PIXELS = Setting(fill="grey", unit="pixel")
+MARKERS = Setting(fill="reference", unit="marker")
+AREAS = np.array([0.0, 0.5, 1.0])
+
+
+def straight(most: float, least: float, *, frames: int = 8) -> Faithfulness:
+    """Curves that rise at once to a level and stay: their areas differ by three quarters of the levels' difference."""
+    curve = np.array([0.0, 1.0, 1.0])
+    return Faithfulness(
+        areas=AREAS, curves=np.stack([np.tile(level * curve, (frames, 1)) for level in (most, least, 0.0)])
+    )
+
+
+@pytest.fixture(scope="module")
+def scored(material: Material, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("curves")
+    score_curves(material, folder, maps=influences(material), settings=(PIXELS, MARKERS), random_orders=2)
+    return folder
+
+
+def test_removing_by_hand_gives_the_same_change(material: Material, scored: Path):
+    table = pq.read_table(scored / "curves.parquet").to_pylist()
+    frame, area = material.explained.frames[0], 0.2
+    relevance = material.explained.relevance["grad-cam"][0]
+    towards = np.sign(frame.prediction - frame.reference_prediction)
+    side = relevance.shape[-1]
+    order = np.lexsort((np.arange(side * side), -(relevance * towards).ravel()))
+    gone = np.zeros(side * side, dtype=bool)
+    gone[order[: round(area * side * side)]] = True
+    image = material.inputs[0].clone()
+    image[:, torch.from_numpy(gone.reshape(side, side))] = 0.5
+    expected = abs(float(material.trained.predict(image[None])[0]) - frame.prediction)
+    found = [
+        row["most_first"]
+        for row in table
+        if (row["fill"], row["method"], row["frame_id"]) == ("grey", "grad-cam", frame.id) and row["area"] == area
+    ]
+    assert found == pytest.approx([expected], abs=1e-5)
+
+
+def test_every_method_and_control_is_scored_under_every_setting(material: Material, scored: Path):
+    told = json.loads((scored / "result.json").read_text())
+    names = {*material.explainers, "edges", "input", "centre"}
+    assert {(one["fill"], one["unit"], one["method"]) for one in told["scores"]} == {
+        (setting.fill, setting.unit, name) for setting in (PIXELS, MARKERS) for name in names
+    }
+    assert {one["method"] for one in told["scores"] if not one["control"]} == set(material.explainers)
+    assert (told["frames"], told["trials"], told["random_orders"]) == (6, 2, 2)
+    assert told["areas"] == list(STUDY_AREAS)
+    assert set(told["scores"][0]["at"]) == {str(area) for area in EQUAL_AREAS}
+
+
+def test_scores_are_the_areas_under_the_stored_curves(scored: Path):
+    table = pq.read_table(scored / "curves.parquet")
+    columns = {name: np.array(table[name].to_pylist()) for name in table.column_names}
+    for one in json.loads((scored / "result.json").read_text())["scores"]:
+        rows = np.ones(table.num_rows, dtype=bool)
+        for name in ("fill", "unit", "method"):
+            rows &= columns[name] == one[name]
+        shape = (-1, len(STUDY_AREAS))
+        gain = np.trapezoid(
+            (columns["most_first"] - columns["least_first"])[rows].reshape(shape), np.array(STUDY_AREAS), axis=-1
+        )
+        assert one["srg"]["estimate"] == pytest.approx(gain.mean())
+
+
+def test_markers_that_are_not_known_everywhere_are_no_unit(material: Material):
+    assert set(material.units()) == {"pixel", "tile", "marker"}
+    assert set(replace(material, markers={}).units()) == {"pixel", "tile"}
+
+
+def test_a_fill_that_is_unknown_is_refused_before_anything_is_made(material: Material, tmp_path: Path):
+    with pytest.raises(Exception, match="no fill named 'pink'"):
+        score_curves(material, tmp_path, maps={}, settings=(Setting(fill="pink", unit="pixel"),))
+    assert not list(tmp_path.iterdir())
+    assert get_fill("grey")
+
+
+def test_an_interrupted_run_goes_on_after_the_last_setting(material: Material, tmp_path: Path, scored: Path):
+    calls = []
+
+    def interrupt(done: int, total: int) -> None:
+        calls.append((done, total))
+        if done > len(material.inputs):
+            raise KeyboardInterrupt
+
+    settings = {"maps": influences(material), "settings": (PIXELS, MARKERS), "random_orders": 2}
+    with pytest.raises(KeyboardInterrupt):
+        score_curves(material, tmp_path, on_frame=interrupt, **settings)
+    assert {path.name for path in (tmp_path / "parts").iterdir()} == {"grey-pixel.npz"}
+    before = len(calls)
+    score_curves(material, tmp_path, on_frame=lambda done, total: calls.append((done, total)), **settings)
+    assert all(done >= len(material.inputs) for done, _ in calls[before:])
+    assert (tmp_path / "result.json").read_text() == (scored / "result.json").read_text()
+
+
+def test_a_method_is_better_only_when_the_interval_leaves_zero_out():
+    rng = np.random.default_rng(0)
+    level = rng.uniform(0.3, 0.5, 8)
+    noisy = Faithfulness(
+        areas=AREAS,
+        curves=np.stack([value[:, None] * np.array([0.0, 1.0, 1.0]) for value in (level, np.zeros(8), np.zeros(8))]),
+    )
+    found = {PIXELS: {"poly-cam": noisy, "grad-cam": straight(0.1, 0.0), "occlusion": noisy, "edges": straight(0, 0)}}
+    told = judge_curves(found, trials=np.arange(8), seed=0)
+    by_pair = {(one["first"], one["second"]): one for one in told["comparisons"]}
+    assert by_pair["poly-cam", "grad-cam"]["sure"]
+    assert by_pair["poly-cam", "grad-cam"]["estimate"] == pytest.approx(0.75 * (level.mean() - 0.1))
+    assert not by_pair["poly-cam", "occlusion"]["sure"]
+    assert by_pair["poly-cam", "edges"]["sure"]
+    assert ("edges", "edges") not in by_pair
+
+
+def test_intervals_resample_trials_not_frames():
+    values = np.array([0.1, 0.1, 0.9, 0.9])
+    rng = np.random.default_rng(1)
+    one = paired_difference(values, np.zeros(4), trials=np.array(["a", "a", "b", "b"]), rng=rng)
+    # of two trials with the means 0.1 and 0.9 a resample draws one of them twice half of the time
+    assert (one.low, one.high, one.units) == (0.1, 0.9, 2)
+    assert not one.sure
+
+
+def test_fills_that_rank_the_methods_backwards_are_named():
+    methods = {"poly-cam": 0.3, "grad-cam": 0.2, "occlusion": 0.1}
+    other = Setting(fill="blur", unit="pixel")
+    found = {
+        PIXELS: {name: straight(level, 0) for name, level in methods.items()},
+        other: {name: straight(0.4 - level, 0) for name, level in methods.items()},
+    }
+    told = judge_curves(found, trials=np.arange(8), seed=0)
+    assert told["agreement"] == [{"unit": "pixel", "first": "grey", "second": "blur", "tau": pytest.approx(-1)}]
+    assert any("rank the methods differently" in alarm for alarm in ranking_alarms(found))
+    same = {PIXELS: found[PIXELS], other: found[PIXELS]}
+    assert not any("rank the methods differently" in alarm for alarm in ranking_alarms(same))
+
+
+def test_a_control_that_wins_raises_an_alarm():
+    found = {PIXELS: {"poly-cam": straight(0.2, 0), RANDOMISED: straight(0.3, 0)}}
+    assert any("no more than the control randomised" in alarm for alarm in ranking_alarms(found))
+    found = {PIXELS: {"poly-cam": straight(0.4, 0), RANDOMISED: straight(0.3, 0)}}
+    assert not ranking_alarms(found)
