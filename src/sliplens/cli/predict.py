@@ -8,6 +8,7 @@ import tyro
 
 from sliplens._version import __version__
 from sliplens.cli.console import OUT, progress_bar, say, wrote
+from sliplens.cli.devices import require_device
 from sliplens.errors import InputError
 from sliplens.provenance import hash_file
 
@@ -84,8 +85,6 @@ class Predict:
         wrote(self.output, f"{source.frames:,} frames, by {name}")
 
     def _check(self) -> None:
-        import torch
-
         if self.output.suffix != ".parquet":
             raise InputError(f"{self.output} does not end in .parquet; name the file to write so")
         if self.output.exists() and not self.overwrite:
@@ -94,12 +93,7 @@ class Predict:
             raise InputError(f"--batch-size must be at least 1, got {self.batch_size}")
         if self.onnx is not None and self.engine not in {None, "onnxruntime", "openvino"}:
             raise InputError(f"--onnx is for onnxruntime and openvino, not for {self.engine}; leave it out")
-        try:
-            # an allocation tells whether the device is there
-            torch.empty(1, device=self.device)
-        except (RuntimeError, AssertionError, NotImplementedError) as error:
-            reason = str(error).splitlines()[0]
-            raise InputError(f"--device {self.device} cannot be used ({reason}); choose cpu or cuda") from None
+        require_device(self.device)
 
     def _options(self) -> "SourceOptions":
         from sliplens.export.sources import SourceOptions

@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from sliplens.cli.console import print_table, progress_bar, say, unchanged, wrote
+from sliplens.cli.devices import require_device
 from sliplens.provenance import hash_file, output_folder
 
 
@@ -25,9 +26,11 @@ class Score:
     output: Annotated[Path, tyro.conf.arg(aliases=("-o",))]
     """Folder to make: curves and table."""
     fill: str = "grey"
-    """What removed pixels become: grey, black, white or blur."""
+    """What removed pixels become: grey, black, white, background, blur or noisy-linear."""
     steps: int | None = None
     """Steps until every pixel is gone; the image's height if not given."""
+    device: str = "cpu"
+    """Where the network runs: cpu, cuda or cuda:1."""
     seed: int = 0
     """Seed of the random order."""
     overwrite: bool = False
@@ -42,7 +45,8 @@ class Score:
         from sliplens.study.scoring import require_same_network
 
         get_fill(self.fill)
-        trained = load_checkpoint(find_run(self.model))
+        require_device(self.device)
+        trained = load_checkpoint(find_run(self.model), device=self.device)
         explained = load_explained(self.explanations)
         require_same_network(trained, explained)
         recipe = {

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from sliplens.cli.console import print_table, progress_bar, unchanged, wrote
+from sliplens.cli.devices import require_device
 from sliplens.errors import InputError
 from sliplens.provenance import output_folder, write_json
 
@@ -70,7 +71,7 @@ class Simulate:
         if self.output is None and self.preview is None and self.video is None:
             raise InputError("nothing to do; name a folder to make, or a picture with --preview")
         self._require_pictures()
-        _require_device(self.device)
+        require_device(self.device)
         recipe = self._recipe()
         plans = plan_trials(recipe)
         if self.preview is not None:
@@ -182,16 +183,3 @@ def _spread(plans: "tuple[TrialPlan, ...]") -> "list[TrialPlan]":
     wet = [plan for plan in plans if plan.condition == "wet"][:1]
     count = min(_PREVIEWED - len(wet), len(dry))
     return [dry[index * (len(dry) - 1) // max(1, count - 1)] for index in range(count)] + wet
-
-
-def _require_device(name: str) -> None:
-    import torch
-
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise InputError(f"device {name!r} is not known; use cpu, cuda or cuda:1") from None
-    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise InputError(f"device {name} is not on this machine; use cpu")
-    if device.type not in {"cpu", "cuda"}:
-        raise InputError(f"device {name} cannot draw frames; use cpu or cuda")

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from sliplens.cli.devices import require_device
 from sliplens.cli.evaluate import Evaluate
 from sliplens.cli.report import Report
 from sliplens.cli.simulate import Simulate
@@ -54,6 +55,8 @@ class Study:
     """Share of the channels that poly-cam measures at first."""
     random_orders: int = 20
     """Random orders that every method has to beat."""
+    device: str = "cpu"
+    """Where the networks run: cpu, cuda or cuda:1."""
     seed: int = 0
     """Seed of the random orders, of new weights and of noise."""
     overwrite: bool = False
@@ -69,6 +72,7 @@ class Study:
             raise InputError("name a data set, or --preset thesis to simulate one")
         if self.random_orders < 1:
             raise InputError(f"--random-orders must be at least 1, got {self.random_orders}")
+        require_device(self.device)
         explainers = study_explainers(self.method or STUDY_METHODS, budget=self.budget)
         networks = self._load_networks()
         folder = self.data or self._simulate()
@@ -109,7 +113,7 @@ class Study:
         from sliplens.models import load_checkpoint
         from sliplens.models.shipped import find_run
 
-        networks = {name: load_checkpoint(find_run(run)) for name, run in self._named().items()}
+        networks = {name: load_checkpoint(find_run(run), device=self.device) for name, run in self._named().items()}
         if not networks:
             raise InputError("a study needs a network; leave out --difference none or --raw none")
         for name, trained in networks.items():

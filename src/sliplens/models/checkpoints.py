@@ -57,6 +57,11 @@ class TrainedModel:
     manifest: Manifest
 
     @property
+    def device(self) -> torch.device:
+        """Where the network runs; inputs are brought there, answers come back."""
+        return next(self.model.parameters(), torch.empty(0)).device
+
+    @property
     def encoding(self) -> Encoding:
         """The input the network was trained on."""
         return get_encoding(self.manifest.input)
@@ -91,8 +96,8 @@ class TrainedModel:
     @torch.no_grad()
     def predict(self, inputs: Float[Tensor, "batch 3 size size"], *, batch_size: int = 64) -> Float[Tensor, " batch"]:
         """Safety margin of encoded frames; not clipped, so that an answer outside [0, 1] shows as what it is."""
-        answers = [self.model(batch).reshape(len(batch)) for batch in inputs.split(batch_size)]
-        return torch.cat(answers) if answers else torch.empty(0)
+        answers = [self.model(batch.to(self.device)).reshape(len(batch)) for batch in inputs.split(batch_size)]
+        return torch.cat(answers).cpu() if answers else torch.empty(0)
 
     @property
     def calibration(self) -> Calibration | None:
@@ -104,9 +109,9 @@ class TrainedModel:
     def estimate(self, inputs: Float[Tensor, "batch 3 size size"], *, batch_size: int = 64) -> "Estimate":
         """Safety margin of encoded frames, with how sure it is."""
         if isinstance(self.model, HistogramRegressor):
-            parts = [self.model.probabilities(batch) for batch in inputs.split(batch_size)]
+            parts = [self.model.probabilities(batch.to(self.device)) for batch in inputs.split(batch_size)]
             bins = len(self.model.edges) - 1
-            probabilities = torch.cat(parts) if parts else torch.empty((0, bins))
+            probabilities = torch.cat(parts) if parts else torch.empty((0, bins), device=self.device)
             return Estimate(
                 margin=(probabilities @ self.model.centres).double().cpu().numpy(),
                 probabilities=probabilities.double().cpu().numpy(),

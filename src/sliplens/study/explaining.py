@@ -19,7 +19,7 @@ DEFAULT_METHODS = ("grad-cam", "integrated-gradients", "poly-cam")
 """The three methods the thesis compares."""
 
 
-def require_methods(methods: Sequence[str], explainers: Mapping[str, Explainer] = EXPLAINERS) -> None:
+def require_methods(methods: Sequence[str], explainers: Mapping[str, object] = EXPLAINERS) -> None:
     """Refuse a method that is not in the table.
 
     Raises
@@ -38,7 +38,7 @@ def explain_frames(
     folder: Path,
     *,
     methods: Sequence[str] = DEFAULT_METHODS,
-    explainers: Mapping[str, Explainer] = EXPLAINERS,
+    explainers: Mapping[str, Explainer | Sequence[Explainer]] = EXPLAINERS,
     on_map: Progress | None = None,
 ) -> Explained:
     """Explain frames with several methods and write the result.
@@ -56,7 +56,8 @@ def explain_frames(
     methods
         Names in the table of explainers.
     explainers
-        The table, where their options are not the default ones.
+        The table, where their options are not the default ones; a method whose options differ from frame to frame has
+        one explainer for each.
     on_map
         Called with the number of maps done and the number of all.
 
@@ -68,7 +69,8 @@ def explain_frames(
     require_methods(methods, explainers)
     parts = folder / "parts"
     parts.mkdir(exist_ok=True)
-    inputs = trained.encoding.normalise(chosen.images)
+    inputs = trained.encoding.normalise(chosen.images).to(trained.device)
+    untouched = chosen.references.to(trained.device)
     relevance: dict[str, Any] = {}
     saliency: dict[str, Any] = {}
     notes: dict[str, Any] = {}
@@ -79,7 +81,10 @@ def explain_frames(
             part = parts / f"{method}-{index:05d}.npz"
             if not part.is_file():
                 one = slice(index, index + 1)
-                explanation = explainers[method](trained.model, inputs[one], reference=chosen.references[one])
+                explain = explainers[method]
+                if isinstance(explain, Sequence):
+                    explain = explain[index]
+                explanation = explain(trained.model, inputs[one], reference=untouched[one])
                 _save_part(part, explanation)
             with np.load(part, allow_pickle=False) as archive:
                 pieces.append({name: archive[name] for name in archive.files})
@@ -110,7 +115,7 @@ def explain_frames(
         saliency=saliency,
         weights_sha256=trained.manifest.weights_sha256,
     )
-    save_explained(explained, folder, pictures=(255 * inputs).round().to(torch.uint8), methods=notes)
+    save_explained(explained, folder, pictures=(255 * inputs).round().to(torch.uint8).cpu(), methods=notes)
     shutil.rmtree(parts)
     return explained
 

@@ -46,7 +46,7 @@ class Material:
     def fast(self, passes: int) -> Passes:
         """Make an engine ready for so many passes of the network."""
         some = self.inputs[:_PARITY_IMAGES]
-        return prepare(self.trained.model, some, self.trained.predict(some), passes=passes)
+        return prepare(self.trained.model, some, self.trained.predict(some).to(some.device), passes=passes)
 
     def units(self) -> dict[str, list[Units]]:
         """What can be removed at once, for each frame: pixels, tiles, and markers where they are known in every one."""
@@ -104,8 +104,8 @@ def gather(
     return Material(
         trained=trained,
         explained=some,
-        inputs=trained.encoding.normalise(some.images),
-        references=chosen.references[torch.tensor([at[pick.id] for pick in picks])],
+        inputs=trained.encoding.normalise(some.images).to(trained.device),
+        references=chosen.references[torch.tensor([at[pick.id] for pick in picks])].to(trained.device),
         picks=picks,
         markers=markers,
         explainers=explainers,

@@ -92,7 +92,7 @@ def score_explanations(
         If the explanations are of another network.
     """
     require_same_network(trained, explained)
-    inputs = trained.encoding.normalise(explained.images)
+    inputs = trained.encoding.normalise(explained.images).to(trained.device)
     shape = (inputs.shape[-2], inputs.shape[-1])
     rng = np.random.default_rng(seed)
     orders = {name: saliency_orders(maps, shape) for name, maps in explained.saliency.items()}
@@ -100,7 +100,7 @@ def score_explanations(
     count = len(inputs)
     some = inputs[:_PARITY_IMAGES]
     passes = len(orders) * count * len(deletion_steps(shape, steps=steps))
-    predict = prepare(trained.model, some, trained.predict(some), passes=passes)
+    predict = prepare(trained.model, some, trained.predict(some).to(trained.device), passes=passes)
     curves: dict[str, DeletionCurves] = {}
     for number, (name, order) in enumerate(orders.items()):
 

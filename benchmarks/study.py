@@ -1,0 +1,83 @@
+"""The whole study on simulated touch with the networks of the package: how long it takes, interrupted once.
+
+It is interrupted while it explains the second network, given again, and given a third time when all is there. Every
+stage that was finished before must be left as it was, and the third run must leave everything so.
+"""
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # the study inherits it
+
+_INTERRUPTED = 130
+_LOOK_EVERY_S = 0.5
+
+
+def main() -> None:
+    """Print the minutes and whether the study went on where it stopped, as text or as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, help="a simulated data set; the thesis's preset is made anew without it")
+    parser.add_argument("--trials", type=int, default=14, help="trials to look at; the thesis: 14")
+    parser.add_argument("--keep", type=Path, help="keep the study in this folder, which must not exist")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    if options.keep is not None and options.keep.exists():
+        parser.error(f"{options.keep} exists; name a new folder, so that the whole study is timed")
+    with tempfile.TemporaryDirectory() as scratch:
+        output = options.keep or Path(scratch) / "study"
+        data = ["--preset", "thesis"] if options.data is None else [str(options.data)]
+        words = [sys.executable, "-m", "sliplens", "study", *data, "-o", str(output), "--trials", str(options.trials)]
+        started = time.perf_counter()
+        stopped = run_until(words, output / ".explain-raw.partial" / "parts")
+        before = written(output)
+        subprocess.run(words, check=True, stdout=sys.stderr)
+        minutes = (time.perf_counter() - started) / 60
+        after = written(output)
+        started = time.perf_counter()
+        subprocess.run(words, check=True, stdout=sys.stderr)
+        told = {
+            "minutes": minutes,
+            "resumed_ok": stopped
+            and bool(before)
+            and all(after[path] == when for path, when in before.items())
+            and written(output) == after
+            and (output / "report.html").is_file(),
+            "stages_before_interruption": len(before),
+            "stages": len(after),
+            "seconds_when_all_is_there": time.perf_counter() - started,
+            "load": os.getloadavg()[2],
+        }
+    if options.json:
+        print(json.dumps(told))
+        return
+    print(f"{minutes:.1f} minutes, {'went on where it stopped' if told['resumed_ok'] else 'did NOT resume'}")
+
+
+def run_until(words: list[str], sign: Path) -> bool:
+    """Run a command, interrupt it once a folder holds something, and say whether it stopped as it should."""
+    process = subprocess.Popen(words, stdout=sys.stderr)
+    try:
+        while process.poll() is None:
+            if sign.is_dir() and any(sign.iterdir()):
+                process.send_signal(signal.SIGINT)
+                break
+            time.sleep(_LOOK_EVERY_S)
+        return process.wait() == _INTERRUPTED
+    finally:
+        process.kill()
+
+
+def written(output: Path) -> dict[Path, int]:
+    """When each finished stage was written."""
+    return {path: path.stat().st_mtime_ns for path in sorted(output.glob("*/run.json"))}
+
+
+if __name__ == "__main__":
+    main()
