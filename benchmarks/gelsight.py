@@ -1,13 +1,24 @@
-"""Real GelSight Mini clips of grasps that slip or hold: whether their dots are followed, and their motion tells a slip.
+"""Real GelSight Mini clips of grasps that slip or hold: whether their dots are followed, and whether a slip is told.
 
-Every clip is followed from the frame with least contact. A classifier of the whole clip (a label a grasp is all there
-is) sees motion alone: from each clip the same number of windows of the same number of frames, spread evenly, each
-reduced to numbers of how its dots move against the window's first frame, in pitches. Clip length, frame count,
-brightness and the number of dots are not among them; what they alone would tell stands beside it, for they do tell.
+Every clip is followed from the frame with least contact. Two classifiers say of a whole clip whether it slips (a label
+a grasp is all there is): a logistic one of how the dots move, and a small convolutional network on difference images.
+Both look at windows of the same number of frames, each against its own first frame, and at the mean over a clip's
+windows, in which their number cannot be seen. Beside them stands what a clip gives away without any touch being looked
+at: frames, dots, brightness, bytes a frame.
 
-Objects are left out one at a time; intervals are of 95 %, from drawing objects again. Balanced accuracy and F1 (of
-slip) are of clips; `grasps` joins both fingers. Whatever lies in folders laid out alike, with a table of the same
-columns, can be measured with --clips and --labels.
+The clips of full length were recorded apart from the shorter ones, of which three in four slip. So clips weigh, in
+training, as if as many slipped as held in either part: knowing which part a clip is of tells nothing. How far the
+answer still depends on length is measured by cutting clips.
+
+Objects are left out one at a time (for the network in folds); intervals are of 95 %, from drawing objects again.
+Balanced accuracy and F1 (of slip) are of clips; `grasps` joins both fingers. Whatever lies in folders laid out alike,
+with a table of the same columns, can be measured with --clips and --labels.
+
+Rest jitter is measured where the picture says that the sensor is still. The clips are compressed: between key frames,
+one in twelve, what does not change is copied, and a copied dot does not jitter. Key frames are coded anew with the
+camera's noise of their moment, so still are runs of three and more key frames that each differ from the one before by
+no more than the noise of the camera: it leaves 0.9 to 1.5 grey levels on average, by finger, and motion adds to them.
+Slow creep of the gel passes for rest, so what is measured is no less than the noise of the dots.
 """
 
 import argparse
@@ -15,25 +26,40 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # must be set before torch is imported
 
+import av
 import numpy as np
-from rich.progress import track as progress
+import torch
+from rich.console import Console
+from rich.progress import track
+from torch import Tensor, nn
 
 from sliplens.errors import SliplensError
 from sliplens.markers import MarkerStatus, track_markers
 from sliplens.markers.estimators import affine_parts
+from sliplens.markers.opencv import import_cv2
 from sliplens.recordings.readers.gelsight import list_gelsight_clips, read_gelsight_clip
 
-WINDOWS, FRAMES = 8, 24
-_STILL_RUN = 10
+FRAMES, STRIDE = 24, 12
+SMALL = (48, 64)
+"""Height and width of the pictures that the network sees."""
+NOISE_LEVELS = 1.5
+"""Mean absolute difference between key frames, in grey levels, up to which they are still."""
+_STILL_KEYS = 3
 _CONTACT_PX = 1.0
 _RIDGE = 1.0
 _DRAWS = 2000
+_CUT = 60
+"""Frames that clips of full length are cut to: about what a short one has."""
+_SHOWN = Console(stderr=True)  # what is printed is the result alone
+_EVERY = 3  # frames from one of the network's windows to the next
+_FOLDS, _EPOCHS, _BATCH, _SEEN = 6, 40, 8, 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +76,15 @@ class Clip:
     """(frames, markers, 2), NaN where a marker was not followed."""
     status: np.ndarray
     """(frames, markers)"""
+    picture: np.ndarray
+    """(frames, rows, columns), grey and small, 8 bits."""
+    key_change: np.ndarray
+    """(frames,), mean absolute difference of a key frame from the one before, in grey levels; NaN for other frames."""
+    file_bytes: int
+
+    def __len__(self) -> int:
+        """Count the frames."""
+        return len(self.status)
 
     @property
     def pitch_px(self) -> float:
@@ -73,7 +108,26 @@ def follow(path: Path, labels: Path | None) -> Clip:
         rest_px=tracks.rest_px[known],
         position_px=np.where(tracks.followed[:, known, None], tracks.position_px[:, known], np.nan),
         status=tracks.status[:, known],
+        picture=np.stack([shrink(frame) for frame in frames]),
+        key_change=measure_key_change(path, frames, skipped=clip.stale_frames),
+        file_bytes=path.stat().st_size,
     )
+
+
+def shrink(frame: np.ndarray) -> np.ndarray:
+    """Grey and small."""
+    cv2 = import_cv2()
+    return cv2.resize(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), SMALL[::-1], interpolation=cv2.INTER_AREA)
+
+
+def measure_key_change(path: Path, frames: list[np.ndarray], *, skipped: int) -> np.ndarray:
+    """How far each key frame differs from the one before; NaN for the others, and for the first."""
+    with av.open(str(path)) as container:
+        keys = np.flatnonzero([frame.key_frame for frame in container.decode(video=0)][skipped:])
+    change = np.full(len(frames), np.nan)
+    for before, after in pairwise(keys):
+        change[after] = np.abs(frames[after].astype(np.float32) - frames[before]).mean()
+    return change
 
 
 def follow_all(folder: Path, labels: Path | None, keep: Path | None) -> tuple[list[Clip], list[str]]:
@@ -86,7 +140,7 @@ def follow_all(folder: Path, labels: Path | None, keep: Path | None) -> tuple[li
             for part in ("slip", "noslip"):
                 (Path(scratch) / part).symlink_to((folder / part).absolute())
         paths = list_gelsight_clips(folder if labels is None else Path(scratch))
-        for path in progress(paths, description="Following dots"):
+        for path in track(paths, console=_SHOWN, description="Following dots"):
             saved = None if keep is None else keep / ("__".join(path.parts[-3:]) + ".npz")
             if saved is not None and saved.is_file():
                 clips.append(read_kept(saved))
@@ -111,9 +165,8 @@ def read_kept(path: Path) -> Clip:
             grasp=str(data["grasp"]),
             grasped=str(data["grasped"]),
             slipped=bool(data["slipped"]),
-            rest_px=data["rest_px"],
-            position_px=data["position_px"],
-            status=data["status"],
+            file_bytes=int(data["file_bytes"]),
+            **{name: data[name] for name in ("rest_px", "position_px", "status", "picture", "key_change")},
         )
 
 
@@ -127,32 +180,57 @@ def alive_at_end(clip: Clip) -> tuple[float, float]:
     return float(followed.sum() / max(1, seen.sum())), float(followed.mean())
 
 
-def rest_jitter(clip: Clip) -> float:
-    """Root mean square, over coordinates, of how dots leave their mean place over the stillest ten frames, in pixels.
+def find_still(clip: Clip) -> list[np.ndarray]:
+    """Runs of key frames in which the picture does not change by more than the camera's noise."""
+    keys = np.flatnonzero(np.isfinite(clip.key_change))
+    runs: list[list[int]] = []
+    for before, key in zip([-1, *keys[:-1]], keys, strict=True):
+        if clip.key_change[key] > NOISE_LEVELS:
+            continue
+        if runs and runs[-1][-1] == before:
+            runs[-1].append(int(key))
+        elif before >= 0:
+            # still against the one before, which may itself have moved: a run begins there
+            runs.append([int(before), int(key)])
+    return [np.array(run) for run in runs if len(run) >= _STILL_KEYS]
 
-    Every other dot chooses the frames and the rest are measured: chosen by themselves, they would flatter themselves.
-    Lossy video repeats what stands still, so that this tells the camera's noise too small: it is a lower bound.
+
+def rest_jitter(clip: Clip) -> tuple[float, int]:
+    """Sum of squares of how far dots lie from their mean place over still runs, and its degrees of freedom."""
+    total, freedom = 0.0, 0
+    for run in find_still(clip):
+        places = clip.position_px[run]
+        kept = places[:, np.all(np.isfinite(places), axis=(0, 2))]
+        total += float(((kept - kept.mean(axis=0)) ** 2).sum())
+        freedom += 2 * (len(run) - 1) * kept.shape[1]
+    return total, freedom
+
+
+def measure_jitter(clips: list[Clip]) -> dict[str, object]:
+    """Root mean square of what dots move by on still frames, in pixels a coordinate."""
+    squares, freedoms = np.array([rest_jitter(clip) for clip in clips]).T
+    still = freedoms > 0
+    return {
+        "jitter_px": float(np.sqrt(squares.sum() / freedoms.sum())),
+        "jitter_px_worst_clip": float(np.sqrt(squares[still] / freedoms[still]).max()),
+        "jitter_clips": int(still.sum()),
+        "jitter_key_frames": sum(len(run) for clip in clips for run in find_still(clip)),
+    }
+
+
+def window_starts(frames: int) -> np.ndarray:
+    """Where the windows of a clip begin: all of it is seen, every frame about twice."""
+    count = 1 + int(np.ceil(max(0, frames - FRAMES) / STRIDE))
+    return np.linspace(0, max(0, frames - FRAMES), count).round().astype(int)
+
+
+def motion_features(clip: Clip, places: np.ndarray | None = None) -> np.ndarray:
+    """Mean over windows of the numbers of `window_features`; not the largest, which grows with a clip's length.
+
+    `places` are other frames than the clip's own, such as a part of it.
     """
-    runs = len(clip.position_px) - _STILL_RUN + 1
-    chooser, measured = clip.position_px[:, ::2], clip.position_px[:, 1::2]
-    spread = [_spread(chooser[at : at + _STILL_RUN]) for at in range(max(runs, 1))]
-    at = int(np.nanargmin(spread))
-    return _spread(measured[at : at + _STILL_RUN])
-
-
-def _spread(places: np.ndarray) -> float:
-    whole = np.all(np.isfinite(places), axis=(0, 2))
-    if not whole.any():
-        return np.nan
-    kept = places[:, whole]
-    return float(np.sqrt(np.mean((kept - kept.mean(axis=0)) ** 2) * len(kept) / max(1, len(kept) - 1)))
-
-
-def motion_features(clip: Clip) -> np.ndarray:
-    """Mean, largest and spread over equally many windows of the numbers of `window_features`."""
-    starts = np.linspace(0, max(0, len(clip.position_px) - FRAMES), WINDOWS).round().astype(int)
-    found = np.array([window_features(clip, clip.position_px[at : at + FRAMES]) for at in starts])
-    return np.concatenate([found.mean(axis=0), found.max(axis=0), found.std(axis=0)])
+    places = clip.position_px if places is None else places
+    return np.mean([window_features(clip, places[at : at + FRAMES]) for at in window_starts(len(places))], axis=0)
 
 
 def window_features(clip: Clip, places: np.ndarray) -> np.ndarray:
@@ -198,11 +276,20 @@ def _quantiles(rows: np.ndarray, share: float) -> np.ndarray:
     return np.array([np.quantile(row[np.isfinite(row)], share) if np.isfinite(row).any() else 0.0 for row in rows])
 
 
-def fit_logistic(values: np.ndarray, labels: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Ridge logistic regression, both classes weighing alike; gives the probability of a slip."""
+def balanced_weights(labels: np.ndarray, full: np.ndarray) -> np.ndarray:
+    """Weights by which as many clips slip as hold, among those of full length and among the shorter ones."""
+    weights = np.zeros(len(labels))
+    for part in (full, ~full):
+        for label in (labels, ~labels):
+            rows = part & label
+            weights[rows] = part.sum() / (2 * max(1, rows.sum()))
+    return weights
+
+
+def fit_logistic(values: np.ndarray, labels: np.ndarray, weight: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Ridge logistic regression; gives the probability of a slip."""
     middle, scale = values.mean(axis=0), values.std(axis=0) + 1e-9
     terms = np.concatenate([np.ones((len(values), 1)), (values - middle) / scale], axis=1)
-    weight = np.where(labels, 0.5 / max(labels.mean(), 1e-9), 0.5 / max(1 - labels.mean(), 1e-9))
     ridge = np.eye(terms.shape[1]) * _RIDGE
     ridge[0, 0] = 1e-6
     at = np.zeros(terms.shape[1])
@@ -222,13 +309,137 @@ def fit_logistic(values: np.ndarray, labels: np.ndarray) -> Callable[[np.ndarray
     return answer
 
 
-def leave_one_out(values: np.ndarray, labels: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Probability of a slip of each clip, from all clips of other objects."""
-    chance = np.full(len(labels), np.nan)
-    for group in np.unique(groups):
-        here = groups == group
-        chance[here] = fit_logistic(values[~here], labels[~here])(values[here])
-    return chance
+@dataclass(frozen=True, kw_only=True)
+class Cases:
+    """Labels of all clips, and what they may be grouped by."""
+
+    slipped: np.ndarray
+    grasped: np.ndarray
+    frames: np.ndarray
+
+    @property
+    def full(self) -> np.ndarray:
+        """Clips of full length."""
+        return self.frames == self.frames.max()
+
+    def only(self, rows: np.ndarray) -> "Cases":
+        """Some of them."""
+        return Cases(slipped=self.slipped[rows], grasped=self.grasped[rows], frames=self.frames[rows])
+
+
+def leave_one_out(values: np.ndarray, cases: Cases) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
+    """For each object, what was fitted on all clips of the others."""
+    fitted = {}
+    for name in np.unique(cases.grasped):
+        rest = cases.grasped != name
+        fitted[str(name)] = fit_logistic(
+            values[rest], cases.slipped[rest], balanced_weights(cases.slipped[rest], cases.full[rest])
+        )
+    return fitted
+
+
+def ask(fitted: dict[str, Callable[[np.ndarray], np.ndarray]], values: np.ndarray, cases: Cases) -> np.ndarray:
+    """Probability of a slip of each clip, by what never saw its object."""
+    return np.array([fitted[str(name)](row[None])[0] for name, row in zip(cases.grasped, values, strict=True)])
+
+
+class WindowNetwork(nn.Module):
+    """Three convolutions on each window, their mean over a clip's windows, and a linear answer; 14,000 weights."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for before, after in ((3, 16), (16, 32), (32, 32)):
+            layers += [nn.Conv2d(before, after, 3, stride=2, padding=1), nn.BatchNorm2d(after), nn.ReLU()]
+        self.see = nn.Sequential(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten())
+        self.answer = nn.Sequential(nn.Dropout(0.3), nn.Linear(32, 1))
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Logit of a slip of each clip, from (clips, windows, 3, rows, columns)."""
+        clips, count = windows.shape[:2]
+        return self.answer(self.see(windows.flatten(0, 1)).reshape(clips, count, -1).mean(dim=1))[:, 0]
+
+
+def difference_windows(clip: Clip) -> Tensor:
+    """What the network sees of a clip: (windows, 3, rows, columns), in units of 24 grey levels, the dots' contrast.
+
+    Last frame of the window less its first; mean absolute difference from frame to frame, threefold; largest absolute
+    difference from the first.
+    """
+    picture = clip.picture.astype(np.float32) / 24
+    found = []
+    for at in range(0, max(1, len(picture) - FRAMES + 1), _EVERY):
+        window = picture[at : at + FRAMES]
+        moved = window - window[0]
+        found.append([moved[-1], 3 * np.abs(np.diff(window, axis=0)).mean(axis=0), np.abs(moved).max(axis=0)])
+    return torch.from_numpy(np.array(found).astype(np.float16))
+
+
+def fold_objects(cases: Cases) -> Iterator[np.ndarray]:
+    """Clips of each fold: objects dealt out in turn by the share of their clips that slip, so that folds are alike."""
+    names = np.unique(cases.grasped)
+    share = [cases.slipped[cases.grasped == name].mean() for name in names]
+    count = [np.sum(cases.grasped == name) for name in names]
+    order = np.lexsort((names, count, share))
+    for fold in range(_FOLDS):
+        yield np.isin(cases.grasped, names[order[fold::_FOLDS]])
+
+
+def network_answers(clips: list[Clip], cases: Cases, *, epochs: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Probability of a slip of each clip, by a network trained on the other folds; and of the clip when it is cut."""
+    windows = [difference_windows(clip) for clip in clips]
+    labels = torch.from_numpy(cases.slipped.astype(np.float32))
+    whole, cut = np.full(len(clips), np.nan), np.full(len(clips), np.nan)
+    for held in track(list(fold_objects(cases)), console=_SHOWN, description="Training networks"):
+        rows = np.flatnonzero(~held)
+        weights = torch.zeros(len(clips))
+        weights[rows] = torch.from_numpy(balanced_weights(cases.slipped[rows], cases.full[rows])).float()
+        network = train_network(windows, labels, weights, rows, epochs=epochs, seed=seed).eval()
+        for row in np.flatnonzero(held):
+            whole[row] = _say_slip(network, windows[row])
+            starts = cut_starts(len(clips[row])) // _EVERY
+            last = (_CUT - FRAMES) // _EVERY + 1
+            cut[row] = np.mean([_say_slip(network, windows[row][at : at + last]) for at in starts])
+    return whole, cut
+
+
+def _say_slip(network: WindowNetwork, windows: Tensor) -> float:
+    """Answer to a clip by as many of its windows whatever its length, evenly spread."""
+    spread = np.linspace(0, len(windows) - 1, 2 * _SEEN).round().astype(int)
+    with torch.no_grad():
+        return float(torch.sigmoid(network(windows[spread].float()[None]))[0])
+
+
+def cut_starts(frames: int) -> np.ndarray:
+    """Where four cuts of a clip begin, evenly spread."""
+    return np.linspace(0, max(0, frames - _CUT), 4).round().astype(int)
+
+
+def train_network(
+    windows: list[Tensor], labels: Tensor, weights: Tensor, rows: np.ndarray, *, epochs: int, seed: int
+) -> WindowNetwork:
+    """Train on some clips; of each, eight windows at random an epoch, mirrored at random, stronger or weaker."""
+    torch.manual_seed(seed)
+    rng = np.random.default_rng(seed)
+    network = WindowNetwork()
+    optimiser = torch.optim.AdamW(network.parameters(), weight_decay=1e-2)
+    steps = epochs * (-(-len(rows) // _BATCH))
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 4e-3, total_steps=steps)
+    for _ in range(epochs):
+        order = rng.permutation(rows)
+        for at in range(0, len(order), _BATCH):
+            some = order[at : at + _BATCH]
+            seen = torch.stack([windows[row][rng.integers(0, len(windows[row]), _SEEN)] for row in some]).float()
+            seen = seen.flip([axis for axis in (3, 4) if rng.random() < 0.5])
+            seen = seen * torch.from_numpy(np.exp(rng.normal(0, 0.4, (len(some), 1, 1, 1, 1)))).float()
+            error = nn.functional.binary_cross_entropy_with_logits(
+                network(seen), labels[some], weight=weights[some], reduction="mean"
+            )
+            optimiser.zero_grad()
+            error.backward()
+            optimiser.step()
+            schedule.step()
+    return network
 
 
 def score(chance: np.ndarray, labels: np.ndarray, groups: np.ndarray) -> dict[str, object]:
@@ -256,39 +467,112 @@ def _scores(said: np.ndarray, labels: np.ndarray) -> tuple[float, float]:
     return float((hit + held) / 2), float(2 * (said & labels).sum() / max(1, said.sum() + labels.sum()))
 
 
-def measure_classifiers(clips: list[Clip]) -> dict[str, object]:
-    """Scores of motion features, of trivial readings of motion, and of what must not be used."""
-    labels, groups = np.array([clip.slipped for clip in clips]), np.array([clip.grasped for clip in clips])
+def measure_classifiers(clips: list[Clip], *, epochs: int, seeds: int) -> dict[str, object]:
+    """Scores of the two classifiers, of trivial readings of motion, and of what must not be used."""
+    cases = Cases(
+        slipped=np.array([clip.slipped for clip in clips]),
+        grasped=np.array([clip.grasped for clip in clips]),
+        frames=np.array([len(clip) for clip in clips]),
+    )
     motion = np.array([motion_features(clip) for clip in clips])
-    count = motion.shape[1] // 3
-    length = np.array([len(clip.status) for clip in clips], dtype=float)[:, None]
     inputs = {
         "motion": motion,
-        "largest_step_alone": motion[:, [count + 1]],
-        "largest_displacement_alone": motion[:, [count + 3]],
-        "leak_frame_count": np.log(length),
+        "largest_step_alone": motion[:, [1]],
+        "largest_displacement_alone": motion[:, [3]],
+        "leak_frame_count": np.log(cases.frames)[:, None],
         "leak_marker_count": np.array([[float(len(clip.rest_px))] for clip in clips]),
+        "leak_brightness": np.array([[clip.picture.mean()] for clip in clips]),
+        "leak_bytes_a_frame": np.log([[clip.file_bytes / len(clip)] for clip in clips]),
     }
-    told: dict[str, object] = {"always_slip": score(np.ones(len(labels)), labels, groups)}
-    for name, values in inputs.items():
-        chance = leave_one_out(values, labels, groups)
-        told[name] = score(chance, labels, groups)
-        if name == "motion":
-            told["grasps"] = _score_grasps(clips, chance)
-            # within a class, what tells the length would still tell it
-            told["motion_rank_correlation_with_length"] = {
-                kind: _rank_correlation(chance[rows], length[rows, 0])
-                for kind, rows in (("slip", labels), ("no_slip", ~labels))
-            }
-    long = length[:, 0] >= np.median(length[~labels])
-    if 0 < labels[long].mean() < 1:
-        chance = leave_one_out(motion[long], labels[long], groups[long])
-        told["motion_on_clips_of_full_length"] = {
-            "clips": int(long.sum()),
-            "slip": int(labels[long].sum()),
-            **score(chance, labels[long], groups[long]),
+    answers = {name: ask(leave_one_out(values, cases), values, cases) for name, values in inputs.items()}
+    told: dict[str, object] = {"always_slip": score(np.ones(len(clips)), cases.slipped, cases.grasped)}
+    told |= {name: _score_all(chance, cases) for name, chance in answers.items()}
+    told["grasps"] = _score_grasps(clips, answers["motion"])
+    told["motion_when_cut"] = measure_cuts(clips, motion, cases)
+    networks = [network_answers(clips, cases, epochs=epochs, seed=seed) for seed in range(seeds)]
+    if networks:
+        whole, cut = np.mean(networks, axis=0)
+        told["small_network"] = _score_all(whole, cases) | {
+            "balanced_accuracy_by_seed": [_scores(one > 0.5, cases.slipped)[0] for one, _ in networks],
+            "answer_moves_by_when_cut": _mean_by_object((cut - whole)[cases.full], cases.only(cases.full)),
+            "with_motion": _score_all((whole + answers["motion"]) / 2, cases),
         }
     return told
+
+
+def _score_all(chance: np.ndarray, cases: Cases) -> dict[str, object]:
+    """Scores over all clips and over those of one length, and how far the answers go with the length in each class."""
+    full = cases.only(cases.full)
+    return {
+        **score(chance, cases.slipped, cases.grasped),
+        "among_full_length": {
+            "clips": len(full.frames),
+            "slip": int(full.slipped.sum()),
+            **score(chance[cases.full], full.slipped, full.grasped),
+        },
+        "rank_correlation_with_length": {
+            kind: _rank_correlation(chance[rows], cases.frames[rows])
+            for kind, rows in (("slip", cases.slipped), ("no_slip", ~cases.slipped))
+        },
+    }
+
+
+def measure_cuts(clips: list[Clip], motion: np.ndarray, cases: Cases) -> dict[str, object]:
+    """Whether the classifier of motion sees how long a clip is: it is asked again of clips that were cut.
+
+    Clips of full length are cut to a short one's (the mean of the answers to four cuts, evenly spread), or shown twice
+    in a row. What a classifier by length alone would answer stands beside. Then all clips are cut to the shortest one's
+    frames, at their beginning, middle or end, and all is fitted anew.
+    """
+    fitted = leave_one_out(motion, cases)
+    length = leave_one_out(np.log(cases.frames)[:, None], cases)
+    rows = np.flatnonzero(cases.full)
+    chosen, whole = cases.only(rows), ask(fitted, motion[rows], cases.only(rows))
+    places = cut_starts(int(cases.frames.max()))
+    cut = np.mean(
+        [
+            ask(
+                fitted,
+                np.array([motion_features(clips[row], clips[row].position_px[at : at + _CUT]) for row in rows]),
+                chosen,
+            )
+            for at in places
+        ],
+        axis=0,
+    )
+    twice = ask(
+        fitted,
+        np.array([motion_features(clips[row], np.concatenate([clips[row].position_px] * 2)) for row in rows]),
+        chosen,
+    )
+    by_length = [
+        ask(length, np.full((len(rows), 1), np.log(frames)), chosen).mean() for frames in (_CUT, cases.frames.max())
+    ]
+    least = int(cases.frames.min())
+    told: dict[str, object] = {
+        "frames": _CUT,
+        "answer_moves_by": _mean_by_object(cut - whole, chosen),
+        "answer_moves_by_when_shown_twice": _mean_by_object(twice - whole, chosen),
+        "answer_by_length_alone_moves_by": float(by_length[0] - by_length[1]),
+        "all_cut_to_frames": least,
+    }
+    for name, share in (("beginning", 0.0), ("middle", 0.5), ("end", 1.0)):
+        starts = [round(share * (len(clip) - least)) for clip in clips]
+        values = np.array(
+            [motion_features(clip, clip.position_px[at : at + least]) for clip, at in zip(clips, starts, strict=True)]
+        )
+        told[f"all_cut_{name}"] = _score_all(ask(leave_one_out(values, cases), values, cases), cases)
+    return told
+
+
+def _mean_by_object(values: np.ndarray, cases: Cases) -> dict[str, object]:
+    """Mean and its interval of 95 %, from drawing objects again."""
+    rng, names = np.random.default_rng(0), np.unique(cases.grasped)
+    groups = [values[cases.grasped == name] for name in names]
+    draws = [
+        np.concatenate([groups[at] for at in rng.integers(0, len(groups), len(groups))]).mean() for _ in range(_DRAWS)
+    ]
+    return {"mean": float(values.mean()), "95": np.quantile(draws, [0.025, 0.975]).tolist()}
 
 
 def _score_grasps(clips: list[Clip], chance: np.ndarray) -> dict[str, object]:
@@ -320,27 +604,29 @@ def main() -> None:
     parser.add_argument("--clips", type=Path, default=default, help="folder with slip/ and noslip/")
     parser.add_argument("--labels", type=Path, help="table of the clips; labels.csv of their folder if not given")
     parser.add_argument("--keep", type=Path, help="folder to keep what was followed in, and to read it from")
+    parser.add_argument("--seeds", type=int, default=2, help="networks a fold, their answers averaged; 0 for none")
+    parser.add_argument("--epochs", type=int, default=_EPOCHS, help="of each network")
+    parser.add_argument("--threads", type=int, default=2, help="of torch")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     if not options.clips.is_dir():
         parser.error(f"{options.clips} does not exist; name the folder of the clips with --clips")
     clips, failed = follow_all(options.clips, options.labels, options.keep)
-    alive, jitter = np.array([alive_at_end(clip) for clip in clips]), np.array([rest_jitter(clip) for clip in clips])
+    torch.set_num_threads(options.threads)
+    alive = np.array([alive_at_end(clip) for clip in clips])
     status = np.concatenate([clip.status.ravel() for clip in clips])
     found = {
         "clips": len(clips),
         "failed": failed,
         "objects": len({clip.grasped for clip in clips}),
-        "frames": sum(len(clip.status) for clip in clips),
+        "frames": sum(len(clip) for clip in clips),
         "tracks_alive": float(alive[:, 0].mean()),
         "tracks_alive_worst_clip": float(alive[:, 0].min()),
         "clips_with_95_percent_alive": float(np.mean(alive[:, 0] >= 0.95)),
         "tracks_alive_of_all": float(alive[:, 1].mean()),
         "followed_in_view": float(np.mean(status[status != MarkerStatus.OUTSIDE] == MarkerStatus.FOLLOWED)),
-        "jitter_px": float(np.sqrt(np.nanmean(jitter**2))),
-        "jitter_px_worst_clip": float(np.nanmax(jitter)),
-        **measure_classifiers(clips),
-        "small_network": None,
+        **measure_jitter(clips),
+        **measure_classifiers(clips, epochs=options.epochs, seeds=options.seeds),
     }
     motion = found["motion"]
     assert isinstance(motion, dict)  # as made above

@@ -62,6 +62,33 @@ def test_the_same_numbers_give_the_same_picture(tmp_path: Path):
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
+def with_estimators(told: dict[str, Any], *, r2: float) -> dict[str, Any]:
+    """Two estimators beside the network."""
+    scores = {name: {**told["conditions"][name], "r2": r2, "mae": 0.2} for name in told["conditions"]}
+    lost = {name: {**one, "r2": None} for name, one in scores.items()}
+    return {**told, "baselines": {"estimators": {"a": {"conditions": scores}, "b": {"conditions": lost}}}}
+
+
+def test_estimators_stand_below_a_page_that_stays_as_it_was(tmp_path: Path):
+    table, told = evaluation()
+    pictures = []
+    for name, own in (("none", told), ("half", with_estimators(told, r2=0.5)), ("bad", with_estimators(told, r2=-7.0))):
+        draw_evaluation(table, own, tmp_path / f"{name}.png", title="same")
+        with Image.open(tmp_path / f"{name}.png") as image:
+            pictures.append(np.array(image.convert("RGB")).astype(int))
+    plain, half, bad = pictures
+    # letters may fall between pixels otherwise where the page is taller; nothing moves by a whole one
+    assert np.abs(half[: len(plain)] - plain).mean() < 1.0
+    below = half[len(plain) :]
+    assert len(below) > 150
+    orange = np.abs(below - (230, 159, 0)).max(axis=-1) < 20
+    blue = np.abs(below - (0, 114, 178)).max(axis=-1) < 20
+    assert orange.sum() > 1000
+    assert blue.sum() > 1000
+    assert not np.array_equal(half, bad)
+    assert bad.shape == half.shape
+
+
 def test_a_file_that_is_no_picture_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match="does not end in"):
         draw_evaluation(*evaluation(), tmp_path / "page.doc", title="no")

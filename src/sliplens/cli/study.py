@@ -77,7 +77,13 @@ class Study:
         networks = self._load_networks()
         folder = self.data or self._simulate()
         for name, model in self._named().items():
-            Evaluate(model=model, data=folder, output=self.output / f"evaluate-{name}", overwrite=self.overwrite).run()
+            Evaluate(
+                model=model,
+                data=folder,
+                output=self.output / f"evaluate-{name}",
+                device=self.device,
+                overwrite=self.overwrite,
+            ).run()
         stages = Stages(
             output=self.output,
             data=Dataset.open(folder),

@@ -15,13 +15,16 @@ from sliplens.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, 
 _COLOURS = {"dry": ORANGE, "wet": BLUE}
 _WIDTH, _HEIGHT, _LEFT, _TOP, _GAP, _CHART = 12.0, 7.5, 0.75, 1.25, 0.95, (3.05, 2.25)
 _MOST_DOTS = 4000
+_READER = 0.36  # inches a reader of the margin
+_LOWEST_R2 = -0.3  # further down it does not matter how far; the number says it
 
 
 def draw_evaluation(predictions: pa.Table, told: Mapping[str, Any], path: Path, *, title: str) -> None:
-    """Save a page of six charts as .png, .pdf or .svg.
+    """Save a page of six charts as .png, .pdf or .svg, or of eight where there are baselines.
 
     Answers against labels; mean squared error in ten bins of the margin (thesis, Fig. 7); bias of each trial; how often
-    intervals hold; uncertainty by condition; the trial of median error over time.
+    intervals hold; uncertainty by condition; the trial of median error over time. Below, R2 and mean absolute error of
+    the network beside those of model-based estimators, where `told` has them.
 
     Parameters
     ----------
@@ -41,7 +44,8 @@ def draw_evaluation(predictions: pa.Table, told: Mapping[str, Any], path: Path, 
     columns = {name: predictions.column(name).to_numpy() for name in predictions.column_names}
     conditions = conditions_in_order(told["conditions"])
     with drawing_style():
-        figure = Figure(figsize=(_WIDTH, _HEIGHT))
+        estimators = told["baselines"]["estimators"] if "baselines" in told else {}
+        figure = Figure(figsize=(_WIDTH, _HEIGHT + (0.9 + _READER * (len(estimators) + 1) if estimators else 0)))
         charts = []
         for index in range(6):
             row, column = divmod(index, 3)
@@ -54,6 +58,8 @@ def draw_evaluation(predictions: pa.Table, told: Mapping[str, Any], path: Path, 
         _plot_coverage(told["reliability"], conditions, ax=charts[3])
         _plot_uncertainty(columns, conditions, told["wet_auroc"], ax=charts[4])
         _plot_typical(columns, told["trials"], ax=charts[5])
+        if estimators:
+            _plot_readers(figure, {"network": told, **estimators}, conditions, top=_HEIGHT + 0.25)
         place_text(figure, _LEFT - 0.5, 0.2, title, fontsize=13, fontweight="bold", parse_math=False)
         place_text(figure, _LEFT - 0.5, 0.52, _summary(told, conditions), fontsize=9, color=GREY)
     save_page(figure, path)
@@ -147,6 +153,36 @@ def _plot_typical(columns: Mapping[str, np.ndarray], trials: Mapping[str, Any], 
     shown = trial if len(trial) <= 18 else f"…{trial[-17:]}"
     ax.set_title(f"Median error: {shown}", parse_math=False)
     ax.legend(fontsize=8)
+
+
+def _plot_readers(
+    figure: Figure, readers: Mapping[str, Mapping[str, Any]], conditions: list[str], *, top: float
+) -> None:
+    """Bars of R2 and of the mean absolute error, a row a reader of the margin."""
+    left, gap = 2.35, 0.5
+    size = (_WIDTH - left - gap - 0.5) / 2, _READER * len(readers)
+    first, second = (place_axes(figure, left + at * (size[0] + gap), top, *size) for at in range(2))
+    thick = 0.8 / max(1, len(conditions))
+    for index, name in enumerate(conditions):
+        scores = [one["conditions"][name] for one in readers.values()]
+        at = np.arange(len(readers)) + (index - (len(conditions) - 1) / 2) * thick
+        r2 = np.array([np.nan if one["r2"] is None else one["r2"] for one in scores])
+        mae = np.array([100 * one["mae"] for one in scores])
+        for ax, values, digits in ((first, r2, 2), (second, mae, 1)):
+            ax.barh(at, np.maximum(values, _LOWEST_R2), height=thick, color=_COLOURS.get(name, GREEN), label=name)
+            for place, value in zip(at, values, strict=True):
+                if np.isfinite(value):
+                    # -0.00 would look like less than nothing
+                    ax.text(max(value, 0), place, f" {round(value, digits) + 0.0:.{digits}f}", va="center", fontsize=7)
+    first.axvline(0, color=BLACK, linewidth=1)
+    first.set(xlabel="R²", title="Network, and estimators from the markers alone")
+    first.set_xlim(max(first.get_xlim()[0], _LOWEST_R2), 1.08)
+    second.set(xlabel="Mean absolute error (points of Γ)")
+    for ax, names in ((first, list(readers)), (second, [""] * len(readers))):
+        ax.set_yticks(range(len(readers)), names)
+        ax.set_ylim(len(readers) - 0.4, -0.6)
+        ax.grid(visible=False, axis="y")
+    second.legend(fontsize=8, loc="lower right")
 
 
 def _summary(told: Mapping[str, Any], conditions: list[str]) -> str:

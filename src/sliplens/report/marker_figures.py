@@ -68,7 +68,7 @@ def plot_arrows(
     ax.imshow(frame)
     ax.quiver(
         *place.T, *way.T, angles="xy", scale_units="xy", scale=1 / magnified, color="white", width=0.008,
-        edgecolor=BLACK, linewidth=0.6, minlength=0.5,
+        headlength=3, headaxislength=2.7, edgecolor=BLACK, linewidth=0.6, minlength=0.5,
     )  # fmt: skip
     height, width = frame.shape[:2]
     ax.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="x (px)", ylabel="y (px)")

@@ -143,18 +143,19 @@ class StickArea(MarginEstimator):
 
 @final
 class Eccentricity(MarginEstimator):
-    """Ikeda's eccentricity: how far the contact's middle has moved for how far it is pressed.
+    """Ikeda's eccentricity e = delta_t / a: how far the contact's middle has moved, for how far it is pressed.
 
     Gamma = (1 - delta_t / delta_full)^1.5 for a sphere, with delta_full = mu (2 - nu) delta / (2 (1 - nu)): full slip
-    begins when the tangential displacement of the stuck middle reaches a multiple of the indentation delta. Both are
-    read in pixels: delta_t is the mean motion of the inner markers since the hold, delta is taken in proportion to the
-    divergence since T_0, and the factor between them, which holds the friction, is fitted on the training trials.
+    begins when the tangential displacement of the stuck middle reaches a multiple of the indentation delta, which for a
+    sphere is a^2 over its radius, a being the contact's. Both are read in pixels: delta_t is the mean motion of the
+    inner markers since the hold, delta is taken in proportion to the divergence since T_0, and the factor between them,
+    which holds the friction, is fitted on the training trials.
 
     References
     ----------
     Ikeda, Kurita, Ueda, Matsumoto and Ogasawara, *Grip Force Control for an Elastic Finger using Vision-based Incipient
-    Slip Feedback*, IROS 2004; Obinata, Ashis, Watanabe and Moriyama, *Vision Based Tactile Sensor Using Transparent
-    Elastic Fingertip for Dexterous Handling*, 2007. Johnson, *Contact Mechanics* (1985), section 7.2.
+    Slip Feedback*, IROS 2004; Obinata et al., *Vision Based Tactile Sensor Using Transparent Elastic Fingertip for
+    Dexterous Handling*, 2007. Johnson, *Contact Mechanics* (1985), section 7.2.
     """
 
     def _fit(self, trials: Sequence[FieldTrial], labels: Float[np.ndarray, " all_frames"]) -> None:

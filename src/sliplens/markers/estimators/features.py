@@ -24,7 +24,9 @@ def shear_over_divergence(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
 def rigid_residual(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
     """Largest, and root mean square, distance of the contact's markers from a rigid motion t + w x r, in pixels.
 
-    Where the contact sticks, it moves as the object does; where it slips, it is left behind.
+    Where the contact sticks, it moves as the object does; where it slips, it is left behind. The paper calls it slip
+    when the largest distance passes a threshold; here the margin is fitted to it, and to the root mean square, which
+    one bad marker moves less.
 
     References
     ----------
@@ -43,8 +45,8 @@ def stick_area(trial: FieldTrial, *, tolerance_px: float) -> Float[np.ndarray, "
 
     References
     ----------
-    Sui, Zhang, Li and Li, *Incipient Slip Detection Method for Soft Objects with Vision-Based Tactile Sensor*,
-    Measurement 2022.
+    Sui et al., *Incipient Slip Detection Method for Soft Objects with Vision-Based Tactile Sensor*, Measurement 2022:
+    the ratio of the areas of stick and contact tells how near slip is.
     """
     distance = _from_rigid(trial, trial.inner)
     contact = trial.inner | trial.outer
@@ -62,8 +64,9 @@ def displacement_entropy(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
 
     References
     ----------
-    Yuan, Li, Srinivasan and Adelson, *Measurement of Shear and Slip with a GelSight Tactile Sensor*, ICRA 2015; Hu et
-    al. use its rate.
+    Yuan, Li, Srinivasan and Adelson, *Measurement of Shear and Slip with a GelSight Tactile Sensor*, ICRA 2015; for the
+    rate Hu et al., *Learning to Detect Slip through Tactile Estimation of the Contact Force Field and its Entropy*,
+    arXiv:2303.00935.
     """
     length = np.linalg.norm(trial.increment_px, axis=-1)
     bins = np.minimum(length / _BIN_PX, _BINS - 1)
@@ -102,7 +105,7 @@ def helmholtz_hodge(trial: FieldTrial) -> Float[np.ndarray, "frames 8"]:
 
     References
     ----------
-    Zhang, Kan, Yang, Dong and Wang, ICRA 2019 (see `affine_parts`).
+    Zhang, Kan, Yang, Tse and Wang, 2019 (see `affine_parts`).
     """
     whole, since = (affine_parts(trial.rest_px, field) for field in (trial.displacement_px, trial.increment_px))
     inner = np.linalg.norm(_mean(trial.increment_px[:, trial.inner]), axis=-1)

@@ -92,8 +92,8 @@ def affine_parts(
 
     References
     ----------
-    Zhang, Kan, Yang, Dong and Wang, *Effective Estimation of Contact Force and Torque for Vision-based Tactile Sensors
-    with Helmholtz-Hodge Decomposition*, ICRA 2019.
+    Zhang, Kan, Yang, Tse and Wang, *Effective Estimation of Contact Force and Torque for Vision-based Tactile Sensor
+    with Helmholtz-Hodge Decomposition*, 2019.
     """
     offset = rest_px - rest_px.mean(axis=0)
     terms = np.concatenate([np.ones((len(offset), 1)), offset], axis=1)

@@ -1,0 +1,248 @@
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from command_line import refused, run
+
+from sliplens.cli.evaluate import Evaluate
+from sliplens.errors import ImageError, InputError
+from sliplens.markers import track_markers
+from sliplens.markers.estimators import ESTIMATORS, field_trial, get_estimator
+from sliplens.models import Manifest, build_model, save_checkpoint
+from sliplens.recordings import Dataset
+from sliplens.simulation import SimulationRecipe, simulate_dataset
+from sliplens.training import baselines
+from sliplens.training.baselines import Baselines, choose_training, evaluate_baselines, marker_kind
+
+pytest.importorskip("cv2", reason="markers are found with OpenCV, of the extra `markers`")
+
+CHOSEN = ("constant", "mean-shear", "dong-rigid-residual")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Simulated presses and pulls of a ChromaTouch, dry and wet."""
+    recipe = SimulationRecipe(dry_trials=5, wet_trials=1, frames_per_trial=20, days=3, seed=4)
+    return simulate_dataset(tmp_path_factory.mktemp("simulated") / "data", recipe)
+
+
+@pytest.fixture(scope="module")
+def fields(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What one test followed, the next need not."""
+    return tmp_path_factory.mktemp("fields")
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Random weights for frames of that size."""
+    folder = tmp_path_factory.mktemp("network")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = build_model()
+    manifest = Manifest(
+        backbone="shufflenet_v2_x1_0",
+        input="difference",
+        image_size=32,
+        frame_size=(224, 224),
+        sensor="chromatouch",
+        data_hash="none",
+    )
+    save_checkpoint(folder, model.eval(), manifest)
+    return folder
+
+
+def labelled_frames(data: Dataset, *, split: str = "test") -> pa.Table:
+    """What a network's predictions say of the frames."""
+    rows = []
+    for info in data.select(split=split):
+        recording = data.load(info, truth=False)
+        rows += [
+            {
+                "trial": info.trial,
+                "condition": info.condition,
+                "frame": int(frame),
+                "time_s": float(recording.time_s[frame]),
+                "safety_margin": float(recording.safety_margin[frame]),
+            }
+            for frame in np.flatnonzero(recording.labelled)
+        ]
+    return pa.Table.from_pylist(rows)
+
+
+def evaluated(data: Dataset, folder: Path, *, names=CHOSEN) -> Baselines:
+    return evaluate_baselines(
+        names,
+        data,
+        training=data.select(split="train"),
+        predictions=labelled_frames(data),
+        kind="chromatouch",
+        folder=folder,
+    )
+
+
+def test_answers_are_those_of_estimators_fitted_by_hand(data: Dataset, fields: Path):
+    found = evaluated(data, fields)
+    tracked, margins = {}, {}
+    for info in data.trials:
+        recording = data.load(info, truth=False)
+        tracked[info.trial] = field_trial(track_markers(recording.frames, recording.reference, "chromatouch"))
+        margins[info.trial] = np.where(recording.labelled, recording.safety_margin, np.nan)
+    train = [info.trial for info in data.select(split="train")]
+    table = found.predictions.to_pydict()
+    label = np.array(table["safety_margin"])
+    for name in CHOSEN:
+        estimator = get_estimator(name).fit([tracked[one] for one in train], [margins[one] for one in train])
+        answers = {one: estimator.estimate(field) for one, field in tracked.items()}
+        expected = [answers[trial][frame] for trial, frame in zip(table["trial"], table["frame"], strict=True)]
+        # frames are stored without loss, so only the order of sums may differ
+        np.testing.assert_allclose(table[name], expected, atol=1e-9)
+        for condition, scores in found.estimators[name].conditions.items():
+            rows = np.array(table["condition"]) == condition
+            assert scores.mae == pytest.approx(np.abs(np.array(expected) - label)[rows].mean())
+            assert scores.frames == rows.sum()
+    assert found.training_trials == len(train)
+    assert found.training_frames == sum(np.isfinite(margins[one]).sum() for one in train)
+    assert found.followed > 0.9
+
+
+def test_the_constant_explains_nothing_of_frames_with_the_mean_it_was_fitted_to(data: Dataset, fields: Path):
+    # scored on its own training trials, the mean of the labels leaves all of their variance
+    found = evaluate_baselines(
+        ("constant",),
+        data,
+        training=[info for info in data.select(split="train") if info.condition == "dry"],
+        predictions=labelled_frames(data, split="train"),
+        kind="chromatouch",
+        folder=fields,
+    )
+    assert found.estimators["constant"].conditions["dry"].r2 == pytest.approx(0, abs=1e-9)
+
+
+def test_fields_that_were_followed_before_are_not_followed_again(data: Dataset, fields: Path, monkeypatch):
+    first = evaluated(data, fields)
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("followed again")
+
+    monkeypatch.setattr(baselines, "track_markers", refuse)
+    again = evaluated(data, fields)
+    assert again.predictions == first.predictions
+    assert again.followed == first.followed
+
+
+def test_trials_without_markers_are_named_and_answered_with_the_training_mean(
+    data: Dataset, fields: Path, tmp_path: Path, monkeypatch
+):
+    evaluated(data, fields)
+    blind = data.select(split="test", condition="dry")[0].trial
+    lost = data.select(split="train")[0].trial
+    for path in fields.iterdir():
+        if path.stem not in {blind, lost}:
+            shutil.copy(path, tmp_path)
+
+    def find_none(*_: object) -> None:
+        raise ImageError("the reference shows 0 whole markers")
+
+    monkeypatch.setattr(baselines, "track_markers", find_none)
+    found = evaluated(data, tmp_path)
+    assert found.failed == dict.fromkeys((lost, blind), "the reference shows 0 whole markers")
+    assert found.training_trials == len(data.select(split="train")) - 1
+    table = found.predictions.to_pydict()
+    rows = np.array(table["trial"]) == blind
+    for name in CHOSEN:
+        np.testing.assert_allclose(np.array(table[name])[rows], table["constant"][0])
+
+
+def test_no_trial_with_markers_is_refused(small_dataset: Dataset, tmp_path: Path):
+    # frames of noise with a square: nothing round in them
+    with pytest.raises(InputError, match="markers were followed in none of the training trials"):
+        evaluated(small_dataset, tmp_path)
+
+
+def test_training_trials_are_spread_over_the_table(data: Dataset):
+    trials = data.trials
+    assert choose_training(trials, 2) == (trials[0], trials[-1])
+    assert choose_training(trials, 100) == trials
+    assert len(set(choose_training(trials, 4))) == 4
+    with pytest.raises(InputError, match="0 training trials are too few"):
+        choose_training(trials, 0)
+
+
+def test_the_kind_of_markers_follows_from_the_name_of_the_sensor(data: Dataset, small_dataset: Dataset):
+    assert marker_kind(data.trials) == "chromatouch"
+    assert marker_kind(small_dataset.trials) == "auto"
+    assert marker_kind((*data.trials, *small_dataset.trials)) == "auto"
+
+
+def test_the_command_puts_them_beside_the_network(data: Dataset, network: Path, tmp_path: Path, capsys):
+    plain, beside = tmp_path / "plain", tmp_path / "beside"
+    assert run("evaluate", network, data.folder, "-o", plain) == 0
+    words = ("evaluate", network, data.folder, "-o", beside, "--baselines", "all", "--baseline-trials", "2")
+    assert run(*words) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"of 2 of the {len(data.select(split='train'))} training trials" in said
+    assert "last frame before the pull" in said
+    results = [json.loads((folder / "result.json").read_text()) for folder in (plain, beside)]
+    own = results[1].pop("baselines")
+    # who reads the network's scores finds them where they were
+    assert results[0] == results[1]
+    assert list(own["estimators"]) == list(ESTIMATORS)
+    assert (own["training_trials"], own["training_trials_the_network_knew"], own["failed"]) == (2, 0, {})
+    assert own["estimators"]["constant"]["conditions"].keys() == results[0]["conditions"].keys()
+    tables = [pq.read_table(beside / name) for name in ("predictions.parquet", "baselines.parquet")]
+    assert tables[1].select(["trial", "frame", "safety_margin"]) == tables[0].select(
+        ["trial", "frame", "safety_margin"]
+    )
+    assert sorted(path.name for path in beside.iterdir()) == [
+        "baselines.parquet",
+        "evaluation.png",
+        "predictions.parquet",
+        "result.json",
+        "run.json",
+    ]
+    assert run(*words) == 0
+    assert "kept" in capsys.readouterr().out
+
+
+def test_what_was_followed_before_an_interruption_is_not_followed_again(
+    data: Dataset, network: Path, tmp_path: Path, monkeypatch
+):
+    command = Evaluate(
+        model=network, data=data.folder, output=tmp_path / "out", baselines=("constant",), baseline_trials=2
+    )
+    count = 2 + len(data.select(split="test"))
+    calls = []
+
+    def follow(*given):
+        calls.append(given)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return track_markers(*given)
+
+    monkeypatch.setattr(baselines, "track_markers", follow)
+    with pytest.raises(KeyboardInterrupt):
+        command.run()
+    assert not (tmp_path / "out").exists()
+    command.run()
+    # two were done, the third was begun and is begun anew
+    assert len(calls) == count + 1
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["baselines"]["failed"] == {}
+
+
+def test_what_cannot_be_compared_is_refused_at_once(data: Dataset, network: Path, tmp_path: Path, capsys, monkeypatch):
+    command = ("evaluate", network, data.folder, "-o", tmp_path / "out", "--baselines")
+    assert "estimator 'magic' is not known" in refused(capsys, *command, "magic")
+    assert "0 training trials are too few" in refused(capsys, *command, "all", "--baseline-trials", "0")
+    assert "markers 'digit' are not known" in refused(capsys, *command, "all", "--markers", "digit")
+    alone = Dataset(folder=data.folder, trials=data.select(split="test"))
+    monkeypatch.setattr(Dataset, "open", lambda _: alone)
+    assert "has no training trials to fit baselines on" in refused(capsys, *command, "all")
+    monkeypatch.undo()
+    monkeypatch.setattr("sliplens.markers.opencv.find_spec", lambda _: None)
+    assert "OpenCV, which is not installed" in refused(capsys, *command, "all")
+    assert not list(tmp_path.iterdir())
