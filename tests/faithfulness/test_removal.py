@@ -63,6 +63,29 @@ def test_what_contributes_is_the_best_map_there_is(images: torch.Tensor, weights
     np.testing.assert_allclose(truth.most_first - total / 2, total / 2 - truth.least_first, atol=1e-12)
 
 
+def test_along_the_target_a_signed_map_is_scored_as_what_it_is(images: torch.Tensor, weights: torch.Tensor, rng):
+    # both signs, and the sum below zero: the target lies below the untouched, black sensor
+    mixed = weights - 0.7 * weights.mean() - 0.5 * weights.max()
+    values = contributions(images, mixed)
+    towards = np.sign(values.sum(axis=(1, 2)))
+    assert np.all(towards == -1)
+    units = [pixel_units((SIZE, SIZE))] * IMAGES
+    shuffled = values.reshape(IMAGES, -1).copy()
+    half = rng.permutation(SIZE**2)[: SIZE**2 // 2]
+    shuffled[:, half] = shuffled[:, rng.permutation(half)]
+    maps = {"truth": -values, "half": -shuffled.reshape(values.shape)}
+    told = {"fill": get_fill("black"), "rng": rng, "areas": EVERY, "random_orders": 2}
+    scores = faithfulness(linear(mixed), images, maps, units, towards=towards, **told)
+    falling = -np.sort((-values).reshape(IMAGES, -1), axis=1)[:, ::-1]
+    lost = np.concatenate([np.zeros((IMAGES, 1)), np.cumsum(-falling, axis=1)], axis=1)
+    np.testing.assert_allclose(scores["truth"].curves[0], lost, atol=1e-12)
+    # a linear network loses evenly whatever the order of the rest: no order beats that of the contributions
+    assert np.all(scores["truth"].symmetric_gain > scores["half"].symmetric_gain)
+    assert np.all(scores["half"].symmetric_gain > 0)
+    # at the end all that there was to explain is gone, whatever the map
+    np.testing.assert_allclose(scores["half"].curves[..., -1], np.tile(-values.sum(axis=(1, 2)), (3, 1)), atol=1e-12)
+
+
 def test_at_equal_areas_the_curves_can_be_read(images: torch.Tensor, weights: torch.Tensor, rng):
     maps = {"truth": contributions(images, weights)}
     units = [tile_units((SIZE, SIZE), size=2)] * IMAGES

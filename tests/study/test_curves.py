@@ -45,7 +45,8 @@ def test_removing_by_hand_gives_the_same_change(material: Material, scored: Path
     gone[order[: round(area * side * side)]] = True
     image = material.inputs[0].clone()
     image[:, torch.from_numpy(gone.reshape(side, side))] = 0.5
-    expected = abs(float(material.trained.predict(image[None])[0]) - frame.prediction)
+    # what spoke for the target and is gone
+    expected = towards * (frame.prediction - float(material.trained.predict(image[None])[0]))
     found = [
         row["most_first"]
         for row in table

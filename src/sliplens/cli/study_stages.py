@@ -2,19 +2,23 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 from sliplens.cli.console import progress_bar, say, unchanged, wrote
+from sliplens.errors import InputError
 from sliplens.explain import Explainer, IntegratedGradients
+from sliplens.faithfulness.removal import Faithfulness
 from sliplens.models import TrainedModel
 from sliplens.provenance import hash_json, output_folder, read_json, to_jsonable
 from sliplens.recordings import Dataset
+from sliplens.simulation.intervention import rebuild_trial
 from sliplens.study.choice import Choice, choose_frames, load_choice, save_choice
-from sliplens.study.curves import influences, score_curves
+from sliplens.study.curves import SETTINGS, Influence, influences, score_curves
 from sliplens.study.explaining import explain_frames
 from sliplens.study.frames import frames_at
-from sliplens.study.judging import RANDOMISED
+from sliplens.study.judging import RANDOMISED, Setting
 from sliplens.study.looks import check_looks
 from sliplens.study.material import Material, gather
 from sliplens.study.remedies import score_remedies
@@ -23,6 +27,7 @@ from sliplens.study.saved import load_explained
 from sliplens.study.scoring import score_explanations
 from sliplens.study.states import load_markers, save_states
 from sliplens.study.timing import time_explainers
+from sliplens.study.truth import judge_by_truth, true_curves
 
 Count = Callable[[int, int], None]
 Work = Callable[[Path, Count], object]
@@ -113,6 +118,7 @@ class Stages:
             markers=load_markers(self.output / "states"),
             explainers=self.explainers,
         )
+        influence = cache(lambda: self._influence(material))
         works: dict[str, tuple[str, Mapping[str, Any], Work]] = {
             "score": (
                 "Deleting pixels, as the thesis did",
@@ -130,7 +136,15 @@ class Stages:
             "faithfulness": (
                 "Removing parts under every fill",
                 {"random_orders": self.random_orders},
-                lambda folder, bar: self._score_curves(material, folder, bar),
+                lambda folder, bar: score_curves(
+                    material,
+                    folder,
+                    maps=influence(),
+                    random_orders=self.random_orders,
+                    further=self._true_curves(material, influence()),
+                    seed=self.seed,
+                    on_frame=bar,
+                ),
             ),
             "randomisation": (
                 "Explaining networks with new weights",
@@ -144,13 +158,55 @@ class Stages:
             ),
             "timing": ("Timing the methods", {}, lambda folder, bar: time_explainers(material, folder, on_method=bar)),
         }
+        if self._redrawn:
+            works["truth"] = (
+                "Putting every marker back",
+                {},
+                lambda folder, bar: judge_by_truth(
+                    trained,
+                    material.explained,
+                    self.data,
+                    folder,
+                    maps=influence(),
+                    fills=list(dict.fromkeys(setting.fill for setting in SETTINGS)),
+                    seed=self.seed,
+                    on_frame=bar,
+                ),
+            )
         for stage, (title, more, work) in works.items():
             self._run(f"{stage}-{name}", stage, {**about, **more}, f"{title} ({name})", work)
 
-    def _score_curves(self, material: Material, folder: Path, bar: Count) -> None:
-        maps = influences(material)
-        maps[RANDOMISED] = explain_untrained(material, IntegratedGradients(), seed=self.seed)
-        score_curves(material, folder, maps=maps, random_orders=self.random_orders, seed=self.seed, on_frame=bar)
+    def _influence(self, material: Material) -> Influence:
+        return {
+            **influences(material),
+            RANDOMISED: explain_untrained(material, IntegratedGradients(), seed=self.seed),
+        }
+
+    def _true_curves(self, material: Material, maps: Influence) -> dict[Setting, Mapping[str, Faithfulness]]:
+        if not self._redrawn:
+            return {}
+        found = true_curves(
+            material.trained,
+            material.explained,
+            self.data,
+            maps=maps,
+            random_orders=self.random_orders,
+            seed=self.seed,
+        )
+        return {Setting(fill="true", unit="marker"): found}
+
+    @cached_property
+    def _redrawn(self) -> bool:
+        """Whether the chosen frames can be drawn anew with markers put back; a recording never can."""
+        if not self.data.simulated:
+            return False
+        info = next(info for info in self.data.trials if info.trial == self.choice.frames[0].trial)
+        try:
+            rebuild_trial(self.data.folder, self.data.load(info))
+        except InputError as error:
+            say(f"  note: the truth is left out, since {error}")
+            return False
+        return True
 
     def _frames(self) -> dict[str, Any]:
         return {"data_hash": self.data.hash, "choice": hash_json(to_jsonable(self.choice))}

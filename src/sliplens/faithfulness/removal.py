@@ -37,6 +37,16 @@ class RemovalCurves:
         """How far each answer lies from that on the whole image, in margin units."""
         return np.abs(self.answers - self.answers[..., :1])
 
+    def lost(self, towards: Float[np.ndarray, " images"]) -> Float64[np.ndarray, "orders images steps"]:
+        """How much of what speaks for the target is gone: changes counted along it, below 0 where more speaks for it.
+
+        Parameters
+        ----------
+        towards
+            Sign of f(x) - f(untouched sensor) of each image.
+        """
+        return towards[:, None] * (self.answers[..., :1] - self.answers)
+
     @property
     def mean_changes(self) -> Float64[np.ndarray, "orders images"]:
         """Area under each curve of changes: the mean change over all shares of the image, by trapezoids from 0."""
@@ -53,7 +63,7 @@ class Faithfulness:
         Share of the image that is gone at each step, from 0 to 1.
     curves
         Change of the answer at each step: the most, the least influential parts, and random ones removed first (the
-        mean over the random orders).
+        mean over the random orders). Along the target where it was given, else its size.
     """
 
     areas: Float64[np.ndarray, " steps"]
@@ -185,6 +195,7 @@ def faithfulness(
     fill: Fill,
     rng: np.random.Generator,
     references: Float[Tensor, "images 3 height width"] | None = None,
+    towards: Float[np.ndarray, " images"] | None = None,
     random_orders: int = RANDOM_ORDERS,
     areas: Sequence[float] = AREAS,
     seed: int = 0,
@@ -193,17 +204,23 @@ def faithfulness(
 ) -> dict[str, Faithfulness]:
     """Score the maps of several methods on the same images, against the same random orders.
 
+    Where maps are signed, what speaks against the target is the least influential, and removing it moves the answer the
+    other way, as far as removing what speaks for it. By size the two are told apart by nothing: a map of what each
+    marker really does then ranks below the same map half shuffled, which it does not along the target (docs/study.md).
+
     Parameters
     ----------
     predict, images, references, fill, areas, seed, batch_size, on_image
         As `removal_curves` takes them.
     influence
         Maps by method, larger where a method says that a part matters more. Of signed relevance give the part that
-        works towards the target, `relevance * sign(target)`.
+        works towards the target, `relevance * sign(target)`, and `towards`.
     units
         What is removed at once, for each image (`pixel_units`, `tile_units`, `marker_units`).
     rng
         Source of the random orders.
+    towards
+        Sign of the target f(x) - f(untouched sensor) of each image: changes count along it; by their size if None.
     random_orders
         How many of them.
 
@@ -229,7 +246,7 @@ def faithfulness(
         batch_size=batch_size,
         on_image=on_image,
     )
-    changes = found.changes
+    changes = found.changes if towards is None else found.lost(towards)
     by_chance = changes[2 * len(influence) :].mean(axis=0)
     return {
         name: Faithfulness(

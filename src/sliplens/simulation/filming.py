@@ -28,6 +28,8 @@ class Film:
     """A trial ready to be drawn, any of its frames in any order; made by `prepare_film`."""
 
     sensor: Sensor
+    grasp: Grasp
+    day: Day
     unit: Unit
     motion: Motion
     noise: Noise | None
@@ -217,6 +219,8 @@ def prepare_film(
     light = brightness(sensor, day=day)
     return Film(
         sensor=sensor,
+        grasp=grasp,
+        day=day,
         unit=unit,
         motion=motion,
         noise=noise,

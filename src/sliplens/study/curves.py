@@ -45,8 +45,9 @@ def influences(material: Material) -> dict[str, Float[np.ndarray, "frames size s
     material
         The explanations and what was explained.
     """
-    towards = np.array([np.sign(one.prediction - one.reference_prediction) for one in material.explained.frames])
-    maps = {name: relevance * towards[:, None, None] for name, relevance in material.explained.relevance.items()}
+    maps = {
+        name: relevance * material.towards[:, None, None] for name, relevance in material.explained.relevance.items()
+    }
     return maps | {name: control(material.inputs).double().cpu().numpy() for name, control in CONTROLS.items()}
 
 
@@ -117,6 +118,7 @@ def score_curves(
                     units[setting.unit],
                     fill=get_fill(setting.fill),
                     references=references,
+                    towards=material.towards,
                     # the same random orders under every fill
                     rng=np.random.default_rng(seed),
                     random_orders=random_orders,

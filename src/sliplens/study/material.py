@@ -43,6 +43,11 @@ class Material:
         """Trial of each frame."""
         return np.array([frame.trial for frame in self.explained.frames])
 
+    @property
+    def towards(self) -> Float[np.ndarray, " frames"]:
+        """Sign of each answer's change from that on the untouched sensor, which the maps explain."""
+        return np.array([np.sign(one.prediction - one.reference_prediction) for one in self.explained.frames])
+
     def fast(self, passes: int) -> Passes:
         """Make an engine ready for so many passes of the network."""
         some = self.inputs[:_PARITY_IMAGES]

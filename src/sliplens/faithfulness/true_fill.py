@@ -1,0 +1,120 @@
+"""The true fill: a marker is removed by drawing the scene with that marker unmoved, which only a simulator can do.
+
+Any other fill puts pixels where no marker ever was, and a network may answer to that; here every image is one that the
+sensor could have seen, and what is taken away is the marker's motion and nothing else.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from sliplens.errors import InputError
+from sliplens.faithfulness.answering import Predict, answer_whole
+from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness, RemovalCurves
+
+Redraw: TypeAlias = Callable[[int, Bool[np.ndarray, "variants markers"]], Float[Tensor, "variants 3 height width"]]
+"""From the number of an image, and the markers that are put back in each variant, to the network's inputs."""
+
+SHARES = (0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+"""Shares of the markers that are put back: each is drawn anew, and of 42 markers one is 2 %."""
+
+
+def marker_curves(
+    predict: Predict,
+    redraw: Redraw,
+    orders: Int[np.ndarray, "orders images markers"],
+    *,
+    batch_size: int = 64,
+    on_image: Callable[[int, int], None] | None = None,
+) -> RemovalCurves:
+    """Answers of a network while markers are put back, in several orders each.
+
+    The areas of the result are `SHARES` of the markers. What several orders ask for is drawn once.
+
+    Parameters
+    ----------
+    predict
+        As `removal_curves` takes it.
+    redraw
+        Draws the images.
+    orders
+        Places among an image's markers, first to be put back first.
+    batch_size
+        Images that are drawn and answered at a time: bounds the memory.
+    on_image
+        Called with the number of images done and the number of all.
+    """
+    areas, (_, images, markers) = np.asarray(SHARES), orders.shape
+    counts = np.round(areas * markers).astype(np.int64)
+    answers = np.empty((len(orders), images, len(areas)))
+    for image in range(images):
+        rank = np.argsort(orders[:, image], axis=-1)
+        back = rank[:, None] < counts[:, None]
+        distinct, asked = np.unique(back.reshape(-1, markers), axis=0, return_inverse=True)
+        told = [
+            answer_whole(predict, redraw(image, distinct[start : start + batch_size]), batch_size=batch_size)
+            for start in range(0, len(distinct), batch_size)
+        ]
+        answers[:, image] = np.concatenate(told)[asked].reshape(back.shape[:2])
+        if on_image is not None:
+            on_image(image + 1, images)
+    return RemovalCurves(areas=areas, answers=answers)
+
+
+def influence_orders(influence: Float[np.ndarray, "images markers"]) -> Int[np.ndarray, "2 images markers"]:
+    """Orders of the markers, from the most to the least influential, and from the least to the most.
+
+    Ties fall alike in both: a map that tells nothing has one order, and gains nothing.
+    """
+    return np.stack([np.argsort(sign * influence, axis=-1, kind="stable") for sign in (-1, 1)])
+
+
+def marker_faithfulness(
+    predict: Predict,
+    redraw: Redraw,
+    influence: Mapping[str, Float[np.ndarray, "images markers"]],
+    *,
+    rng: np.random.Generator,
+    towards: Float[np.ndarray, " images"] | None = None,
+    random_orders: int = RANDOM_ORDERS,
+    batch_size: int = 64,
+    on_image: Callable[[int, int], None] | None = None,
+) -> dict[str, Faithfulness]:
+    """Score the maps of several methods by putting markers back, against the same random orders.
+
+    Parameters
+    ----------
+    predict, redraw, batch_size, on_image
+        As `marker_curves` takes them.
+    influence
+        How much each marker matters, by method (`unit_means`): larger goes first. Of signed relevance give the part
+        that works towards the target, `relevance * sign(target)`.
+    rng
+        Source of the random orders.
+    towards
+        As `faithfulness` takes it.
+    random_orders
+        How many of them.
+
+    Raises
+    ------
+    InputError
+        If an influence is not finite.
+    """
+    for name, values in influence.items():
+        if not np.isfinite(values).all():
+            raise InputError(f"{name} gives some marker no finite influence; leave out markers that no pixel shows")
+    orders = [influence_orders(values) for values in influence.values()]
+    images, markers = orders[0].shape[1:]
+    by_chance = [[rng.permutation(markers) for _ in range(images)] for _ in range(random_orders)]
+    asked = np.concatenate([*orders, np.array(by_chance)])
+    curves = marker_curves(predict, redraw, asked, batch_size=batch_size, on_image=on_image)
+    changes = curves.changes if towards is None else curves.lost(towards)
+    random = changes[2 * len(orders) :].mean(axis=0)
+    return {
+        name: Faithfulness(areas=curves.areas, curves=np.stack([changes[2 * number], changes[2 * number + 1], random]))
+        for number, name in enumerate(influence)
+    }

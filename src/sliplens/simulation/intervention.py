@@ -1,0 +1,211 @@
+"""A stored simulated trial made anew, so that markers can be put back while all else, the noise too, stays."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from sliplens._version import __version__
+from sliplens.errors import InputError
+from sliplens.provenance import RUN_FILE, read_json
+from sliplens.recordings import Recording
+from sliplens.simulation.filming import Film, batches
+from sliplens.simulation.information import Touch
+from sliplens.simulation.loading import Loading
+from sliplens.simulation.look import draw_look
+from sliplens.simulation.noise import NoisePicks
+from sliplens.simulation.nuisances import Nuisances
+from sliplens.simulation.plan import FrameTotals, SimulationRecipe, TrialPlan, plan_trials
+from sliplens.simulation.sensor import SENSORS
+from sliplens.simulation.trials import prepare_trial
+
+_ROUNDING = 1
+"""Grey levels by which the same scene may differ where another device or library drew it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmedTrial:
+    """A simulated trial with all that drew it."""
+
+    plan: TrialPlan
+    loading: Loading
+    film: Film
+
+    def touch(self, frame: int) -> Touch:
+        """All that moves the markers of a frame, apart from its margin; what an earlier slip left is not told.
+
+        Drift and creep are in the force and the friction that hold in this frame.
+        """
+        grasp, loading = self.film.grasp, self.loading
+        creep = 1 + grasp.creep * (1 - np.exp(-loading.held_s[frame] / grasp.creep_time_s))
+        return Touch(
+            grasp=replace(
+                grasp,
+                normal_force_n=float(loading.normal_force_n[frame] * creep),
+                friction=float(loading.friction_coefficient[frame]),
+            ),
+            modulus_factor=self.film.day.modulus_factor,
+            marker_depth=self.film.unit.marker_depth,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outlines:
+    """Circles that the markers of a frame fill, in camera pixels, and those that they filled at rest."""
+
+    rest_px: Float[np.ndarray, "markers 2"]
+    rest_radius_px: Float[np.ndarray, " markers"]
+    """Of the widest channel."""
+    now_px: Float[np.ndarray, "markers 2"]
+    now_radius_px: Float[np.ndarray, " markers"]
+
+
+def read_recipe(folder: Path) -> SimulationRecipe:
+    """Read the recipe of a data set from its `run.json`.
+
+    Raises
+    ------
+    InputError
+        If there is none that this version can follow.
+    """
+    path = folder / RUN_FILE
+    try:
+        stored = read_json(path)["config"]["recipe"]
+        totals = stored["frame_totals"]
+        records: dict[str, Any] = {
+            "sensor": SENSORS[stored["sensor"]["name"]],
+            "nuisances": Nuisances(**_tuples(stored["nuisances"])),
+            "frame_totals": None if totals is None else FrameTotals(**totals),
+        }
+        return SimulationRecipe(**(_tuples(stored) | records))
+    except (InputError, KeyError, TypeError, AttributeError):
+        raise InputError(
+            f"{path} does not tell the recipe of the simulated trials; give the recipe, or a data set that "
+            "sliplens simulate made"
+        ) from None
+
+
+def _tuples(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+
+
+def rebuild_trial(folder: Path, recording: Recording, *, recipe: SimulationRecipe | None = None) -> FilmedTrial:
+    """Make a stored simulated trial ready to be drawn anew, the same bytes as before.
+
+    Parameters
+    ----------
+    folder
+        Of its data set.
+    recording
+        The trial, with its truth.
+    recipe
+        What simulated it; read from the folder if None.
+
+    Raises
+    ------
+    InputError
+        If the trial was not simulated, its recipe is not known or another one, or what is drawn differs from what is
+        stored.
+    """
+    name, truth = recording.trial, recording.truth
+    if truth is None:
+        raise InputError(f"trial {name} has no simulated truth and cannot be drawn anew; choose a simulated data set")
+    recipe = read_recipe(folder) if recipe is None else recipe
+    plans = {plan.trial: plan for plan in plan_trials(recipe)}
+    if recipe.hash != truth.recipe or name not in plans:
+        raise InputError(
+            f"trial {name} of {folder} was simulated by another recipe, or by another version of sliplens than this "
+            f"{__version__}; simulate the data set again"
+        )
+    loading, film = prepare_trial(plans[name])
+    # the untouched sensor shows light, seat and print; the last frame all that came after
+    last = len(film) - 1
+    drawn = torch.stack([film.draw_reference(), film.draw(slice(last, last + 1))[0]]).numpy().astype(np.int16)
+    if np.abs(drawn - [recording.reference, recording.frames[last]]).max() > _ROUNDING:
+        raise InputError(
+            f"trial {name} of {folder} is drawn otherwise than it is stored: its frames were changed, or other "
+            "versions of numpy and torch made it; simulate the data set again"
+        )
+    return FilmedTrial(plan=plans[name], loading=loading, film=film)
+
+
+def put_markers_back(film: Film, frame: int, back: Bool[np.ndarray, "variants markers"]) -> Film:
+    """Film of one moment, in each of its frames with other markers put back; all else stays, the noise too.
+
+    A marker that is put back lies where it lay untouched, as large as it was and pressed by nothing. The focus and the
+    paleness that the touch gives to all markers stay: they are of the gel, not of the marker.
+
+    Parameters
+    ----------
+    film
+        The trial.
+    frame
+        The moment.
+    back
+        Which markers are put back, in each of the new film's frames.
+    """
+    count, motion = len(back), film.motion
+    at, taken = np.full(count, frame), np.full(count, frame + 1)  # the untouched sensor's picks come first
+
+    def where_back(rest: np.ndarray | float, now: np.ndarray) -> np.ndarray:
+        chosen = back[..., None] if now.ndim == 2 else back
+        return np.where(chosen, rest, now[None])
+
+    return replace(
+        film,
+        motion=replace(
+            motion,
+            centres_px=where_back(motion.rest_px, motion.centres_px[frame]),
+            scale=where_back(1.0, motion.scale[frame]),
+            pressure=where_back(0.0, motion.pressure[frame]),
+            touch=motion.touch[at],
+            indentation_m=motion.indentation_m[at],
+            contact_radius_m=motion.contact_radius_m[at],
+            stick_radius_m=motion.stick_radius_m[at],
+        ),
+        marker_px=where_back(film.marker_rest_px, film.marker_px[frame]),
+        blur_px=film.blur_px[np.append(0, taken)],
+        noise_picks=NoisePicks(
+            field=film.noise_picks.field[np.append(0, taken)], corner=film.noise_picks.corner[np.append(0, taken)]
+        ),
+    )
+
+
+def draw_with_markers_back(
+    film: Film, frame: int, back: Bool[np.ndarray, "variants markers"], *, device: str | torch.device = "cpu"
+) -> UInt8[Tensor, "variants height width 3"]:
+    """Draw a frame with markers put back (`put_markers_back`), once for each choice of them.
+
+    With none put back it is the frame as it is stored.
+    """
+    changed = put_markers_back(film, frame, back)
+    return torch.cat([changed.draw(part, device=device) for part in batches(len(back), device=device)])
+
+
+def marker_outlines(film: Film, frame: int) -> Outlines:
+    """Circles that the markers of a frame fill, and those that they filled at rest."""
+    motion, look = film.motion, film.sensor.look
+
+    def radius(scale: np.ndarray, pressure: np.ndarray, touch: np.ndarray, taken: int) -> np.ndarray:
+        drawn = draw_look(
+            look,
+            geometry=film.sensor.geometry,
+            unit=film.unit,
+            scale=scale[None],
+            pressure=pressure[None],
+            touch=touch,
+            blur_px=film.blur_px[taken : taken + 1],
+        )
+        return drawn.radius_px[0].max(axis=-1)
+
+    ones = np.ones(len(film.marker_rest_px))
+    return Outlines(
+        rest_px=film.marker_rest_px,
+        rest_radius_px=radius(ones, 0 * ones, np.zeros(1), 0),
+        now_px=film.marker_px[frame],
+        now_radius_px=radius(motion.scale[frame], motion.pressure[frame], motion.touch[frame : frame + 1], frame + 1),
+    )

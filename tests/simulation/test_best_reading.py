@@ -1,0 +1,134 @@
+"""The best reading of the margin: closed forms, conditioning of Gaussians, and what an unbiased reading must obey."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sliplens.errors import ContactError
+from sliplens.simulation import CHROMATOUCH, Nuisances, SimulationRecipe, plan_trials
+from sliplens.simulation.best_reading import NOISE_PX, marker_readings, reading_gain
+from sliplens.simulation.information import (
+    MARGIN,
+    Sensitivity,
+    Touch,
+    margin_bound,
+    marker_sensitivity,
+    prior_sigma,
+    visible_markers,
+)
+from sliplens.simulation.intervention import FilmedTrial
+from sliplens.simulation.nuisances import Grasp
+from sliplens.simulation.trials import prepare_trial
+
+NAMES = (MARGIN, "log_friction", "log_load")
+PRIOR = {"log_friction": 0.2, "log_load": 0.5}
+
+
+@pytest.fixture
+def jacobian(rng) -> np.ndarray:
+    return rng.normal(size=(8, 3))
+
+
+@pytest.fixture(scope="module")
+def trial() -> FilmedTrial:
+    plan = plan_trials(SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=24, seed=5))[-1]
+    loading, film = prepare_trial(plan)
+    return FilmedTrial(plan=plan, loading=loading, film=film)
+
+
+def test_one_unknown_is_read_by_projection(jacobian):
+    # least squares of u = j Gamma: Gamma-hat = j . u / |j|^2, whatever the noise
+    for noise in (0.1, 3.0):
+        gain = reading_gain(jacobian, NAMES, noise_px=noise, prior={})
+        np.testing.assert_allclose(gain, jacobian[:, 0] / (jacobian[:, 0] @ jacobian[:, 0]), rtol=1e-12)
+
+
+def test_without_priors_the_reading_follows_the_margin_and_nothing_else(jacobian):
+    gain = reading_gain(jacobian, NAMES, noise_px=0.1, prior=dict.fromkeys(NAMES, np.inf))
+    np.testing.assert_allclose(gain @ jacobian, [1, 0, 0], atol=1e-12)
+    # best linear unbiased: the margin's row of the pseudo-inverse, when nothing is known of any unknown
+    np.testing.assert_allclose(gain, np.linalg.pinv(jacobian)[0], rtol=1e-10)
+
+
+def test_with_priors_the_reading_is_the_mean_of_the_conditioned_gaussian(jacobian):
+    prior = {MARGIN: 0.3, **PRIOR}
+    spread = np.diag(np.square([prior[name] for name in NAMES]))
+    expected = (spread @ jacobian.T @ np.linalg.inv(jacobian @ spread @ jacobian.T + 0.4**2 * np.eye(8)))[0]
+    gain = reading_gain(jacobian, NAMES, noise_px=0.4, prior=prior)
+    np.testing.assert_allclose(gain, expected, rtol=1e-9)
+    # and shrinks by what is left of the prior's variance
+    bound = margin_bound(Sensitivity(unknowns=NAMES, jacobian=jacobian[None]), noise_px=0.4, prior=prior)[0]
+    assert gain @ jacobian[:, 0] == pytest.approx(1 - bound**2 / 0.3**2, rel=1e-9)
+
+
+def test_a_prior_on_the_margin_shrinks_all_gains_alike(jacobian):
+    free, shrunk = (reading_gain(jacobian, NAMES, noise_px=0.4, prior=PRIOR | more) for more in ({}, {MARGIN: 0.3}))
+    assert np.ptp(shrunk / free) == pytest.approx(0, abs=1e-9)
+    assert 0 < (shrunk / free)[0] < 1
+
+
+def test_the_readings_error_is_the_bound(jacobian):
+    gain = reading_gain(jacobian, NAMES, noise_px=0.4, prior=PRIOR)
+    assert gain @ jacobian[:, 0] == pytest.approx(1, rel=1e-12)
+    # noise in every coordinate, and nuisances spread as their priors
+    spread = sum((gain @ jacobian[:, NAMES.index(name)] * sigma) ** 2 for name, sigma in PRIOR.items())
+    bound = margin_bound(Sensitivity(unknowns=NAMES, jacobian=jacobian[None]), noise_px=0.4, prior=PRIOR)[0]
+    assert np.sqrt(0.4**2 * gain @ gain + spread) == pytest.approx(bound, rel=1e-9)
+
+
+def test_the_error_is_the_bound_of_the_sensor_too():
+    touch, prior = Touch(grasp=Grasp(normal_force_n=1.2)), prior_sigma(Nuisances(), wet=False)
+    sensitivity = marker_sensitivity(np.array([0.2, 0.5, 0.8]), sensor=CHROMATOUCH, touch=touch)
+    bound = margin_bound(sensitivity, noise_px=0.1, prior=prior)
+    for number, jacobian in enumerate(sensitivity.jacobian):
+        gain = reading_gain(jacobian, sensitivity.unknowns, noise_px=0.1, prior=prior)
+        passed = gain @ jacobian
+        # columns from metres to radians: digits are lost to their angles, not to their lengths
+        assert passed[0] == pytest.approx(1, rel=1e-6)
+        spread = sum((passed[sensitivity.unknowns.index(name)] * sigma) ** 2 for name, sigma in prior.items())
+        assert np.sqrt(0.1**2 * gain @ gain + spread) == pytest.approx(bound[number], rel=1e-6)
+
+
+def test_a_markers_effect_is_what_the_reading_loses_with_it(trial):
+    frame = int(np.nanargmin(np.abs(trial.loading.safety_margin - 0.5)))
+    margin = trial.loading.safety_margin[frame]
+    seen, effects = marker_readings(trial, frame)
+    np.testing.assert_array_equal(seen, visible_markers(CHROMATOUCH))
+    # slow: the normal equations, and each marker put back by hand
+    one = marker_sensitivity(np.array([margin]), sensor=CHROMATOUCH, touch=trial.touch(frame))
+    prior = prior_sigma(trial.plan.recipe.nuisances, wet=True)
+    jacobian = one.jacobian[0] / NOISE_PX
+    precision = np.diag([0.0, *(1 / prior[name] ** 2 for name in one.unknowns[1:])])
+    gain = np.linalg.solve(jacobian.T @ jacobian + precision, jacobian.T)[0] / NOISE_PX
+    moved = (trial.film.motion.centres_px[frame] - trial.film.motion.rest_px)[seen]
+    for marker in range(0, len(seen), 7):
+        back = moved.copy()
+        back[marker] = 0
+        # the condition of the normal equations is the square of the problem's
+        assert gain @ (moved - back).ravel() == pytest.approx(effects[marker], rel=1e-4, abs=1e-6)
+
+
+def test_the_camera_may_sit_as_it_likes(trial):
+    frame = int(np.nanargmin(np.abs(trial.loading.safety_margin - 0.5)))
+    film = trial.film
+    turned = replace(trial, film=replace(film, marker_px=film.marker_px + 3, marker_rest_px=film.marker_rest_px + 3))
+    np.testing.assert_array_equal(marker_readings(turned, frame)[1], marker_readings(trial, frame)[1])
+
+
+def test_the_ends_of_the_margin_can_be_read(trial):
+    for end in (1.0, 0.0):
+        frame = int(np.flatnonzero(trial.loading.safety_margin == end)[0])
+        effects = marker_readings(trial, frame)[1]
+        assert np.isfinite(effects).all()
+        assert np.ptp(effects) > 0
+
+
+def test_without_contact_there_is_no_margin_to_read(trial):
+    with pytest.raises(ContactError, match=r"frame 0 of .* has no contact, and so no margin; choose"):
+        marker_readings(trial, 0)
+
+
+def test_impossible_noise_is_refused(jacobian):
+    with pytest.raises(ContactError, match="noise and priors must be positive"):
+        reading_gain(jacobian, NAMES, noise_px=0.0, prior={})

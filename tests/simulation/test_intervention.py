@@ -1,0 +1,198 @@
+"""Scenes drawn anew: what is put back changes, what is left alone does not, to the byte."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sliplens.errors import InputError
+from sliplens.provenance import output_folder
+from sliplens.recordings import Dataset, Recording
+from sliplens.simulation import (
+    CHROMATOUCH,
+    FLAT_GEL,
+    PRESETS,
+    FrameTotals,
+    Nuisances,
+    SimulationRecipe,
+    plan_trials,
+    simulate_dataset,
+)
+from sliplens.simulation.filming import prepare_film
+from sliplens.simulation.intervention import (
+    FilmedTrial,
+    draw_with_markers_back,
+    marker_outlines,
+    put_markers_back,
+    read_recipe,
+    rebuild_trial,
+)
+from sliplens.simulation.loading import load_at_margins
+from sliplens.simulation.motion import move_markers
+from sliplens.simulation.nuisances import Day, Grasp, nominal_unit
+
+REACH_PX = 17
+"""Of what is drawn of a marker: half of its patch of 32 pixels, and the rounding of its place."""
+RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=24, seed=5)
+
+
+def simulate(folder: Path, recipe: SimulationRecipe) -> Dataset:
+    with output_folder(folder, stage="simulate", config={"recipe": recipe, "device": "cpu"}) as out:
+        simulate_dataset(out.folder, recipe)
+    return Dataset.open(folder)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Dataset:
+    return simulate(tmp_path_factory.mktemp("simulated") / "data", RECIPE)
+
+
+@pytest.fixture(scope="module")
+def recordings(data: Dataset) -> list[Recording]:
+    return list(data.load_all(data.trials))
+
+
+@pytest.fixture(scope="module")
+def trials(data: Dataset, recordings: list[Recording]) -> list[FilmedTrial]:
+    return [rebuild_trial(data.folder, recording) for recording in recordings]
+
+
+def nobody(trial: FilmedTrial, variants: int = 1) -> np.ndarray:
+    return np.zeros((variants, len(trial.film.marker_rest_px)), dtype=bool)
+
+
+def in_pull(trial: FilmedTrial) -> int:
+    return int(np.nanargmin(np.abs(trial.loading.safety_margin - 0.4)))
+
+
+def test_with_no_marker_put_back_a_frame_has_the_stored_bytes(trials, recordings):
+    for trial, recording in zip(trials, recordings, strict=True):
+        for frame in (0, in_pull(trial), len(trial.film) - 1):
+            drawn = draw_with_markers_back(trial.film, frame, nobody(trial, 5)).numpy()
+            np.testing.assert_array_equal(drawn, np.broadcast_to(recording.frames[frame], drawn.shape))
+
+
+def test_putting_back_what_did_not_move_changes_nothing(trials, recordings):
+    for trial, recording in zip(trials, recordings, strict=True):
+        assert np.isnan(trial.loading.safety_margin[0])
+        drawn = draw_with_markers_back(trial.film, 0, ~nobody(trial)).numpy()
+        np.testing.assert_array_equal(drawn[0], recording.frames[0])
+
+
+@pytest.mark.parametrize("sensor", [CHROMATOUCH, FLAT_GEL])
+def test_all_markers_back_and_no_touch_is_the_untouched_sensor(sensor):
+    grasp = Grasp()
+    film = prepare_film(
+        sensor,
+        loading=load_at_margins(np.array([0.3]), grasp=grasp),
+        grasp=grasp,
+        day=Day(camera_shift_px=(2.0, -1.0), camera_rotation_rad=0.02),
+        unit=nominal_unit(sensor.geometry.markers),
+        rng=np.random.default_rng(0),
+        noise=None,
+    )
+    changed = put_markers_back(film, 0, np.ones((1, sensor.geometry.markers), dtype=bool))
+    nothing = np.zeros(1)
+    motion = replace(changed.motion, touch=nothing, contact_radius_m=nothing, stick_radius_m=nothing)
+    untouched = replace(changed, motion=replace(motion, indentation_m=nothing)).draw(slice(0, 1)).numpy()[0]
+    np.testing.assert_array_equal(untouched, film.draw_reference().numpy())
+    # the touch alone, its veil and sharper focus, is what is left of a frame whose markers are all put back
+    assert np.any(changed.draw(slice(0, 1)).numpy()[0] != untouched)
+
+
+def test_a_change_stays_near_the_markers_old_and_new_place(trials, recordings):
+    trial, recording = trials[0], recordings[0]
+    frame, film = in_pull(trial), trials[0].film
+    rows, columns = np.mgrid[: recording.frames.shape[1], : recording.frames.shape[2]]
+    for marker in (0, 4, 20):
+        back = nobody(trial)
+        back[0, marker] = True
+        changed = (draw_with_markers_back(film, frame, back).numpy()[0] != recording.frames[frame]).any(axis=-1)
+        assert changed.any()
+        allowed = np.zeros_like(changed)
+        for x, y in (film.marker_rest_px[marker], film.marker_px[frame, marker]):
+            allowed |= (np.abs(columns - x) <= REACH_PX) & (np.abs(rows - y) <= REACH_PX)
+        assert not changed[~allowed].any()
+
+
+def test_markers_far_apart_are_put_back_as_if_alone(trials, recordings):
+    trial, recording = trials[0], recordings[0]
+    frame, back = in_pull(trial), nobody(trial, 3)
+    # on opposite sides of the second ring, and both
+    back[[0, 2], 7] = True
+    back[[1, 2], 13] = True
+    stored = recording.frames[frame].astype(int)
+    one, other, both = draw_with_markers_back(trial.film, frame, back).numpy() - stored
+    assert np.abs(one).max() > 20
+    np.testing.assert_array_equal(both, one + other)
+
+
+def test_a_frames_touch_moves_its_markers_as_the_trial_did(trials):
+    for trial in trials:
+        margins = trial.loading.safety_margin
+        # before the first slip, which the touch does not tell of
+        for frame in np.flatnonzero(margins > 0)[::5].tolist():
+            if trial.loading.carried_friction[frame] > 0:
+                continue
+            touch = trial.touch(frame)
+            motion = move_markers(
+                trial.film.sensor,
+                loading=load_at_margins(margins[frame : frame + 1], grasp=touch.grasp),
+                grasp=touch.grasp,
+                modulus_factor=touch.modulus_factor,
+                marker_depth=touch.marker_depth,
+            )
+            np.testing.assert_allclose(motion.centres_px[0], trial.film.motion.centres_px[frame], atol=1e-9)
+
+
+def test_outlines_are_the_drawn_circles(trials):
+    film = trials[0].film
+    outlines = marker_outlines(film, 0)
+    scale = film.sensor.geometry.marker_scale() * film.unit.radius_factor
+    np.testing.assert_allclose(outlines.rest_radius_px, scale * max(film.sensor.look.radius_px))
+    np.testing.assert_allclose(outlines.now_radius_px, outlines.rest_radius_px)
+    pressed = marker_outlines(film, in_pull(trials[0]))
+    # the apex comes nearer and is squeezed, the rim of the dome does neither
+    assert pressed.now_radius_px[0] > 1.03 * pressed.rest_radius_px[0]
+    assert pressed.now_radius_px[-1] == pytest.approx(pressed.rest_radius_px[-1], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        *PRESETS.values(),
+        replace(RECIPE, sensor=FLAT_GEL, nuisances=Nuisances(dry_friction=(0.2, 0.9)), displacement="half-space"),
+        replace(RECIPE, frame_totals=FrameTotals(train=40, validation=20, test=40), release=True, test_days=1),
+    ],
+)
+def test_a_recipe_comes_back_from_its_folder(recipe: SimulationRecipe, tmp_path: Path):
+    with output_folder(tmp_path / "data", stage="simulate", config={"recipe": recipe, "device": "cpu"}):
+        pass
+    assert read_recipe(tmp_path / "data") == recipe
+
+
+def test_a_folder_that_tells_no_recipe_needs_one(data: Dataset, recordings, tmp_path: Path):
+    with pytest.raises(InputError, match=r"run\.json does not tell the recipe .*; give the recipe, or a data set"):
+        rebuild_trial(tmp_path, recordings[0])
+    assert rebuild_trial(tmp_path, recordings[0], recipe=RECIPE).plan.trial == recordings[0].trial
+    own = replace(RECIPE, sensor=replace(CHROMATOUCH, name="of my own"))
+    with output_folder(tmp_path / "own", stage="simulate", config={"recipe": own}):
+        pass
+    with pytest.raises(InputError, match="does not tell the recipe"):
+        read_recipe(tmp_path / "own")
+
+
+def test_what_was_not_simulated_so_is_refused(data: Dataset, recordings):
+    with pytest.raises(InputError, match=r"was simulated by another recipe, or by another version .*; simulate"):
+        rebuild_trial(data.folder, recordings[0], recipe=replace(RECIPE, seed=6))
+    with pytest.raises(InputError, match="has no simulated truth and cannot be drawn anew"):
+        rebuild_trial(data.folder, replace(recordings[0], truth=None))
+    frames = recordings[0].frames.copy()
+    frames[-1, 100, 100] ^= 64
+    with pytest.raises(InputError, match="is drawn otherwise than it is stored"):
+        rebuild_trial(data.folder, replace(recordings[0], frames=frames))
+
+
+def test_trials_are_rebuilt_whatever_their_place_in_the_plan(trials):
+    assert [trial.plan.trial for trial in trials] == [plan.trial for plan in plan_trials(RECIPE)]

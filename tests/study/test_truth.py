@@ -1,0 +1,294 @@
+"""Maps held against what each marker does: with a network that adds up how far the pixels changed."""
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from torch import Tensor, nn
+
+from sliplens.errors import CheckpointError, InputError
+from sliplens.faithfulness.controls import CONTROLS
+from sliplens.faithfulness.true_fill import SHARES
+from sliplens.faithfulness.units import unit_means
+from sliplens.models import Manifest, TrainedModel
+from sliplens.provenance import output_folder
+from sliplens.recordings import Dataset
+from sliplens.simulation import CHROMATOUCH, SimulationRecipe, simulate_dataset
+from sliplens.simulation.best_reading import marker_readings
+from sliplens.simulation.information import visible_markers
+from sliplens.simulation.intervention import draw_with_markers_back
+from sliplens.study import Explained, ExplainedFrame, frames_from_dataset
+from sliplens.study.truth import judge_by_truth, true_curves
+from sliplens.study.truth_effects import shuffle_half
+from sliplens.study.truth_scenes import find_places, redrawing, stage_frames
+
+SIZE = 112
+RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=20, seed=5)
+LEVELS = (1.0, 0.3)
+"""Nothing slips in the first."""
+
+
+class Linear(nn.Module):
+    """A weight for each pixel, positive: whatever is put back lowers the answer."""
+
+    weight: nn.Parameter
+
+    def __init__(self) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(0)
+        # smooth, so that markers differ as wholes
+        coarse = torch.rand(1, 3, 7, 7, generator=generator) ** 2 / 1000
+        self.weight = nn.Parameter(nn.functional.interpolate(coarse, size=(SIZE, SIZE), mode="bilinear"))
+
+    def forward(self, images: Tensor) -> Tensor:
+        return (images * self.weight).sum(dim=(1, 2, 3))[:, None] + 0.5
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Dataset:
+    folder = tmp_path_factory.mktemp("simulated") / "data"
+    with output_folder(folder, stage="simulate", config={"recipe": RECIPE}) as out:
+        simulate_dataset(out.folder, RECIPE)
+    return Dataset.open(folder)
+
+
+@pytest.fixture(scope="module")
+def trained() -> TrainedModel:
+    manifest = Manifest(
+        backbone="none",
+        # the size of the difference to the untouched sensor, as it is
+        input="amplitude",
+        image_size=SIZE,
+        frame_size=(224, 224),
+        sensor="chromatouch",
+        data_hash="none",
+        weights_sha256="of these weights",
+    )
+    return TrainedModel(model=Linear().eval(), manifest=manifest)
+
+
+@pytest.fixture(scope="module")
+def explained(trained: TrainedModel, data: Dataset) -> Explained:
+    chosen = frames_from_dataset(trained, data, levels=LEVELS)
+    inputs = trained.encoding.normalise(chosen.images)
+    assert isinstance(trained.model, Linear)
+    # what each pixel adds to the answer
+    told = (inputs * trained.model.weight).sum(dim=1).detach().numpy()
+    answers, empty = trained.predict(inputs), trained.predict(chosen.references)
+    return Explained(
+        input="amplitude",
+        source=chosen.source,
+        frames=tuple(
+            ExplainedFrame(
+                id=chosen.ids[index],
+                trial=chosen.trial[index],
+                condition="dry",
+                safety_margin=float(chosen.safety_margin[index]),
+                prediction=float(answers[index]),
+                reference_prediction=float(empty[index]),
+            )
+            for index in range(len(chosen.ids))
+        ),
+        images=chosen.images,
+        relevance={"attribution": told},
+        saliency={"attribution": np.abs(told)},
+        weights_sha256="of these weights",
+    )
+
+
+@pytest.fixture(scope="module")
+def given(trained: TrainedModel, explained: Explained, data: Dataset) -> tuple[TrainedModel, Explained, Dataset]:
+    return trained, explained, data
+
+
+@pytest.fixture(scope="module")
+def maps(trained: TrainedModel, explained: Explained) -> dict[str, np.ndarray]:
+    towards = np.array([np.sign(frame.prediction - frame.reference_prediction) for frame in explained.frames])
+    inputs = trained.encoding.normalise(explained.images)
+    return {"attribution": explained.relevance["attribution"] * towards[:, None, None]} | {
+        name: control(inputs).double().numpy() for name, control in CONTROLS.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def judged(trained, explained, data, maps, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("truth")
+    judge_by_truth(trained, explained, data, folder, maps=maps, fills=("reference", "grey"))
+    return folder
+
+
+def rows_of(folder: Path, frame: str) -> list[dict]:
+    return [row for row in pq.read_table(folder / "effects.parquet").to_pylist() if row["frame_id"] == frame]
+
+
+def test_effects_are_what_putting_one_marker_back_changes(trained, explained, data, judged):
+    seen = visible_markers(CHROMATOUCH)
+    for frame in stage_frames(trained, explained, data):
+        rows = rows_of(judged, frame.id)
+        assert [row["marker"] for row in rows] == seen.tolist()
+        film = frame.scene.film
+        stored = data.load(next(info for info in data.trials if info.trial == frame.trial)).frames[frame.number]
+        whole = trained.predict(trained.encode(stored[None], frame.reference))[0]
+        for row in rows[::9]:
+            back = np.zeros((1, len(film.marker_rest_px)), dtype=bool)
+            back[0, row["marker"]] = True
+            drawn = draw_with_markers_back(film, frame.number, back).numpy()
+            changed = trained.predict(trained.encode(drawn, frame.reference))[0]
+            # float32 sums of 37,632 terms, in another order
+            assert row["network_effect"] == pytest.approx(float(whole - changed), abs=1e-6)
+            # one pixel of the network is two of the camera
+            x, y = film.marker_px[frame.number, row["marker"]]
+            assert (row["x_px"], row["y_px"]) == pytest.approx(((x + 0.5) / 2 - 0.5, (y + 0.5) / 2 - 0.5))
+            assert row["state"] == frame.contact_map[round(y), round(x)]
+        np.testing.assert_array_equal(
+            [row["margin_effect"] for row in rows], marker_readings(frame.scene, frame.number)[1]
+        )
+
+
+def test_maps_show_the_effects_on_the_markers(judged, explained):
+    with np.load(judged / "maps.npz") as archive:
+        painted = dict(archive)
+    for index, frame in enumerate(explained.frames):
+        for name in ("network", "margin"):
+            assert painted[name].shape == (len(LEVELS), SIZE, SIZE)
+            assert painted[name].dtype == np.float32
+            values = {np.float32(row[f"{name}_effect"]) for row in rows_of(judged, frame.id)}
+            assert set(painted[name][index].ravel()) <= values | {np.float32(0)}
+            for row in rows_of(judged, frame.id):
+                # where the marker is, the map has its effect
+                x, y = round(row["x_px"]), round(row["y_px"])
+                assert painted[name][index, y, x] == np.float32(row[f"{name}_effect"])
+
+
+def test_the_oracle_is_right_and_chance_knows_nothing(judged, explained):
+    result = json.loads((judged / "result.json").read_text())
+    assert result["frames"] == len(explained.frames)
+    methods = result["methods"]
+    assert set(methods) == {"attribution", "edges", "input", "centre", "random", "oracle", "degraded-oracle"}
+    assert methods["oracle"]["spearman_network"] == pytest.approx(1)
+    assert methods["oracle"]["mass"]["markers"] == pytest.approx(1)
+    assert 0 < methods["degraded-oracle"]["spearman_network"] < 1
+    # exact for a linear network, but for rounding to grey levels and for what of a marker lies beyond its rim
+    assert methods["attribution"]["spearman_network"] > 0.9
+    for measure in ("mass", "rank"):
+        # of 12,544 pixels a frame: 2 % is four deviations of a share; where nothing slips, nothing is to be found
+        for area in ("markers", "edges", "slip_annulus"):
+            assert methods["random"][measure][area] == pytest.approx(result["areas"][area], abs=0.02)
+    # the effects on the reading, as the oracle ranks them: what the network does against what it should
+    assert methods["oracle"]["spearman_margin"] == pytest.approx(result["network_against_margin"]["estimate"])
+    assert result["intervals"]["oracle"]["spearman_network"]["units"] == 1
+
+
+def test_markers_areas_and_rims_are_where_they_are(trained, explained, data):
+    frame = stage_frames(trained, explained, data)[1]
+    places = find_places(frame, image_size=SIZE)
+    assert not (places.edges & ~places.markers).any()
+    # the middle of a marker is no rim, its neighbourhood is its own
+    for number, (x, y) in enumerate(np.round(places.now_px).astype(int)):
+        assert places.units[y, x] == number
+    painted = places.paint(np.arange(1.0, len(frame.markers) + 1))
+    np.testing.assert_array_equal(unit_means(painted, places.units)[:-1], np.arange(1.0, len(frame.markers) + 1))
+    # half the camera's size: every other pixel
+    slips = frame.contact_map[1::2, 1::2] == 1
+    np.testing.assert_array_equal(places.slip_annulus, slips)
+
+
+def test_the_meta_test_tells_fills_apart(judged):
+    meta = {row["fill"]: row for row in json.loads((judged / "result.json").read_text())["meta"]}
+    assert set(meta) == {"reference", "grey", "true"}
+    for row in meta.values():
+        for one in (row, row["by_size"]):
+            assert one["random"] == 0
+            assert one["holds"] == (one["oracle"] > one["degraded"] > 0)
+            assert one["gap"]["estimate"] == pytest.approx(one["oracle"] - one["degraded"])
+    # each marker of this network counts for itself and all one way: the oracle's order is the best there is
+    assert meta["true"]["holds"]
+    assert meta["true"]["gap"]["low"] > 0
+    # and what is put back moves the answer towards the target only, so that the sign tells nothing more
+    assert meta["true"]["by_size"]["oracle"] == pytest.approx(meta["true"]["oracle"], abs=1e-6)
+
+
+def test_an_interrupted_judgement_goes_on_after_the_last_frame(
+    given: tuple[TrainedModel, Explained, Dataset], maps: dict[str, np.ndarray], judged: Path, tmp_path: Path
+):
+    def interrupt(done: int, total: int) -> None:
+        assert total == len(LEVELS)
+        raise KeyboardInterrupt
+
+    judge = partial(judge_by_truth, *given, tmp_path, maps=maps, fills=("reference", "grey"))
+    with pytest.raises(KeyboardInterrupt):
+        judge(on_frame=interrupt)
+    first = tmp_path / "parts" / "00000.npz"
+    before = first.stat().st_mtime_ns
+    kept = []
+    judge(on_frame=lambda *_: kept.append(first.stat().st_mtime_ns))
+    assert kept == [before] * len(LEVELS)
+    assert not (tmp_path / "parts").exists()
+    ours, theirs = (json.loads((folder / "result.json").read_text()) for folder in (tmp_path, judged))
+    assert ours["methods"].keys() == theirs["methods"].keys()
+    for one, other in zip(ours["meta"], theirs["meta"], strict=True):
+        for name in ("oracle", "degraded"):
+            assert one[name] == pytest.approx(other[name], abs=1e-6)
+
+
+def test_curves_under_the_true_fill_know_the_oracle(trained, explained, data, maps, judged):
+    frames = stage_frames(trained, explained, data)
+    places = [find_places(frame, image_size=SIZE) for frame in frames]
+    oracle = np.stack(
+        [
+            np.sign(told.prediction - told.reference_prediction)
+            * one.paint(np.array([row["network_effect"] for row in rows_of(judged, told.id)]))
+            for one, told in zip(places, explained.frames, strict=True)
+        ]
+    )
+    rng = np.random.default_rng(0)
+    noise = {f"noise {index}": rng.random(oracle.shape) for index in range(3)}
+    found = true_curves(trained, explained, data, maps={"oracle": oracle, **maps, **noise}, random_orders=4)
+    np.testing.assert_array_equal(found["oracle"].areas, SHARES)
+    for name in noise:
+        assert np.all(found["oracle"].symmetric_gain > found[name].symmetric_gain)
+    # where all are put back, no order matters
+    assert np.ptp([one.curves[:, :, -1] for one in found.values()], axis=0) == pytest.approx(0, abs=1e-12)
+
+
+def test_redrawn_inputs_are_those_that_were_explained(trained, explained, data):
+    frames = stage_frames(trained, explained, data)
+    redraw = redrawing(trained, frames)
+    inputs = trained.encoding.normalise(explained.images)
+    for index, frame in enumerate(frames):
+        nobody = np.zeros((2, len(frame.markers)), dtype=bool)
+        assert torch.equal(redraw(index, nobody), inputs[index : index + 1].expand(2, -1, -1, -1))
+
+
+def test_half_of_the_effects_are_shuffled(rng):
+    values = np.arange(40.0)
+    shuffled = shuffle_half(values, rng=rng)
+    np.testing.assert_array_equal(np.sort(shuffled), values)
+    moved = np.flatnonzero(shuffled != values)
+    # of 20 that are shuffled one stays on average
+    assert 14 <= len(moved) <= 20
+
+
+def test_frames_of_other_data_are_refused(given, maps, small_dataset, tmp_path):
+    trained, explained, data = given
+
+    def judge(explained: Explained, data: Dataset = data) -> None:
+        judge_by_truth(trained, explained, data, tmp_path, maps=maps)
+
+    with pytest.raises(InputError, match="was recorded: what each marker does is known of simulated frames alone"):
+        judge(explained, replace(data, simulated=False))
+    with pytest.raises(InputError, match="has no trial day4-dry-001; name the data set whose frames were explained"):
+        judge(explained, small_dataset)
+    with pytest.raises(InputError, match=r"is not the frame of .* that was explained; explain it again"):
+        judge(replace(explained, images=255 - explained.images))
+    with pytest.raises(InputError, match="one does not name a frame of trial"):
+        judge(replace(explained, frames=tuple(replace(frame, id="one") for frame in explained.frames)))
+    with pytest.raises(CheckpointError, match="made with another network"):
+        judge(replace(explained, weights_sha256="of others"))
+    with pytest.raises(InputError, match="no fill named 'pink'"):
+        judge_by_truth(trained, explained, data, tmp_path, maps=maps, fills=("pink",))
