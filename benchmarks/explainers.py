@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torchvision import models
 
-from sliplens.explain import EXPLAINERS, GradCam, IntegratedGradients
+from sliplens.explain import EXPLAINERS, GradCam, IntegratedGradients, Occlusion
 from sliplens.export.extras import missing_packages
 from sliplens.provenance import machine, versions
 
@@ -54,6 +54,12 @@ def build(*, size: int, batch: int, device: torch.device) -> tuple[nn.Module, Te
     return model.eval().to(device), torch.rand(batch, 3, size, size, generator=generator).to(device)
 
 
+def marker_grid(size: int) -> Tensor:
+    """Places of 9 x 9 markers: random images show none."""
+    lines = (torch.arange(9) + 0.5) * size / 9
+    return torch.cartesian_prod(lines, lines)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description="Time the explainers on an untrained ShuffleNetV2.")
@@ -69,9 +75,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     def timed(work: Callable[[], object], repeats: int = options.repeats) -> float:
         return median_seconds(work, repeats=repeats, device=options.device)
 
-    seconds = {}
+    seconds, explainers = {}, EXPLAINERS | {"occlusion-marker": Occlusion(markers_px=marker_grid(options.size))}
     for name in options.methods:
-        explain = EXPLAINERS[name]
+        explain = explainers[name]
         # thousands of passes average out on their own; one call after the warm-up is enough
         seconds[name] = timed(lambda e=explain: e(model, images), repeats=1 if name == "poly-cam" else options.repeats)
         print(f"{name:<22} {seconds[name] / options.batch:9.4f} s an image, {options.size} px, batch {options.batch}")

@@ -1,8 +1,9 @@
 """Poly-CAM against a plain loop of one masked image at a time, on trained networks and frames of their own kind.
 
-The exact map must be that of the loop; the fast one, with a budget, must be like it. All times are taken in this run,
-on the same frames. The plain loop is timed on every n-th channel of each layer, `--loop-passes` in all, and its time
-scaled up to all channels: a pass costs the same whatever its mask.
+The exact map must be that of the loop; the fast one, which starts with a budget and goes on until it expects to be like
+the exact one, must be like it. All times are taken in this run, on the same frames. The plain loop is timed on every
+n-th channel of each layer, `--loop-passes` in all, and its time scaled up: a pass costs the same whatever
+its mask.
 """
 
 import argparse
@@ -113,6 +114,7 @@ def measure(
                 "top10_overlap": top_overlap(whole.saliency[0], quick.saliency[0]),
                 "told_pearson_r": told.pearson_r,
                 "told_top10_overlap": told.top_overlap,
+                "measured_share": told.measured / told.channels,
             }
         )
         print(" ".join(f"{key} {value:.4g}" for key, value in rows[-1].items()), flush=True)

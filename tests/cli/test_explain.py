@@ -4,13 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import tyro
 from PIL import Image
 
 from sliplens.cli.explain import Explain
 from sliplens.errors import InputError, SliplensError
 from sliplens.explain import EXPLAINERS
-from sliplens.images import read_image
+from sliplens.explain.occlusion import marker_regions
+from sliplens.images import list_images, read_image
 from sliplens.provenance import read_json
 from sliplens.recordings import Dataset
 from sliplens.study import load_explained
@@ -86,6 +88,49 @@ def test_expected_gradients_take_the_frames_without_slip(
     assert "no background" not in capsys.readouterr().out
     run(difference_run, small_dataset.folder, "-o", tmp_path / "without", *common, 0)
     assert "no background was given" in capsys.readouterr().out.replace("\n", " ")
+
+
+MARKERS = torch.tensor([[8.0, 8.0], [24.0, 9.0], [15.0, 22.0]])
+
+
+def test_markers_are_occluded_where_each_frame_has_them(
+    difference_run: Path, small_dataset: Dataset, tmp_path: Path, monkeypatch
+):
+    asked = []
+
+    def places(recording, row, *, image_size):
+        asked.append(f"{recording.trial}-f{row:04d}")
+        return MARKERS + len(asked)  # elsewhere in every frame
+
+    monkeypatch.setattr("sliplens.explain.places.markers_in_recording", places)
+    run(difference_run, small_dataset.folder, "-o", tmp_path / "maps", "--method", "occlusion-marker")
+    explained = load_explained(tmp_path / "maps")
+    assert asked == [frame.id for frame in explained.frames]
+    for number, relevance in enumerate(explained.relevance["occlusion-marker"], start=1):
+        regions = marker_regions((32, 32), MARKERS + number).numpy()
+        # each marker has one value, and so has what lies between them
+        assert all(np.ptp(relevance[regions == region]) == 0 for region in range(4))
+        assert np.unique(relevance).size > 1
+
+
+def test_markers_are_found_in_camera_frames_only(
+    raw_run: Path, difference_run: Path, difference_folder: Path, tmp_path: Path, monkeypatch
+):
+    words = ("-o", tmp_path / "maps", "--method", "occlusion-marker")
+    refused(
+        "occlusion-marker finds the markers in camera frames", difference_run, "--frames", difference_folder, *words
+    )
+    assert not (tmp_path / "maps").exists()
+    seen = []
+
+    def places(frame, *, image_size):
+        seen.append(frame)
+        return MARKERS
+
+    monkeypatch.setattr("sliplens.explain.places.markers_in_frame", places)
+    paths = list_images(difference_folder)
+    run(raw_run, "--frames", difference_folder, "--reference", paths[0], *words)
+    assert all(np.array_equal(one, read_image(path)) for one, path in zip(seen, paths, strict=True))
 
 
 def test_the_table_of_methods(capsys):

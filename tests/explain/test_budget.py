@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from sliplens.explain import PolyCam
+from sliplens.errors import InputError
+from sliplens.explain import Likeness, PolyCam, passes
 from sliplens.explain.maps import pearson_r, top_overlap
 from sliplens.explain.sampling import Field
 
@@ -26,7 +27,7 @@ def effects(places):
 
 def test_the_estimate_is_that_of_the_dense_formula(places, effects):
     kernel = kernel_of(places)
-    field = Field(kernel, capacity=12)
+    field = Field(kernel)
     for _ in range(2):
         field.learn(effects[field.choose(6, importance=torch.ones(40, dtype=torch.float64))])
     chosen = torch.tensor(field.chosen)
@@ -47,7 +48,7 @@ def test_the_estimate_is_that_of_the_dense_formula(places, effects):
 def test_each_choice_is_where_the_most_is_at_stake(places):
     kernel = kernel_of(places)
     importance = torch.linspace(1, 2, 40, dtype=torch.float64)
-    field = Field(kernel, capacity=5)
+    field = Field(kernel)
     chosen = field.choose(5, importance=importance).tolist()
     for count in range(5):
         before = torch.tensor(chosen[:count], dtype=torch.long)
@@ -59,7 +60,7 @@ def test_each_choice_is_where_the_most_is_at_stake(places):
 
 
 def test_draws_scatter_as_the_field_says(places, effects):
-    field = Field(kernel_of(places), capacity=10)
+    field = Field(kernel_of(places))
     field.learn(effects[field.choose(10, importance=torch.ones(40, dtype=torch.float64))])
     estimate, deviation = field.estimate()
     draws = field.draws(4000, generator=torch.Generator().manual_seed(1))
@@ -86,7 +87,7 @@ def test_the_whole_budget_gives_the_exact_map(network, images):
 def test_the_error_that_is_told_is_not_smaller_than_the_error(network, images):
     model = network("small shufflenet")
     exact = PolyCam()(model, images)
-    rough = PolyCam(budget=0.4)(model, images)
+    rough = PolyCam(budget=0.4, likeness=None)(model, images)
     for index, told in enumerate(rough.approximations):
         assert told.measured == math.ceil(0.4 * told.channels)
         truth = exact.saliency[index], rough.saliency[index]
@@ -101,8 +102,59 @@ def test_passes_follow_the_budget(network, images):
     model = network("small shufflenet")
     seen = []
     model.register_forward_pre_hook(lambda _module, arguments: seen.append(len(arguments[0])))
-    (told,) = PolyCam(budget=0.25)(model, images[:1]).approximations
+    (told,) = PolyCam(budget=0.25, likeness=None)(model, images[:1]).approximations
     assert sum(seen) == 4 + 2 * told.measured  # the image, the reference, the search for layers, the activations
+
+
+def test_more_is_measured_where_the_map_is_not_expected_to_be_alike(network, images):
+    model, asked = network("small shufflenet"), Likeness(pearson_r=0.9, top_overlap=0.6)
+    exact = PolyCam()(model, images)
+    once = PolyCam(budget=0.4, likeness=None)(model, images)
+    further = PolyCam(budget=0.4, likeness=asked)(model, images)
+    more = []
+    for index, (first, last) in enumerate(zip(once.approximations, further.approximations, strict=True)):
+        # half of what may be missing: the draws do not know all that can go wrong
+        enough = [1 - one.pearson_r <= 0.05 and 1 - one.top_overlap <= 0.2 for one in (first, last)]
+        assert enough[1]
+        assert (last.measured > first.measured) == (not enough[0])
+        assert pearson_r(exact.saliency[index], further.saliency[index]) >= 0.9
+        assert top_overlap(exact.saliency[index], further.saliency[index]) >= 0.6
+        more.append(not enough[0])
+        if enough[0]:
+            torch.testing.assert_close(further.relevance[index], once.relevance[index])
+    assert set(more) == {True, False}  # both cases are here
+
+
+def test_all_channels_are_measured_where_nothing_less_is_asked(network, images):
+    model, seen = network("small shufflenet"), []
+    explain = PolyCam(budget=0.25, likeness=Likeness(pearson_r=1.0))
+    explanation = explain(model, images[:1], on_progress=lambda *step: seen.append(step))
+    (told,) = explanation.approximations
+    assert told.measured == told.channels
+    torch.testing.assert_close(explanation.relevance, PolyCam()(model, images[:1]).relevance)
+    done, totals = zip(*seen, strict=True)
+    assert list(done) == sorted(set(done))
+    assert set(totals) == {done[-1]} == {72}
+
+
+def test_all_rounds_use_one_engine(network, images, monkeypatch):
+    prepared = []
+
+    def prepare(*arguments, **options):
+        prepared.append(passes.prepare(*arguments, **options))
+        return prepared[-1]
+
+    monkeypatch.setattr("sliplens.explain.poly_cam.prepare", prepare)
+    explain = PolyCam(budget=0.25, likeness=Likeness(pearson_r=1.0), engine="folded")
+    assert explain(network("small shufflenet"), images[:2]).engine == "folded"
+    assert len(prepared) == 1
+
+
+@pytest.mark.parametrize("wrong", [{"pearson_r": 1.1}, {"top_overlap": -0.1}])
+def test_a_likeness_is_a_share(wrong):
+    ((name, value),) = wrong.items()
+    with pytest.raises(InputError, match=f"asks for a {name} of {value}; give a number from 0 to 1"):
+        Likeness(**wrong)
 
 
 def test_channels_without_an_answer_are_told(images):

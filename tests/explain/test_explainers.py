@@ -15,6 +15,7 @@ from sliplens.explain import (
     HiResCam,
     IntegratedGradients,
     LayerCam,
+    Occlusion,
     PolyCam,
     SmoothGrad,
 )
@@ -28,6 +29,8 @@ QUICK = EXPLAINERS | {
     "integrated-gradients": SHORT,
     "expected-gradients": ExpectedGradients(integrated=SHORT),
     "smooth-grad": SmoothGrad(samples=3),
+    # the images here show none
+    "occlusion-marker": Occlusion(markers_px=torch.tensor([[3.0, 3.0], [5.0, 60.0], [30.0, 31.0], [47.0, 12.0]])),
 }
 CAMS = ["grad-cam", "hires-cam", "layer-cam", "poly-cam"]
 # what adds up to f(x) - f(reference), for some networks at least
@@ -91,7 +94,7 @@ def test_model_is_given_back_as_it_was(name, network, images):
     ("name", "call"),
     [(name, call) for name in NAMES for call in (1, 2)]  # predicting, or looking for layers, or explaining
     + [(name, 3) for name in NAMES if name not in CAMS[:3]]
-    + [("poly-cam", 4), ("poly-cam", 5), ("occlusion", 4)],
+    + [("poly-cam", 4), ("poly-cam", 5), ("occlusion", 4), ("occlusion-marker", 4)],
 )
 def test_model_is_given_back_as_it_was_after_an_exception(name, call, network, images):
     model = in_use(network("small shufflenet"))
@@ -164,10 +167,15 @@ def test_map_moves_with_the_image(name, network):
         return images
 
     model = network("gap")
-    # noise does not move with the image
-    explain = SmoothGrad(samples=1, noise=0.0) if name == "smooth-grad" else QUICK[name]
-    one = explain(model, with_patch(24)).relevance[0, 16:56, 16:56]
-    other = explain(model, with_patch(40)).relevance[0, 32:72, 32:72]
+    # noise does not move with the image; markers do
+    places = torch.tensor([[30.0, 30.0], [40.0, 28.0], [33.0, 41.0]])
+    moving = {
+        "smooth-grad": lambda _: SmoothGrad(samples=1, noise=0.0),
+        "occlusion-marker": lambda at: Occlusion(markers_px=places + at - 24, radius_px=6.0),
+    }
+    explain = moving.get(name, lambda _: QUICK[name])
+    one = explain(24)(model, with_patch(24)).relevance[0, 16:56, 16:56]
+    other = explain(40)(model, with_patch(40)).relevance[0, 32:72, 32:72]
     correlation = torch.corrcoef(torch.stack([one.flatten(), other.flatten()]))[0, 1]
     assert float(correlation) >= 0.99
 

@@ -16,6 +16,7 @@ CHEAP = {
     "expected-gradients": ExpectedGradients(integrated=SHORT),
     "smooth-grad": SmoothGrad(samples=2),
     "occlusion": Occlusion(tile_px=32),
+    "occlusion-marker": Occlusion(markers_px=torch.tensor([[10.0, 12.0], [40.0, 20.0], [25.0, 50.0]])),
 }
 FIRST = {"shufflenet": "conv1", "resnet": "relu", "mobilenet": "features.0", "vgg": "features.1"}
 

@@ -60,7 +60,10 @@ def test_few_units_are_never_sure(rng):
 
 def test_curves_of_other_frames_are_not_compared(rng):
     one, other = (
-        DeletionCurve(frame_ids=(name,), pixels_removed=np.array([1, 2]), scores=np.ones((1, 2))) for name in "ab"
+        DeletionCurve(
+            frame_ids=(name,), pixels_removed=np.array([1, 2]), scores=np.ones((1, 2)), predictions=np.ones((1, 2))
+        )
+        for name in "ab"
     )
 
     assert compare_deletion(one, other, rng=rng) is None

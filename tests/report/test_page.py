@@ -47,7 +47,7 @@ def parse(text: str) -> Reader:
 @pytest.fixture(scope="module")
 def complete(pristine_workspace, tmp_path_factory):
     """A complete workspace and its page, for the tests that only read."""
-    return pristine_workspace, build_report(pristine_workspace, tmp_path_factory.mktemp("out") / "report.html")
+    return pristine_workspace, build_report(pristine_workspace, tmp_path_factory.mktemp("out") / "report.html").page
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def reader(text) -> Reader:
 @pytest.fixture
 def build(workspace, tmp_path):
     """The page of a workspace of one's own, as it is when called."""
-    return lambda: build_report(workspace, tmp_path / "report.html").read_text(encoding="utf-8")
+    return lambda: build_report(workspace, tmp_path / "report.html").page.read_text(encoding="utf-8")
 
 
 def keep(workspace, *names):
@@ -118,7 +118,7 @@ def test_warnings_and_alarms_are_shown(text):
 
 
 def test_same_results_make_the_same_page(text, complete, tmp_path):
-    assert build_report(complete[0], tmp_path / "again.html").read_text(encoding="utf-8") == text
+    assert build_report(complete[0], tmp_path / "again.html").page.read_text(encoding="utf-8") == text
 
 
 def test_missing_stages_are_named(build, workspace):

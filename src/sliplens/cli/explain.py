@@ -1,6 +1,6 @@
 """`sliplens explain`."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from sliplens.models import TrainedModel
     from sliplens.study import ChosenFrames, Explained
 
+_BY_MARKER = "occlusion-marker"
 _FULL_STICK = 0.9
 """Safety margin from which a labelled frame counts as one without slip."""
 
@@ -45,7 +46,8 @@ class Explain:
     list_methods: bool = False
     """Print the table of explainers and do nothing else."""
     budget: float = 1.0
-    """Share of the channels that poly-cam measures; below 1 it is faster, and tells what its maps may have lost."""
+    """Share of the channels that poly-cam measures at first; below 1 it is faster. It goes on where the map is not
+    expected to be like the exact one, and tells how far it is."""
     colours: Literal["inferno", "jet"] = "inferno"
     """Of the pictures: perceptually uniform, or as the thesis's figures have them."""
     split: str = "test"
@@ -105,17 +107,44 @@ class Explain:
                 say(f"  note, {name}: {warning}")
         wrote(self.output, f"{len(self.method)} maps of each of {len(chosen.ids)} frames, panel.png")
 
-    def _table(self, trained: "TrainedModel", chosen: "ChosenFrames") -> "Mapping[str, Explainer]":
+    def _table(self, trained: "TrainedModel", chosen: "ChosenFrames") -> "dict[str, Explainer | Sequence[Explainer]]":
         """The explainers with the options that were asked for."""
         from sliplens.explain import EXPLAINERS, ExpectedGradients, PolyCam
 
         free = [index for index, margin in enumerate(chosen.safety_margin) if margin >= _FULL_STICK]
         background = trained.encoding.normalise(chosen.images[free]) if free else None
-        return {
+        table: dict[str, Explainer | Sequence[Explainer]] = {
             **EXPLAINERS,
             "poly-cam": PolyCam(budget=self.budget),
             "expected-gradients": ExpectedGradients(background=background),
         }
+        if _BY_MARKER in self.method:
+            table[_BY_MARKER] = self._occlude_markers(trained, chosen)
+        return table
+
+    def _occlude_markers(self, trained: "TrainedModel", chosen: "ChosenFrames") -> "list[Explainer]":
+        """Occlusion by marker, frame by frame: where the simulator put them, else where they are found."""
+        from sliplens.explain import Occlusion
+        from sliplens.explain.places import markers_in_frame, markers_in_recording
+        from sliplens.images import list_images, read_image
+        from sliplens.recordings import Dataset
+
+        size = trained.manifest.image_size
+        if self.data is not None:
+            data = Dataset.open(self.data)
+            opened = {info.trial: data.load(info) for info in data.trials if info.trial in chosen.trial}
+            places = [
+                markers_in_recording(opened[trial], int(name.removeprefix(f"{trial}-f")), image_size=size)
+                for name, trial in zip(chosen.ids, chosen.trial, strict=True)
+            ]
+        elif self.frames is not None and self.reference is not None:
+            places = [markers_in_frame(read_image(path), image_size=size) for path in list_images(self.frames)]
+        else:
+            raise InputError(
+                f"{_BY_MARKER} finds the markers in camera frames, which difference images are not; give camera frames "
+                "and --reference, or a data set"
+            )
+        return [Occlusion(markers_px=one) for one in places]
 
     def _draw(self, explained: "Explained", trained: "TrainedModel", folder: Path) -> None:
         import numpy as np

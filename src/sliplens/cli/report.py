@@ -11,7 +11,10 @@ from sliplens.cli.console import wrote
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Draw one self-contained page from what the other commands wrote into a folder."""
+    """Draw one self-contained page from what the other commands wrote into a folder.
+
+    The figures of a study are written beside it too, in the folder figures: each as PDF, its numbers as CSV.
+    """
 
     workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="WORKSPACE")]
     """Folder that holds the results, one subfolder a command."""
@@ -22,5 +25,7 @@ class Report:
         """Draw and write the page."""
         from sliplens.report import build_report
 
-        page = build_report(self.workspace, self.output or self.workspace / "report.html")
-        wrote(page, "open it in a browser")
+        written = build_report(self.workspace, self.output or self.workspace / "report.html")
+        if written.figures:
+            wrote(written.figures[0].parent, f"{len(written.figures) // 2} figures as PDF, their numbers as CSV")
+        wrote(written.page, "open it in a browser")

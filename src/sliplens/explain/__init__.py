@@ -1,5 +1,6 @@
 """Why the network predicts this margin: explanations of f(x) - f(reference), signed and in margin units."""
 
+from sliplens.explain.budget import Likeness
 from sliplens.explain.cam import GradCam, HiResCam, LayerCam
 from sliplens.explain.expected import ExpectedGradients
 from sliplens.explain.explanation import Approximation, Explainer, Explanation, Level, Progress
@@ -8,6 +9,7 @@ from sliplens.explain.layers import Layer, find_layers
 from sliplens.explain.listening import capture
 from sliplens.explain.lrp import Lrp
 from sliplens.explain.occlusion import Occlusion
+from sliplens.explain.places import find_markers
 from sliplens.explain.poly_cam import PolyCam
 from sliplens.explain.smooth import SmoothGrad
 
@@ -20,6 +22,7 @@ EXPLAINERS: dict[str, Explainer] = {
     "expected-gradients": ExpectedGradients(),
     "smooth-grad": SmoothGrad(),
     "occlusion": Occlusion(),
+    "occlusion-marker": Occlusion(markers_px=find_markers),
     "lrp": Lrp(),
 }
 """The explainers by name, with their default options; use `dataclasses.replace` for others. `lrp` needs an extra."""
@@ -36,6 +39,7 @@ __all__ = [
     "Layer",
     "LayerCam",
     "Level",
+    "Likeness",
     "Lrp",
     "Occlusion",
     "PolyCam",
@@ -43,4 +47,5 @@ __all__ = [
     "SmoothGrad",
     "capture",
     "find_layers",
+    "find_markers",
 ]

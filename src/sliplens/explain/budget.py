@@ -1,15 +1,18 @@
 """Poly-CAM from the effects of some channels, chosen where they matter to the map, with the error that this leaves."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from sliplens.errors import InputError
 from sliplens.explain.explanation import Approximation
-from sliplens.explain.levels import combine, layer_map
+from sliplens.explain.health import ALIKE_R, ALIKE_TOP
+from sliplens.explain.levels import layer_map
 from sliplens.explain.maps import FLOOR, pearson_r, top_overlap
 from sliplens.explain.sampling import Field
 from sliplens.explain.scores import supporting_share
@@ -17,6 +20,24 @@ from sliplens.explain.scores import supporting_share
 _FIRST = 0.3  # share of the budget spent before anything is known of the effects
 _ROUNDS = 6
 _DRAWS = 16
+_GROWTH = 1.25  # channels measured after a further round, over those before it
+_SURE = 2  # allowed over expected shortfall; the true one was found to be up to 1.7 times the expected
+_NEARLY_ALL = 0.75  # where so many would be measured, the rest costs little and leaves nothing to estimate
+
+
+@dataclass(frozen=True, kw_only=True)
+class Likeness:
+    """What a map from some of the channels should have in common with the exact one."""
+
+    pearson_r: float = ALIKE_R
+    """Correlation over the pixels."""
+    top_overlap: float = ALIKE_TOP
+    """Share of the strongest tenth of the pixels that is the exact map's too."""
+
+    def __post_init__(self) -> None:
+        for name in ("pearson_r", "top_overlap"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"the likeness asks for a {name} of {getattr(self, name)}; give a number from 0 to 1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,9 +56,10 @@ def estimate_effects(
     *,
     active: Int[Tensor, " some"],
     budget: float,
+    likeness: Likeness | None,
     change: Float[Tensor, ""],
     measure: Callable[[Int[Tensor, " part"]], Float[Tensor, " part"]],
-    size: tuple[int, int],
+    to_map: Callable[[list[Tensor]], Float[Tensor, "height width"]],
     seed: int,
 ) -> Estimated:
     """Measure the effects of some channels and estimate the others from them.
@@ -52,6 +74,9 @@ def estimate_effects(
     more such draw as far as anyone knows, is expected to have in common with it. The process's variance is fitted to
     the measured effects, so a network whose effects the masks foretell badly gives a larger expected error.
 
+    Rounds go on after the budget is spent until what the map is expected to miss is half of what it may. The draws know
+    what the measured effects leave open under this kernel, not how wrong the kernel is: hence the half.
+
     Parameters
     ----------
     activations
@@ -61,68 +86,109 @@ def estimate_effects(
     active
         Channels whose effect is not known to be zero, all layers in a row.
     budget
-        Share of them to measure, in (0, 1).
+        Share of them to measure at first, in (0, 1).
+    likeness
+        What the map should have in common with the exact one, for which more channels are measured, all if need be;
+        None for those of the budget only.
     change
         f(x) - f(b).
     measure
         Effects of channels, in rising order.
-    size
-        Height and width of the image in pixels.
+    to_map
+        The map that weights of each layer give.
     seed
         Of the draws.
     """
-    sizes = [len(one) for one in activations]
+    search = _Search(activations, kernel, active=active, change=change, measure=measure, to_map=to_map, seed=seed)
     count = min(len(active), max(1, math.ceil(budget * len(active))))
-    field = Field(kernel, capacity=count)
-    norms = [one.flatten(1).norm(dim=1) for one in activations]
-    importance = torch.cat([norm / norm.norm().clamp_min(FLOOR) for norm in norms])[active]
     first = math.ceil(_FIRST * count)
     rounds = min(_ROUNDS, max(1, count - first))
-    stops = [first + (count - first) * step // rounds for step in range(1, rounds + 1)]
+    search.explore(first)
+    for step in range(1, rounds + 1):
+        search.explore(first + (count - first) * step // rounds)
+    while True:
+        found = search.judge()
+        if likeness is None or count == len(active) or _reached(found, likeness):
+            return Estimated(effects=search.effects(), approximation=found)
+        wanted = math.ceil(_GROWTH * count)
+        count = len(active) if wanted > _NEARLY_ALL * len(active) else wanted
+        search.explore(count)
 
-    def everywhere(effects: Tensor) -> list[Tensor]:
-        spread = effects.new_zeros(sum(sizes))
-        spread[active] = effects
-        return list(supporting_share(spread, change=change.to(spread)).to(change.dtype).split(sizes))
 
-    def explore(until: int, importance: Tensor) -> tuple[Tensor, Tensor]:
-        if until > len(field.chosen):
-            chosen = field.choose(until - len(field.chosen), importance=importance.to(kernel))
-            order = chosen.argsort()
-            effects = kernel.new_empty(len(chosen))
-            effects[order] = measure(active[chosen[order]]).to(kernel)
-            field.learn(effects)
-        return field.estimate()
-
-    estimate, deviation = explore(first, importance)
-    for stop in stops:
-        strength = torch.cat(
-            [
-                norm / layer_map(one, weights).norm().clamp_min(FLOOR)
-                for norm, one, weights in zip(norms, activations, everywhere(estimate), strict=True)
-            ]
-        )[active]
-        odds = estimate * change.sign() / deviation.clamp_min(FLOOR)
-        importance = strength.clamp_max(1 / FLOOR) * torch.special.ndtr(odds)
-        estimate, deviation = explore(stop, importance)
-    result = combine(activations, everywhere(estimate), size=size)[0]
-    drawn = [
-        combine(activations, everywhere(effects), size=size)[0]
-        for effects in field.draws(_DRAWS, generator=torch.Generator().manual_seed(seed))
-    ]
-    everything = estimate.new_zeros(sum(sizes))
-    everything[active] = estimate
-    return Estimated(
-        effects=everything.to(change.dtype),
-        approximation=Approximation(
-            measured=count,
-            channels=len(active),
-            pearson_r=_mean(pearson_r(result, one) for one in drawn),
-            top_overlap=_mean(top_overlap(result, one) for one in drawn),
-        ),
+def _reached(found: Approximation, likeness: Likeness) -> bool:
+    # not "short > allowed": of a map that holds NaN nothing is expected
+    return all(
+        _SURE * (1 - getattr(found, name)) <= 1 - getattr(likeness, name) for name in ("pearson_r", "top_overlap")
     )
 
 
-def _mean(values: Iterable[float]) -> float:
-    found = list(values)
-    return sum(found) / len(found)
+class _Search:
+    """The channels measured so far, and what they say of all."""
+
+    def __init__(
+        self,
+        activations: Sequence[Tensor],
+        kernel: Tensor,
+        *,
+        active: Tensor,
+        change: Tensor,
+        measure: Callable[[Tensor], Tensor],
+        to_map: Callable[[list[Tensor]], Tensor],
+        seed: int,
+    ) -> None:
+        self._activations, self._active, self._change = activations, active, change
+        self._measure, self._to_map, self._seed = measure, to_map, seed
+        self._field = Field(kernel)
+        self._norms = [one.flatten(1).norm(dim=1) for one in activations]
+        self._dtype = kernel.dtype
+
+    def explore(self, until: int) -> None:
+        """Measure channels until there are so many."""
+        count = until - len(self._field.chosen)
+        if count < 1:
+            return
+        chosen = self._field.choose(count, importance=self._importance().to(self._dtype))
+        order = chosen.argsort()
+        effects = torch.empty(len(chosen), dtype=self._dtype, device=chosen.device)
+        effects[order] = self._measure(self._active[chosen[order]]).to(effects)
+        self._field.learn(effects)
+
+    def effects(self) -> Tensor:
+        """Of every channel in margin units."""
+        return self._spread(self._field.estimate()[0]).to(self._change.dtype)
+
+    def judge(self) -> Approximation:
+        """What the map is expected to have in common with the exact one."""
+        estimate, _ = self._field.estimate()
+        result = self._to_map(self._weights(estimate))
+        generator = torch.Generator().manual_seed(self._seed)
+        drawn = [self._to_map(self._weights(effects)) for effects in self._field.draws(_DRAWS, generator=generator)]
+        return Approximation(
+            measured=len(self._field.chosen),
+            channels=len(self._active),
+            pearson_r=fmean(pearson_r(result, one) for one in drawn),
+            top_overlap=fmean(top_overlap(result, one) for one in drawn),
+        )
+
+    def _importance(self) -> Tensor:
+        """What an error of each effect costs the map."""
+        if not self._field.chosen:
+            return torch.cat([norm / norm.norm().clamp_min(FLOOR) for norm in self._norms])[self._active]
+        estimate, deviation = self._field.estimate()
+        strength = torch.cat(
+            [
+                norm / layer_map(one, weights).norm().clamp_min(FLOOR)
+                for norm, one, weights in zip(self._norms, self._activations, self._weights(estimate), strict=True)
+            ]
+        )[self._active]
+        odds = estimate * self._change.sign() / deviation.clamp_min(FLOOR)
+        return strength.clamp_max(1 / FLOOR) * torch.special.ndtr(odds)
+
+    def _weights(self, effects: Tensor) -> list[Tensor]:
+        shares = supporting_share(self._spread(effects), change=self._change.to(effects))
+        return list(shares.to(self._change.dtype).split([len(one) for one in self._activations]))
+
+    def _spread(self, effects: Tensor) -> Tensor:
+        every = effects.new_zeros(sum(map(len, self._activations)))
+        every[self._active] = effects
+        return every

@@ -5,21 +5,21 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from jaxtyping import Shaped
-from torch import Tensor, nn
+from torch import Tensor
 
-from sliplens.errors import InputError, ModelError
+from sliplens.errors import ModelError
 from sliplens.explain.cells import grad_cam_map, hires_cam_map, layer_cam_map
-from sliplens.explain.clock import Clock
-from sliplens.explain.explanation import Explanation, Progress
+from sliplens.explain.explanation import Progress
+from sliplens.explain.health import check_slopes
 from sliplens.explain.layers import Layer, recall_layers
 from sliplens.explain.listening import capture
 from sliplens.explain.maps import spread
-from sliplens.explain.subject import Held, holding
+from sliplens.explain.method import Found, Method, require_at_least_one
+from sliplens.explain.subject import Held
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Cam:
+class _Cam(Method):
     """One layer's cells, weighted by the gradient at the image.
 
     The published maps weigh the activations A(x). They add up to f(x) less what the layers behind it add on their own:
@@ -37,53 +37,43 @@ class _Cam:
     """Whether the contrast adds up to f(x) - f(b) for a head linear in the mean over space."""
 
     def __post_init__(self) -> None:
-        if self.batch_size < 1:
-            raise InputError(f"{type(self).__name__}'s batch_size is {self.batch_size}; give at least 1")
+        require_at_least_one(type(self).__name__, batch_size=self.batch_size)
 
     @abstractmethod
     def _cells(self, activations: Tensor, gradients: Tensor, *, change: Tensor) -> Tensor:
         """Relevance of the layer's cells in margin units."""
 
-    def __call__(
-        self,
-        model: nn.Module,
-        images: Shaped[Tensor, "*batch channels height width"],
-        *,
-        reference: Shaped[Tensor, "..."] | None = None,
-        on_progress: Progress | None = None,
-    ) -> Explanation:
-        """Explain a batch; see `Explainer` for the arguments and errors. Progress counts images."""
-        clock = Clock()
-        with holding(model, images, reference=reference) as held:
-            layer = self._find_layer(held)
-            parts, predictions, empty_predictions = [], [], []
-            empty = empty_prediction = None
-            for part in torch.arange(len(held.images)).split(self.batch_size):
-                # images and references in one pass; one reference for all is looked at once
-                shared = held.references[: 0 if parts else 1]
-                references = held.references[part] if len(held.references) > 1 else shared
-                seen = _differentiate(held, torch.cat([held.images[part], references]), count=len(part), layer=layer)
-                activations, prediction = seen.activations[: len(part)], seen.predictions[: len(part)]
-                if len(references):
-                    empty, empty_prediction = seen.activations[len(part) :], seen.predictions[len(part) :]
-                assert empty is not None  # the first pass has references
-                assert empty_prediction is not None
-                change = (prediction - empty_prediction)[:, None, None, None]
-                contrast = activations - empty if self.contrast else activations
-                cells = self._cells(contrast, seen.gradients, change=change)
-                parts.append(spread(cells, (images.shape[-2], images.shape[-1])))
-                predictions.append(prediction)
-                empty_predictions.append(empty_prediction.expand_as(prediction))
-                if on_progress is not None:
-                    on_progress(sum(map(len, parts)), len(held.images))
-            subject = held.predicted(torch.cat(predictions), torch.cat(empty_predictions))
-            relevance = torch.cat(parts)
-        return subject.explanation(
-            relevance,
+    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
+        layer = self._find_layer(held)
+        parts, predictions, empty_predictions = [], [], []
+        empty = empty_prediction = None
+        for part in torch.arange(len(held.images)).split(self.batch_size):
+            # images and references in one pass; one reference for all is looked at once
+            shared = held.references[: 0 if parts else 1]
+            references = held.references[part] if len(held.references) > 1 else shared
+            seen = _differentiate(held, torch.cat([held.images[part], references]), count=len(part), layer=layer)
+            activations, prediction = seen.activations[: len(part)], seen.predictions[: len(part)]
+            if len(references):
+                empty, empty_prediction = seen.activations[len(part) :], seen.predictions[len(part) :]
+            assert empty is not None  # the first pass has references
+            assert empty_prediction is not None
+            change = (prediction - empty_prediction)[:, None, None, None]
+            contrast = activations - empty if self.contrast else activations
+            cells = self._cells(contrast, seen.gradients, change=change)
+            parts.append(spread(cells, (held.images.shape[-2], held.images.shape[-1])))
+            predictions.append(prediction)
+            empty_predictions.append(empty_prediction.expand_as(prediction))
+            if on_progress is not None:
+                on_progress(sum(map(len, parts)), len(held.images))
+        subject = held.predicted(torch.cat(predictions), torch.cat(empty_predictions))
+        relevance = torch.cat(parts)
+        return Found(
+            subject=subject,
+            relevance=relevance,
             method=self.method,
-            clock=clock,
             complete=self.contrast and self.complete,
             target=f"{'f(x) - f(reference)' if self.contrast else 'f(x)'}, through layer {layer.name}",
+            findings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=subject.change.tolist()),
         )
 
     def _find_layer(self, held: Held) -> Layer:

@@ -3,18 +3,18 @@
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float, Shaped
-from torch import Tensor, nn
+from jaxtyping import Float
+from torch import Tensor
 
-from sliplens.explain.clock import Clock
-from sliplens.explain.explanation import Explanation, Progress
+from sliplens.explain.explanation import Progress
 from sliplens.explain.inputs import require_images
 from sliplens.explain.integrated import IntegratedGradients
-from sliplens.explain.subject import explaining, holding
+from sliplens.explain.method import Found, Method
+from sliplens.explain.subject import Held, holding
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExpectedGradients:
+class ExpectedGradients(Method):
     """Expected Gradients: the mean of Integrated Gradients over a background of references.
 
     "Why this margin rather than that of frames without slip?": no single frame has to stand for no slip. The relevance
@@ -39,44 +39,28 @@ class ExpectedGradients:
     background: Float[Tensor, "frames 3 height width"] | None = None
     integrated: IntegratedGradients = field(default_factory=IntegratedGradients)
 
-    def __call__(
-        self,
-        model: nn.Module,
-        images: Shaped[Tensor, "*batch channels height width"],
-        *,
-        reference: Shaped[Tensor, "..."] | None = None,
-        on_progress: Progress | None = None,
-    ) -> Explanation:
-        """Explain a batch; see `Explainer` for the arguments and errors. Progress counts images.
+    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
+        alone = held.predict_all()
+        if self.background is None:
+            frames, heights = alone.reference[:, None], alone.reference_prediction[:, None]
+        else:
+            # checked as images are, and brought to the network's type
+            with holding(held.model, require_images(self.background), reference=None) as behind:
+                heights = behind.predict_all().prediction.expand(len(alone.images), -1)
+                frames = behind.images.expand(len(alone.images), -1, -1, -1, -1)
+        subject = alone.predicted(alone.prediction, heights.mean(dim=1))
 
-        Raises
-        ------
-        ImageError
-            Also if the background cannot be used.
-        """
-        clock = Clock()
-        with explaining(model, images, reference=reference) as alone:
-            if self.background is None:
-                frames, heights = alone.reference[:, None], alone.reference_prediction[:, None]
-            else:
-                # checked as images are, and brought to the network's type
-                with holding(model, require_images(self.background), reference=None) as held:
-                    heights = held.predict_all().prediction.expand(len(alone.images), -1)
-                    frames = held.images.expand(len(alone.images), -1, -1, -1, -1)
-            subject = alone.predicted(alone.prediction, heights.mean(dim=1))
+        def mean_over(index: int) -> Tensor:
+            image, end = subject.images[index], subject.prediction[index]
+            pairs = zip(frames[index], heights[index], strict=True)
+            lines = [self.integrated.integrate(subject, image, frame, ends=(start, end)) for frame, start in pairs]
+            return torch.stack([line.relevance for line in lines]).mean(dim=0)
 
-            def mean_over(index: int) -> Tensor:
-                image, end = subject.images[index], subject.prediction[index]
-                pairs = zip(frames[index], heights[index], strict=True)
-                lines = [self.integrated.integrate(subject, image, frame, ends=(start, end)) for frame, start in pairs]
-                return torch.stack(lines).mean(dim=0)
-
-            relevance = subject.each_image(mean_over, on_progress=on_progress)
         only = ("no background was given, so the reference alone stands for it, as in integrated gradients",)
-        return subject.explanation(
-            relevance,
+        return Found(
+            subject=subject,
+            relevance=subject.each_image(mean_over, on_progress=on_progress),
             method="expected-gradients",
-            clock=clock,
             complete=True,
             target="f(x) - f(reference)" if self.background is None else "f(x) - mean of f over the background",
             findings=only if self.background is None else (),

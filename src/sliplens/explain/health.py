@@ -12,6 +12,7 @@ CLOSE = 0.02  # margin units; a difference below the regressor's own error expla
 GAP = 0.01  # share of |f(x) - f(reference)| that may stay unexplained
 LOWEST, HIGHEST = -0.1, 1.1  # margins that a regressor tells of data like its own, with its error
 ALIKE_R, ALIKE_TOP = 0.99, 0.9  # what an approximate map should have in common with the exact one
+FLAT = 0.1  # share of |f(x) - f(reference)| that gradients at the image must make up, all of one sign
 
 
 def check_maps(
@@ -100,4 +101,28 @@ def check_approximations(approximations: Sequence[Approximation]) -> Iterator[st
                 f"image {index}: with {one.measured} of {one.channels} channels measured the map is expected to "
                 f"correlate with the exact one at {one.pearson_r:.3f} and to share {one.top_overlap:.0%} of its "
                 "strongest pixels; raise the budget"
+            )
+
+
+def check_slopes(sizes: Sequence[float], *, change: Sequence[float]) -> Iterator[str]:
+    """Say where the gradients at an image are next to nothing, though there is something to explain.
+
+    Gradient times contrast is as large as what it explains where the network is linear: the sum of its sizes is then at
+    least |f(x) - f(reference)|. Where that sum is below a tenth of it, the gradients would not explain more than a
+    tenth even if all of them pulled one way: the network is saturated at the image, and its slope there has little to
+    do with how the prediction came about.
+
+    Parameters
+    ----------
+    sizes
+        Sum of |gradient x contrast| of each image in margin units.
+    change
+        f(x) - f(reference) of each image in margin units.
+    """
+    for index, (size, difference) in enumerate(zip(sizes, change, strict=True)):
+        if abs(difference) >= CLOSE and size < FLAT * abs(difference):
+            yield (
+                f"image {index}: the gradients at the image make up {size / abs(difference):.2g} of "
+                f"f(x) - f(reference) = {difference:.2g}, less than {FLAT:g}: the network is saturated there, so "
+                "compare with poly-cam or occlusion, which need no gradient"
             )

@@ -4,20 +4,31 @@ from dataclasses import dataclass
 
 import torch
 from captum import attr
-from jaxtyping import Float, Shaped
-from torch import Tensor, nn
+from jaxtyping import Float
+from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.explain.clock import Clock
-from sliplens.explain.explanation import Explanation, Progress
-from sliplens.explain.subject import Subject, explaining
+from sliplens.explain.explanation import Progress
+from sliplens.explain.health import check_slopes
+from sliplens.explain.method import Found, Method
+from sliplens.explain.subject import Held, Subject
 
 _NODES = 4  # of a piece; the slope along the path has kinks, on which more nodes to a piece are wasted
 _ROUNDING = 1e-6  # of |f|: a gap that float32 predictions cannot resolve is no gap
 
 
 @dataclass(frozen=True, kw_only=True)
-class IntegratedGradients:
+class Line:
+    """What the gradients from a reference to an image add up to."""
+
+    relevance: Float[Tensor, "height width"]
+    """In margin units."""
+    slope: float
+    """Of the last piece, next to the image: what its relevance would be, sign left out, if it were the whole line."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class IntegratedGradients(Method):
     """Integrated Gradients along the straight line from the reference, with as many steps as completeness needs.
 
     Relevance is (x - b) times the integral over t in [0, 1] of df/dx at b + t (x - b), summed over the channels; it
@@ -64,25 +75,25 @@ class IntegratedGradients:
         if not self.tolerance > 0:
             raise InputError(f"integrated gradients' tolerance is {self.tolerance}; give a share above 0")
 
-    def __call__(
-        self,
-        model: nn.Module,
-        images: Shaped[Tensor, "*batch channels height width"],
-        *,
-        reference: Shaped[Tensor, "..."] | None = None,
-        on_progress: Progress | None = None,
-    ) -> Explanation:
-        """Explain a batch; see `Explainer` for the arguments and errors. Progress counts images."""
-        clock = Clock()
-        with explaining(model, images, reference=reference) as subject:
-            ends = torch.stack([subject.reference_prediction, subject.prediction], dim=1)
-            relevance = subject.each_image(
-                lambda index: self.integrate(
-                    subject, subject.images[index], subject.reference[index], ends=(ends[index, 0], ends[index, 1])
-                ),
-                on_progress=on_progress,
+    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
+        subject = held.predict_all()
+        ends = torch.stack([subject.reference_prediction, subject.prediction], dim=1)
+        slopes = []
+
+        def integral(index: int) -> Tensor:
+            line = self.integrate(
+                subject, subject.images[index], subject.reference[index], ends=(ends[index, 0], ends[index, 1])
             )
-        return subject.explanation(relevance, method="integrated-gradients", clock=clock, complete=True)
+            slopes.append(line.slope)
+            return line.relevance
+
+        return Found(
+            subject=subject,
+            relevance=subject.each_image(integral, on_progress=on_progress),
+            method="integrated-gradients",
+            complete=True,
+            findings=check_slopes(slopes, change=subject.change.tolist()),
+        )
 
     def integrate(
         self,
@@ -91,7 +102,7 @@ class IntegratedGradients:
         reference: Float[Tensor, "3 height width"],
         *,
         ends: tuple[Float[Tensor, ""], Float[Tensor, ""]],
-    ) -> Float[Tensor, "height width"]:
+    ) -> "Line":
         """Relevance of one image against one reference.
 
         Parameters
@@ -116,7 +127,9 @@ class IntegratedGradients:
             gaps = parts.sum(dim=(1, 2)).double() - rises
             rooms = (self.max_steps - used) // (2 * nodes)
             if abs(float(gaps.sum())) <= allowed or rooms == 0:
-                return parts.sum(dim=0)
+                last = int(stops.argmax())
+                slope = parts[last].abs().sum() / (stops[last] - starts[last])
+                return Line(relevance=parts.sum(dim=0), slope=float(slope))
             shares, order = gaps.abs().sort(descending=True)
             # the fewest pieces that hold half of all gaps
             count = min(int((shares.cumsum(0) < shares.sum() / 2).sum()) + 1, rooms)

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Shaped
 from torch import Tensor, fx, nn
 
-from sliplens.explain.clock import Clock
-from sliplens.explain.explanation import Explanation, Progress
-from sliplens.explain.subject import explaining
+from sliplens.explain.explanation import Progress
+from sliplens.explain.method import Found, Method
+from sliplens.explain.subject import Held
 from sliplens.export.extras import require_packages
 from sliplens.export.folding import fold_batch_norm
 from sliplens.models.heads import HistogramRegressor
@@ -19,7 +18,7 @@ _KEPT = 0.1  # share of f(x) by which the relevance may miss it without a warnin
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lrp:
+class Lrp(Method):
     """Layer-wise relevance propagation: alpha-1-beta-0 in convolutions, epsilon in linear layers, flat in the first.
 
     The prediction is handed back from layer to layer, each giving its inputs their share of its output. A histogram
@@ -44,40 +43,25 @@ class Lrp:
 
     batch_size: int = 32
 
-    def __call__(
-        self,
-        model: nn.Module,
-        images: Shaped[Tensor, "*batch channels height width"],
-        *,
-        reference: Shaped[Tensor, "..."] | None = None,
-        on_progress: Progress | None = None,
-    ) -> Explanation:
-        """Explain a batch; see `Explainer` for the arguments and errors. Progress counts images.
-
-        Raises
-        ------
-        InputError
-            Also if zennit is not installed.
-        """
+    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
         require_packages("zennit", extra="lrp", purpose="LRP")
-        clock = Clock()
-        with explaining(model, images, reference=reference) as subject:
-            copy = fold_batch_norm(subject.model)
-            for module in copy.modules():
-                if isinstance(module, fx.GraphModule):
-                    _name_functions(module)
-            parts, done = [], 0
-            for part in subject.images.split(self.batch_size):
-                parts.append(_propagate(copy, part))
-                done += len(part)
-                if on_progress is not None:
-                    on_progress(done, len(subject.images))
-            relevance = torch.cat(parts)
-            shares = (relevance.sum(dim=(1, 2)) / subject.prediction).tolist()
-        return subject.explanation(
-            relevance,
+        subject = held.predict_all()
+        copy = fold_batch_norm(subject.model)
+        for module in copy.modules():
+            if isinstance(module, fx.GraphModule):
+                _name_functions(module)
+        parts, done = [], 0
+        for part in subject.images.split(self.batch_size):
+            parts.append(_propagate(copy, part))
+            done += len(part)
+            if on_progress is not None:
+                on_progress(done, len(subject.images))
+        relevance = torch.cat(parts)
+        shares = (relevance.sum(dim=(1, 2)) / subject.prediction).tolist()
+        return Found(
+            subject=subject,
+            relevance=relevance,
             method="lrp",
-            clock=clock,
             complete=False,
             target="f(x)",
             findings=[

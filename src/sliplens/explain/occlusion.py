@@ -1,16 +1,22 @@
 """Occlusion: what the prediction loses when a part of the image is replaced by the reference."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import torch
 from captum import attr
-from jaxtyping import Float, Int, Shaped
-from torch import Tensor, nn
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.explain.clock import Clock
-from sliplens.explain.explanation import Explanation, Progress
-from sliplens.explain.subject import explaining
+from sliplens.explain.explanation import Progress
+from sliplens.explain.method import Found, Method, require_at_least_one
+from sliplens.explain.subject import Held
+
+Places: TypeAlias = Float[Tensor, "markers 2"]
+FindPlaces: TypeAlias = Callable[[Float[Tensor, "3 height width"], Float[Tensor, "3 height width"]], Places]
+"""From an image and its reference, in [0, 1], to x and y of its markers in pixels."""
 
 
 def tile_regions(size: tuple[int, int], *, tile_px: int) -> Int[Tensor, "height width"]:
@@ -45,7 +51,7 @@ def marker_regions(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Occlusion:
+class Occlusion(Method):
     """Occlusion by tile, or by marker where the markers' places are given, signed, in margin units.
 
     The relevance of a region is f(x) - f(x with the region as in the reference), spread evenly over its pixels. Nothing
@@ -58,8 +64,8 @@ class Occlusion:
     tile_px
         Side of a tile in pixels.
     markers_px
-        x and y of the markers in the image that the network sees, (markers, 2); they are then the regions, and what
-        lies between them is one more.
+        x and y of the markers in the image that the network sees, (markers, 2), or what finds them in each image, such
+        as `find_markers`; they are then the regions, and what lies between them is one more.
     radius_px
         How far a marker reaches; see `marker_regions`.
     batch_size
@@ -71,58 +77,56 @@ class Occlusion:
     """
 
     tile_px: int = 16
-    markers_px: Float[Tensor, "markers 2"] | None = None
+    markers_px: Places | FindPlaces | None = None
     radius_px: float | None = None
     batch_size: int = 32
 
     def __post_init__(self) -> None:
+        require_at_least_one("occlusion", batch_size=self.batch_size)
         if self.tile_px < 1:
             raise InputError(f"occlusion's tile_px is {self.tile_px}; give at least 1 pixel")
-        if self.batch_size < 1:
-            raise InputError(f"occlusion's batch_size is {self.batch_size}; give at least 1")
-        if self.markers_px is not None and self.radius_px is None and len(self.markers_px) < 2:
-            raise InputError(
-                f"occlusion has {len(self.markers_px)} marker(s) and no radius_px; a single one's reach must be given"
-            )
+        if isinstance(self.markers_px, Tensor):
+            self._require_reach(self.markers_px)
         if self.radius_px is not None and not self.radius_px > 0:
             raise InputError(f"occlusion's radius_px is {self.radius_px}; give a radius above 0 pixels")
 
-    def __call__(
-        self,
-        model: nn.Module,
-        images: Shaped[Tensor, "*batch channels height width"],
-        *,
-        reference: Shaped[Tensor, "..."] | None = None,
-        on_progress: Progress | None = None,
-    ) -> Explanation:
-        """Explain a batch; see `Explainer` for the arguments and errors. Progress counts images."""
-        clock = Clock()
-        with explaining(model, images, reference=reference) as subject, torch.no_grad():
-            regions = self._regions((images.shape[-2], images.shape[-1])).to(subject.images.device)
-            areas = regions.flatten().bincount()[regions]
-            captum = attr.FeatureAblation(subject.predict)
+    @torch.no_grad()
+    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
+        subject = held.predict_all()
+        captum = attr.FeatureAblation(subject.predict)
 
-            def lost(index: int) -> Tensor:
-                effects = captum.attribute(
-                    subject.images[index, None],
-                    baselines=subject.reference[index, None],
-                    feature_mask=regions[None, None],
-                    perturbations_per_eval=self.batch_size,
-                )
-                # Captum gives every pixel and channel the whole effect of its region
-                return effects[0, 0] / areas
+        def lost(index: int) -> Tensor:
+            image, empty = subject.images[index], subject.reference[index]
+            regions = self._regions(image, empty).to(image.device)
+            effects = captum.attribute(
+                image[None],
+                baselines=empty[None],
+                feature_mask=regions[None, None],
+                perturbations_per_eval=self.batch_size,
+            )
+            # Captum gives every pixel and channel the whole effect of its region
+            return effects[0, 0] / regions.flatten().bincount()[regions]
 
-            relevance = subject.each_image(lost, on_progress=on_progress)
-        unit = f"tiles of {self.tile_px} px" if self.markers_px is None else "markers"
-        return subject.explanation(
-            relevance,
-            method="occlusion",
-            clock=clock,
+        by_tile = self.markers_px is None
+        return Found(
+            subject=subject,
+            relevance=subject.each_image(lost, on_progress=on_progress),
+            method="occlusion" if by_tile else "occlusion-marker",
             complete=False,
-            target=f"f(x) - f(x with one region as in the reference), {unit}",
+            target="f(x) - f(x with one region as in the reference), "
+            + (f"tiles of {self.tile_px} px" if by_tile else "markers"),
         )
 
-    def _regions(self, size: tuple[int, int]) -> Tensor:
+    def _regions(self, image: Tensor, empty: Tensor) -> Tensor:
+        size = image.shape[-2], image.shape[-1]
         if self.markers_px is None:
             return tile_regions(size, tile_px=self.tile_px)
-        return marker_regions(size, self.markers_px, radius_px=self.radius_px)
+        places = self.markers_px if isinstance(self.markers_px, Tensor) else self.markers_px(image, empty)
+        self._require_reach(places)
+        return marker_regions(size, places, radius_px=self.radius_px)
+
+    def _require_reach(self, places: Places) -> None:
+        if not len(places) or (self.radius_px is None and len(places) < 2):
+            raise InputError(
+                f"occlusion has {len(places)} marker(s) and no radius_px; a single one's reach must be given"
+            )

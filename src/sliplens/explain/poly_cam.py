@@ -3,26 +3,26 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int, Shaped
-from torch import Tensor, nn
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.explain.budget import estimate_effects
-from sliplens.explain.clock import Clock
+from sliplens.explain.budget import Likeness, estimate_effects
 from sliplens.explain.effects import Regions, as_predictions, measure
-from sliplens.explain.explanation import Approximation, Explanation, Level, Progress
+from sliplens.explain.explanation import Approximation, Level, Progress
 from sliplens.explain.health import check_approximations, check_weights
 from sliplens.explain.layers import Layer, find_layers
 from sliplens.explain.levels import combine, scale_to
 from sliplens.explain.listening import capture
+from sliplens.explain.method import Found, Method
 from sliplens.explain.passes import Passes, prepare
 from sliplens.explain.sampling import mask_kernel
 from sliplens.explain.scores import SCORES, VARIANTS, channel_effects, supporting_share
-from sliplens.explain.subject import Subject, explaining
+from sliplens.explain.subject import Held, Subject
 
 
 @dataclass(frozen=True, kw_only=True)
-class PolyCam:
+class PolyCam(Method):
     """Poly-CAM with the regression score.
 
     A channel's mask M (its activation between its extreme percentiles, resized to the image) blends the image x with
@@ -54,8 +54,12 @@ class PolyCam:
         Which level's map is the relevance, counted from the finest, 0. The thesis displayed the finest of its ten, and
         scored the fifth from the coarsest, `level=5`.
     budget
-        Share of the channels to measure, in (0, 1]; 1 for the exact map. Below 1 the other channels' effects are
-        estimated, and `Explanation.approximations` says what the map is expected to have in common with the exact one.
+        Share of the channels to measure at first, in (0, 1]; 1 for the exact map. Below 1 the other channels' effects
+        are estimated, and `Explanation.approximations` says how many were measured and what the map is expected to have
+        in common with the exact one.
+    likeness
+        What that should be: more channels are measured until it is expected, all of them if need be. None to stop at
+        the budget, whatever the map is like.
     engine
         What runs the masked images; see `passes.prepare`.
     batch_size
@@ -76,6 +80,7 @@ class PolyCam:
     layers: tuple[str, ...] | None = None
     level: int = 0
     budget: float = 1.0
+    likeness: Likeness | None = Likeness()  # noqa: RUF009 (frozen)
     engine: str = "auto"
     batch_size: int | None = None
     levels: bool = False
@@ -93,51 +98,49 @@ class PolyCam:
         if self.budget < 1 and self.score != "regression":
             raise InputError(f"Poly-CAM has no budget for score={self.score!r}; leave the budget out")
 
-    def __call__(
-        self,
-        model: nn.Module,
-        images: Shaped[Tensor, "*batch channels height width"],
-        *,
-        reference: Shaped[Tensor, "..."] | None = None,
-        on_progress: Progress | None = None,
-    ) -> Explanation:
-        """Explain a batch; see `Explainer` for the arguments and errors. Progress counts channels of every image."""
-        clock = Clock()
-        with explaining(model, images, reference=reference) as subject, torch.no_grad():
-            layers = self._find_layers(subject)
-            channels = sum(layer.channels for layer in layers)
-            count = _Count(total=len(subject.images) * channels, report=on_progress)
-            passes = self._prepare(subject, round(self.budget * channels))
-            size = (subject.images.shape[-2], subject.images.shape[-1])
-            weights, saliencies, approximations = [], [], []
-            for index in range(len(subject.images)):
-                activations = _activations(subject, index, layers)
-                shares, approximation = self._weights(subject, index, activations, passes=passes, count=count)
-                weights.append(shares)
-                approximations += approximation
-                saliencies.append(combine(activations, shares, size=size))
-            levels = tuple(
-                Level(
-                    layer=layer.name,
-                    saliency=torch.stack([maps[depth] for maps in saliencies]).float(),
-                    weights=torch.stack([shares[depth] for shares in weights]).float(),
-                )
-                for depth, layer in enumerate(layers)
+    @torch.no_grad()
+    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
+        """Progress counts the channels of every image."""
+        subject = held.predict_all()
+        layers = self._find_layers(subject)
+        channels = sum(layer.channels for layer in layers)
+        count = _Count(total=len(subject.images) * channels, report=on_progress)
+        # one engine for all rounds and images
+        passes = self._prepare(subject, round(self.budget * channels))
+        weights, saliencies, approximations = [], [], []
+        for index in range(len(subject.images)):
+            activations = _activations(subject, index, layers)
+            shares, approximation = self._weights(subject, index, activations, passes=passes, count=count)
+            weights.append(shares)
+            approximations += approximation
+            saliencies.append(self._levels(activations, shares, like=subject.images[index]))
+        levels = tuple(
+            Level(
+                layer=layer.name,
+                saliency=torch.stack([maps[depth] for maps in saliencies]).float(),
+                weights=torch.stack([shares[depth] for shares in weights]).float(),
             )
-            exact = scale_to(torch.stack([maps[self.level] for maps in saliencies]), total=subject.change)
-        return subject.explanation(
-            exact,
+            for depth, layer in enumerate(layers)
+        )
+        return Found(
+            subject=subject,
+            relevance=scale_to(torch.stack([maps[self.level] for maps in saliencies]), total=subject.change),
             method="poly-cam",
-            clock=clock,
             complete=True,
             findings=(
                 *check_weights([layer.name for layer in layers], weights, change=subject.change.tolist()),
                 *check_approximations(approximations),
             ),
-            levels=levels if self.levels else (),
-            approximations=tuple(approximations),
-            engine=passes.engine,
+            more={
+                "levels": levels if self.levels else (),
+                "approximations": tuple(approximations),
+                "engine": passes.engine,
+            },
         )
+
+    @staticmethod
+    def _levels(activations: list[Tensor], weights: list[Tensor], *, like: Tensor) -> list[Tensor]:
+        return combine(activations, weights, size=(like.shape[-2], like.shape[-1]))
 
     def _find_layers(self, subject: Subject) -> tuple[Layer, ...]:
         image = subject.images[:1]
@@ -189,9 +192,10 @@ class PolyCam:
                 mask_kernel(regions, active),
                 active=active,
                 budget=self.budget,
+                likeness=self.likeness,
                 change=change,
                 measure=effects,
-                size=(black.shape[-2], black.shape[-1]),
+                to_map=lambda weights: self._levels(activations, weights, like=black)[self.level],
                 seed=self.seed,
             )
             count.add(len(active) - found.approximation.measured)

@@ -61,9 +61,9 @@ class Field:
     Rasmussen and Williams, *Gaussian processes for machine learning* (2006), eqs. 2.23 and 2.24.
     """
 
-    def __init__(self, kernel: Float[Tensor, "channels channels"], *, capacity: int) -> None:
+    def __init__(self, kernel: Float[Tensor, "channels channels"]) -> None:
         self._kernel = kernel
-        self._factor = kernel.new_zeros(len(kernel), capacity)
+        self._factor = kernel.new_zeros(len(kernel), 0)
         self._variance = kernel.diagonal().clone()
         self.chosen: list[int] = []
         """Channels chosen so far, in their order."""
@@ -80,6 +80,7 @@ class Field:
             What an error of the channel's effect costs, >= 0.
         """
         chosen = []
+        self._factor = torch.cat([self._factor, self._factor.new_zeros(len(self._factor), count)], dim=1)
         free = torch.ones_like(self._variance)
         free[self.chosen] = -1  # never again, even where nothing is uncertain
         for place in range(len(self.chosen), len(self.chosen) + count):

@@ -5,17 +5,17 @@ from typing import Any
 
 import torch
 from captum import attr
-from jaxtyping import Shaped
-from torch import Tensor, nn
+from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.explain.clock import Clock
-from sliplens.explain.explanation import Explanation, Progress
-from sliplens.explain.subject import explaining
+from sliplens.explain.explanation import Progress
+from sliplens.explain.health import check_slopes
+from sliplens.explain.method import Found, Method, require_at_least_one
+from sliplens.explain.subject import Held
 
 
 @dataclass(frozen=True, kw_only=True)
-class SmoothGrad:
+class SmoothGrad(Method):
     """SmoothGrad times what the image adds to the reference, signed, in margin units.
 
     Relevance is (x - b) times the mean of df/dx over x plus normal noise, summed over the channels. The gradient alone,
@@ -45,42 +45,35 @@ class SmoothGrad:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.samples < 1:
-            raise InputError(f"SmoothGrad's samples is {self.samples}; give at least 1")
-        if self.batch_size < 1:
-            raise InputError(f"SmoothGrad's batch_size is {self.batch_size}; give at least 1")
+        require_at_least_one("SmoothGrad", samples=self.samples, batch_size=self.batch_size)
         if not self.noise >= 0:
             raise InputError(f"SmoothGrad's noise is {self.noise}; give a standard deviation of at least 0")
 
-    def __call__(
-        self,
-        model: nn.Module,
-        images: Shaped[Tensor, "*batch channels height width"],
-        *,
-        reference: Shaped[Tensor, "..."] | None = None,
-        on_progress: Progress | None = None,
-    ) -> Explanation:
-        """Explain a batch; see `Explainer` for the arguments and errors. Progress counts images."""
-        clock = Clock()
-        with explaining(model, images, reference=reference) as subject:
-            tunnel = attr.NoiseTunnel(attr.Saliency(subject.predict))
+    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
+        subject = held.predict_all()
+        tunnel = attr.NoiseTunnel(attr.Saliency(subject.predict))
 
-            def smoothed(index: int) -> Tensor:
-                image, empty = subject.images[index, None], subject.reference[index, None]
-                # Captum draws from the global state, which is given back as it was
-                with torch.random.fork_rng(devices=[image.device] if image.is_cuda else []):
-                    torch.manual_seed(self.seed)
-                    gradient: Any = tunnel.attribute(
-                        image,
-                        nt_type="smoothgrad",
-                        nt_samples=self.samples,
-                        nt_samples_batch_size=min(self.batch_size, self.samples),
-                        stdevs=float(self.noise),
-                        abs=False,
-                    )
-                return (gradient.detach() * (image - empty)).sum(dim=1)[0]
+        def smoothed(index: int) -> Tensor:
+            image, empty = subject.images[index, None], subject.reference[index, None]
+            # Captum draws from the global state, which is given back as it was
+            with torch.random.fork_rng(devices=[image.device] if image.is_cuda else []):
+                torch.manual_seed(self.seed)
+                gradient: Any = tunnel.attribute(
+                    image,
+                    nt_type="smoothgrad",
+                    nt_samples=self.samples,
+                    nt_samples_batch_size=min(self.batch_size, self.samples),
+                    stdevs=float(self.noise),
+                    abs=False,
+                )
+            return (gradient.detach() * (image - empty)).sum(dim=1)[0]
 
-            relevance = subject.each_image(smoothed, on_progress=on_progress)
-        return subject.explanation(
-            relevance, method="smooth-grad", clock=clock, complete=False, target="the linear model of f at x"
+        relevance = subject.each_image(smoothed, on_progress=on_progress)
+        return Found(
+            subject=subject,
+            relevance=relevance,
+            method="smooth-grad",
+            complete=False,
+            target="the linear model of f at x",
+            findings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=subject.change.tolist()),
         )

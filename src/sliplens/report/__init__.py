@@ -10,12 +10,13 @@ from sliplens.report.figures import (
     plot_predictions,
 )
 from sliplens.report.overlay import overlay_saliency, plot_colour_bar, plot_overlay
-from sliplens.report.page import build_report
-from sliplens.report.records import Results
+from sliplens.report.page import Written, build_report
 from sliplens.report.results import load_results
+from sliplens.report.workspace import Results
 
 __all__ = [
     "Results",
+    "Written",
     "build_report",
     "draw_audit",
     "draw_contact_sheet",

@@ -11,7 +11,7 @@ from sliplens.report.figures import (
     plot_margin_over_time,
     plot_predictions,
 )
-from sliplens.report.records import Predictions, Results, Scored
+from sliplens.report.records import Predictions, Scored
 from sliplens.report.style import (
     INPUT_COLOURS,
     PURPLE,
@@ -24,6 +24,7 @@ from sliplens.report.style import (
     percent,
     source_name,
 )
+from sliplens.report.workspace import Results
 
 
 def chart_bins(results: Results) -> Chart:

@@ -71,6 +71,32 @@ class Fields:
             return self._refuse(key, value, "a list of whole numbers")
         return tuple(value)
 
+    def flag(self, key: str) -> bool:
+        """Return true or false."""
+        value = self._take(key, None)
+        return value if isinstance(value, bool) else self._refuse(key, value, "true or false")
+
+    def optional_numbers(self, key: str) -> tuple[float | None, ...]:
+        """Return a list of finite numbers, None where one is null."""
+        value = self._take(key, None)
+        if not isinstance(value, list):
+            return self._refuse(key, value, "a list of numbers")
+        inside = self._wrap({f"{key}[{index}]": item for index, item in enumerate(value)}, key)
+        return tuple(inside.optional_number(name) for name in inside.values)
+
+    def named_numbers(self, key: str) -> dict[str, float | None]:
+        """Return a field that maps names to finite numbers, None where one is null."""
+        part = self.part(key)
+        return {name: part.optional_number(name) for name in part.values}
+
+    def part(self, key: str) -> "Fields":
+        """Return a field that is an object."""
+        return self._wrap(self._take(key, None), key)
+
+    def optional_part(self, key: str) -> "Fields | None":
+        """Return a field that is an object, or None where it is null or absent."""
+        return None if self.values.get(key) is None else self.part(key)
+
     def inner(self, key: str, *, optional: bool = False) -> dict[str, "Fields"]:
         """Return a field that maps names to objects."""
         value = self._take(key, {} if optional else None)

@@ -46,7 +46,7 @@ def read_predictions(path: Path, *, command: str) -> Predictions:
         If the file is missing or damaged, or lacks a column.
     """
     numbers = ("time_s", "safety_margin", "prediction")
-    table = _read_table(path, ("trial", "condition", "frame", *numbers), command=command)
+    table = read_table(path, ("trial", "condition", "frame", *numbers), command=command)
     return Predictions(
         trial=np.array(table["trial"].to_pylist(), dtype=str),
         condition=np.array(table["condition"].to_pylist(), dtype=str),
@@ -65,25 +65,29 @@ def read_deletion(path: Path, *, command: str) -> dict[str, DeletionCurve]:
     InputError
         If the file is missing or damaged, lacks a column, or a frame lacks steps that others have.
     """
-    table = _read_table(path, ("frame_id", "method", "step", "pixels_removed", "score"), command=command)
+    table = read_table(path, ("frame_id", "method", "step", "pixels_removed", "prediction", "score"), command=command)
     method = np.array(table["method"].to_pylist(), dtype=str)
     frame = np.array(table["frame_id"].to_pylist(), dtype=str)
     step = table["step"].to_numpy().astype(np.int64)
     removed = table["pixels_removed"].to_numpy().astype(np.int64)
     score = table["score"].to_numpy().astype(np.float64)
+    prediction = table["prediction"].to_numpy().astype(np.float64)
     curves = {}
     for name in dict.fromkeys(method.tolist()):
         rows = method == name
         ids, frame_at = np.unique(frame[rows], return_inverse=True)
         steps, step_at = np.unique(step[rows], return_inverse=True)
-        total, count = np.zeros((2, len(ids), len(steps)))
+        total, answers, count = np.zeros((3, len(ids), len(steps)))
         np.add.at(total, (frame_at, step_at), score[rows])
+        np.add.at(answers, (frame_at, step_at), prediction[rows])
         np.add.at(count, (frame_at, step_at), 1)
         if not count.all():
             raise InputError(f"{path} lacks steps of some frames under {name!r}; make it again with `{command}`")
         pixels = np.zeros(len(steps), dtype=np.int64)
         pixels[step_at] = removed[rows]
-        curves[name] = DeletionCurve(frame_ids=tuple(ids.tolist()), pixels_removed=pixels, scores=total / count)
+        curves[name] = DeletionCurve(
+            frame_ids=tuple(ids.tolist()), pixels_removed=pixels, scores=total / count, predictions=answers / count
+        )
     return curves
 
 
@@ -140,7 +144,14 @@ def read_pictures(
     return np.stack(pictures)
 
 
-def _read_table(path: Path, columns: tuple[str, ...], *, command: str) -> pa.Table:
+def read_table(path: Path, columns: tuple[str, ...], *, command: str, may_be_empty: bool = False) -> pa.Table:
+    """Read a Parquet file that has these columns, without empty cells, and at least one row unless it may be empty.
+
+    Raises
+    ------
+    InputError
+        If it is missing or damaged, lacks a column, or has an empty cell or no row.
+    """
     cure = f"make the folder again with `{command}`"
     try:
         table = pq.ParquetFile(path).read()
@@ -153,6 +164,6 @@ def _read_table(path: Path, columns: tuple[str, ...], *, command: str) -> pa.Tab
         raise InputError(f"{path} lacks the column {', '.join(absent)}; {cure}")
     if any(table[name].null_count for name in columns):
         raise InputError(f"{path} has empty cells; {cure}")
-    if table.num_rows == 0:
+    if table.num_rows == 0 and not may_be_empty:
         raise InputError(f"{path} has no row; {cure}")
     return table

@@ -10,24 +10,31 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from sliplens.errors import InputError
 from sliplens.report.drawing import Picture, draw_picture
 from sliplens.report.overlay import plot_colour_bar
-from sliplens.report.records import Results, Run
-from sliplens.report.results import load_results
+from sliplens.report.pages import written_whole
+from sliplens.report.records import Run
+from sliplens.report.results import READERS, load_results
 from sliplens.report.sections import Section, build_sections
+from sliplens.report.study.believing import judge_study
+from sliplens.report.study.evidence import tell_interval
+from sliplens.report.study.plates import FOLDER, Plate, write_plates
+from sliplens.report.study.sections import build_study_page
 from sliplens.report.style import input_name, method_name, source_name
 from sliplens.report.verdict import Statement, judge
+from sliplens.report.workspace import Results
 
 _TEMPLATE = "report.html.j2"
-_STAGES = ("simulate", "train", "evaluate", "explain", "score")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Page:
-    """All that the template lays out."""
+    """All that the template lays out, and the figures that are written beside it."""
 
     name: str
     finished: str
     statements: tuple[Statement, ...]
     sections: tuple[Section, ...]
+    plates: tuple[Plate, ...]
+    study: bool
     colour_bar: Picture
     warnings: tuple[str, ...]
     runs: tuple[Run, ...]
@@ -36,8 +43,19 @@ class Page:
     machine: tuple[tuple[str, str], ...]
 
 
-def build_report(workspace: Path, output: Path) -> Path:
-    """Write the report of a workspace as one self-contained HTML file.
+@dataclass(frozen=True, kw_only=True)
+class Written:
+    """The page, and the files of a study's figures; these are none for other workspaces."""
+
+    page: Path
+    figures: tuple[Path, ...]
+
+
+def build_report(workspace: Path, output: Path) -> Written:
+    """Write the report of a workspace as one self-contained HTML file, and a study's figures beside it.
+
+    Each figure is written as `figures/NAME.pdf`, and its numbers as `figures/NAME.csv`; other files there are left as
+    they are.
 
     Parameters
     ----------
@@ -49,8 +67,8 @@ def build_report(workspace: Path, output: Path) -> Path:
 
     Returns
     -------
-    Path
-        The file written.
+    Written
+        The files written.
 
     Raises
     ------
@@ -59,15 +77,13 @@ def build_report(workspace: Path, output: Path) -> Path:
     """
     if output.is_dir():
         raise InputError(f"{output} is a folder; name the HTML file to write, such as {output / 'report.html'}")
-    text = render_page(build_page(load_results(workspace)))
-    part = output.with_name(f".{output.name}.part")
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
+    page = build_page(load_results(workspace))
+    text = render_page(page)
+    # the figures first: a page that is there has all that it names
+    figures = write_plates(page.plates, output.parent / FOLDER)
+    with written_whole(output) as part:
         part.write_text(text, encoding="utf-8")
-        part.replace(output)
-    except OSError as error:
-        raise InputError(f"cannot write {output} ({error.strerror}); choose another file") from None
-    return output
+    return Written(page=output, figures=figures)
 
 
 def render_page(page: Page) -> str:
@@ -79,7 +95,7 @@ def render_page(page: Page) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(_TEMPLATE).render(page=page)
+    return environment.get_template(_TEMPLATE).render(page=page, interval=tell_interval)
 
 
 def build_page(results: Results) -> Page:
@@ -87,11 +103,18 @@ def build_page(results: Results) -> Page:
     # one stream, seeded: the same results give the same intervals
     rng = np.random.default_rng(0)
     newest = results.runs[-1]
+    if results.study:
+        drawn = build_study_page(results, rng=rng)
+        sections, plates, statements = drawn.sections, drawn.plates, judge_study(results, rng=rng)
+    else:
+        sections, plates, statements = build_sections(results, rng=rng), (), judge(results, rng=rng)
     return Page(
         name=results.workspace.resolve().name,
         finished=newest.finished[:16].replace("T", " at "),
-        statements=judge(results, rng=rng),
-        sections=build_sections(results, rng=rng),
+        statements=statements,
+        sections=sections,
+        plates=plates,
+        study=bool(results.study),
         colour_bar=draw_picture(
             lambda ax: plot_colour_bar(ax=ax),
             alt="Colours of the saliency maps, from dark (least important) to light yellow (most important)",
@@ -116,7 +139,7 @@ def _warnings(results: Results) -> list[str]:
             for method, cost in explained.methods.items()
             for warning in cost.warnings
         ]
-    versions = {tuple(sorted(run.versions.items())) for run in results.runs if run.stage in _STAGES}
+    versions = {tuple(sorted(run.versions.items())) for run in results.runs if run.stage in READERS}
     if len(versions) > 1:
         told.append("The stages were run with different versions of the libraries; see the versions of each run.json.")
     return told

@@ -1,6 +1,7 @@
 """Panels of saliency: the network's input above what each method made of it, from full stick to full slip."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from sliplens.report.drawing import Picture, png_picture
 from sliplens.report.overlay import overlay_saliency, stretch_saliency
@@ -31,6 +32,8 @@ class PanelRow:
 @dataclass(frozen=True, kw_only=True)
 class Panel:
     """A table of pictures with its caption."""
+
+    layout: ClassVar[str] = "panel"
 
     columns: tuple[PanelColumn, ...]
     rows: tuple[PanelRow, ...]

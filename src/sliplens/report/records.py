@@ -1,6 +1,6 @@
-"""Records of the saved results that a report is made from."""
+"""Records of the saved results that a report of any workspace is made from."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -162,11 +162,12 @@ class MethodScore:
 
 @dataclass(frozen=True, kw_only=True)
 class DeletionCurve:
-    """Deletion score D of each frame while pixels are removed."""
+    """Deletion score D of each frame while pixels are removed, and the answers it comes from, in margin units."""
 
     frame_ids: tuple[str, ...]
     pixels_removed: Int[np.ndarray, " steps"]
     scores: Float64[np.ndarray, "frames steps"]
+    predictions: Float64[np.ndarray, "frames steps"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,27 +181,3 @@ class Scored:
     methods: dict[str, MethodScore]
     alarms: tuple[str, ...]
     curves: dict[str, DeletionCurve]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Results:
-    """All that a workspace holds; a stage that was not run is None or an empty table.
-
-    Attributes
-    ----------
-    trainings, evaluations
-        By input ("raw", "difference").
-    explanations, scores
-        By input and source ("simulated", "real").
-    notes
-        What a reader must know of how the results were chosen.
-    """
-
-    workspace: Path
-    runs: tuple[Run, ...]
-    simulation: Simulation | None = None
-    trainings: dict[str, Training] = field(default_factory=dict)
-    evaluations: dict[str, Evaluation] = field(default_factory=dict)
-    explanations: dict[tuple[str, str], Explained] = field(default_factory=dict)
-    scores: dict[tuple[str, str], Scored] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()

@@ -22,13 +22,14 @@ from sliplens.report.records import (
     ExplainedFrame,
     Method,
     MethodScore,
-    Results,
     Run,
     Scored,
     Simulation,
     SplitCount,
     Training,
 )
+from sliplens.report.study.readers import STUDY_READERS, gather_study
+from sliplens.report.workspace import Results
 
 RESULT_FILE = "result.json"
 
@@ -79,6 +80,7 @@ def load_results(workspace: Path) -> Results:
         evaluations={key[1]: value for key, value in found.items() if key[0] == "evaluate"},
         explanations={key[1:]: value for key, value in found.items() if key[0] == "explain"},
         scores={key[1:]: value for key, value in found.items() if key[0] == "score"},
+        study=gather_study(found),
         notes=tuple(notes),
     )
 
@@ -107,7 +109,8 @@ def _read_run(folder: Path) -> Run:
 
 
 def _read_result(run: Run) -> Fields:
-    return _read_object(run.folder / RESULT_FILE, command=f"sliplens {run.stage}")
+    command = "study" if run.stage in STUDY_READERS else run.stage
+    return _read_object(run.folder / RESULT_FILE, command=f"sliplens {command}")
 
 
 def _read_simulation(run: Run, fields: Fields) -> Simulation:
@@ -233,4 +236,5 @@ READERS: dict[str, Callable[[Run, Fields], Any]] = {
     "evaluate": _read_evaluation,
     "explain": _read_explained,
     "score": _read_scored,
+    **STUDY_READERS,
 }

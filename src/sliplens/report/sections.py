@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sliplens.report.blocks import Notes
 from sliplens.report.charts import (
     chart_bins,
     chart_faithfulness,
@@ -14,7 +15,7 @@ from sliplens.report.charts import (
 )
 from sliplens.report.drawing import Chart
 from sliplens.report.panels import Panel, build_panel
-from sliplens.report.records import Results
+from sliplens.report.study.claim import Claim
 from sliplens.report.style import in_order, input_name, inputs_in_order
 from sliplens.report.tables import (
     Table,
@@ -24,22 +25,23 @@ from sliplens.report.tables import (
     table_timing,
     table_training,
 )
+from sliplens.report.workspace import Results
 
 _INPUTS = ("raw", "difference")
+Block = Table | Chart | Panel | Claim | Notes
+"""Laid out by the template's macro of the name `layout`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A part of the page: what is missing of it, and its tables, charts and panels in the order they are read."""
+    """A part of the page: what is missing of it, and what it shows in the order it is read."""
 
     id: str
     title: str
     short_title: str
     intro: str
     missing: tuple[str, ...] = ()
-    tables: tuple[Table, ...] = ()
-    charts: tuple[Chart, ...] = ()
-    panels: tuple[Panel, ...] = ()
+    blocks: tuple[Block, ...] = ()
 
 
 def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Section, ...]:
@@ -49,7 +51,7 @@ def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Secti
         _faithfulness_section(results, rng=rng),
         _maps_section(results),
         _real_section(results),
-        _recipe_section(results),
+        recipe_section(results),
     )
 
 
@@ -62,8 +64,7 @@ def _accuracy_section(results: Results) -> Section:
         intro="The networks answer on trials they were not trained on. A raw image is the camera's frame; a difference "
         "image is that frame against the untouched sensor.",
         missing=_missing("evaluate", results.evaluations),
-        tables=(table_accuracy(results),) if results.evaluations else (),
-        charts=tuple(charts),
+        blocks=(table_accuracy(results), *charts) if results.evaluations else (),
     )
 
 
@@ -80,8 +81,10 @@ def _faithfulness_section(results: Results, *, rng: np.random.Generator) -> Sect
         "did rely on them: D = (1 \N{MINUS SIGN} |change of Γ|)² falls from 1 towards 0. Removing pixels in random "
         "order is the control that each method has to beat.",
         missing=_missing("score", {name for name, _ in results.scores}),
-        tables=tuple(table_deletion(scores, rng=rng) for scores in by_source.values()),
-        charts=tuple(chart_faithfulness(results, scores) for scores in by_source.values()),
+        blocks=(
+            *(table_deletion(scores, rng=rng) for scores in by_source.values()),
+            *(chart_faithfulness(results, scores) for scores in by_source.values()),
+        ),
     )
 
 
@@ -93,8 +96,10 @@ def _maps_section(results: Results) -> Section:
         short_title="Saliency maps",
         intro="From full stick (Γ 100 %) on the left to the onset of full slip (Γ 0 %) on the right.",
         missing=_missing("explain", {name for name, _ in shown}),
-        panels=tuple(build_panel(shown[key]) for key in sorted(shown, key=lambda key: (key[0] != "raw", key))),
-        tables=(table_timing(results),) if results.explanations else (),
+        blocks=(
+            *(build_panel(shown[key]) for key in sorted(shown, key=lambda key: (key[0] != "raw", key))),
+            *((table_timing(results),) if results.explanations else ()),
+        ),
     )
 
 
@@ -107,12 +112,15 @@ def _real_section(results: Results) -> Section:
         intro="Frames of a real sensor, shown to the same networks.",
         # real frames may exist as difference images only, so one input is enough
         missing=() if shown else ("Real frames: not run yet; `sliplens explain` makes it.",),
-        tables=(table_real(results),) if shown else (),
-        panels=tuple(build_panel(shown[name]) for name in inputs_in_order(shown)),
+        blocks=(
+            *((table_real(results),) if shown else ()),
+            *(build_panel(shown[name]) for name in inputs_in_order(shown)),
+        ),
     )
 
 
-def _recipe_section(results: Results) -> Section:
+def recipe_section(results: Results) -> Section:
+    """Say how the results were made; the template adds versions and recipes."""
     simulation = results.simulation
     if simulation is None:
         intro = "No simulation is recorded in this workspace."
@@ -132,8 +140,7 @@ def _recipe_section(results: Results) -> Section:
             *(() if simulation else ("Simulation: not run yet; `sliplens simulate` makes it.",)),
             *_missing("train", results.trainings),
         ),
-        tables=(table_training(results),) if results.trainings else (),
-        charts=(chart_learning(results),) if results.trainings else (),
+        blocks=(table_training(results), chart_learning(results)) if results.trainings else (),
     )
 
 

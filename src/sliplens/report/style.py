@@ -1,6 +1,6 @@
 """Names, colours and drawing style that all figures and tables share."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -13,25 +13,65 @@ BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILLION, PURPLE = (
 )  # fmt: skip
 GREY = "#6B7280"
 
+UNKNOWN = "\N{EN DASH}"
+"""Stands for a number that is not there."""
 INPUT_NAMES = {"raw": "Raw images", "difference": "Difference images"}
 INPUT_COLOURS = {"raw": ORANGE, "difference": BLUE}
 SOURCE_NAMES = {"simulated": "simulated touch", "real": "real touch"}
 
 CONTROL = "random"
+CONTROLS = ("edges", "input", "centre", "randomised", CONTROL)
+"""Maps that know nothing of the trained network: what an explanation has to beat."""
 METHOD_NAMES = {
     "grad-cam": "Grad-CAM",
     "integrated-gradients": "Integrated Gradients",
     "poly-cam": "Poly-CAM",
+    "poly-cam-thesis": "Poly-CAM as in the thesis",
     "hires-cam": "HiResCAM",
     "layer-cam": "LayerCAM",
     "expected-gradients": "Expected Gradients",
     "smooth-grad": "SmoothGrad",
     "occlusion": "Occlusion",
+    "occlusion-marker": "Occlusion by marker",
     "lrp": "LRP",
+    "edges": "Edge filter (control)",
+    "input": "The input itself (control)",
+    "centre": "Centred blob (control)",
+    "randomised": "New weights (control)",
     CONTROL: "Random order (control)",
+    "oracle": "The truth itself",
+    "degraded-oracle": "The truth, damaged",
 }
-METHOD_COLOURS = {"grad-cam": VERMILLION, "integrated-gradients": SKY, "poly-cam": GREEN, CONTROL: BLACK}
-METHOD_LINES = {"grad-cam": "-", "integrated-gradients": "--", "poly-cam": "-.", CONTROL: ":"}
+METHOD_COLOURS = {
+    "grad-cam": VERMILLION,
+    "integrated-gradients": SKY,
+    "poly-cam": GREEN,
+    "poly-cam-thesis": ORANGE,
+    "occlusion": BLUE,
+    "occlusion-marker": PURPLE,
+    "lrp": GREY,
+    CONTROL: BLACK,
+}
+METHOD_LINES: dict[str, Any] = {
+    "grad-cam": "-",
+    "integrated-gradients": "--",
+    "poly-cam": "-.",
+    "poly-cam-thesis": (0, (5, 1)),
+    "occlusion": (0, (3, 1, 1, 1)),
+    "occlusion-marker": (0, (1, 2)),
+    "lrp": (0, (1, 1)),
+    CONTROL: ":",
+}
+FILL_NAMES = {
+    "reference": "untouched frame",
+    "grey": "grey",
+    "background": "background",
+    "blur": "blur",
+    "noisy-linear": "noisy linear",
+    "true": "true scene",
+}
+"""What removed parts become, the most natural first."""
+UNIT_NAMES = {"pixel": "pixels", "tile": "tiles", "marker": "markers"}
 
 _STYLE: Any = {
     # letters as outlines: the page looks the same wherever it is opened
@@ -103,9 +143,21 @@ def inputs_in_order(names: Iterable[str]) -> list[str]:
 
 
 def methods_in_order(names: Iterable[str]) -> list[str]:
-    """Methods as in the thesis, the control last."""
+    """Methods as in the thesis, the controls last."""
     found = set(names)
-    return [*in_order(found - {CONTROL}, METHOD_NAMES), *(found & {CONTROL})]
+    return [*in_order(found - set(CONTROLS), METHOD_NAMES), *(name for name in CONTROLS if name in found)]
+
+
+def fill_name(fill: str, unit: str = "pixel") -> str:
+    """Name of what removed parts become, and of the parts where they are no pixels."""
+    name = FILL_NAMES.get(fill, fill)
+    # the true scene is drawn anew without one marker's motion: there is no other unit
+    return name if unit == "pixel" or fill == "true" else f"{name} ({UNIT_NAMES.get(unit, unit)})"
+
+
+def listed(texts: Sequence[str]) -> str:
+    """Join texts as a sentence does."""
+    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}"
 
 
 def conditions_in_order(names: Iterable[str]) -> list[str]:
@@ -115,14 +167,16 @@ def conditions_in_order(names: Iterable[str]) -> list[str]:
 
 def percent(value: float | None, *, digits: int = 0) -> str:
     """Write a share as a percentage, or a dash where it is not known."""
-    return "–" if value is None else f"{100 * value:.{digits}f}\N{NO-BREAK SPACE}%"  # noqa: RUF001 (an en dash is meant)
+    return UNKNOWN if value is None else f"{100 * value:.{digits}f}\N{NO-BREAK SPACE}%"
 
 
 def signed(value: float, digits: int) -> str:
-    """Write a number with its sign."""
-    return f"{value:+.{digits}f}".replace("-", "\N{MINUS SIGN}")
+    """Write a number with its sign; what rounds to nothing is +0."""
+    return f"{round(value, digits) + 0.0:+.{digits}f}".replace("-", "\N{MINUS SIGN}")
 
 
 def decimals(value: float | None, digits: int) -> str:
     """Write a number, or a dash where it is not known."""
-    return "–" if value is None else f"{value:.{digits}f}"  # noqa: RUF001 (an en dash is meant)
+    if value is None:
+        return UNKNOWN
+    return f"{round(value, digits) + 0.0:.{digits}f}".replace("-", "\N{MINUS SIGN}")

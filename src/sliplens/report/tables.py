@@ -1,13 +1,13 @@
 """Tables of the page: cells as text, so that the template only lays them out."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from sliplens.intervals import Difference
 from sliplens.report.compare import compare_deletion
-from sliplens.report.records import Results, Scored
+from sliplens.report.records import Scored
 from sliplens.report.style import (
     CONTROL,
     conditions_in_order,
@@ -22,21 +22,32 @@ from sliplens.report.style import (
     source_name,
 )
 from sliplens.report.thesis import ACCURACY, DELETION, MARK, NETWORK_PIXELS, SECONDS
+from sliplens.report.workspace import Results
 
 Kind = Literal["name", "number", "best", "thesis"]
+Shade = Literal[0, 1, 2, 3, 4]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """Text of a cell, and what it is: a name, a number, the best number of its group, or a figure of the thesis."""
+    """Text of a cell, and what it is: a name, a number, the best number of its group, or a figure of the thesis.
+
+    Attributes
+    ----------
+    shade
+        How dark its ground is, from 0 (as the page) to 4, where a table is read as a map of heat.
+    """
 
     text: str
     kind: Kind = "number"
+    shade: Shade = 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
     """A table with its caption."""
+
+    layout: ClassVar[str] = "table"
 
     caption: str
     head: tuple[Cell, ...]
@@ -72,7 +83,9 @@ def table_accuracy(results: Results) -> Table:
         caption="How well each network reads the safety margin on test trials. MSE in squared margin units (Γ from 0 "
         "to 1), MAE in percentage points of Γ; the lower MSE of each condition is bold. Grey columns: the "
         f"{MARK}.",
-        head=_head("Objects", "Input", "MSE", "MSE, thesis", "R²", "R², thesis", "MAE (points)", "Frames / trials"),
+        head=table_head(
+            "Objects", "Input", "MSE", "MSE, thesis", "R²", "R², thesis", "MAE (points)", "Frames / trials"
+        ),
         rows=tuple(rows),
     )
 
@@ -90,10 +103,10 @@ def table_deletion(scores: dict[str, Scored], *, rng: np.random.Generator) -> Ta
                 (
                     Cell(text=input_name(name), kind="name"),
                     Cell(text=method_name(method), kind="name"),
-                    Cell(text=_spread(score.mean, score.sd), kind="best" if score.mean == lowest else "number"),
+                    Cell(text=tell_spread(score.mean, score.sd), kind="best" if score.mean == lowest else "number"),
                     Cell(text=_gap(against_control(scored, method, rng=rng))),
                     Cell(text=decimals(score.last_step_mean, 3)),
-                    Cell(text=_spread(*thesis) if thesis else decimals(None, 3), kind="thesis"),
+                    Cell(text=tell_spread(*thesis) if thesis else decimals(None, 3), kind="thesis"),
                     Cell(text=str(score.frames)),
                 )
             )
@@ -103,7 +116,7 @@ def table_deletion(scores: dict[str, Scored], *, rng: np.random.Generator) -> Ta
         "lower = more faithful, and the lowest of each input is bold. “Against random”: mean difference from the "
         "random control with a 95 % interval (frames resampled); below zero = better than chance. “Last step”: D once "
         f"every pixel is filled, which no map has a part in. Grey column: the {MARK}.",
-        head=_head("Input", "Method", "Score D", "Against random", "Last step", "Score D, thesis", "Frames"),
+        head=table_head("Input", "Method", "Score D", "Against random", "Last step", "Score D, thesis", "Frames"),
         rows=tuple(rows),
     )
 
@@ -135,7 +148,7 @@ def table_timing(results: Results) -> Table:
         caption=f"Seconds to explain one frame, images of {' and '.join(map(str, sides))} px. The thesis timed images "
         f"of {NETWORK_PIXELS} px on an RTX 3060 Ti and did not wait for the GPU to finish, so its seconds show the "
         "order of magnitude only.",
-        head=_head("Method", *(f"{short_input_name(name)}, {source}" for name, source in keys), "Thesis"),
+        head=table_head("Method", *(f"{short_input_name(name)}, {source}" for name, source in keys), "Thesis"),
         rows=tuple(rows),
     )
 
@@ -159,7 +172,7 @@ def table_real(results: Results) -> Table:
         )
     return Table(
         caption=f"{len(rows)} real frames: the recorded safety margin, and what each network reads.",
-        head=_head("Frame", "Objects", "True Γ", *(f"Read from {input_name(name).lower()}" for name in names)),
+        head=table_head("Frame", "Objects", "True Γ", *(f"Read from {input_name(name).lower()}" for name in names)),
         rows=tuple(rows),
     )
 
@@ -180,7 +193,7 @@ def table_training(results: Results) -> Table:
     }
     return Table(
         caption="How the networks were trained.",
-        head=_head("", *(input_name(name) for name in trainings)),
+        head=table_head("", *(input_name(name) for name in trainings)),
         rows=tuple(
             (Cell(text=fact, kind="name"), *(Cell(text=tell(one)) for one in trainings.values()))
             for fact, tell in facts.items()
@@ -188,11 +201,13 @@ def table_training(results: Results) -> Table:
     )
 
 
-def _head(*texts: str) -> tuple[Cell, ...]:
+def table_head(*texts: str) -> tuple[Cell, ...]:
+    """Head of a table; what names the thesis is marked as its own."""
     return tuple(Cell(text=text, kind="thesis" if "thesis" in text.lower() else "name") for text in texts)
 
 
-def _spread(mean: float, sd: float) -> str:
+def tell_spread(mean: float, sd: float) -> str:
+    """Write a mean with its standard deviation."""
     return f"{mean:.3f} ± {sd:.3f}"
 
 

@@ -6,8 +6,31 @@ Polak, *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile 
 the third digit of the recorded scores, the seconds on an RTX 3060 Ti and without device synchronisation.
 """
 
+from collections.abc import Collection
+
 MARK = "thesis (real touch, other data)"
 NETWORK_PIXELS = 224
+
+THESIS_POLY_CAM = "poly-cam-thesis"
+"""Poly-CAM with the score, layers and map of the thesis."""
+
+
+def thesis_row(method: str, among: Collection[str]) -> str | None:
+    """Name the method of the thesis that one of ours stands beside; None if there is none.
+
+    Its Poly-CAM stands beside ours run as in the thesis, and beside our own only where that was not run.
+
+    Parameters
+    ----------
+    method
+        One of ours.
+    among
+        All that were run.
+    """
+    if method == THESIS_POLY_CAM:
+        return "poly-cam"
+    return None if method == "poly-cam" and THESIS_POLY_CAM in among else method
+
 
 ACCURACY: dict[tuple[str, str], tuple[float, float]] = {
     ("raw", "dry"): (1.87e-2, 0.85),

@@ -7,19 +7,21 @@ import numpy as np
 
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.report.compare import agreement, compare_errors
-from sliplens.report.records import Explained, Results, Scored
+from sliplens.report.records import Explained, Scored
 from sliplens.report.style import (
     CONTROL,
     conditions_in_order,
     decimals,
     input_name,
     inputs_in_order,
+    listed,
     method_name,
     percent,
     source_name,
 )
 from sliplens.report.tables import against_control
 from sliplens.report.thesis import NETWORK_PIXELS
+from sliplens.report.workspace import Results
 
 Tone = Literal["good", "plain", "caution"]
 
@@ -33,10 +35,14 @@ class Statement:
     tone: Tone = "plain"
 
 
+def judge_accuracy(results: Results, *, rng: np.random.Generator) -> list[Statement]:
+    """State how well each network reads the margin, and which input does better."""
+    return _accuracy(results) + _winners(results, rng=rng)
+
+
 def judge(results: Results, *, rng: np.random.Generator) -> tuple[Statement, ...]:
     """State what the results show, from accuracy to real touch; what was not run is left out."""
-    statements = _accuracy(results)
-    statements += _winners(results, rng=rng)
+    statements = judge_accuracy(results, rng=rng)
     statements += [
         _faithfulness(results.scores[key], rng=rng)
         for key in sorted(results.scores, key=lambda key: (key[1] == "real", key[0] != "raw", key))
@@ -45,7 +51,7 @@ def judge(results: Results, *, rng: np.random.Generator) -> tuple[Statement, ...
         statements.append(_what_deletion_measures(results))
     real = {name: one for (name, source), one in results.explanations.items() if source == "real"}
     statements += [_real_touch(real[name]) for name in inputs_in_order(real)]
-    statements += _scale(results)
+    statements += tell_scale(results)
     return tuple(statements)
 
 
@@ -59,12 +65,12 @@ def _accuracy(results: Results) -> list[Statement]:
         r2 = [f"{decimals(scores[condition].r2, 2)} on {condition}" for condition in conditions]
         mae = [decimals(100 * scores[condition].mae, 1) for condition in conditions]
         sentences.append(
-            f"From {input_name(name).lower()} the network reads the safety margin with R² {_list(r2)} objects; on "
-            f"average it is off by {_list(mae)} percentage points."
+            f"From {input_name(name).lower()} the network reads the safety margin with R² {listed(r2)} objects; on "
+            f"average it is off by {listed(mae)} percentage points."
         )
         poor = [condition for condition in conditions if (scores[condition].r2 or 0.0) <= 0]
         if poor:
-            sentences.append(f"On {_list(poor)} objects that is no better than always answering the mean label.")
+            sentences.append(f"On {listed(poor)} objects that is no better than always answering the mean label.")
         useless = useless or bool(poor)
     return [
         Statement(topic="Accuracy on test trials", text=" ".join(sentences), tone="caution" if useless else "plain")
@@ -130,7 +136,7 @@ def _faithfulness(scored: Scored, *, rng: np.random.Generator) -> Statement:
         else:
             text += " It does not beat the control: by this score no map tells more than chance."
     elif failing:
-        text += f" It beats the control; {_list(failing)} {'does' if len(failing) == 1 else 'do'} not."
+        text += f" It beats the control; {listed(failing)} {'does' if len(failing) == 1 else 'do'} not."
     else:
         text += " It beats the control, as does every other method." if len(methods) > 1 else " It beats the control."
     return Statement(topic=topic, text=text, tone="good" if best in beating else "caution")
@@ -149,7 +155,7 @@ def _what_deletion_measures(results: Results) -> Statement:
     )
     if last:
         text += (
-            f" With every pixel filled, where no map has a part, D is {_list(last)}: a score near "
+            f" With every pixel filled, where no map has a part, D is {listed(last)}: a score near "
             "that tells of the fill."
         )
     return Statement(topic="How far to trust D", text=text, tone="caution")
@@ -185,7 +191,8 @@ def _real_touch(explained: Explained) -> Statement:
     return Statement(topic=topic, text=text, tone="plain" if useful else "caution")
 
 
-def _scale(results: Results) -> list[Statement]:
+def tell_scale(results: Results) -> list[Statement]:
+    """State how little or much the networks were trained on."""
     if not results.trainings:
         return []
     one = results.trainings[inputs_in_order(results.trainings)[-1]]
@@ -203,7 +210,3 @@ def _scale(results: Results) -> list[Statement]:
         ". The thesis measured a real sensor, so its figures beside these show the scale of such errors, not a contest."
     )
     return [Statement(topic="What this run is", text=text)]
-
-
-def _list(texts: list[str]) -> str:
-    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}"

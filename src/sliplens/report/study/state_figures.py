@@ -1,0 +1,168 @@
+"""Figures of the contact states: frame, field and difference; and fields beside saliency."""
+
+import numpy as np
+from PIL import Image
+
+from sliplens.errors import InputError
+from sliplens.markers import DisplacementField, interpolate_field
+from sliplens.report.marker_figures import ARROWS, MarkedFrame, draw_fields_beside_saliency, plot_arrows, plot_field
+from sliplens.report.pages import place_axes
+from sliplens.report.study.grids import CELL_IN, Cell, draw_grid
+from sliplens.report.study.plates import Plate
+from sliplens.report.study.records import StateFrame, States
+from sliplens.report.study.shown import explained_of, shown_frames
+from sliplens.report.style import drawing_style, listed, percent
+from sliplens.report.trial_charts import TIMES, brighten, brightening
+from sliplens.report.workspace import Results
+
+_SURE = 0.2  # confidence of a field below which it is a guess, as `plot_field` draws it
+_METHOD = "poly-cam"
+_FEWEST_STILL_PX = 0.3
+
+
+def plate_contact_states(states: States) -> Plate | None:
+    """Draw frame with arrows, field, and difference image, a column a contact state (thesis, Fig. 4).
+
+    None where no frame has markers enough for a field.
+    """
+    chosen = _one_a_state(states)
+    fields = {frame.id: _field(frame) for frame in chosen}
+    lengths = [_longest(field) for field in fields.values() if field is not None]
+    if not lengths:
+        return None
+    factor = brightening([frame.difference[None] for frame in chosen])
+    size = (chosen[0].raw.shape[0], chosen[0].raw.shape[1])
+    rows = [
+        (f"Camera, arrows\n{TIMES}\N{NO-BREAK SPACE}{ARROWS:g}", [Cell(picture=frame.raw) for frame in chosen]),
+        ("Field of the\nmarkers", [Cell(picture=None if fields[frame.id] is None else frame.raw) for frame in chosen]),
+        (
+            "Difference" if factor == 1 else f"Difference\n{TIMES}\N{NO-BREAK SPACE}{factor:g}",
+            [Cell(picture=brighten(frame.difference, factor)) for frame in chosen],
+        ),
+    ]
+    heads = [f"{frame.contact_state.capitalize()}\nΓ {percent(frame.safety_margin)}" for frame in chosen]
+    grid = draw_grid(rows, heads=heads, below_in=0.55, cell_in=1.3 * CELL_IN)
+    top = max(*lengths, _FEWEST_STILL_PX) if len(lengths) > 1 else max(lengths[0], _FEWEST_STILL_PX)
+    mappable = None
+    with drawing_style():
+        for column, frame in enumerate(chosen):
+            _bare(plot_arrows(frame.raw, frame.rest_px, frame.position_px - frame.rest_px, ax=grid.axes[0][column]))
+            field = fields[frame.id]
+            if field is not None:
+                grid.axes[1][column].clear()
+                mappable = plot_field(field, size=size, ax=grid.axes[1][column], longest_px=top)
+                _bare(grid.axes[1][column])
+        assert mappable is not None  # there is a field
+        bar = place_axes(grid.figure, 1.25, grid.bottom_in + 0.05, 2.6, 0.12)
+        grid.figure.colorbar(mappable, cax=bar, orientation="horizontal", label="Displacement (px)")
+    told = "; ".join(_tell_motion(frame, fields[frame.id]) for frame in chosen)
+    return Plate(
+        name="fig-04-states",
+        figure=grid.figure,
+        alt=f"Camera image, displacement field and difference image at {listed(heads).replace(chr(10), ', ')}",
+        caption=f"What a touch looks like, trial {states.trial}: camera image with the markers' displacement (from "
+        f"{states.markers_from}), the field between them, and the difference image. Largest displacement: {told}.",
+        numbers=_marker_numbers(chosen),
+        pixels=True,
+    )
+
+
+def plate_fields_beside_saliency(results: Results) -> Plate | None:
+    """Draw raw frame, field and Poly-CAM side by side, a row a state (thesis, Fig. 12); None without all three."""
+    states, explained = results.study.states, explained_of(results, "raw")
+    if states is None or explained is None or _METHOD not in explained.saliency:
+        return None
+    known = {explained.frames[one.index].id: one for one in shown_frames(results, explained)}
+    marked, numbers = [], {name: [] for name in ("frame_id", "safety_margin", "moves_px", "saliency_moves_share")}
+    for frame in states.frames:
+        field = _field(frame)
+        if frame.id not in known or field is None:
+            continue
+        saliency = explained.saliency[_METHOD][known[frame.id].index]
+        fitted = _resized(saliency, (frame.raw.shape[0], frame.raw.shape[1]))
+        marked.append(
+            MarkedFrame(title=f"Γ {percent(frame.safety_margin)}", frame=frame.raw, field=field, saliency=fitted)
+        )
+        for name, value in zip(
+            numbers, (frame.id, frame.safety_margin, _longest(field), _share_on_moving(fitted, field)), strict=True
+        ):
+            numbers[name].append(value)
+    if not marked:
+        return None
+    shares = ", ".join(
+        f"{percent(share)} at Γ {percent(margin)}"
+        for share, margin in zip(numbers["saliency_moves_share"], numbers["safety_margin"], strict=True)
+    )
+    return Plate(
+        name="fig-12-poly-cam-raw",
+        figure=draw_fields_beside_saliency(marked),
+        alt=f"Raw frame, displacement field and Poly-CAM map side by side at {listed([one.title for one in marked])}",
+        caption="Poly-CAM on raw images beside the displacement of the markers. Share of the saliency that lies where "
+        f"the skin moves by more than half of that frame's largest displacement: {shares}.",
+        numbers=numbers,
+        pixels=True,
+    )
+
+
+def _one_a_state(states: States) -> list[StateFrame]:
+    by_state: dict[str, list[StateFrame]] = {}
+    for frame in sorted(states.frames, key=lambda one: -one.level):
+        by_state.setdefault(frame.contact_state, []).append(frame)
+    return [frames[len(frames) // 2] for frames in by_state.values()]
+
+
+def _field(frame: StateFrame) -> DisplacementField | None:
+    try:
+        return interpolate_field(
+            frame.rest_px, frame.position_px - frame.rest_px, size=(frame.raw.shape[0], frame.raw.shape[1])
+        )
+    except InputError:
+        return None  # too few markers were followed into this frame
+
+
+def _longest(field: DisplacementField) -> float:
+    length = np.linalg.norm(field.displacement_px, axis=-1)[field.confidence > _SURE]
+    return float(length.max()) if len(length) else 0.0
+
+
+def _share_on_moving(saliency: np.ndarray, field: DisplacementField) -> float:
+    length = np.linalg.norm(field.displacement_px, axis=-1) * (field.confidence > _SURE)
+    high, wide = saliency.shape
+    rows = np.abs(np.arange(high)[:, None] - field.y_px).argmin(axis=1)
+    columns = np.abs(np.arange(wide)[:, None] - field.x_px).argmin(axis=1)
+    moving = (length > length.max() / 2)[rows][:, columns]
+    total = float(saliency.sum())
+    return float(saliency[moving].sum() / total) if total > 0 else float("nan")
+
+
+def _resized(saliency: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Network pixels to camera pixels."""
+    if saliency.shape == size:
+        return saliency
+    image = Image.fromarray(saliency.astype(np.float32), mode="F")
+    return np.clip(np.asarray(image.resize((size[1], size[0]), Image.Resampling.BILINEAR)), 0, 1)
+
+
+def _tell_motion(frame: StateFrame, field: DisplacementField | None) -> str:
+    told = "unknown" if field is None else f"{_longest(field):.1f} px"
+    return f"{told} at {frame.contact_state}, Γ {percent(frame.safety_margin)}"
+
+
+def _marker_numbers(frames: list[StateFrame]) -> dict[str, np.ndarray]:
+    counts = [len(frame.rest_px) for frame in frames]
+    rest = np.concatenate([frame.rest_px for frame in frames])
+    now = np.concatenate([frame.position_px for frame in frames])
+    return {
+        "frame_id": np.repeat([frame.id for frame in frames], counts),
+        "contact_state": np.repeat([frame.contact_state for frame in frames], counts),
+        "safety_margin": np.repeat([frame.safety_margin for frame in frames], counts),
+        "rest_x_px": rest[:, 0],
+        "rest_y_px": rest[:, 1],
+        "x_px": now[:, 0],
+        "y_px": now[:, 1],
+    }
+
+
+def _bare(ax) -> None:  # noqa: ANN001
+    ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
+    ax.grid(visible=False)

@@ -1,0 +1,34 @@
+"""All that a workspace holds, as a report sees it."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from sliplens.report.records import Evaluation, Explained, Run, Scored, Simulation, Training
+from sliplens.report.study.records import Study
+
+
+@dataclass(frozen=True, kw_only=True)
+class Results:
+    """All that a workspace holds; a stage that was not run is None or an empty table.
+
+    Attributes
+    ----------
+    trainings, evaluations
+        By input ("raw", "difference").
+    explanations, scores
+        By input and source ("simulated", "real").
+    study
+        What a study adds; false where none was run.
+    notes
+        What a reader must know of how the results were chosen.
+    """
+
+    workspace: Path
+    runs: tuple[Run, ...]
+    simulation: Simulation | None = None
+    trainings: dict[str, Training] = field(default_factory=dict)
+    evaluations: dict[str, Evaluation] = field(default_factory=dict)
+    explanations: dict[tuple[str, str], Explained] = field(default_factory=dict)
+    scores: dict[tuple[str, str], Scored] = field(default_factory=dict)
+    study: Study = field(default_factory=Study)
+    notes: tuple[str, ...] = ()

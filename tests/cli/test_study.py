@@ -1,0 +1,73 @@
+"""`sliplens study`: the whole experiment on a small data set, its resumption, and what is said to mistakes."""
+
+import json
+from pathlib import Path
+
+import pytest
+from command_line import refused, run
+
+from sliplens.recordings import Dataset
+
+STAGES = ("evaluate", "explain", "score", "deletion", "faithfulness", "randomisation", "looks", "timing")
+
+
+@pytest.fixture(scope="module")
+def words(difference_run: Path, raw_run: Path, fine_dataset: Dataset) -> tuple[object, ...]:
+    networks = ("--difference", difference_run, "--raw", raw_run)
+    quick = ("--method", "grad-cam", "occlusion", "--trials", 2, "--random-orders", 2)
+    return ("study", fine_dataset.folder, *networks, *quick)
+
+
+def test_a_study_makes_every_stage_and_the_page_and_keeps_what_is_there(
+    words: tuple[object, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    output = tmp_path / "study"
+    assert run(*words, "-o", output) == 0
+    folders = {path.name for path in output.iterdir() if path.is_dir() and not path.name.startswith(".")}
+    stages = {f"{stage}-{name}" for stage in STAGES for name in ("difference", "raw")}
+    assert folders >= {"choice", "states", *stages}
+    assert (output / "report.html").is_file()
+    for name in ("difference", "raw"):
+        told = json.loads((output / f"faithfulness-{name}" / "result.json").read_text())
+        assert (told["frames"], told["trials"]) == (6, 2)
+        assert {one["method"] for one in told["scores"] if one["control"]} == {"edges", "input", "centre", "randomised"}
+    # as after an interruption: one stage is missing, the others stay as they are
+    before = {path: path.stat().st_mtime_ns for path in output.glob("*/result.json")}
+    gone = output / "looks-raw"
+    for path in gone.iterdir():
+        path.unlink()
+    gone.rmdir()
+    capsys.readouterr()
+    assert run(*words, "-o", output) == 0
+    told = capsys.readouterr().out
+    assert told.count("kept") == len(before) - 1
+    after = {path: path.stat().st_mtime_ns for path in output.glob("*/result.json")}
+    assert {path for path in after if after[path] != before[path]} == {gone / "result.json"}
+
+
+def test_a_network_of_the_wrong_input_is_refused(
+    difference_run: Path, fine_dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    line = refused(capsys, "study", fine_dataset.folder, "--raw", difference_run, "-o", tmp_path / "study")
+    assert "give one that was trained on raw" in line
+    assert not (tmp_path / "study").exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        (("--difference", "none", "--raw", "none"), "a study needs a network"),
+        (("--method", "guess"), "no explainer named 'guess'"),
+        (("--random-orders", 0), "at least 1"),
+        (("--preset", "thesis"), "name a data set, or --preset"),
+    ],
+)
+def test_mistakes_are_told_before_anything_is_made(
+    fine_dataset: Dataset,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    more: tuple[object, ...],
+    sentence: str,
+):
+    assert sentence in refused(capsys, "study", fine_dataset.folder, "-o", tmp_path / "study", *more)
+    assert not (tmp_path / "study").exists()

@@ -1,0 +1,266 @@
+"""A made-up workspace: the files that the stages write, with plausible numbers and nothing measured."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from PIL import Image
+
+METHODS = ("grad-cam", "integrated-gradients", "poly-cam")
+MARGINS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
+NOISE = {("raw", "dry"): 0.14, ("raw", "wet"): 0.24, ("difference", "dry"): 0.09, ("difference", "wet"): 0.17}
+FALL = {"grad-cam": 0.25, "integrated-gradients": 0.15, "poly-cam": 0.08, "random": 0.45}
+
+
+def write_run(folder: Path, stage: str, config: dict[str, Any], result: dict[str, Any], *, minute: int = 0) -> Path:
+    """A stage's folder with `run.json` and `result.json`."""
+    folder.mkdir(parents=True)
+    run = {
+        "stage": stage,
+        "config": config,
+        "config_hash": stage.encode().hex(),
+        "versions": {"sliplens": "0.1.0", "python": "3.12.1", "torch": "2.9.0", "numpy": "2.3.1"},
+        "machine": {"system": "Linux", "processor": "x86_64", "cores": 2},
+        "finished": f"2026-11-21T04:{minute:02d}:00+00:00",
+    }
+    (folder / "run.json").write_text(json.dumps(run), encoding="utf-8")
+    (folder / "result.json").write_text(json.dumps(result), encoding="utf-8")
+    return folder
+
+
+def write_simulation(workspace: Path) -> Path:
+    splits = {"train": (40, 1600), "validation": (8, 320), "test": (16, 640)}
+    return write_run(
+        workspace / "data",
+        "simulate",
+        {"trials": 64, "seed": 0, "size": [224, 224]},
+        {
+            "trials": 64,
+            "frames": 2560,
+            "by_split": {name: {"trials": trials, "frames": frames} for name, (trials, frames) in splits.items()},
+            "conditions": ["dry", "wet"],
+        },
+    )
+
+
+def write_training(workspace: Path, name: str, *, size: int, rng: np.random.Generator) -> Path:
+    epochs = np.arange(12)
+    floor = 0.02 if name == "raw" else 0.011
+    validation = floor + 0.08 * np.exp(-epochs / 2.5) * rng.uniform(0.9, 1.1, 12)
+    folder = write_run(
+        workspace / f"network-{name}",
+        "train",
+        {"input": name, "data": "data", "seed": 0, "minutes": 2.0},
+        {
+            "input": name,
+            "backbone": "shufflenet_v2_x1_0",
+            "image_size": size,
+            "frame_size": [224, 224],
+            "train_frames": 1600,
+            "validation_frames": 320,
+            "epochs": 12.3,
+            "minutes": 2.0,
+            "seed": 0,
+            "best_validation_mse": float(validation.min()),
+            "parameters": 1254629,
+            "stopped_by": "time limit",
+        },
+        minute=5,
+    )
+    with (folder / "metrics.csv").open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["epoch", "train_mse", "validation_mse", "minutes"])
+        writer.writerows(
+            zip(epochs.tolist(), (0.8 * validation).tolist(), validation.tolist(), (epochs / 6).tolist(), strict=True)
+        )
+    return folder
+
+
+def bins(labels: np.ndarray, squared: np.ndarray) -> list[dict[str, Any]]:
+    rows = []
+    for low in range(10):
+        inside = (labels >= low / 10) & ((labels < (low + 1) / 10) | (low == 9))
+        mse = float(squared[inside].mean()) if inside.any() else None
+        rows.append({"low": low / 10, "high": (low + 1) / 10, "frames": int(inside.sum()), "mse": mse})
+    return rows
+
+
+def write_evaluation(
+    workspace: Path, name: str, *, trials: int, rng: np.random.Generator, trial_name: str = "day4-{}-{:03d}"
+) -> Path:
+    time = np.linspace(0, 2, 40)
+    columns: dict[str, list] = {
+        key: [] for key in ("trial", "condition", "day", "frame", "time_s", "safety_margin", "prediction")
+    }
+    conditions = {}
+    for condition in ("dry", "wet"):
+        labels, answers = [], []
+        for trial in range(trials):
+            # one law for both inputs: the labels of a test frame do not depend on the network
+            label = np.clip(1.02 - time / (1.5 + 0.05 * trial), 0, 1)
+            answer = (
+                label + NOISE[name, condition] * (rng.normal() * 0.5 + rng.normal(size=40) * 0.8) + 0.05 * (1 - label)
+            )
+            labels.append(label)
+            answers.append(answer)
+            columns["trial"] += [trial_name.format(condition, trial)] * 40
+            columns["condition"] += [condition] * 40
+            columns["day"] += ["day4"] * 40
+            columns["frame"] += list(range(40))
+            columns["time_s"] += time.tolist()
+            columns["safety_margin"] += label.tolist()
+            columns["prediction"] += answer.tolist()
+        truth, read = np.concatenate(labels), np.concatenate(answers)
+        squared = (read - truth) ** 2
+        conditions[condition] = {
+            "frames": len(truth),
+            "trials": trials,
+            "mse": float(squared.mean()),
+            "r2": float(1 - squared.mean() / truth.var()),
+            "mae": float(np.abs(read - truth).mean()),
+            "bins": bins(truth, squared),
+        }
+    folder = write_run(
+        workspace / f"test-{name}", "evaluate", {"input": name}, {"input": name, "conditions": conditions}, minute=9
+    )
+    pq.write_table(pa.table(columns), folder / "predictions.parquet")
+    return folder
+
+
+def picture_and_maps(
+    margin: float, name: str, *, size: int, rng: np.random.Generator
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """A dome of dark markers that move down as the margin falls, and a map of each kind on its lower markers."""
+    y, x = np.mgrid[:size, :size] / size
+    light = 0.75 - 0.6 * ((x - 0.5) ** 2 + (y - 0.5) ** 2)
+    now, still, moved = np.zeros((3, size, size))
+    for row in np.linspace(0.14, 0.86, 6):
+        for column in np.linspace(0.14, 0.86, 6):
+            reach = np.exp(-8 * ((row - 0.55) ** 2 + (column - 0.5) ** 2))
+            shift = 0.08 * (1 - margin) * reach
+            dot = np.exp(-((x - column) ** 2 + (y - row - shift) ** 2) / 0.0012)
+            still += np.exp(-((x - column) ** 2 + (y - row) ** 2) / 0.0012)
+            now += dot
+            moved += reach**2 * dot
+    tint = np.array([0.85, 0.75, 1.0])
+    image = (light - 0.5 * now)[..., None] * tint if name == "raw" else 2.0 * np.abs(now - still)[..., None] * tint
+    image = np.clip(image + rng.normal(0, 0.015, image.shape), 0, 1)
+    blob = np.exp(-((x - 0.5) ** 2 + (y - 0.6) ** 2) / 0.06)
+    maps = {
+        "grad-cam": blob,
+        "integrated-gradients": moved * rng.random((size, size)) + 0.15 * rng.random((size, size)),
+        "poly-cam": moved,
+    }
+    return (255 * image).astype(np.uint8), {key: (one - one.min()) / np.ptp(one) for key, one in maps.items()}
+
+
+def write_explanation(
+    workspace: Path, name: str, source: str, *, size: int, rng: np.random.Generator, condition: str = "dry"
+) -> Path:
+    noise = 0.03 if source == "simulated" else 0.2
+    margins = [margin for margin in MARGINS for _ in range(2 if source == "simulated" else 1)]
+    ids = [
+        f"{'day4' if source == 'simulated' else 'real'}-dry-{place:03d}-f{int(40 * (1 - m)):03d}"
+        for place, m in enumerate(margins)
+    ]
+    frames = [
+        {
+            "id": frame_id,
+            "condition": condition,
+            "safety_margin": margin,
+            "prediction": float(np.clip(margin + rng.normal(0, noise), 0, 1.05)),
+            "reference_prediction": 1.0,
+        }
+        for frame_id, margin in zip(ids, margins, strict=True)
+    ]
+    seconds = {"grad-cam": 0.031, "integrated-gradients": 0.42, "poly-cam": 3.1}
+    warned = (
+        {"integrated-gradients": ["completeness gap 1.8 % on 2 frames"]} if name == "raw" and source == "real" else {}
+    )
+    folder = write_run(
+        workspace / f"maps-{name}-{source}",
+        "explain",
+        {"input": name, "source": source, "methods": list(METHODS)},
+        {
+            "input": name,
+            "source": source,
+            "image_size": size,
+            "frames": frames,
+            "methods": {key: {"seconds_per_frame": seconds[key], "warnings": warned.get(key, [])} for key in METHODS},
+        },
+        minute=12,
+    )
+    (folder / "frames").mkdir()
+    found: dict[str, list[np.ndarray]] = {key: [] for key in METHODS}
+    for frame_id, margin in zip(ids, margins, strict=True):
+        picture, maps = picture_and_maps(margin, name, size=size, rng=rng)
+        Image.fromarray(picture).save(folder / "frames" / f"{frame_id}.png")
+        for key in METHODS:
+            found[key].append(maps[key])
+    arrays = {key: 0.01 * np.stack(found[key]).astype(np.float32) for key in METHODS}
+    arrays |= {f"{key}.saliency": np.stack(found[key]).astype(np.float32) for key in METHODS}
+    np.savez_compressed(folder / "maps.npz", allow_pickle=False, **arrays)
+    return folder
+
+
+def write_score(workspace: Path, name: str, *, size: int, rng: np.random.Generator) -> Path:
+    columns: dict[str, list] = {
+        key: [] for key in ("frame_id", "method", "step", "pixels_removed", "prediction", "score")
+    }
+    last = 0.25 if name == "difference" else 0.45
+    removed = np.arange(1, size + 1) * size
+    methods = {}
+    for method, fall in FALL.items():
+        curves = []
+        for frame in range(12):
+            rate = fall * rng.uniform(0.7, 1.3) * (1 if name == "difference" else 2)
+            fallen = (1 - np.exp(-removed / size**2 / rate)) / (1 - np.exp(-1 / rate))
+            score = np.clip(1 - (1 - last) * fallen + 0.01 * rng.normal(size=size) * (fallen < 1), 0, 1)
+            curves.append(score)
+            columns["frame_id"] += [f"f{frame:03d}"] * size
+            columns["method"] += [method] * size
+            columns["step"] += list(range(size))
+            columns["pixels_removed"] += removed.tolist()
+            columns["prediction"] += (1 - np.sqrt(score)).tolist()
+            columns["score"] += score.tolist()
+        auc = np.mean(curves, axis=1)
+        methods[method] = {
+            "mean": float(auc.mean()),
+            "sd": float(auc.std()),
+            "last_step_mean": float(np.mean([curve[-1] for curve in curves])),
+            "frames": 12,
+        }
+    folder = write_run(
+        workspace / f"score-{name}",
+        "score",
+        {"input": name, "fill": "grey"},
+        {
+            "input": name,
+            "source": "simulated",
+            "fill": "grey",
+            "steps": size,
+            "pixels_per_step": size,
+            "methods": methods,
+            "alarms": ["on 3 frames the filled image is answered like the frame itself"] if name == "raw" else [],
+        },
+        minute=20,
+    )
+    pq.write_table(pa.table(columns), folder / "deletion.parquet")
+    return folder
+
+
+def write_workspace(workspace: Path, *, size: int = 24, trials: int = 6, seed: int = 20261121) -> Path:
+    """Every stage, for both inputs."""
+    rng = np.random.default_rng(seed)
+    write_simulation(workspace)
+    for name in ("raw", "difference"):
+        write_training(workspace, name, size=size, rng=rng)
+        write_evaluation(workspace, name, trials=trials, rng=rng)
+        for source in ("simulated", "real"):
+            write_explanation(workspace, name, source, size=size, rng=rng)
+        write_score(workspace, name, size=size, rng=rng)
+    return workspace

@@ -1,0 +1,257 @@
+"""The verdicts flip where the data flips."""
+
+import numpy as np
+import pytest
+
+from sliplens.intervals import Difference
+from sliplens.report import load_results
+from sliplens.report.study.believing import judge_study, rank_methods
+from sliplens.report.study.claim import all_of, judge_gap, most_of
+from sliplens.report.study.claims import judge_claims
+from sliplens.report.study.evidence import compare_gain, share_of_strongest
+
+from .made_up import write_run
+from .study_results import (
+    GAINS,
+    LOOKS,
+    METHODS,
+    Made,
+    write_choice,
+    write_faithfulness,
+    write_maps,
+    write_others,
+    write_thesis_scores,
+    write_truth,
+)
+
+
+@pytest.fixture
+def judged(tmp_path, rng):
+    """Answers of each claim, by the claim's id and the subject."""
+
+    def judge(made: Made):
+        write_choice(tmp_path, made)
+        for name in made.inputs:
+            write_faithfulness(tmp_path, name, made, rng=rng)
+            write_others(tmp_path, name, made)
+            write_truth(tmp_path, name, made, rng=rng)
+        claims = judge_claims(load_results(tmp_path), rng=rng)
+        return {(claim.id, answer.subject): answer for claim in claims for answer in claim.answers}
+
+    return judge
+
+
+DIFFERENCE, RAW, BOTH = "Difference images", "Raw images", "Both networks"
+
+
+@pytest.mark.parametrize(
+    ("gains", "outcome"),
+    [
+        ({}, "holds"),
+        # overtaken by one of the two is enough
+        ({"grad-cam": 0.3}, "does not hold"),
+        ({"poly-cam": -0.1}, "does not hold"),
+        # the same gain but for what trials add: no interval leaves zero out in most fills
+        ({"integrated-gradients": GAINS["poly-cam"]}, "undecided"),
+    ],
+)
+def test_poly_cam_is_most_faithful_only_where_it_gains_more(judged, gains, outcome):
+    answer = judged(Made(gains=GAINS | gains))["most-faithful", DIFFERENCE]
+
+    assert answer.outcome == outcome
+
+
+@pytest.mark.parametrize(("raw_more", "outcome"), [(0.0, "holds"), (0.3, "does not hold")])
+def test_difference_images_lead_only_where_their_gain_is_larger(judged, raw_more, outcome):
+    assert judged(Made(raw_more=raw_more))["difference", BOTH].outcome == outcome
+
+
+@pytest.mark.parametrize(("gain", "outcome"), [(-0.05, "holds"), (0.2, "does not hold"), (0.021, "undecided")])
+def test_grad_cam_is_unfaithful_only_where_a_control_or_chance_beats_it(judged, gain, outcome):
+    # the best control gains 0.02: a gain of 0.021 is above chance for sure and beats nothing
+    answer = judged(Made(gains=GAINS | {"grad-cam": gain, "edges": 0.02}))["grad-cam", DIFFERENCE]
+
+    assert answer.outcome == outcome
+
+
+def test_grad_cam_below_an_edge_filter_is_unfaithful_though_above_chance(judged):
+    answer = judged(Made(gains=GAINS | {"grad-cam": 0.05, "edges": 0.2}))["grad-cam", DIFFERENCE]
+
+    assert answer.outcome == "holds"
+    assert "less Edge filter (control)" in answer.text
+
+
+@pytest.mark.parametrize(
+    ("variation", "stability", "outcome"),
+    [(0.2, 0.6, "holds"), (0.005, 0.6, "does not hold"), (0.2, 0.99, "does not hold"), (0.03, 0.6, "undecided")],
+)
+def test_integrated_gradients_is_noisy_by_both_measures_or_not(judged, variation, stability, outcome):
+    own = {**LOOKS["integrated-gradients"], "total_variation": variation, "noise_stability": stability}
+
+    assert judged(Made(looks={**LOOKS, "integrated-gradients": own}))["noisy", RAW].outcome == outcome
+
+
+@pytest.mark.parametrize(
+    ("top_share", "edge_mass", "outcome"),
+    [(0.8, 0.3, "holds"), (0.2, 0.3, "does not hold"), (0.8, 0.01, "does not hold")],
+)
+def test_edges_of_two_markers_need_both_the_share_and_the_edges(judged, top_share, edge_mass, outcome):
+    answer = judged(Made(top_share=top_share, edge_mass=edge_mass))["two-markers", DIFFERENCE]
+
+    assert answer.outcome == outcome
+
+
+def test_poly_cam_as_in_the_thesis_is_judged_beside_ours(judged):
+    methods = (*METHODS, "poly-cam-thesis")
+    answers = judged(Made(methods=methods, gains=GAINS | {"poly-cam-thesis": -0.2}))
+
+    found = {subject: answer.outcome for (claim, subject), answer in answers.items() if claim == "most-faithful"}
+    assert found["Difference images, Poly-CAM as in the thesis"] == "does not hold"
+    assert found["Difference images, Poly-CAM"] == "holds"
+
+
+def test_claims_without_results_stay_undecided_and_say_so(judged, tmp_path, rng):
+    write_choice(tmp_path, Made())
+
+    claims = judge_claims(load_results(tmp_path), rng=rng)
+
+    answers = [answer for claim in claims for answer in claim.answers]
+    assert len(claims) == 5
+    assert {answer.outcome for answer in answers} == {"undecided"}
+    assert all("Not tested: " in answer.text for answer in answers)
+
+
+def test_one_network_alone_is_judged_alone(judged):
+    answers = judged(Made(inputs=("raw",)))
+
+    assert {subject for _, subject in answers} == {RAW, BOTH}
+    assert "those of one are there" in answers["difference", BOTH].text
+
+
+def test_every_interval_of_a_claim_is_told_with_its_setting(judged):
+    answer = judged(Made())["most-faithful", DIFFERENCE]
+
+    assert {finding.where for finding in answer.findings} == {
+        "untouched frame",
+        "grey",
+        "blur",
+        "untouched frame (markers)",
+        "true scene",
+    }
+    assert all(finding.gap is not None and finding.gap.low < finding.gap.high for finding in answer.findings)
+
+
+def test_the_score_of_the_thesis_is_told_but_does_not_decide(tmp_path, rng):
+    made = Made(inputs=("difference",))
+    write_choice(tmp_path, made)
+    write_faithfulness(tmp_path, "difference", made, rng=rng)
+    maps = write_maps(tmp_path, "difference", made, rng=rng)
+    # by the thesis's score Poly-CAM is the worst
+    write_thesis_scores(tmp_path, "difference", Made(gains=GAINS | {"poly-cam": -0.5}), maps, rng=rng)
+
+    answer = judge_claims(load_results(tmp_path), rng=rng)[0].answers[0]
+
+    told = [finding for finding in answer.findings if finding.where == "score of the thesis"]
+    assert answer.outcome == "holds"
+    assert len(told) == 2
+    assert all(finding.outcome is None and finding.gap is not None and finding.gap.low > 0 for finding in told)
+
+
+def test_estimates_are_the_gaps_that_were_put_in(judged, tmp_path, rng):
+    judged(Made(spread=0.0))
+    curves = load_results(tmp_path).study.faithfulness["difference"].curves
+
+    gap = compare_gain(curves["grey", "pixel", "poly-cam"], curves["grey", "pixel", "grad-cam"], rng=rng)
+
+    # curves were built to have that area; trapezoids of 21 steps add no error to an area set by trapezoids
+    assert gap is not None
+    assert gap.estimate == pytest.approx(GAINS["poly-cam"] - GAINS["grad-cam"], abs=1e-9)
+
+
+def test_same_data_give_the_same_claims(judged, tmp_path):
+    judged(Made())
+    results = load_results(tmp_path)
+
+    again = [judge_claims(results, rng=np.random.default_rng(0)) for _ in range(2)]
+
+    assert again[0] == again[1]
+
+
+def test_share_of_the_strongest_is_that_of_the_effects(judged, tmp_path, rng):
+    judged(Made(top_share=0.7))
+
+    share = share_of_strongest(load_results(tmp_path).study.truth["raw"].effects, count=2, rng=rng)
+
+    # effects were scaled by up to 2 %, each on its own
+    assert share is not None
+    assert share.estimate == pytest.approx(0.7, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "joined", "most"),
+    [
+        (["holds", "holds"], "holds", "holds"),
+        (["holds", "undecided"], "undecided", "undecided"),
+        (["holds", "holds", "undecided"], "undecided", "holds"),
+        (["holds", "holds", "does not hold"], "does not hold", "undecided"),
+        (["does not hold", "does not hold", "undecided"], "does not hold", "does not hold"),
+        ([], "undecided", "undecided"),
+    ],
+)
+def test_outcomes_join(outcomes, joined, most):
+    assert all_of(outcomes) == joined
+    assert most_of(outcomes) == most
+
+
+def test_a_gap_over_too_few_trials_decides_nothing():
+    gap = Difference(estimate=1.0, low=0.9, high=1.1, units=3)
+
+    assert judge_gap(gap) == "undecided"
+
+
+def test_the_method_to_believe_is_the_one_that_beats_the_controls(judged, tmp_path, rng):
+    judged(Made(gains=GAINS | {"integrated-gradients": 0.4}))
+
+    statements = {one.topic: one for one in judge_study(load_results(tmp_path), rng=rng)}
+
+    found = statements["Which to believe, difference images"]
+    assert found.tone == "good"
+    assert found.text.startswith("Believe Integrated Gradients. Under 4 of 4 fills")
+    assert "ahead of Poly-CAM, the next, under untouched frame, grey, blur and true scene" in found.text
+    assert "Grad-CAM does not beat the controls" in found.text
+
+
+def test_no_method_is_believed_where_a_control_wins(judged, tmp_path, rng):
+    judged(Made(gains=GAINS | {"edges": 0.5}))
+
+    found = judge_study(load_results(tmp_path), rng=rng)[0]
+
+    assert found.tone == "caution"
+    assert found.text.startswith("None: no method beats both chance and the best control under most fills.")
+    assert "Poly-CAM comes nearest, under 0 of 4" in found.text
+
+
+def test_too_few_trials_believe_nothing(judged, tmp_path, rng):
+    judged(Made(trials=3))
+
+    found = judge_study(load_results(tmp_path), rng=rng)[0]
+
+    assert found.text == "Not known: 3 trials are too few to tell a method from chance; 5 or more are needed."
+
+
+def test_a_fill_counts_once_whatever_the_units(judged, tmp_path):
+    judged(Made())
+
+    best = rank_methods(load_results(tmp_path).study.faithfulness["raw"])[0]
+
+    # the untouched frame was tried by pixel and by marker
+    assert best.tested == (("reference", "pixel"), ("grey", "pixel"), ("blur", "pixel"), ("true", "marker"))
+
+
+def test_without_scores_nothing_is_believed(tmp_path, rng):
+    write_choice(tmp_path, Made())
+    write_run(tmp_path / "looks-raw", "looks", {}, {"input": "raw", "source": "simulated", "frames": 1, "methods": {}})
+
+    statements = judge_study(load_results(tmp_path), rng=rng)
+
+    assert [one.text.split(":")[0] for one in statements] == ["Not known", "Not known"]

@@ -1,0 +1,167 @@
+"""What the figures of a study are made of."""
+
+import csv
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from sliplens.errors import InputError
+from sliplens.faithfulness.deletion import deletion_order
+from sliplens.report import load_results
+from sliplens.report.study.grids import Cell, draw_grid
+from sliplens.report.study.plates import Plate, show_plate, write_plates
+from sliplens.report.study.removal_figures import plate_removal
+from sliplens.report.study.score_tables import table_scores
+from sliplens.report.study.shown import bright_pictures, explained_of, gone, shown_frames, told_frame
+from sliplens.report.study.truth_figures import paint_effects
+from sliplens.report.style import ORANGE, SKY
+
+from .study_results import METHODS, Made, write_choice, write_faithfulness
+
+
+@pytest.fixture(scope="module")
+def results(pristine_study):
+    return load_results(pristine_study)
+
+
+def make_plate(name: str = "one", numbers: dict | None = None) -> Plate:
+    figure = Figure(figsize=(2, 1), layout="constrained")
+    figure.subplots().plot([0, 1])
+    return Plate(
+        name=name, figure=figure, alt="A line that rises.", caption="A line.", numbers=numbers or {"x": [0, 1]}
+    )
+
+
+def test_what_is_gone_is_what_the_score_removes(rng):
+    # many ties: which of them goes first must be the same too
+    saliency = rng.integers(0, 4, (12, 9)) / 3
+
+    for pixels in (0, 1, 17, 60, 108):
+        expected = np.zeros(saliency.size, dtype=bool)
+        expected[deletion_order(saliency)[:pixels]] = True
+        np.testing.assert_array_equal(gone(saliency, pixels), expected.reshape(saliency.shape))
+
+
+def test_shown_frames_are_one_trial_from_stick_to_slip(results):
+    explained = explained_of(results, "raw")
+    assert explained is not None
+
+    frames = shown_frames(results, explained)
+
+    assert [frame.level for frame in frames] == [1.0, 0.8, 0.6, 0.4, 0.2, 0.0]
+    assert {explained.frames[frame.index].id[:3] for frame in frames} == {"t00"}
+
+
+def test_deletion_is_shown_on_the_scored_frame_nearest_to_a_fifth(results):
+    explained = explained_of(results, "raw")
+    assert explained is not None
+
+    index = told_frame(explained, results.scores["raw", "simulated"].curves)
+
+    assert index is not None
+    assert explained.frames[index].id == "t00-f0032"
+
+
+def test_differences_are_made_brighter_all_alike_and_raw_frames_never(results):
+    raw, difference = explained_of(results, "raw"), explained_of(results, "difference")
+    assert raw is not None
+    assert difference is not None
+
+    untouched, called = bright_pictures(raw, [0, 3])
+    np.testing.assert_array_equal(untouched[3], raw.pictures[3])
+    assert called == "Input"
+
+    # the frame of full stick alone is all but black
+    brighter, called = bright_pictures(difference, [0])
+    factor = float(called.split("\N{NO-BREAK SPACE}")[1])
+    assert factor > 1
+    np.testing.assert_array_equal(brighter[0], np.minimum(np.round(np.float32(factor) * difference.pictures[0]), 255))
+
+
+def test_effects_are_orange_below_zero_and_blue_above():
+    picture = np.full((4, 4, 3), 100, dtype=np.uint8)
+    effects = np.zeros((4, 4), dtype=np.float32)
+    effects[0, 0], effects[3, 3] = -0.2, 0.2
+
+    painted = paint_effects(picture, effects)
+
+    np.testing.assert_allclose(painted[0, 0] / 255, to_rgb(ORANGE), atol=1 / 255)
+    np.testing.assert_allclose(painted[3, 3] / 255, to_rgb(SKY), atol=1 / 255)
+    # where nothing happens the picture is grey
+    assert len(set(painted[1, 1].tolist())) == 1
+
+
+def test_effects_of_another_size_are_laid_on_their_places():
+    painted = paint_effects(np.zeros((8, 8, 3), dtype=np.uint8), np.array([[1.0, 0.0], [0.0, 0.0]], dtype=np.float32))
+
+    assert painted[:4, :4].any(axis=-1).all()
+    assert not painted[4:].any()
+    assert not painted[:, 4:].any()
+
+
+def test_removed_pixels_are_as_many_as_the_caption_says(results):
+    plate = plate_removal(results, "poly-cam")
+
+    assert plate is not None
+    shares = np.array(plate.numbers["share_removed"])[:7]
+    # one step removes 1/24 of the image: the nearest step is within half of that
+    np.testing.assert_allclose(shares, [0, 0.01, 0.05, 0.1, 0.2, 0.5, 1.0], atol=1 / 24)
+
+
+def test_grid_has_an_axes_for_each_cell_and_leaves_absent_ones_blank():
+    picture = np.zeros((5, 5, 3), dtype=np.uint8)
+
+    grid = draw_grid([("A", [Cell(picture=picture), Cell(picture=None)])], heads=["one", "two"])
+
+    assert [len(row) for row in grid.axes] == [2]
+    assert [len(ax.images) for ax in grid.axes[0]] == [1, 0]
+    assert [text.get_text() for text in grid.axes[0][1].texts] == ["no frame"]
+
+
+def test_numbers_are_written_with_nine_digits(tmp_path):
+    page, table = write_plates([make_plate(numbers={"name": ["a", "b"], "value": np.array([1 / 3, 2.0])})], tmp_path)
+
+    with table.open(newline="") as stream:
+        assert list(csv.reader(stream)) == [["name", "value"], ["a", "0.333333333"], ["b", "2"]]
+    assert page.name == "one.pdf"
+
+
+def test_columns_of_unequal_length_write_nothing(tmp_path):
+    with pytest.raises(ValueError, match="shorter"):
+        write_plates([make_plate(numbers={"a": [1, 2], "b": [1]})], tmp_path)
+
+    assert not list(tmp_path.rglob("*.csv*"))
+
+
+def test_folder_that_cannot_be_made_is_told(tmp_path):
+    (tmp_path / "figures").write_text("")
+
+    with pytest.raises(InputError, match=r"cannot write .*one.pdf"):
+        write_plates([make_plate()], tmp_path / "figures")
+
+
+def test_same_plate_makes_the_same_files(tmp_path):
+    files = [write_plates([make_plate()], tmp_path / name)[0].read_bytes() for name in "ab"]
+
+    assert files[0] == files[1]
+    assert show_plate(make_plate()).pictures == show_plate(make_plate()).pictures
+
+
+def test_figures_of_the_thesis_are_named_as_such():
+    assert show_plate(make_plate("fig-05-deletion")).files.startswith("Fig. 5 of the thesis, for this data;")
+    assert show_plate(make_plate("timing")).files.startswith("Also figures/timing.pdf")
+
+
+@pytest.mark.parametrize(("more", "beside"), [((), "Poly-CAM"), (("poly-cam-thesis",), "Poly-CAM as in the thesis")])
+def test_the_thesis_stands_beside_its_own_poly_cam(tmp_path, rng, more, beside):
+    made = Made(inputs=("raw",), methods=(*METHODS, *more))
+    write_choice(tmp_path, made)
+    write_faithfulness(tmp_path, "raw", made, rng=rng)
+
+    table = table_scores(load_results(tmp_path).study.faithfulness["raw"], None)
+
+    told = {row[0].text: row[2].text for row in table.rows}
+    assert told[beside] == "0.512 ± 0.203"
+    assert list(told.values()).count("0.512 ± 0.203") == 1

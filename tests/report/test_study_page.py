@@ -1,0 +1,286 @@
+"""The page of a study: whole, by itself, and true to its numbers."""
+
+import csv
+import html
+import re
+import shutil
+from html.parser import HTMLParser
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import refused, run
+
+from sliplens.report import Written, load_results
+from sliplens.report.page import build_page, render_page
+
+from .study_results import Made, write_choice, write_others
+
+THESIS_FIGURES = {
+    "fig-04-states",
+    "fig-05-deletion",
+    "fig-07-mse-by-bin",
+    "fig-08-methods",
+    "fig-09-faithfulness",
+    "fig-10-highlighted",
+    "fig-11-poly-cam-difference",
+    "fig-12-poly-cam-raw",
+    "fig-15-methods-difference",
+    "fig-16-methods-raw",
+    "fig-17-faithfulness-difference",
+    "fig-18-faithfulness-raw",
+    "fig-19-removal-grad-cam",
+    "fig-20-removal-integrated-gradients",
+    "fig-21-removal-poly-cam",
+}
+OWN_FIGURES = {"randomisation", "sound-curves-difference", "sound-curves-raw", "truth-difference", "truth-raw"}
+STAGES = ("deletion", "faithfulness", "randomisation", "looks", "timing", "truth")
+
+
+class Reader(HTMLParser):
+    """Tags with their attributes, and the caption of each figure."""
+
+    def __init__(self):
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.captions: list[str] = []
+        self._inside = False
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag == "figcaption":
+            self._inside = True
+            self.captions.append("")
+
+    def handle_endtag(self, tag):
+        self._inside = self._inside and tag != "figcaption"
+
+    def handle_data(self, data):
+        if self._inside:
+            self.captions[-1] += data
+
+
+@pytest.fixture(scope="module")
+def text(study_report: Written) -> str:
+    return study_report.page.read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def reader(text) -> Reader:
+    reader = Reader()
+    reader.feed(text)
+    return reader
+
+
+@pytest.fixture(scope="module")
+def caption(reader):
+    """Caption of a figure, by the name of its files."""
+    return lambda name: next(one for one in reader.captions if f"figures/{name}.pdf" in one)
+
+
+@pytest.fixture(scope="module")
+def numbers(study_report: Written):
+    """Rows of a figure's CSV."""
+
+    def read(name: str) -> list[dict[str, str]]:
+        with (study_report.page.parent / "figures" / f"{name}.csv").open(encoding="utf-8", newline="") as stream:
+            return list(csv.DictReader(stream))
+
+    return read
+
+
+def test_every_figure_of_the_thesis_is_there_as_pdf_and_csv(study_report):
+    found = {path.stem: path for path in study_report.figures}
+
+    assert set(found) == THESIS_FIGURES | OWN_FIGURES
+    assert {path.name for path in (study_report.page.parent / "figures").iterdir()} == {
+        f"{name}.{suffix}" for name in found for suffix in ("pdf", "csv")
+    }
+    for path in study_report.figures:
+        assert path.suffix == ".csv" or path.read_bytes().startswith(b"%PDF")
+        assert b"CreationDate" not in path.read_bytes()
+
+
+def test_page_asks_for_nothing_but_itself(text, reader):
+    asked = [value for _, attributes in reader.tags for key in ("src", "href") if (value := attributes.get(key))]
+
+    assert asked
+    assert all(value.startswith(("data:image/", "#")) for value in asked)
+    assert not re.search(r"url\(|@import|<link|<script|http-equiv=\"refresh", text)
+
+
+def test_every_picture_has_words(reader):
+    images = [attributes for tag, attributes in reader.tags if tag == "img"]
+
+    assert len(images) == len(THESIS_FIGURES | OWN_FIGURES)
+    assert all(len(attributes["alt"] or "") > 20 for attributes in images)
+
+
+def test_headings_go_down_one_step_at_a_time(reader):
+    levels = [int(tag[1]) for tag, _ in reader.tags if re.fullmatch(r"h[1-6]", tag)]
+
+    assert levels[0] == 1
+    assert levels.count(1) == 1
+    assert all(after <= before + 1 for before, after in pairwise(levels))
+
+
+def test_verdict_comes_first_and_the_contents_lead_everywhere(reader):
+    sections = [attributes["id"] for tag, attributes in reader.tags if tag == "section"]
+    links = [attributes["href"] for tag, attributes in reader.tags if tag == "a"]
+
+    assert sections[:4] == ["verdict", "claims", "accuracy", "faithfulness"]
+    assert "truth" in sections
+    assert links == [f"#{one}" for one in sections]
+
+
+def test_all_five_claims_are_answered_for_both_networks(text):
+    answers = re.findall(r'<span class="badge ([a-z-]+)">', text)
+
+    # (b) compares both networks and has one answer
+    assert len(answers) == 2 + 1 + 2 + 2 + 2
+    assert set(answers) == {"holds"}
+
+
+def test_caption_of_the_bins_is_their_largest_error(caption, numbers):
+    rows = [row for row in numbers("fig-07-mse-by-bin") if row["mse"]]
+
+    for condition in ("dry", "wet"):
+        worst = max((row for row in rows if row["condition"] == condition), key=lambda row: float(row["mse"]))
+        place = f"{100 * float(worst['low']):.0f}\N{NO-BREAK SPACE}% to {100 * float(worst['high']):.0f}"
+        assert f"{condition}: {place}" in caption("fig-07-mse-by-bin")
+        assert f"MSE {float(worst['mse']):.4f}" in caption("fig-07-mse-by-bin")
+
+
+@pytest.mark.parametrize("name", ["fig-09-faithfulness", "fig-17-faithfulness-difference", "fig-18-faithfulness-raw"])
+def test_captions_of_the_deletion_curves_are_their_means(caption, numbers, name):
+    by_curve: dict[tuple[str, str], list[float]] = {}
+    for row in numbers(name):
+        by_curve.setdefault((row["input"], row["method"]), []).append(float(row["mean"]))
+
+    told = [float(value) for value in re.findall(r"(?:CAM|Gradients|\(control\)) (0\.\d{3})", caption(name))]
+    assert sorted(told) == sorted(round(float(np.mean(values)), 3) for values in by_curve.values())
+
+
+@pytest.mark.parametrize("name", ["difference", "raw"])
+def test_captions_of_the_sound_curves_are_the_areas_between_them(caption, numbers, name):
+    rows = [row for row in numbers(f"sound-curves-{name}") if (row["fill"], row["unit"]) == ("reference", "pixel")]
+    words = {"poly-cam": "Poly-CAM", "grad-cam": "Grad-CAM", "integrated-gradients": "Integrated Gradients"}
+
+    for method, word in words.items():
+        own = [row for row in rows if row["method"] == method]
+        area, most, least = (
+            np.array([float(row[key]) for row in own]) for key in ("area", "most_first", "least_first")
+        )
+        gain = f"{np.trapezoid(most - least, area):+.3f}".replace("-", "\N{MINUS SIGN}")
+        assert f"{word} {gain}" in caption(f"sound-curves-{name}")
+
+
+@pytest.mark.parametrize("method", ["19-removal-grad-cam", "20-removal-integrated-gradients", "21-removal-poly-cam"])
+def test_captions_of_the_removal_are_its_answers_and_scores(caption, numbers, method):
+    rows = numbers(f"fig-{method}")
+
+    whole, last = rows[0], rows[6]
+    assert float(last["share_removed"]) == 1
+    words = f"y {100 * float(last['prediction']):.0f}\N{NO-BREAK SPACE}%, D {float(last['score']):.2f}"
+    assert f"whole y {100 * float(whole['prediction']):.0f}\N{NO-BREAK SPACE}%" in caption(f"fig-{method}")
+    assert words in caption(f"fig-{method}")
+
+
+def test_caption_of_what_is_highlighted_is_what_is_gone(caption, numbers):
+    rows = [row for row in numbers("fig-10-highlighted") if float(row["pixels_removed"]) > 0]
+
+    assert {(row["input"], row["method"]) for row in rows} == {
+        (name, method) for name in ("difference", "raw") for method in ("grad-cam", "integrated-gradients", "poly-cam")
+    }
+    for row in rows:
+        gone, answer = (f"{100 * float(row[key]):.0f}\N{NO-BREAK SPACE}%" for key in ("share_removed", "prediction"))
+        assert f"{gone} gone, y {answer}, D {float(row['score']):.2f}" in caption("fig-10-highlighted")
+
+
+def test_caption_of_the_fields_is_the_saliency_on_moving_skin(caption, numbers):
+    for row in numbers("fig-12-poly-cam-raw"):
+        share, margin = (100 * float(row[key]) for key in ("saliency_moves_share", "safety_margin"))
+        assert f"{share:.0f}\N{NO-BREAK SPACE}% at Γ {margin:.0f}" in caption("fig-12-poly-cam-raw")
+
+
+def test_caption_of_the_methods_is_their_share_above_half(caption, numbers):
+    for row in numbers("fig-08-methods"):
+        assert f"{100 * float(row['share_above_half']):.0f}\N{NO-BREAK SPACE}% ({row['input']})" in caption(
+            "fig-08-methods"
+        )
+
+
+def test_tables_hold_the_thesis_score_beside_the_sound_ones(text, pristine_study):
+    results = load_results(pristine_study)
+    cells = {html.unescape(one) for one in re.findall(r"<td[^>]*>([^<]*)</td>", text)}
+
+    for name in ("difference", "raw"):
+        scored = results.scores[name, "simulated"].methods["poly-cam"]
+        assert f"{scored.mean:.3f} ± {scored.sd:.3f}" in cells
+        for score in results.study.faithfulness[name].scores:
+            gap = score.srg
+            values = [f"{one:+.3f}".replace("-", "\N{MINUS SIGN}") for one in (gap.estimate, gap.low, gap.high)]
+            assert f"{values[0]}{'*' if gap.sure else ''}\n{values[1]} to {values[2]}" in cells
+    assert {"0.325 ± 0.106", "0.200 ± 0.146"} <= cells
+
+
+def test_alarms_and_the_choice_of_trials_are_told(text):
+    assert "The fill decides in 2 of 18 frames." in text
+    assert "does not beat a random order" in text
+    assert "5 of 60 dry test trials lie within 3 %, so the nearest other was taken too." in text
+
+
+@pytest.mark.parametrize("kept", ["choice", "states", *(f"{stage}-raw" for stage in STAGES)])
+def test_a_stage_alone_makes_a_page_that_names_the_others(pristine_study, tmp_path, kept):
+    shutil.copytree(pristine_study / kept, tmp_path / kept)
+
+    page = render_page(build_page(load_results(tmp_path)))
+
+    missing = re.findall(r'<p class="missing">([^<]*)</p>', page)
+    assert len(missing) >= 8
+    assert all("not run yet; `sliplens study` makes it." in one for one in missing)
+    assert "<h2>Verdict</h2>" in page
+
+
+def test_one_network_alone_misses_nothing_of_the_other(tmp_path):
+    made = Made(inputs=("raw",))
+    write_choice(tmp_path, made)
+    write_others(tmp_path, "raw", made)
+
+    page = render_page(build_page(load_results(tmp_path)))
+
+    assert not re.findall(r'<p class="missing">Difference images', page)
+
+
+def test_command_says_what_it_wrote(pristine_study, tmp_path, capsys):
+    shutil.copytree(pristine_study / "timing-raw", tmp_path / "timing-raw")
+    shutil.copytree(pristine_study / "randomisation-raw", tmp_path / "randomisation-raw")
+
+    assert run("report", tmp_path) == 0
+
+    told = capsys.readouterr().out
+    assert f"{tmp_path / 'figures'}  1 figures as PDF, their numbers as CSV" in told
+    assert f"{tmp_path / 'report.html'}  open it in a browser" in told
+    # a half-written file has a name that begins with a point
+    assert not list(tmp_path.rglob(".*"))
+
+
+def test_nothing_is_written_where_a_result_is_malformed(pristine_study, tmp_path, capsys):
+    shutil.copytree(pristine_study / "randomisation-raw", tmp_path / "randomisation-raw")
+    (tmp_path / "randomisation-raw" / "result.json").write_text('{"input": "raw"}')
+
+    told = refused(capsys, "report", tmp_path)
+
+    assert "lacks" in told
+    assert [path.name for path in Path(tmp_path).iterdir()] == ["randomisation-raw"]
+
+
+def test_figures_of_others_are_left_alone(pristine_study, tmp_path):
+    shutil.copytree(pristine_study / "randomisation-raw", tmp_path / "randomisation-raw")
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "my-own.pdf").write_text("mine")
+
+    assert run("report", tmp_path) == 0
+
+    assert (tmp_path / "figures" / "my-own.pdf").read_text() == "mine"

@@ -1,0 +1,191 @@
+"""What a study saved is read whole, and refused in one sentence where it is malformed."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+from sliplens.errors import InputError
+from sliplens.report import load_results
+
+from .study_results import FILLS, METHODS
+
+
+def change(path: Path, place: tuple, value: object) -> None:
+    """Put a value into a JSON file, `place` keys and indices deep."""
+    whole = json.loads(path.read_text(encoding="utf-8"))
+    inside = whole
+    for key in place[:-1]:
+        inside = inside[key]
+    inside[place[-1]] = value
+    path.write_text(json.dumps(whole), encoding="utf-8")
+
+
+def test_every_stage_is_read(study):
+    found = load_results(study).study
+
+    assert found.choice is not None
+    assert found.states is not None
+    assert found.inputs == {"raw"}
+    assert found.source == "simulated"
+    for table in (found.deletion, found.faithfulness, found.randomisation, found.looks, found.timing, found.truth):
+        assert set(table) == {"raw"}
+
+
+def test_curves_and_scores_tell_the_same(study):
+    faithful = load_results(study).study.faithfulness["raw"]
+
+    assert {key[:2] for key in faithful.curves} == set(FILLS)
+    for score in faithful.scores:
+        curve = faithful.curves[score.key]
+        assert curve.most_first.shape == (18, 21)
+        assert curve.srg.mean() == pytest.approx(score.srg.estimate)
+
+
+def test_rows_may_stand_in_any_order(study):
+    path = study / "faithfulness-raw" / "curves.parquet"
+    before = load_results(study).study.faithfulness["raw"].curves
+    table = pq.read_table(path)
+    pq.write_table(table.take(np.random.default_rng(0).permutation(table.num_rows)), path)
+
+    after = load_results(study).study.faithfulness["raw"].curves
+
+    assert set(after) == set(before)
+    for key, curve in after.items():
+        assert curve.frame_ids == before[key].frame_ids
+        np.testing.assert_array_equal(curve.trials, before[key].trials)
+        np.testing.assert_array_equal(curve.least_first, before[key].least_first)
+
+
+def test_curves_that_stop_early_keep_their_length(study):
+    remedies = load_results(study).study.deletion["raw"]
+
+    stopped = remedies.curves["stop-at-half", "grad-cam"]
+    assert len(stopped) == 18
+    assert all(len(curve.pixels_removed) < 24 for curve in stopped.values())
+    assert all(len(curve.pixels_removed) == 24 for curve in remedies.curves["insertion", "grad-cam"].values())
+
+
+def test_markers_keep_their_places(study):
+    states = load_results(study).study.states
+
+    assert states is not None
+    assert [frame.contact_state for frame in states.frames] == ["contact", *["incipient slip"] * 4, "full slip"]
+    for frame in states.frames:
+        assert frame.rest_px.shape == frame.position_px.shape == (36, 2)
+        # one marker was not followed
+        assert np.isnan(frame.position_px[0]).all()
+        assert np.isfinite(frame.position_px[1:]).all()
+
+
+def test_null_is_unknown(study):
+    change(study / "looks-raw" / "result.json", ("methods", "poly-cam", "resolution"), None)
+    change(study / "truth-raw" / "result.json", ("network_against_margin",), None)
+    change(study / "truth-raw" / "result.json", ("intervals", "poly-cam", "spearman_margin"), None)
+    change(study / "randomisation-raw" / "result.json", ("methods", "poly-cam", "similarity", 1), None)
+    change(study / "faithfulness-raw" / "result.json", ("agreement", 0, "tau"), None)
+
+    found = load_results(study).study
+
+    assert found.looks["raw"].methods["poly-cam"]["resolution"] is None
+    assert found.truth["raw"].network_against_margin is None
+    assert found.truth["raw"].methods["poly-cam"].margin is None
+    assert found.randomisation["raw"].methods["poly-cam"].similarity[1] is None
+    assert found.faithfulness["raw"].agreement[0].tau is None
+
+
+@pytest.mark.parametrize(
+    ("file", "place", "value", "message"),
+    [
+        ("choice", ("trials", 0, "qualified"), "yes", r"at trials\[0\] has 'yes' as 'qualified' where true or false"),
+        ("choice", ("told",), None, r"choice/result.json lacks 'told'; make the folder again with `sliplens study`"),
+        ("states", ("frame_size",), [24], r"has 1 numbers as 'frame_size'"),
+        ("states", ("frames",), [], r"states/result.json names no frame"),
+        ("states", ("frames", 0, "id"), "../x", r"'../x.raw.png' in .*states is no file name"),
+        ("deletion-raw", ("variants", "insertion", "mode"), "up", r"has 'up' as 'mode' where deletion or insertion"),
+        ("faithfulness-raw", ("scores", 0, "srg"), 0.1, r"has 0.1 as 'srg' where an object belongs"),
+        ("faithfulness-raw", ("scores", 0, "srg", "low"), "x", r"at scores\[0\] at srg has 'x' as 'low'"),
+        ("faithfulness-raw", ("scores", 0, "at"), {"all": 1.0}, r"names an area under 'at' that is no number"),
+        ("faithfulness-raw", ("scores", 0, "method"), "none", r"lacks the curves of reference / pixel / none"),
+        ("randomisation-raw", ("methods", "poly-cam", "layers"), [1], r"has 1 layers but 4 similarities"),
+        ("randomisation-raw", ("methods", "poly-cam", "similarity"), 1, r"'similarity' where a list of numbers"),
+        ("looks-raw", ("methods", "poly-cam", "gini"), "much", r"has 'much' as 'gini' where a finite number"),
+        ("timing-raw", ("methods", "poly-cam", "seconds"), None, r"lacks 'seconds'"),
+        ("truth-raw", ("areas",), [], r"has \[\] as 'areas' where an object belongs"),
+        ("truth-raw", ("meta", 0, "holds"), 1, r"has 1 as 'holds' where true or false belongs"),
+    ],
+)
+def test_malformed_fields_are_told_in_one_sentence(study, file, place, value, message):
+    change(study / file / "result.json", place, value)
+
+    with pytest.raises(InputError, match=message) as caught:
+        load_results(study)
+
+    assert "\n" not in str(caught.value)
+    assert "`sliplens study`" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("file", "message"),
+    [
+        ("faithfulness-raw/curves.parquet", r"curves.parquet does not exist"),
+        ("deletion-raw/deletion.parquet", r"deletion.parquet does not exist"),
+        ("truth-raw/effects.parquet", r"effects.parquet does not exist"),
+        ("truth-raw/maps.npz", r"maps.npz does not exist"),
+        ("states/markers.parquet", r"markers.parquet does not exist"),
+        ("states/frames/t00-f0000.raw.png", r"t00-f0000.raw.png does not exist"),
+    ],
+)
+def test_missing_files_are_told(study, file, message):
+    (study / file).unlink()
+
+    with pytest.raises(InputError, match=message):
+        load_results(study)
+
+
+def test_a_curve_without_all_its_areas_is_told(study):
+    path = study / "faithfulness-raw" / "curves.parquet"
+    pq.write_table(pq.read_table(path).slice(1), path)
+
+    with pytest.raises(InputError, match=r"lacks areas of some frames under reference / pixel / grad-cam"):
+        load_results(study)
+
+
+def test_a_table_without_a_column_is_told(study):
+    path = study / "truth-raw" / "effects.parquet"
+    pq.write_table(pq.read_table(path).drop_columns(["margin_effect"]), path)
+
+    with pytest.raises(InputError, match=r"effects.parquet lacks the column margin_effect"):
+        load_results(study)
+
+
+def test_maps_of_other_frames_are_told(study):
+    np.savez(
+        study / "truth-raw" / "maps.npz", allow_pickle=False, network=np.zeros((2, 4, 4)), margin=np.zeros((2, 4, 4))
+    )
+
+    with pytest.raises(InputError, match=r"holds maps of shape \(2, 4, 4\) where 18 finite ones belong"):
+        load_results(study)
+
+
+def test_a_picture_of_another_size_is_told(study):
+    Image.new("RGB", (10, 10)).save(study / "states" / "frames" / "t00-f0000.difference.png")
+
+    with pytest.raises(InputError, match=r"is 10 x 10 pixels, 24 x 24 are needed"):
+        load_results(study)
+
+
+def test_methods_unknown_to_the_report_are_kept(study):
+    path = study / "faithfulness-raw" / "curves.parquet"
+    table = pq.read_table(path)
+    own = table.filter(pa.array([name == "poly-cam" for name in table["method"].to_pylist()]))
+    named = own.set_column(own.column_names.index("method"), "method", pa.array(["my-cam"] * own.num_rows))
+    pq.write_table(pa.concat_tables([table, named]), path)
+
+    curves = load_results(study).study.faithfulness["raw"].curves
+
+    assert {method for _, _, method in curves} >= {*METHODS, "my-cam"}
