@@ -1,5 +1,6 @@
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -20,7 +21,7 @@ def scored(material: Material, tmp_path_factory: pytest.TempPathFactory) -> Path
     return folder
 
 
-def rows(folder: Path, variant: str, method: str, frame: str) -> list[dict[str, object]]:
+def rows(folder: Path, variant: str, method: str, frame: str) -> list[dict[str, Any]]:
     table = pq.read_table(folder / "deletion.parquet").to_pylist()
     return [one for one in table if (one["variant"], one["method"], one["frame_id"]) == (variant, method, frame)]
 
@@ -29,7 +30,7 @@ def test_insertion_shows_only_the_most_salient_pixels(material: Material, scored
     frame, side = material.explained.frames[0], material.inputs.shape[-1]
     order = deletion_order(material.explained.saliency["grad-cam"][0])
     for row in rows(scored, "insertion", "grad-cam", frame.id):
-        seen = side * side - int(row["pixels_removed"])  # pyright: ignore[reportArgumentType]
+        seen = side * side - int(row["pixels_removed"])
         image = torch.full_like(material.inputs[0], 0.5).flatten(1)
         kept = torch.from_numpy(order[:seen].copy())
         image[:, kept] = material.inputs[0].flatten(1)[:, kept]
@@ -47,7 +48,7 @@ def test_deletion_stops_once_no_pixel_above_a_half_is_left(material: Material, s
     pixels = material.inputs.shape[-1] ** 2
     for index, frame in enumerate(material.explained.frames):
         above = int((material.explained.saliency["grad-cam"][index] > 0.5).sum())
-        steps = [int(row["pixels_removed"]) for row in rows(scored, "stop-at-half", "grad-cam", frame.id)]  # pyright: ignore[reportArgumentType]
+        steps = [int(row["pixels_removed"]) for row in rows(scored, "stop-at-half", "grad-cam", frame.id)]
         assert steps[-1] >= above
         # one step fewer would have left some
         assert len(steps) == 1 or steps[-2] < above

@@ -110,8 +110,8 @@ def _faithfulness(results: Results) -> tuple[Section, list[Plate | Table | Notes
         short_title="Faithfulness",
         intro="Table 2 of the thesis beside scores that do not depend on one fill. Parts of a frame are removed: first "
         "those that a map says speak for the answer, first those that speak least for it, and at random. With a "
-        "faithful map the answer goes back to that on the untouched sensor at once in the first case, and not in the second. "
-        "Controls are maps that know nothing of the trained network.",
+        "faithful map the answer goes back to that on the untouched sensor at once in the first case, and not in the "
+        "second. Controls are maps that know nothing of the trained network.",
         missing=_missing(results, found),
     )
     return section, blocks
