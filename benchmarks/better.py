@@ -95,7 +95,7 @@ def make_maps(trained: TrainedModel, case: Case, *, options: argparse.Namespace)
     """Maps of one frame by name, larger where a pixel supports the change more."""
     model, image, reference = trained.model, case.image[None], case.reference
     added = (case.image - reference).abs().mean(dim=0)
-    ours = PolyCam(budget=options.budget)(model, image, reference=reference)
+    ours = PolyCam(budget=options.budget, levels=True)(model, image, reference=reference)
     with still(model), torch.no_grad():
         alone, published = (
             unit_weights(model, image, [layer.name for layer in find(model, image)])
@@ -108,10 +108,10 @@ def make_maps(trained: TrainedModel, case: Case, *, options: argparse.Namespace)
         print(f"  {told.measured} of {told.channels} channels, expected r {told.pearson_r:.4f}", flush=True)
     return {
         OURS: ours.saliency[0],
-        "regression, times |x - reference|": ours.saliency[0] * added,
+        "regression, activity only": ours.levels[0].saliency[0],
         "thesis, finest": published[0],
         "thesis, level 5": published[5],
-        "same layers, weights 1": alone[0],
+        "same layers, weights 1": alone[0] * added,
         "|x - reference|": added,
     }
 

@@ -62,7 +62,7 @@ def by_hand(model: nn.Module, image, reference, *, layers: tuple[str, ...], vari
     for layer_map in reversed(layer_maps[:-1]):
         smooth = resize(resize(layer_map, result.shape), layer_map.shape)
         result = np.maximum(layer_map / np.maximum(smooth, 1e-12) * resize(result, layer_map.shape), 0)
-    return resize(mask_of(result), size)
+    return resize(mask_of(result), size) * (image - reference).abs().mean(dim=0).numpy()
 
 
 @pytest.mark.parametrize("variant", ["+", "-", "+/-"])
@@ -116,6 +116,14 @@ def test_sums_to_the_change_with_its_sign(network, images, reference):
     assert bool((explanation.completeness_gap < 1e-6).all())
 
 
+def test_nothing_is_relevant_where_the_image_is_the_reference(network, images, reference):
+    images = images[:1].clone()
+    images[..., 20:40, 30:50] = reference[:, 20:40, 30:50]
+    relevance = PolyCam()(network("small shufflenet"), images, reference=reference).relevance[0]
+    assert relevance.any()
+    assert not relevance[20:40, 30:50].any()
+
+
 def test_full_mask_has_the_whole_effect():
     class Flat(nn.Module):
         """One channel, nearly constant but for a dark corner: its mask is nearly full."""
@@ -143,7 +151,7 @@ def test_levels_are_kept_on_request_fine_to_coarse(network, images):
     for level in explanation.levels:
         assert level.saliency.shape == (2, 64, 64)
         assert bool(((level.saliency >= 0) & (level.saliency <= 1)).all())
-    finest = explanation.levels[0].saliency
+    finest = explanation.levels[0].saliency * images[:2].mean(dim=1).float()
     torch.testing.assert_close(explanation.saliency, finest / finest.amax(dim=(1, 2), keepdim=True))
     assert PolyCam()(model, images[:1]).levels == ()
 

@@ -36,7 +36,8 @@ class PolyCam(Method):
 
     A layer's map is relu(sum of weight x activation). From the last layer to the first it is divided by itself
     resized to the coarser result and back, then multiplied by that result. The finest product, normalised like a
-    mask, is the saliency.
+    mask, times what the image adds to the reference, the mean of |x - b| over the colours, is the saliency: where x
+    equals b a mask neither shows nor hides anything, however active the channel.
 
     The relevance is that saliency scaled to add up to f(x) - f(b). The scaling is a convention, not a property of the
     method: it gives the map the sign and unit of the others, and says nothing about how much one pixel contributes.
@@ -107,13 +108,14 @@ class PolyCam(Method):
         count = _Count(total=len(subject.images) * channels, report=on_progress)
         # one engine for all rounds and images
         passes = self._prepare(subject, round(self.budget * channels))
-        weights, saliencies, approximations = [], [], []
+        weights, saliencies, shown, approximations = [], [], [], []
         for index in range(len(subject.images)):
             activations = _activations(subject, index, layers)
             shares, approximation = self._weights(subject, index, activations, passes=passes, count=count)
             weights.append(shares)
             approximations += approximation
             saliencies.append(self._levels(activations, shares, like=subject.images[index]))
+            shown.append(self._shown(saliencies[-1], subject, index))
         levels = tuple(
             Level(
                 layer=layer.name,
@@ -124,7 +126,7 @@ class PolyCam(Method):
         )
         return Found(
             subject=subject,
-            relevance=scale_to(torch.stack([maps[self.level] for maps in saliencies]), total=subject.change),
+            relevance=scale_to(torch.stack(shown), total=subject.change),
             method="poly-cam",
             complete=True,
             findings=(
@@ -141,6 +143,12 @@ class PolyCam(Method):
     @staticmethod
     def _levels(activations: list[Tensor], weights: list[Tensor], *, like: Tensor) -> list[Tensor]:
         return combine(activations, weights, size=(like.shape[-2], like.shape[-1]))
+
+    def _shown(self, levels: list[Tensor], subject: Subject, index: int) -> Tensor:
+        """The map of one level, where the image shows something: where x = b no mask has an effect."""
+        if SCORES[self.score].as_published:
+            return levels[self.level]
+        return levels[self.level] * (subject.images[index] - subject.reference[index]).abs().mean(dim=0)
 
     def _find_layers(self, subject: Subject) -> tuple[Layer, ...]:
         image = subject.images[:1]
@@ -195,7 +203,7 @@ class PolyCam(Method):
                 likeness=self.likeness,
                 change=change,
                 measure=effects,
-                to_map=lambda weights: self._levels(activations, weights, like=black)[self.level],
+                to_map=lambda weights: self._shown(self._levels(activations, weights, like=black), subject, index),
                 seed=self.seed,
             )
             count.add(len(active) - found.approximation.measured)

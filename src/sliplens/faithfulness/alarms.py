@@ -50,7 +50,7 @@ def follows_last_step(
     if len(score) < _FEWEST or np.std(score) == 0 or np.std(last) == 0:
         return []
     tied = float(np.corrcoef(score, last)[0, 1])
-    if abs(tied) < _TIED_TO_LAST:
+    if tied < _TIED_TO_LAST:
         return []
     return [f"{name} correlates with its last step by {tied:.2f}: it measures the fill rather than the map"]
 
