@@ -1,5 +1,7 @@
 """The verdicts flip where the data flips."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -229,6 +231,17 @@ def test_no_method_is_believed_where_a_control_wins(judged, tmp_path, rng):
     assert found.tone == "caution"
     assert found.text.startswith("None: no method beats both chance and the best control under most fills.")
     assert "Poly-CAM comes nearest, under 0 of 4" in found.text
+
+
+def test_a_fill_that_cannot_tell_the_truth_has_no_vote(judged, tmp_path, rng):
+    judged(Made(gains=GAINS | {"integrated-gradients": 0.4}))
+    study = load_results(tmp_path).study
+    (meta,) = study.truth["difference"].meta
+    truth = replace(study.truth["difference"], meta=(meta, replace(meta, fill="grey", holds=False)))
+
+    best = rank_methods(study.faithfulness["difference"], truth)[0]
+
+    assert best.tested == (("reference", "pixel"), ("blur", "pixel"), ("true", "marker"))
 
 
 def test_too_few_trials_believe_nothing(judged, tmp_path, rng):

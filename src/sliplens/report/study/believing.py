@@ -6,9 +6,11 @@ import numpy as np
 
 from sliplens.intervals import FEWEST_UNITS, Difference
 from sliplens.report.study.evidence import controls, settings, tell_interval
+from sliplens.report.study.localised import Truth
 from sliplens.report.study.scored import Faithful
 from sliplens.report.style import (
     CONTROLS,
+    FILL_NAMES,
     fill_name,
     input_name,
     inputs_in_order,
@@ -46,8 +48,17 @@ class Standing:
         return 2 * len(self.beaten) > len(self.tested)
 
 
-def rank_methods(faithful: Faithful) -> list[Standing]:
-    """Rank the methods: those that beat the best control in most settings first, by their gain."""
+def rank_methods(faithful: Faithful, truth: Truth | None = None) -> list[Standing]:
+    """Rank the methods: those that beat the best control in most settings first, by their gain.
+
+    Parameters
+    ----------
+    faithful
+        Scores of the methods.
+    truth
+        What the simulation tells: fills under which even a map made from the truth does not win are left out.
+    """
+    unfit = _unfit_fills(truth)
     known = controls(faithful)
     gaps = {(one.fill, one.unit, one.first): one.gap for one in faithful.comparisons if one.second in known}
     scores = {score.key: score for score in faithful.scores}
@@ -55,7 +66,7 @@ def rank_methods(faithful: Faithful) -> list[Standing]:
     for method in methods_in_order(score.method for score in faithful.scores if not score.control):
         if method in CONTROLS:
             continue
-        tested = [one for one in _votes(faithful, method) if (*one, method) in gaps]
+        tested = [one for one in _votes(faithful, method) if (*one, method) in gaps and one[0] not in unfit]
         beaten = [one for one in tested if _gains(gaps[*one, method]) and _gains(scores[*one, method].srg)]
         gains = [scores[*one, method].srg.estimate for one in tested]
         standings.append(
@@ -88,7 +99,8 @@ def judge_study(results: Results, *, rng: np.random.Generator) -> tuple[Statemen
 
 def _believe(faithful: Faithful, results: Results) -> Statement:
     topic = f"Which to believe, {input_name(faithful.input).lower()}"
-    ranked = rank_methods(faithful)
+    truth = results.study.truth.get(faithful.input)
+    ranked = rank_methods(faithful, truth)
     if not any(one.tested for one in ranked):
         return Statement(topic=topic, text="Not known: no method was compared with a control.", tone="caution")
     best = ranked[0]
@@ -96,7 +108,7 @@ def _believe(faithful: Faithful, results: Results) -> Statement:
         trials = f"{faithful.trials} trials are too few to tell a method from chance; {FEWEST_UNITS} or more are needed"
         return Statement(topic=topic, text=f"Not known: {trials}.", tone="caution")
     if not best.qualifies:
-        return Statement(topic=topic, text=_tell_none(ranked), tone="caution")
+        return Statement(topic=topic, text=_tell_none(ranked) + _tell_unfit(truth), tone="caution")
     score = next(one for one in faithful.scores if one.key == (*best.beaten[0], best.method))
     others = [one for one in ranked[1:] if one.qualifies]
     text = (
@@ -109,7 +121,7 @@ def _believe(faithful: Faithful, results: Results) -> Statement:
     failing = [method_name(one.method) for one in ranked if not one.qualifies]
     if failing:
         text += f" {listed(failing)} {'does' if len(failing) == 1 else 'do'} not beat the controls under most fills."
-    text += _tell_open(best)
+    text += _tell_open(best) + _tell_unfit(truth)
     text += _tell_truth(results, faithful.input, best.method)
     if faithful.alarms:
         count = len(faithful.alarms)
@@ -153,6 +165,17 @@ def _against(faithful: Faithful, method: str, rival: str) -> dict[tuple[str, str
 def _tell_open(best: Standing) -> str:
     lost = [fill_name(*one) for one in best.tested if one not in best.beaten]
     return f" It does not do so under {listed(lost)}." if lost else ""
+
+
+def _unfit_fills(truth: Truth | None) -> list[str]:
+    return [] if truth is None else [one.fill for one in truth.meta if not one.holds]
+
+
+def _tell_unfit(truth: Truth | None) -> str:
+    unfit = [FILL_NAMES.get(fill, fill) for fill in _unfit_fills(truth)]
+    if not unfit:
+        return ""
+    return f" Left out: {listed(unfit)}, where even a map made from the truth does not win."
 
 
 def _tell_truth(results: Results, name: str, method: str) -> str:

@@ -5,6 +5,7 @@ from sliplens.report.study.localised import REGIONS, Localisation, Truth
 from sliplens.report.study.records import LOOKS, Choice, Looks, Randomisation, Timing
 from sliplens.report.style import (
     CONTROL,
+    FILL_NAMES,
     UNKNOWN,
     decimals,
     input_name,
@@ -152,13 +153,14 @@ def table_localisation(truth: Truth) -> Table:
     return Table(
         caption=f"{input_name(truth.input)}, {truth.frames} simulated frames: share of the relevance, and of the "
         "strongest pixels, in three regions; and Spearman's correlation of the map's mean on each marker with what "
-        "putting that marker back does to the network's answer and to the true margin (95 % interval over trials).",
+        "putting that marker back does to the network's answer and to the best reading of the margin (95 % interval "
+        "over trials).",
         head=table_head(
             "Method",
             *(f"Mass, {_REGION_NAMES[region]}" for region in REGIONS),
             *(f"Strongest, {_REGION_NAMES[region]}" for region in REGIONS),
             "With the answer",
-            "With the true margin",
+            "With the best reading",
         ),
         rows=(*rows, nothing),
     )
@@ -170,11 +172,12 @@ def table_meta(truth: Truth) -> Table | None:
         return None
     return Table(
         caption=f"{input_name(truth.input)}: the score put to the test. A map made from the truth must gain more than "
-        "that map damaged, and that more than chance; a fill where this fails cannot judge methods.",
+        "that map damaged, and that more than chance; a fill where this fails cannot judge methods, and the verdict "
+        "leaves it out.",
         head=table_head("Fill", "Holds", "SRG of the truth", "SRG, damaged", "SRG, random"),
         rows=tuple(
             (
-                Cell(text=one.fill, kind="name"),
+                Cell(text=FILL_NAMES.get(one.fill, one.fill), kind="name"),
                 Cell(text="yes" if one.holds else "no", kind="name"),
                 *(Cell(text=decimals(value, 3)) for value in (one.oracle, one.degraded, one.random)),
             )

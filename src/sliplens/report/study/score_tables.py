@@ -80,8 +80,8 @@ def table_equal_areas(faithful: Faithful) -> Table | None:
     chance = (Cell(text=f"{faithful.random_orders} random orders", kind="name"),)
     chance += tuple(Cell(text=decimals(mean_at(curve, area)[1], 3)) for area in areas)
     return Table(
-        caption=f"{input_name(faithful.input)}: mean change of the answer, in margin units, where equal shares of the "
-        f"image are gone, most influential {UNIT_NAMES.get(unit, unit)} first (fill: {fill_name(fill)}). Bold: largest "
+        caption=f"{input_name(faithful.input)}: mean evidence lost, in margin units, where equal shares of the "
+        f"image are gone, most supporting {UNIT_NAMES.get(unit, unit)} first (fill: {fill_name(fill)}). Bold: largest "
         "of the methods.",
         head=table_head("Method", *(f"{percent(area)} gone" for area in areas)),
         rows=(*rows, chance),

@@ -218,8 +218,9 @@ def _truth(results: Results) -> tuple[Section, list[Plate | Table | Notes | None
         title="What the network should have looked at",
         short_title="Truth",
         intro="Simulated touch can be filmed again with one marker put back where it rested: what that does to the "
-        "network's answer is what a map should show, and what it does to the true margin is where the network should "
-        "look."
+        "network's answer is what a map should show. What it does to the best reading of the margin (linear in the "
+        "markers' displacements, exact for small ones) is where the network should look; stretched over a marker's "
+        "whole motion that reading may exceed the margin itself, and the markers cancel."
         if simulated
         else "Only simulated touch can be filmed again with one marker put back: of recorded touch no truth is known.",
         missing=_missing(results, found) if simulated else (),

@@ -64,10 +64,10 @@ def plate_truth(results: Results, name: str) -> Plate | None:
     return Plate(
         name=f"truth-{name}",
         figure=draw_grid(rows, heads=heads, bar=True).figure,
-        alt=f"{input_name(name)}: effect of each marker on the answer and on the true margin beside the maps of "
-        f"{listed([method_name(one) for one in methods])}",
-        caption=f"{input_name(name)}: what each marker does to the network's answer and to the true margin, in "
-        "percentage points (value less value with that marker put back where it rested; orange lowers, blue raises, "
+        alt=f"{input_name(name)}: effect of each marker on the answer and on the best reading of the margin beside the "
+        f"maps of {listed([method_name(one) for one in methods])}",
+        caption=f"{input_name(name)}: what each marker does to the network's answer and to the best reading of the margin, "
+        "in percentage points (value less value with that marker put back where it rested; orange lowers, blue raises, "
         f"full colour at the largest of each picture), beside the best methods' maps. {_tell_match(truth, methods)}",
         numbers={
             "frame_id": truth.effects.frame_id,
