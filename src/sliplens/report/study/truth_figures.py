@@ -66,9 +66,10 @@ def plate_truth(results: Results, name: str) -> Plate | None:
         figure=draw_grid(rows, heads=heads, bar=True).figure,
         alt=f"{input_name(name)}: effect of each marker on the answer and on the best reading of the margin beside the "
         f"maps of {listed([method_name(one) for one in methods])}",
-        caption=f"{input_name(name)}: what each marker does to the network's answer and to the best reading of the margin, "
-        "in percentage points (value less value with that marker put back where it rested; orange lowers, blue raises, "
-        f"full colour at the largest of each picture), beside the best methods' maps. {_tell_match(truth, methods)}",
+        caption=f"{input_name(name)}: what each marker does to the network's answer and to the best reading of the "
+        "margin, in percentage points (value less value with that marker put back where it rested; orange lowers, blue "
+        "raises, full colour at the largest of each picture), beside the best methods' maps. "
+        f"{_tell_match(truth, methods)}",
         numbers={
             "frame_id": truth.effects.frame_id,
             "marker": truth.effects.marker,
