@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sliplens.cli.console import print_table, progress_bar, say, unchanged, wrote
+from sliplens.cli.devices import require_device
 from sliplens.errors import InputError
 from sliplens.provenance import output_folder, read_json
 
@@ -58,6 +59,8 @@ class Explain:
     """How many trials."""
     levels: tuple[float, ...] = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
     """Safety margins at which frames are taken."""
+    device: str = "cpu"
+    """Where the network runs: cpu, cuda or cuda:1."""
     overwrite: bool = False
     """Replace the folder if it exists."""
 
@@ -78,7 +81,8 @@ class Explain:
         if self.trials < 1:
             raise InputError(f"--trials must be at least 1, got {self.trials}")
         require_methods(self.method)
-        trained = load_checkpoint(find_run(self.model))
+        require_device(self.device)
+        trained = load_checkpoint(find_run(self.model), device=self.device)
         chosen = self._choose(trained)
         recipe = {
             "weights_sha256": trained.manifest.weights_sha256,
