@@ -47,6 +47,7 @@ class Made:
     spread: float = 0.01
     """Of the gains over trials."""
     looks: Mapping[str, Mapping[str, float]] = field(default_factory=lambda: LOOKS)
+    rougher_told: bool = True
     top_share: float = 0.8
     """Of the network's effects that two markers hold."""
     edge_mass: float = 0.3
@@ -412,7 +413,13 @@ def write_others(workspace: Path, name: str, made: Made) -> None:
         {**origin, "frames": 6, "methods": methods, "alarms": []},
     )
     looks = {method: {"frame_stability": 0.9, **values} for method, values in made.looks.items()}
-    write_run(workspace / f"looks-{name}", "looks", {}, {**origin, "frames": 42, "methods": looks})
+    rougher = [
+        {"measure": "total_variation", "first": first, "second": second, **interval(gap, made.trials, half=0.001)}
+        for first, second in combinations(looks, 2)
+        for gap in [looks[first]["total_variation"] - looks[second]["total_variation"]]
+    ]
+    told = {**origin, "frames": 42, "methods": looks, "comparisons": rougher if made.rougher_told else []}
+    write_run(workspace / f"looks-{name}", "looks", {}, told)
     seconds = {"grad-cam": 0.02, "integrated-gradients": 0.4, "poly-cam": 3.0}
     timed = {
         method: {"seconds": one, "seconds_without_forward": one - 0.01, "low": one * 0.9, "high": one * 1.1}
@@ -480,6 +487,7 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
                 method: {
                     "spearman_network": interval(value, made.trials),
                     "spearman_margin": interval(value / 2, made.trials),
+                    "edges_over_chance": interval(made.edge_mass - 0.07, made.trials, half=0.01),
                 }
                 for method, value in spearman.items()
             },
@@ -495,5 +503,6 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
     return folder
 
 
-def interval(value: float, units: int) -> dict[str, Any]:
-    return {"estimate": value, "low": value - 0.05, "high": value + 0.05, "units": units, "sure": True}
+def interval(value: float, units: int, *, half: float = 0.05) -> dict[str, Any]:
+    sure = abs(value) > half and units >= 5
+    return {"estimate": value, "low": value - half, "high": value + half, "units": units, "sure": sure}

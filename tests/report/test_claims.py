@@ -90,12 +90,24 @@ def test_grad_cam_below_an_edge_filter_is_unfaithful_though_above_chance(judged)
 def test_integrated_gradients_is_noisy_by_both_measures_or_not(judged, variation, stability, outcome):
     own = {**LOOKS["integrated-gradients"], "total_variation": variation, "noise_stability": stability}
 
-    assert judged(Made(looks={**LOOKS, "integrated-gradients": own}))["noisy", RAW].outcome == outcome
+    made = Made(looks={**LOOKS, "integrated-gradients": own}, rougher_told=False)
+    assert judged(made)["noisy", RAW].outcome == outcome
+
+
+# the made-up intervals reach 0.001 either way; Poly-CAM's maps have 0.05
+@pytest.mark.parametrize(
+    ("variation", "outcome"), [(0.2, "holds"), (0.0505, "undecided"), (0.03, "does not hold"), (0.005, "does not hold")]
+)
+def test_rougher_counts_beyond_the_interval_alone(judged, variation, outcome):
+    own = {**LOOKS["integrated-gradients"], "total_variation": variation}
+    answer = judged(Made(looks={**LOOKS, "integrated-gradients": own}))["noisy", RAW]
+    assert answer.outcome == outcome
+    assert any("less Poly-CAM" in finding.compared and finding.gap is not None for finding in answer.findings)
 
 
 @pytest.mark.parametrize(
     ("top_share", "edge_mass", "outcome"),
-    [(0.8, 0.3, "holds"), (0.2, 0.3, "does not hold"), (0.8, 0.01, "does not hold")],
+    [(0.8, 0.3, "holds"), (0.2, 0.3, "does not hold"), (0.8, 0.01, "does not hold"), (0.8, 0.075, "undecided")],
 )
 def test_edges_of_two_markers_need_both_the_share_and_the_edges(judged, top_share, edge_mass, outcome):
     answer = judged(Made(top_share=top_share, edge_mass=edge_mass))["two-markers", DIFFERENCE]

@@ -57,6 +57,10 @@ def test_looks_are_those_of_the_saved_maps(material: Material, fine_dataset: Dat
     found = told["methods"]["grad-cam"]
     assert found["total_variation"] == pytest.approx(np.mean([total_variation(one) for one in maps]))
     assert found["gini"] == pytest.approx(np.mean([gini(one) for one in maps]))
+    (gap,) = told["comparisons"]
+    other = np.mean([total_variation(one) for one in material.explained.saliency[gap["second"]].astype(np.float64)])
+    assert (gap["first"], gap["measure"]) == ("grad-cam", "total_variation")
+    assert gap["estimate"] == pytest.approx(found["total_variation"] - other)
     # frames that follow each other share a reference without noise: nothing shakes, so the maps stay as they are
     assert told["noise_sd"] == 0
     assert found["noise_stability"] == pytest.approx(1.0, abs=1e-4)

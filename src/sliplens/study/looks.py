@@ -1,6 +1,8 @@
 """What the eye judges of the maps of a study, as numbers."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ from torch import Tensor
 
 from sliplens.explain import Explainer
 from sliplens.faithfulness.looks import gini, resolution, stability, total_variation
+from sliplens.intervals import paired_difference
 from sliplens.models import TrainedModel
 from sliplens.provenance import write_json
 from sliplens.recordings import Dataset
@@ -50,12 +53,10 @@ def check_looks(
     on_method
         Called with the methods done and their number.
     """
-    explained = material.explained
-    noisy, following, noise_sd = _once_more(
-        material.trained, data, material.picks[:repeated], rng=np.random.default_rng(seed)
-    )
+    explained, rng = material.explained, np.random.default_rng(seed)
+    noisy, following, noise_sd = _once_more(material.trained, data, material.picks[:repeated], rng=rng)
     references = material.references[:repeated]
-    told = {}
+    told, roughness = {}, {}
     for number, (name, explainer) in enumerate(material.explainers.items(), start=1):
 
         def again(images: Tensor, explainer: Explainer = explainer) -> Float[np.ndarray, "repeated height width"]:
@@ -68,9 +69,10 @@ def check_looks(
             for one, frame in zip(saliency, explained.frames, strict=True)
             if frame.id in material.markers
         ]
+        roughness[name] = np.array([total_variation(one) for one in saliency])
         told[name] = {
             "resolution": mean_of_known(np.array(apart, dtype=np.float64)),
-            "total_variation": mean_of_known(np.array([total_variation(one) for one in saliency])),
+            "total_variation": mean_of_known(roughness[name]),
             "gini": mean_of_known(np.array([gini(one) for one in saliency])),
             "noise_stability": mean_of_known(stability(before, again(noisy))),
             "frame_stability": mean_of_known(stability(before, again(following))),
@@ -86,6 +88,12 @@ def check_looks(
             "repeated_frames": len(references),
             "noise_sd": noise_sd,
             "methods": told,
+            # stability was tried on few frames: no interval would mean anything
+            "comparisons": [
+                {"measure": "total_variation", "first": first, "second": second, **asdict(gap), "sure": gap.sure}
+                for first, second in combinations(roughness, 2)
+                for gap in [paired_difference(roughness[first], roughness[second], trials=material.trials, rng=rng)]
+            ],
         },
     )
 

@@ -31,6 +31,7 @@ from sliplens.study.truth_measures import (
     Maps,
     agreements,
     covered_shares,
+    edges_over_chance,
     localisation,
     marker_means,
     mean_interval,
@@ -129,7 +130,10 @@ def judge_by_truth(
                 for name, values in judged.items()
             },
             "intervals": {
-                name: {f"spearman_{effect}": mean_interval(found[effect], trials, seed=seed) for effect in EFFECTS}
+                name: {
+                    **{f"spearman_{effect}": mean_interval(found[effect], trials, seed=seed) for effect in EFFECTS},
+                    "edges_over_chance": mean_interval(edges_over_chance(judged[name], places), trials, seed=seed),
+                }
                 for name, found in agreement.items()
             },
             "network_against_margin": interval,

@@ -50,6 +50,14 @@ def localisation(maps: Maps, places: Sequence[Places]) -> dict[str, dict[str, fl
     return found
 
 
+def edges_over_chance(maps: Maps, places: Sequence[Places]) -> Float[np.ndarray, " frames"]:
+    """Mass of the positive part of each map on the edges of markers, less the share of the image that they cover."""
+    positive = np.clip(maps.astype(np.float64), 0, None)
+    return np.array(
+        [relevance_mass(values, one.edges) - one.edges.mean() for values, one in zip(positive, places, strict=True)]
+    )
+
+
 def agreements(
     maps: Maps, places: Sequence[Places], effects: Sequence[MarkerEffects]
 ) -> dict[str, Float[np.ndarray, " frames"]]:

@@ -25,6 +25,8 @@ class Localisation:
     """Interval of `spearman_network`."""
     margin: Difference | None
     """Interval of `spearman_margin`."""
+    edges: Difference | None
+    """Mass on the edges of markers less the share of the image that they cover."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,10 @@
 """Claims about what maps look like and where networks look."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
+from sliplens.intervals import Difference
 from sliplens.report.study.claim import Answer, Claim, Finding, Outcome, all_of, judge_gap
 from sliplens.report.study.evidence import share_of_strongest
 from sliplens.report.study.localised import Truth
@@ -34,8 +37,8 @@ def claim_noisy(results: Results) -> Claim:
     return Claim(
         id="noisy",
         title="Integrated Gradients is noisy",
-        test="Tested by numbers: holds where its maps have the largest total variation of all methods and are the "
-        "least stable under sensor noise. These are means over frames; no interval is kept of them.",
+        test="Tested by numbers: holds where its maps have a larger total variation than those of every other method, "
+        "beyond the 95 % interval, and are the least stable under sensor noise (means over few frames, no interval).",
         answers=tuple(answers),
     )
 
@@ -55,6 +58,18 @@ def _noisiest(looks: Looks) -> Answer:
                           f"{method_name(_NOISY)} and of another method are not both known.")  # fmt: skip
         noisier = [name for name, value in values.items() if sign * own > sign * value]
         outcome: Outcome = "holds" if len(noisier) == len(values) else "undecided" if noisier else "does not hold"
+        gaps = _rougher(looks, values) if measure == "total_variation" else {}
+        if gaps:
+            outcome = all_of(judge_gap(gap) for gap in gaps.values())
+            findings += [
+                Finding(
+                    where=_MEASURE_NAMES[measure],
+                    compared=f"{method_name(_NOISY)} less {method_name(name)}",
+                    gap=gap,
+                    outcome=judge_gap(gap),
+                )
+                for name, gap in gaps.items()
+            ]
         outcomes.append(outcome)
         others = listed([f"{method_name(name)} {decimals(value, 3)}" for name, value in values.items()])
         parts.append(f"{_MEASURE_NAMES[measure]} {decimals(own, 3)} ({others})")
@@ -70,6 +85,18 @@ def _noisiest(looks: Looks) -> Answer:
     return Answer(
         subject=subject, outcome=all_of(outcomes), text=f"{text[:1].upper()}{text[1:]}.", findings=tuple(findings)
     )
+
+
+def _rougher(looks: Looks, others: Iterable[str]) -> dict[str, Difference]:
+    """How much rougher its maps are than those of the others, where that was compared."""
+    gaps = {}
+    for name in others:
+        if (_NOISY, name) in looks.rougher:
+            gaps[name] = looks.rougher[_NOISY, name]
+        elif (name, _NOISY) in looks.rougher:
+            gap = looks.rougher[name, _NOISY]
+            gaps[name] = Difference(estimate=-gap.estimate, low=-gap.high, high=-gap.low, units=gap.units)
+    return gaps
 
 
 def claim_edges(results: Results, *, rng: np.random.Generator) -> Claim:
@@ -91,7 +118,7 @@ def claim_edges(results: Results, *, rng: np.random.Generator) -> Claim:
         title="The network looks at the edges of two markers",
         test="Tested on simulated touch in two parts, both needed: putting back a marker at a time, the strongest two "
         "hold more than half of all change of the answer; and Poly-CAM's relevance lies on marker edges more than "
-        "their share of the image (no interval is kept of that).",
+        "their share of the image.",
         answers=tuple(answers),
     )
 
@@ -102,6 +129,9 @@ def _looks_at_two(truth: Truth, *, rng: np.random.Generator) -> Answer:
     found = truth.methods.get(looker)
     mass, area = None if found is None else found.mass["edges"], truth.areas["edges"]
     on_edges: Outcome = "undecided" if mass is None or area is None else "holds" if mass > area else "does not hold"
+    gap = None if found is None else found.edges
+    if gap is not None:
+        on_edges = judge_gap(gap)
     two: Outcome = "undecided"
     if share is not None:
         half = type(share)(estimate=share.estimate - 0.5, low=share.low - 0.5, high=share.high - 0.5, units=share.units)
@@ -131,8 +161,9 @@ def _looks_at_two(truth: Truth, *, rng: np.random.Generator) -> Answer:
             ),
             Finding(
                 where="relevance mass",
-                compared=f"on edges, against their {percent(area)} of the image",
-                value=percent(mass),
+                compared=f"on edges, less their {percent(area)} of the image",
+                value="" if gap is not None else percent(mass),
+                gap=gap,
                 outcome=on_edges,
             ),
         ),

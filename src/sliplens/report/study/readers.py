@@ -21,7 +21,7 @@ from sliplens.report.study.records import (
     Study,
     Timing,
 )
-from sliplens.report.study.scored_readers import read_faithful, read_interval, read_remedies
+from sliplens.report.study.scored_readers import read_faithful, read_gap, read_interval, read_remedies
 from sliplens.report.study.tables_on_disk import read_effects, read_state_frames, read_truth_maps
 
 
@@ -109,6 +109,12 @@ def _read_looks(run: Run, fields: Fields) -> Looks:
             name: {measure: inner.optional_number(measure) for measure in LOOKS}
             for name, inner in fields.inner("methods").items()
         },
+        # studies made before these were kept have none
+        rougher={
+            (row.text("first"), row.text("second")): read_gap(row)
+            for row in (fields.rows("comparisons") if "comparisons" in fields.values else [])
+            if row.text("measure") == "total_variation"
+        },
     )
 
 
@@ -167,7 +173,7 @@ def _read_truth(run: Run, fields: Fields) -> Truth:
 def _read_localisation(inner: Fields, intervals: Fields | None) -> Localisation:
     found: dict[str, Difference | None] = {
         name: None if intervals is None else read_interval(intervals, name)
-        for name in ("spearman_network", "spearman_margin")
+        for name in ("spearman_network", "spearman_margin", "edges_over_chance")
     }
     return Localisation(
         mass=_regions(inner, "mass"),
@@ -176,6 +182,7 @@ def _read_localisation(inner: Fields, intervals: Fields | None) -> Localisation:
         spearman_margin=inner.optional_number("spearman_margin"),
         network=found["spearman_network"],
         margin=found["spearman_margin"],
+        edges=found["edges_over_chance"],
     )
 
 

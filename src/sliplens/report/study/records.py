@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float64, UInt8
 
+from sliplens.intervals import Difference
 from sliplens.report.records import Run
 from sliplens.report.study.localised import Truth
 from sliplens.report.study.scored import Faithful, Remedies
@@ -108,6 +109,8 @@ class Looks:
     source: str
     frames: int
     methods: dict[str, dict[str, float | None]]
+    rougher: dict[tuple[str, str], Difference]
+    """Total variation of the first method's maps less that of the second's; empty where it was not compared."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ def read_interval(fields: Fields, key: str) -> Difference | None:
     part = fields.optional_part(key)
     if part is None or part.optional_number("estimate") is None:
         return None
-    return _interval(part)
+    return read_gap(part)
 
 
 def read_remedies(run: Run, fields: Fields) -> Remedies:
@@ -61,7 +61,7 @@ def read_faithful(run: Run, fields: Fields) -> Faithful:
                 unit=row.text("unit"),
                 first=row.text("first"),
                 second=row.text("second"),
-                gap=_interval(row),
+                gap=read_gap(row),
             )
             for row in fields.rows("comparisons")
             if row.text("measure", default="srg") == "srg"
@@ -86,8 +86,8 @@ def _read_score(row: Fields) -> SoundScore:
         unit=row.text("unit"),
         method=row.text("method"),
         control=row.flag("control"),
-        srg=_interval(row.part("srg")),
-        gain_over_random=_interval(row.part("gain_over_random")),
+        srg=read_gap(row.part("srg")),
+        gain_over_random=read_gap(row.part("gain_over_random")),
         most_first=row.number("most_first"),
         least_first=row.number("least_first"),
         random=row.number("random"),
@@ -104,7 +104,8 @@ def _areas(row: Fields) -> dict[float, float]:
         ) from None
 
 
-def _interval(part: Fields) -> Difference:
+def read_gap(part: Fields) -> Difference:
+    """Read an estimate with its 95 % interval, which must be there."""
     return Difference(
         estimate=part.number("estimate"), low=part.number("low"), high=part.number("high"), units=part.integer("units")
     )
