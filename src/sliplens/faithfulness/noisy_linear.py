@@ -8,6 +8,7 @@ from torch.nn import functional
 NOISE_SD = 0.01
 """Of ROAD, in units of the image's range."""
 _KERNEL = torch.tensor([[1 / 12, 1 / 6, 1 / 12], [1 / 6, 0.0, 1 / 6], [1 / 12, 1 / 6, 1 / 12]])
+_SMALL = 8
 _TOLERANCE = 1e-3
 """A quarter of a grey level: what is left of the residual says how far pixels are from the mean of their neighbours."""
 
@@ -40,8 +41,23 @@ def noisy_linear(
     Rong et al., *A Consistent and Efficient Evaluation Strategy for Attribution Methods* (2022): ROAD, section 4 and
     appendix; weights of 1/6 for the four nearest and 1/12 for the diagonal neighbours.
     """
+    # channels last: the small convolution of every step is six times as fast on a CPU
+    filled = _solve(images.contiguous(memory_format=torch.channels_last), gone[:, None], tolerance=tolerance)
+    if noise is not None:
+        filled = filled + NOISE_SD * noise * gone[:, None]
+    return filled.clamp(0, 1)
+
+
+def _solve(
+    images: Float[Tensor, "batch 3 height width"], gone: Bool[Tensor, "batch 1 height width"], *, tolerance: float
+) -> Float[Tensor, "batch 3 height width"]:
+    """Images whose removed pixels are the weighted means of their neighbours; see `noisy_linear`.
+
+    The solution at half the size is where it begins: alone, conjugate gradients carry what they know by one pixel a
+    step, which takes ten times as long where holes are large.
+    """
     kernel = _KERNEL.to(images).expand(3, 1, 3, 3)
-    hole = gone[:, None].to(images.dtype)
+    hole = gone.to(images.dtype)
     left = 1 - hole
 
     def gather(values: Tensor) -> Tensor:
@@ -49,10 +65,7 @@ def noisy_linear(
 
     weights = gather(torch.ones_like(images[:1]))  # less than one at the border, where neighbours are missing
     known = left.sum(dim=(2, 3), keepdim=True)
-    mean = torch.where(
-        known > 0, (images * left).sum(dim=(2, 3), keepdim=True) / known.clamp_min(1), images.mean((2, 3), keepdim=True)
-    )
-    filled = images * left + mean * hole
+    filled = images * left + _begin(images, left, tolerance=tolerance) * hole
 
     def apply(values: Tensor) -> Tensor:
         """The matrix: of values that are zero outside the holes."""
@@ -73,7 +86,19 @@ def noisy_linear(
         after = residual.square().sum(dim=(1, 2, 3), keepdim=True)
         direction = residual + after / square.clamp_min(1e-30) * direction
         square = after
-    filled = filled + change * hole
-    if noise is not None:
-        filled = filled + NOISE_SD * noise * hole
-    return filled.clamp(0, 1)
+    return filled + change * hole
+
+
+def _begin(
+    images: Float[Tensor, "batch 3 height width"], left: Float[Tensor, "batch 1 height width"], *, tolerance: float
+) -> Float[Tensor, "batch 3 height width"]:
+    """A first guess: the solution at half the size, or the mean of what is left of a small or whole image."""
+    known = left.sum(dim=(2, 3), keepdim=True)
+    whole = images.mean((2, 3), keepdim=True)
+    mean = torch.where(known > 0, (images * left).sum(dim=(2, 3), keepdim=True) / known.clamp_min(1), whole)
+    if min(images.shape[-2:]) < _SMALL or bool((known == 0).any()) or bool((left == 1).all()):
+        return mean.expand_as(images)
+    share = functional.avg_pool2d(left, 2, ceil_mode=True, count_include_pad=False)
+    seen = functional.avg_pool2d(images * left, 2, ceil_mode=True, count_include_pad=False) / share.clamp_min(0.1)
+    half = _solve(torch.where(share > 0, seen, mean), share == 0, tolerance=tolerance)
+    return functional.interpolate(half, size=images.shape[-2:], mode="bilinear", align_corners=False)
