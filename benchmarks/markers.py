@@ -2,7 +2,7 @@
 
 Centres and tracks are compared with the simulator's own; the speed is that of frames of 640 x 480 pixels with 100
 markers, of which every tool is given the same. scikit-image's blobs are linked by trackpy, Lucas-Kanade is OpenCV's
-pyramidal one from frame to frame. Both are left out where they are not installed: `pip install scikit-image trackpy`.
+pyramidal one from frame to frame. Both are left out where they are not installed; the extra `dev` has them.
 
 A track is right if it is followed in the last frame and, whenever it says it was followed, lies within a pixel of its
 own marker; markers that leave the frame in between are not counted. Damage begins in mid-trial: of every ten markers
