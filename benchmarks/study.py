@@ -30,6 +30,8 @@ def main() -> None:
     options = parser.parse_args()
     if options.keep is not None and options.keep.exists():
         parser.error(f"{options.keep} exists; name a new folder, so that the whole study is timed")
+    # a shell that started this in the background had it ignore interruptions, and so would the study
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with tempfile.TemporaryDirectory() as scratch:
         output = options.keep or Path(scratch) / "study"
         data = ["--preset", "thesis"] if options.data is None else [str(options.data)]

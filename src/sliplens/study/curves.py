@@ -1,5 +1,6 @@
 """The sound curves of a study: every method and control, under several fills and units, with intervals and alarms."""
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -153,6 +154,7 @@ def score_curves(
             ],
         },
     )
+    shutil.rmtree(parts)
 
 
 def _answer_blank(predict: Predict, material: Material, fill: str, seed: int) -> Float[np.ndarray, " frames"]:
