@@ -50,8 +50,7 @@ class Material:
 
     def fast(self, passes: int) -> Passes:
         """Make an engine ready for so many passes of the network."""
-        some = self.inputs[:_PARITY_IMAGES]
-        return prepare(self.trained.model, some, self.trained.predict(some).to(some.device), passes=passes)
+        return make_fast(self.trained, self.inputs, passes=passes)
 
     def units(self) -> dict[str, list[Units]]:
         """What can be removed at once, for each frame: pixels, tiles, and markers where they are known in every one."""
@@ -70,6 +69,12 @@ class Material:
         """Where the network sees the markers of a frame, and how far each one reaches (`network_places`)."""
         size = self.trained.manifest.frame_size
         return network_places(self.markers[frame], frame_size=(size[0], size[1]), image_size=self.inputs.shape[-1])
+
+
+def make_fast(trained: TrainedModel, inputs: Float[Tensor, "frames 3 size size"], *, passes: int) -> Passes:
+    """Make an engine ready for so many passes of a network, checked on a few of its inputs, on the network's device."""
+    some = inputs[:_PARITY_IMAGES].to(trained.device)
+    return prepare(trained.model, some, trained.predict(some).to(trained.device), passes=passes)
 
 
 def gather(

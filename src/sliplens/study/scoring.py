@@ -9,7 +9,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from sliplens.errors import CheckpointError
-from sliplens.explain.passes import prepare
 from sliplens.faithfulness import (
     DeletionCurves,
     deletion_curves,
@@ -21,10 +20,10 @@ from sliplens.faithfulness.alarms import fill_decides, flat_maps, follows_last_s
 from sliplens.faithfulness.deletion import deletion_steps, saliency_orders
 from sliplens.models import TrainedModel
 from sliplens.provenance import write_json
+from sliplens.study.material import make_fast
 from sliplens.study.saved import RESULT_FILE, Explained
 
 CONTROL = "random"
-_PARITY_IMAGES = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,9 +97,8 @@ def score_explanations(
     orders = {name: saliency_orders(maps, shape) for name, maps in explained.saliency.items()}
     orders[CONTROL] = np.stack([random_order(shape, rng=rng) for _ in explained.frames])
     count = len(inputs)
-    some = inputs[:_PARITY_IMAGES]
     passes = len(orders) * count * len(deletion_steps(shape, steps=steps))
-    predict = prepare(trained.model, some, trained.predict(some).to(trained.device), passes=passes)
+    predict = make_fast(trained, inputs, passes=passes)
     curves: dict[str, DeletionCurves] = {}
     for number, (name, order) in enumerate(orders.items()):
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from sliplens.explain.passes import prepare
 from sliplens.faithfulness import get_fill
 from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness
 from sliplens.faithfulness.true_fill import SHARES, marker_faithfulness
@@ -15,6 +14,7 @@ from sliplens.models import TrainedModel
 from sliplens.provenance import write_json
 from sliplens.recordings import Dataset
 from sliplens.simulation import SimulationRecipe
+from sliplens.study.material import make_fast
 from sliplens.study.saved import RESULT_FILE, Explained, mean_of_known
 from sliplens.study.scoring import require_same_network
 from sliplens.study.truth_effects import (
@@ -173,7 +173,7 @@ def true_curves(
     inputs = trained.encoding.normalise(explained.images)
     passes = len(frames) * (2 * len(maps) + random_orders) * (len(SHARES) - 2)
     return marker_faithfulness(
-        prepare(trained.model, inputs, trained.predict(inputs), passes=passes),
+        make_fast(trained, inputs, passes=passes),
         redrawing(trained, frames),
         {name: np.stack(marker_means(values, places)) for name, values in maps.items()},
         rng=np.random.default_rng(seed),
@@ -215,7 +215,7 @@ def _all_effects(
     files = [parts / f"{index:05d}.npz" for index in range(len(frames))]
     # each marker alone, and under each fill two maps both ways
     passes = sum(not file.is_file() for file in files) * (len(frames[0].markers) + 4 * len(SHARES) * (len(fills) + 1))
-    predict = prepare(trained.model, inputs, trained.predict(inputs), passes=passes)
+    predict = make_fast(trained, inputs, passes=passes)
     redraw = redrawing(trained, frames)
     for index, (file, frame) in enumerate(zip(files, frames, strict=True)):
         if not file.is_file():
