@@ -156,6 +156,20 @@ def test_levels_are_kept_on_request_fine_to_coarse(network, images):
     assert PolyCam()(model, images[:1]).levels == ()
 
 
+@pytest.mark.parametrize("score", ["regression", "thesis"])
+def test_layers_finer_than_the_level_cost_nothing_and_change_nothing(score, network, images):
+    model = network("small shufflenet")
+    seen = []
+    model.register_forward_pre_hook(lambda _module, arguments: seen.append(len(arguments[0])))
+    alone = PolyCam(score=score, level=2)(model, images[:1])
+    cost = sum(seen)
+    seen.clear()
+    every = PolyCam(score=score, level=2, levels=True)(model, images[:1])
+    torch.testing.assert_close(alone.relevance, every.relevance)
+    finer = sum(level.weights.shape[1] for level in every.levels[:2])
+    assert sum(seen) - cost == 2 * finer
+
+
 def test_batch_size_does_not_change_the_map(network, images):
     model = network("small shufflenet")
     one, other = (PolyCam(batch_size=size)(model, images[:1]).relevance for size in (1, 50))

@@ -10,14 +10,16 @@ import torch
 from sliplens.faithfulness import deletion_order
 from sliplens.study.material import Material
 from sliplens.study.remedies import score_remedies
+from sliplens.study.scoring import load_curves, score_explanations
 
 STEPS = 8
 
 
 @pytest.fixture(scope="module")
 def scored(material: Material, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("remedies")
-    score_remedies(material, folder, steps=STEPS)
+    folder, score = (tmp_path_factory.mktemp(name) for name in ("remedies", "score"))
+    score_explanations(material.trained, material.explained, score, steps=STEPS)
+    score_remedies(material, folder, grey=load_curves(score, material.explained), steps=STEPS)
     return folder
 
 
@@ -67,3 +69,9 @@ def test_the_table_holds_the_mean_of_every_curve(material: Material, scored: Pat
             assert score["mean"] == pytest.approx(np.mean(means))
             assert score["sd"] == pytest.approx(np.std(means))
             assert score["frames"] == 6
+
+
+def test_deletion_to_grey_is_read_back_as_it_was_scored(material: Material, tmp_path: Path):
+    result = score_explanations(material.trained, material.explained, tmp_path, steps=STEPS)
+    for name, curves in load_curves(tmp_path, material.explained).items():
+        assert curves.auc.mean() == pytest.approx(result.methods[name].mean, abs=1e-5)  # of an engine, to its parity

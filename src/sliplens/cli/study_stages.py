@@ -24,7 +24,7 @@ from sliplens.study.material import Material, gather
 from sliplens.study.remedies import score_remedies
 from sliplens.study.sanity import check_randomisation, explain_untrained
 from sliplens.study.saved import load_explained
-from sliplens.study.scoring import score_explanations
+from sliplens.study.scoring import load_curves, score_explanations
 from sliplens.study.states import load_markers, save_states
 from sliplens.study.timing import time_explainers
 from sliplens.study.truth import judge_by_truth, true_curves
@@ -131,7 +131,13 @@ class Stages:
             "deletion": (
                 "Trying the thesis's remedies",
                 {},
-                lambda folder, bar: score_remedies(material, folder, seed=self.seed, on_curve=bar),
+                lambda folder, bar: score_remedies(
+                    material,
+                    folder,
+                    grey=load_curves(self.output / f"score-{name}", material.explained),
+                    seed=self.seed,
+                    on_curve=bar,
+                ),
             ),
             "faithfulness": (
                 "Removing parts under every fill",

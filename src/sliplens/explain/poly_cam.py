@@ -53,7 +53,7 @@ class PolyCam(Method):
         Names of the layers; by default those that belong to the score.
     level
         Which level's map is the relevance, counted from the finest, 0. The thesis displayed the finest of its ten, and
-        scored the fifth from the coarsest, `level=5`.
+        scored the fifth from the coarsest, `level=5`. Layers finer than that have no part in it, and cost no pass.
     budget
         Share of the channels to measure at first, in (0, 1]; 1 for the exact map. Below 1 the other channels' effects
         are estimated, and `Explanation.approximations` says how many were measured and what the map is expected to have
@@ -66,7 +66,7 @@ class PolyCam(Method):
     batch_size
         Masked images in one pass; None for what suits the engine.
     levels
-        Keep the saliency and the weights of each layer in the explanation.
+        Keep the saliency and the weights of each layer in the explanation, those finer than `level` too.
     seed
         Of the draws that tell the error of a map with a budget.
 
@@ -146,9 +146,10 @@ class PolyCam(Method):
 
     def _shown(self, levels: list[Tensor], subject: Subject, index: int) -> Tensor:
         """The map of one level, where the image shows something: where x = b no mask has an effect."""
+        level = levels[self.level if self.levels else 0]
         if SCORES[self.score].as_published:
-            return levels[self.level]
-        return levels[self.level] * (subject.images[index] - subject.reference[index]).abs().mean(dim=0)
+            return level
+        return level * (subject.images[index] - subject.reference[index]).abs().mean(dim=0)
 
     def _find_layers(self, subject: Subject) -> tuple[Layer, ...]:
         image = subject.images[:1]
@@ -158,7 +159,8 @@ class PolyCam(Method):
             layers = find_layers(subject.model, image, names=self.layers)
         if not 0 <= self.level < len(layers):
             raise InputError(f"Poly-CAM has no level {self.level} for {len(layers)} layers; count from 0, the finest")
-        return layers
+        # a level is made of its own layer and the coarser ones: the finer ones are measured only where they are kept
+        return layers if self.levels else layers[self.level :]
 
     def _prepare(self, subject: Subject, channels: int) -> Passes:
         return prepare(

@@ -10,15 +10,21 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float, Int
 
-from sliplens.faithfulness import deletion_curves, deletion_score, get_fill, random_order, summarise_deletion
+from sliplens.faithfulness import (
+    DeletionCurves,
+    deletion_curves,
+    deletion_score,
+    get_fill,
+    random_order,
+    summarise_deletion,
+)
 from sliplens.faithfulness.alarms import follows_last_step
 from sliplens.faithfulness.deletion import saliency_orders
 from sliplens.provenance import write_json
 from sliplens.study.material import Material
 from sliplens.study.saved import RESULT_FILE, Explained
-from sliplens.study.scoring import CONTROL
+from sliplens.study.scoring import CONTROL, CURVES_FILE
 
-CURVES_FILE = "deletion.parquet"
 STEPS = 56
 """A quarter of the thesis's 224: the mean over the steps differs from that over all of them by less than a step."""
 _STOP = 0.5
@@ -45,6 +51,7 @@ def score_remedies(
     material: Material,
     folder: Path,
     *,
+    grey: Mapping[str, DeletionCurves],
     steps: int = STEPS,
     seed: int = 0,
     on_curve: Callable[[int, int], None] | None = None,
@@ -57,8 +64,11 @@ def score_remedies(
         The network, and the explanations of the frames that are scored.
     folder
         Gets `deletion.parquet` and `result.json`; must exist.
+    grey
+        The curves that the thesis scores, deletion to grey, by method with the random control (`load_curves`): stopping
+        early needs no pass of its own.
     steps
-        Steps until every pixel is gone.
+        Steps of the others until every pixel is gone.
     seed
         Of the random control.
     on_curve
@@ -74,7 +84,7 @@ def score_remedies(
     orders = {name: saliency_orders(maps, shape) for name, maps in explained.saliency.items()}
     orders[CONTROL] = np.stack([random_order(shape, rng=rng) for _ in explained.frames])
     background = BACKGROUND.get(explained.input, "background")
-    total, done = 3 * len(orders) * len(inputs), 0
+    total, done = 2 * len(orders) * len(inputs), 0
     predict = material.fast(total * steps)
 
     def run(fill: str, one: Int[np.ndarray, "frames pixels"]) -> list[_Curve]:
@@ -87,12 +97,8 @@ def score_remedies(
 
         found = deletion_curves(predict, inputs, one, fill=get_fill(fill), steps=steps, on_image=report)
         done = before + len(inputs)
-        return [
-            _Curve(pixels_removed=found.pixels_removed, predictions=answers, scores=scores)
-            for answers, scores in zip(found.predictions, found.scores, strict=True)
-        ]
+        return _split(found)
 
-    grey = {name: run("grey", one) for name, one in orders.items()}
     variants: dict[str, tuple[dict[str, Any], Curves]] = {
         "stop-at-half": (
             {
@@ -103,7 +109,7 @@ def score_remedies(
                 "stop": _STOP,
                 "better": "lower",
             },
-            _stopped(grey, explained),
+            _stopped({name: _split(found) for name, found in grey.items()}, explained),
         ),
         "background": (
             {
@@ -152,6 +158,13 @@ def score_remedies(
             ],
         },
     )
+
+
+def _split(curves: DeletionCurves) -> list[_Curve]:
+    return [
+        _Curve(pixels_removed=curves.pixels_removed, predictions=answers, scores=scores)
+        for answers, scores in zip(curves.predictions, curves.scores, strict=True)
+    ]
 
 
 def _stopped(curves: Curves, explained: Explained) -> Curves:

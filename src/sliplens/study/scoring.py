@@ -23,6 +23,7 @@ from sliplens.provenance import write_json
 from sliplens.study.material import make_fast
 from sliplens.study.saved import RESULT_FILE, Explained
 
+CURVES_FILE = "deletion.parquet"
 CONTROL = "random"
 
 
@@ -110,7 +111,7 @@ def score_explanations(
     names = [frame.id for frame in explained.frames]
     pq.write_table(
         pa.concat_tables([_table(method, curve, names) for method, curve in curves.items()]),
-        folder / "deletion.parquet",
+        folder / CURVES_FILE,
     )
     result = ScoreResult(
         methods={method: _method_score(curve) for method, curve in curves.items()},
@@ -130,6 +131,22 @@ def score_explanations(
         },
     )
     return result
+
+
+def load_curves(folder: Path, explained: Explained) -> dict[str, DeletionCurves]:
+    """Read the curves that `score_explanations` wrote of some explanations, by method, the control among them."""
+    table = pq.read_table(folder / CURVES_FILE)
+    method, shape = table["method"].to_numpy(), (len(explained.frames), -1)
+    base = np.array([frame.prediction for frame in explained.frames])
+    found = {}
+    for name in dict.fromkeys(method.tolist()):
+        mine = method == name
+        found[name] = DeletionCurves(
+            pixels_removed=table["pixels_removed"].to_numpy()[mine].reshape(shape)[0],
+            base=base,
+            predictions=table["prediction"].to_numpy()[mine].reshape(shape),
+        )
+    return found
 
 
 def _method_score(curve: DeletionCurves) -> MethodScore:
