@@ -109,6 +109,7 @@ def make_maps(trained: TrainedModel, case: Case, *, options: argparse.Namespace)
     return {
         OURS: ours.saliency[0],
         "regression, activity only": ours.levels[0].saliency[0],
+        "regression x |x - reference|": ours.levels[0].saliency[0] * added,
         "thesis, finest": published[0],
         "thesis, level 5": published[5],
         "same layers, weights 1": alone[0] * added,

@@ -22,7 +22,7 @@ def test_a_study_makes_every_stage_and_the_page_and_keeps_what_is_there(
     words: tuple[object, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     output = tmp_path / "study"
-    assert run(*words, "-o", output) == 0
+    assert run(*words, "-o", output, "--jobs", 1) == 0
     folders = {path.name for path in output.iterdir() if path.is_dir() and not path.name.startswith(".")}
     stages = {f"{stage}-{name}" for stage in STAGES for name in ("difference", "raw")}
     assert folders >= {"choice", "states", *stages}
@@ -31,14 +31,14 @@ def test_a_study_makes_every_stage_and_the_page_and_keeps_what_is_there(
         told = json.loads((output / f"faithfulness-{name}" / "result.json").read_text())
         assert (told["frames"], told["trials"]) == (6, 2)
         assert {one["method"] for one in told["scores"] if one["control"]} == {"edges", "input", "centre", "randomised"}
-    # as after an interruption: one stage is missing, the others stay as they are
+    # as after an interruption: one stage is missing, the others stay as they are; now each network has its process
     before = {path: path.stat().st_mtime_ns for path in output.glob("*/result.json")}
     gone = output / "looks-raw"
     for path in gone.iterdir():
         path.unlink()
     gone.rmdir()
     capsys.readouterr()
-    assert run(*words, "-o", output) == 0
+    assert run(*words, "-o", output, "--jobs", 2) == 0
     told = capsys.readouterr().out
     assert told.count("kept") == len(before) - 1
     after = {path: path.stat().st_mtime_ns for path in output.glob("*/result.json")}
@@ -59,6 +59,7 @@ def test_a_network_of_the_wrong_input_is_refused(
         (("--difference", "none", "--raw", "none"), "a study needs a network"),
         (("--method", "guess"), "no explainer named 'guess'"),
         (("--random-orders", 0), "at least 1"),
+        (("--jobs", 0), "--jobs must be at least 1"),
         (("--preset", "thesis"), "name a data set, or --preset"),
     ],
 )

@@ -62,7 +62,13 @@ def by_hand(model: nn.Module, image, reference, *, layers: tuple[str, ...], vari
     for layer_map in reversed(layer_maps[:-1]):
         smooth = resize(resize(layer_map, result.shape), layer_map.shape)
         result = np.maximum(layer_map / np.maximum(smooth, 1e-12) * resize(result, layer_map.shape), 0)
-    return resize(mask_of(result), size) * (image - reference).abs().mean(dim=0).numpy()
+    return resize(mask_of(result), size) * changed(image, reference)
+
+
+def changed(image, reference) -> np.ndarray:
+    """A pixel counts as far as it differs, and wholly from 5 % of the largest difference on."""
+    difference = np.abs(image.numpy() - reference.numpy()).mean(axis=0)
+    return np.minimum(difference / (0.05 * difference.max()), 1)
 
 
 @pytest.mark.parametrize("variant", ["+", "-", "+/-"])
@@ -124,6 +130,26 @@ def test_nothing_is_relevant_where_the_image_is_the_reference(network, images, r
     assert not relevance[20:40, 30:50].any()
 
 
+def test_where_the_image_hardly_differs_the_map_fades_and_elsewhere_it_is_the_finest_level(network, images, reference):
+    model, images = network("small shufflenet"), images[:1].clone()
+    difference = (images[0] - reference).abs().mean(dim=0)
+    step = 0.01 * float(difference.max())
+    images[0, :, 20:40, 30:50] = reference[:, 20:40, 30:50] + step
+    explanation = PolyCam(levels=True)(model, images, reference=reference)
+    level = explanation.levels[0].saliency[0]
+    share = torch.where(level > 1e-3, explanation.saliency[0] / level, torch.nan)
+    clear = difference > 0.06 * difference.max()
+    clear[20:40, 30:50] = False
+    inside, outside = share[20:40, 30:50], share[clear]
+    whole = float(outside.nanmedian())
+    torch.testing.assert_close(outside[outside.isfinite()], torch.full_like(outside, whole)[outside.isfinite()])
+    # a hundredth of the largest difference is a fifth of what counts
+    assert inside.isfinite().any()
+    torch.testing.assert_close(
+        inside[inside.isfinite()] / whole, torch.full_like(inside, 0.2)[inside.isfinite()], rtol=1e-3, atol=0
+    )
+
+
 def test_full_mask_has_the_whole_effect():
     class Flat(nn.Module):
         """One channel, nearly constant but for a dark corner: its mask is nearly full."""
@@ -151,7 +177,8 @@ def test_levels_are_kept_on_request_fine_to_coarse(network, images):
     for level in explanation.levels:
         assert level.saliency.shape == (2, 64, 64)
         assert bool(((level.saliency >= 0) & (level.saliency <= 1)).all())
-    finest = explanation.levels[0].saliency * images[:2].mean(dim=1).float()
+    parts = [changed(image, torch.zeros_like(image)) for image in images[:2]]
+    finest = explanation.levels[0].saliency * torch.from_numpy(np.stack(parts)).float()
     torch.testing.assert_close(explanation.saliency, finest / finest.amax(dim=(1, 2), keepdim=True))
     assert PolyCam()(model, images[:1]).levels == ()
 

@@ -1,6 +1,8 @@
 """`sliplens study`."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -9,10 +11,13 @@ import tyro
 from sliplens.cli.devices import require_device
 from sliplens.cli.evaluate import Evaluate
 from sliplens.cli.report import Report
+from sliplens.cli.screen import Screen, Terminal
 from sliplens.cli.simulate import Simulate
+from sliplens.cli.together import run_together
 from sliplens.errors import InputError
 
 if TYPE_CHECKING:
+    from sliplens.cli.study_stages import Stages
     from sliplens.models import TrainedModel
 
 _PRESET_FRAMES = 80
@@ -57,6 +62,9 @@ class Study:
     """Random orders that every method has to beat."""
     device: str = "cpu"
     """Where the networks run: cpu, cuda or cuda:1."""
+    jobs: int | None = None
+    """Networks to judge at the same time, each by a process with its share of the cores; one after the other with 1. If
+    not given, both at once where they run on a processor."""
     seed: int = 0
     """Seed of the random orders, of new weights and of noise."""
     overwrite: bool = False
@@ -64,16 +72,16 @@ class Study:
 
     def run(self) -> None:
         """Run every stage that is not there yet, and draw the report."""
-        from sliplens.cli.study_stages import Stages
-        from sliplens.recordings import Dataset
         from sliplens.study.methods import STUDY_METHODS, study_explainers
 
         if (self.data is None) == (self.preset is None):
             raise InputError("name a data set, or --preset thesis to simulate one")
+        if self.jobs is not None and self.jobs < 1:
+            raise InputError(f"--jobs must be at least 1, got {self.jobs}")
         if self.random_orders < 1:
             raise InputError(f"--random-orders must be at least 1, got {self.random_orders}")
         require_device(self.device)
-        explainers = study_explainers(self.method or STUDY_METHODS, budget=self.budget)
+        study_explainers(self.method or STUDY_METHODS, budget=self.budget)  # a mistake is told before all else
         networks = self._load_networks()
         folder = self.data or self._simulate()
         for name, model in self._named().items():
@@ -84,7 +92,31 @@ class Study:
                 device=self.device,
                 overwrite=self.overwrite,
             ).run()
-        stages = Stages(
+        stages = self.stages(folder, networks)
+        stages.choose(
+            split=self.split or ("train" if self.preset else "test"),
+            condition=self.condition,
+            trials=self.trials,
+            tolerance=self.tolerance,
+        )
+        threads = self._threads(len(networks))
+        if threads is None:
+            for name in networks:
+                stages.judge(name)
+        else:
+            run_together(partial(_judge, self, folder), list(networks), threads=threads)
+        for name in networks:
+            stages.time(name)
+        Report(workspace=self.output).run()
+
+    def stages(self, folder: Path, networks: "Mapping[str, TrainedModel]", screen: Screen | None = None) -> "Stages":
+        """The stages of this study on a data set, with some of its networks."""
+        from sliplens.cli.study_stages import Stages
+        from sliplens.recordings import Dataset
+        from sliplens.study.methods import STUDY_METHODS, study_explainers
+
+        explainers = study_explainers(self.method or STUDY_METHODS, budget=self.budget)
+        return Stages(
             output=self.output,
             data=Dataset.open(folder),
             networks=networks,
@@ -93,16 +125,34 @@ class Study:
             random_orders=self.random_orders,
             seed=self.seed,
             overwrite=self.overwrite,
+            screen=screen or Terminal(),
         )
-        stages.choose(
-            split=self.split or ("train" if self.preset else "test"),
-            condition=self.condition,
-            trials=self.trials,
-            tolerance=self.tolerance,
-        )
-        for name in networks:
-            stages.judge(name)
-        Report(workspace=self.output).run()
+
+    def load_network(self, name: str) -> "TrainedModel":
+        """One of the networks, by its input.
+
+        Raises
+        ------
+        InputError
+            If it was trained on another input.
+        """
+        from sliplens.models import load_checkpoint
+        from sliplens.models.shipped import find_run
+
+        trained = load_checkpoint(find_run(self._named()[name]), device=self.device)
+        if trained.manifest.input != name:
+            raise InputError(
+                f"--{name} names a network on {trained.manifest.input} images; give one that was trained on {name}"
+            )
+        return trained
+
+    def _threads(self, networks: int) -> int | None:
+        """Threads of each network's process, or None to judge them one after the other in this one."""
+        import torch
+
+        jobs = self.jobs if self.jobs is not None else (networks if self.device == "cpu" else 1)
+        cores = torch.get_num_threads()
+        return None if min(jobs, networks, cores) < 2 else cores // networks
 
     def _simulate(self) -> Path:
         folder = self.output / "data"
@@ -116,15 +166,11 @@ class Study:
         }
 
     def _load_networks(self) -> "dict[str, TrainedModel]":
-        from sliplens.models import load_checkpoint
-        from sliplens.models.shipped import find_run
-
-        networks = {name: load_checkpoint(find_run(run), device=self.device) for name, run in self._named().items()}
+        networks = {name: self.load_network(name) for name in self._named()}
         if not networks:
             raise InputError("a study needs a network; leave out --difference none or --raw none")
-        for name, trained in networks.items():
-            if trained.manifest.input != name:
-                raise InputError(
-                    f"--{name} names a network on {trained.manifest.input} images; give one that was trained on {name}"
-                )
         return networks
+
+
+def _judge(study: Study, folder: Path, name: str, screen: Screen) -> None:
+    study.stages(folder, {name: study.load_network(name)}, screen).judge(name)

@@ -6,7 +6,7 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
-from sliplens.cli.console import progress_bar, say, unchanged, wrote
+from sliplens.cli.screen import Count, Screen, Terminal
 from sliplens.errors import InputError
 from sliplens.explain import Explainer, IntegratedGradients
 from sliplens.faithfulness.removal import Faithfulness
@@ -29,7 +29,9 @@ from sliplens.study.states import load_markers, save_states
 from sliplens.study.timing import time_explainers
 from sliplens.study.truth import judge_by_truth, true_curves
 
-Count = Callable[[int, int], None]
+_CONTROL = IntegratedGradients(steps=32, max_steps=32)
+"""Of the network with new weights: a control need not be complete."""
+
 Work = Callable[[Path, Count], object]
 
 
@@ -46,7 +48,7 @@ class Stages:
     random_orders: int
     seed: int
     overwrite: bool
-    _choice: Choice | None = field(default=None, init=False)
+    screen: Screen = field(default_factory=Terminal)
 
     def choose(self, *, split: str, condition: str, trials: int, tolerance: float) -> None:
         """Choose the frames, and keep what the camera saw of them."""
@@ -72,8 +74,7 @@ class Stages:
             save_choice(found, folder)
 
         self._run("choice", "choice", config, "Choosing trials", choose)
-        self._choice = load_choice(self.output / "choice")
-        say(f"  {self._choice.told}")
+        self.screen.say(f"  {self.choice.told}")
         self._run(
             "states",
             "states",
@@ -82,16 +83,14 @@ class Stages:
             lambda folder, bar: save_states(self.choice, self.data, folder, on_frame=bar),
         )
 
-    @property
+    @cached_property
     def choice(self) -> Choice:
         """What `choose` chose."""
-        assert self._choice is not None, "choose first"
-        return self._choice
+        return load_choice(self.output / "choice")
 
     def judge(self, name: str) -> None:
-        """Explain the frames with one network's methods, and judge the explanations in every way."""
-        trained = self.networks[name]
-        about = {**self._frames(), **self.settings, "weights_sha256": trained.manifest.weights_sha256}
+        """Explain the frames with one network's methods, and judge the explanations in every way but by the clock."""
+        trained, about = self.networks[name], self._about(name)
         rows: dict[str, list[int]] = {}
         for pick in self.choice.frames:
             rows.setdefault(pick.trial, []).append(pick.frame)
@@ -109,21 +108,13 @@ class Stages:
                 on_map=bar,
             ),
         )
-        explained = load_explained(self.output / f"explain-{name}")
-        material = gather(
-            trained,
-            explained,
-            self.data,
-            tuple(pick for pick in self.choice.frames if pick.scored),
-            markers=load_markers(self.output / "states"),
-            explainers=self.explainers,
-        )
+        material = self._material(name)
         influence = cache(lambda: self._influence(material))
         works: dict[str, tuple[str, Mapping[str, Any], Work]] = {
             "score": (
                 "Deleting pixels, as the thesis did",
                 # the report reads these of every score
-                {"input": name, "source": explained.source, "fill": "grey"},
+                {"input": name, "source": material.explained.source, "fill": "grey"},
                 lambda folder, bar: score_explanations(
                     trained, material.explained, folder, seed=self.seed, on_curve=bar
                 ),
@@ -162,7 +153,6 @@ class Stages:
                 {},
                 lambda folder, bar: check_looks(material, self.data, folder, seed=self.seed, on_method=bar),
             ),
-            "timing": ("Timing the methods", {}, lambda folder, bar: time_explainers(material, folder, on_method=bar)),
         }
         if self._redrawn:
             works["truth"] = (
@@ -182,10 +172,37 @@ class Stages:
         for stage, (title, more, work) in works.items():
             self._run(f"{stage}-{name}", stage, {**about, **more}, f"{title} ({name})", work)
 
+    def time(self, name: str) -> None:
+        """Time one network's methods; to be done while nothing else runs."""
+        self._run(
+            f"timing-{name}",
+            "timing",
+            self._about(name),
+            f"Timing the methods ({name})",
+            lambda folder, bar: time_explainers(self._material(name), folder, on_method=bar),
+        )
+
+    def _about(self, name: str) -> dict[str, Any]:
+        return {
+            **self._frames(),
+            **self.settings,
+            "weights_sha256": self.networks[name].manifest.weights_sha256,
+        }
+
+    def _material(self, name: str) -> Material:
+        return gather(
+            self.networks[name],
+            load_explained(self.output / f"explain-{name}"),
+            self.data,
+            tuple(pick for pick in self.choice.frames if pick.scored),
+            markers=load_markers(self.output / "states"),
+            explainers=self.explainers,
+        )
+
     def _influence(self, material: Material) -> Influence:
         return {
             **influences(material),
-            RANDOMISED: explain_untrained(material, IntegratedGradients(), seed=self.seed),
+            RANDOMISED: explain_untrained(material, _CONTROL, seed=self.seed),
         }
 
     def _true_curves(self, material: Material, maps: Influence) -> dict[Setting, Mapping[str, Faithfulness]]:
@@ -210,7 +227,7 @@ class Stages:
         try:
             rebuild_trial(self.data.folder, self.data.load(info))
         except InputError as error:
-            say(f"  note: the truth is left out, since {error}")
+            self.screen.say(f"  note: the truth is left out, since {error}")
             return False
         return True
 
@@ -221,10 +238,10 @@ class Stages:
         target = self.output / name
         with output_folder(target, stage=stage, config=config, overwrite=self.overwrite) as out:
             if out.complete:
-                unchanged(target)
+                self.screen.unchanged(target)
                 return
-            with progress_bar(title) as bar:
+            with self.screen.progress_bar(title) as bar:
                 work(out.folder, bar)
         for alarm in read_json(target / "result.json").get("alarms", []):
-            say(f"  alarm: {alarm}")
-        wrote(target, title[0].lower() + title[1:])
+            self.screen.say(f"  alarm: {alarm}")
+        self.screen.wrote(target, title[0].lower() + title[1:])

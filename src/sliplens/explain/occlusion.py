@@ -12,6 +12,7 @@ from torch import Tensor
 from sliplens.errors import InputError
 from sliplens.explain.explanation import Progress
 from sliplens.explain.method import Found, Method, require_at_least_one
+from sliplens.explain.passes import prepare
 from sliplens.explain.subject import Held
 
 Places: TypeAlias = Float[Tensor, "markers 2"]
@@ -93,7 +94,19 @@ class Occlusion(Method):
     @torch.no_grad()
     def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
         subject = held.predict_all()
-        captum = attr.FeatureAblation(subject.predict)
+        tiles = -(-subject.images.shape[-2] // self.tile_px) * -(-subject.images.shape[-1] // self.tile_px)
+        passes = prepare(
+            subject.model,
+            torch.cat([subject.images[:1], subject.reference[:1]]),
+            torch.stack([subject.prediction[0], subject.reference_prediction[0]]),
+            # markers are about as many
+            passes=len(subject.images) * tiles,
+        )
+
+        def predict(images: Tensor) -> Tensor:
+            return torch.cat(list(passes.run(images.split(passes.batch_size))))
+
+        captum = attr.FeatureAblation(predict)
 
         def lost(index: int) -> Tensor:
             image, empty = subject.images[index], subject.reference[index]
@@ -115,6 +128,7 @@ class Occlusion(Method):
             complete=False,
             target="f(x) - f(x with one region as in the reference), "
             + (f"tiles of {self.tile_px} px" if by_tile else "markers"),
+            more={"engine": passes.engine},
         )
 
     def _regions(self, image: Tensor, empty: Tensor) -> Tensor:

@@ -41,15 +41,19 @@ def noisy_linear(
     Rong et al., *A Consistent and Efficient Evaluation Strategy for Attribution Methods* (2022): ROAD, section 4 and
     appendix; weights of 1/6 for the four nearest and 1/12 for the diagonal neighbours.
     """
-    # channels last: the small convolution of every step is six times as fast on a CPU
-    filled = _solve(images.contiguous(memory_format=torch.channels_last), gone[:, None], tolerance=tolerance)
+    # channels last: the small convolution of every step is six times as fast on a CPU; a mask for each colour, since
+    # there a product with one for all of them takes six times as long
+    each, mask = (
+        one.contiguous(memory_format=torch.channels_last) for one in (images, gone[:, None].expand(images.shape))
+    )
+    filled = _solve(each, mask, tolerance=tolerance)
     if noise is not None:
-        filled = filled + NOISE_SD * noise * gone[:, None]
-    return filled.clamp(0, 1)
+        filled.addcmul_(noise, mask, value=NOISE_SD)
+    return filled.clamp_(0, 1)
 
 
 def _solve(
-    images: Float[Tensor, "batch 3 height width"], gone: Bool[Tensor, "batch 1 height width"], *, tolerance: float
+    images: Float[Tensor, "batch 3 height width"], gone: Bool[Tensor, "batch 3 height width"], *, tolerance: float
 ) -> Float[Tensor, "batch 3 height width"]:
     """Images whose removed pixels are the weighted means of their neighbours; see `noisy_linear`.
 
@@ -63,34 +67,38 @@ def _solve(
     def gather(values: Tensor) -> Tensor:
         return functional.conv2d(values, kernel, padding=1, groups=3)
 
-    weights = gather(torch.ones_like(images[:1]))  # less than one at the border, where neighbours are missing
+    # less than one at the border, where neighbours are missing
+    weights = gather(torch.ones_like(images[:1]))
     known = left.sum(dim=(2, 3), keepdim=True)
-    filled = images * left + _begin(images, left, tolerance=tolerance) * hole
+    filled = (images * left).addcmul_(_begin(images, left, tolerance=tolerance), hole)
 
-    def apply(values: Tensor) -> Tensor:
-        """The matrix: of values that are zero outside the holes."""
-        return (weights * values - gather(values)) * hole
+    # in place wherever it can be: fresh memory of this size costs more than the arithmetic
+    scratch = torch.empty_like(filled)
 
-    residual = (gather(filled) - weights * filled) * hole
+    def dot(one: Tensor, other: Tensor) -> Tensor:
+        return torch.mul(one, other, out=scratch).sum(dim=(1, 2, 3), keepdim=True)
+
     # a whole image that is gone has its mean for a solution, and a matrix that is singular
-    residual = residual * (known > 0)
-    direction, square = residual.clone(), residual.square().sum(dim=(1, 2, 3), keepdim=True)
-    change = torch.zeros_like(images)
+    inside = hole * (known > 0)
+    residual = gather(filled).addcmul_(weights, filled, value=-1).mul_(inside)
+    direction, square = residual.clone(), dot(residual, residual)
     for _ in range(4 * max(images.shape[-2:])):
-        if float(residual.abs().max()) <= tolerance:
+        low, high = residual.permute(0, 2, 3, 1).aminmax()  # as it lies in memory
+        if max(-float(low), float(high)) <= tolerance:
             break
-        pushed = apply(direction)
-        step = square / (direction * pushed).sum(dim=(1, 2, 3), keepdim=True).clamp_min(1e-30)
-        change += step * direction
-        residual -= step * pushed
-        after = residual.square().sum(dim=(1, 2, 3), keepdim=True)
-        direction = residual + after / square.clamp_min(1e-30) * direction
+        # the matrix: of values that are zero outside the holes
+        pushed = gather(direction).neg_().addcmul_(weights, direction).mul_(inside)
+        step = square / dot(direction, pushed).clamp_min(1e-30)
+        filled.addcmul_(step, direction)
+        residual.addcmul_(step, pushed, value=-1)
+        after = dot(residual, residual)
+        direction.mul_(after / square.clamp_min(1e-30)).add_(residual)
         square = after
-    return filled + change * hole
+    return filled
 
 
 def _begin(
-    images: Float[Tensor, "batch 3 height width"], left: Float[Tensor, "batch 1 height width"], *, tolerance: float
+    images: Float[Tensor, "batch 3 height width"], left: Float[Tensor, "batch 3 height width"], *, tolerance: float
 ) -> Float[Tensor, "batch 3 height width"]:
     """A first guess: the solution at half the size, or the mean of what is left of a small or whole image."""
     known = left.sum(dim=(2, 3), keepdim=True)

@@ -22,7 +22,7 @@ from sliplens.study.material import Material
 from sliplens.study.saved import RESULT_FILE, Explained
 
 CURVES_FILE = "curves.parquet"
-STUDY_AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+STUDY_AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
 """Fewer than `removal.AREAS`, so that many settings can be scored: the equal areas, and enough for trapezoids."""
 
 Influence = Mapping[str, Float[np.ndarray, "images height width"]]

@@ -25,8 +25,8 @@ from sliplens.study.material import Material
 from sliplens.study.saved import RESULT_FILE, Explained
 from sliplens.study.scoring import CONTROL, CURVES_FILE
 
-STEPS = 56
-"""A quarter of the thesis's 224: the mean over the steps differs from that over all of them by less than a step."""
+STEPS = 28
+"""An eighth of the thesis's 224: the mean over the steps differs from that over all of them by less than a step."""
 _STOP = 0.5
 BACKGROUND = {"difference": "black", "raw": "white"}
 """What the thesis proposes as the background of its two inputs."""

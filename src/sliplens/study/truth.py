@@ -211,7 +211,7 @@ def _all_effects(
     on_frame: Callable[[int, int], None] | None,
 ) -> list[MarkerEffects]:
     parts.mkdir(exist_ok=True)
-    inputs, towards = trained.encoding.normalise(explained.images), _towards(explained)
+    inputs, towards = trained.encoding.normalise(explained.images).to(trained.device), _towards(explained)
     files = [parts / f"{index:05d}.npz" for index in range(len(frames))]
     # each marker alone, and under each fill two maps both ways
     passes = sum(not file.is_file() for file in files) * (len(frames[0].markers) + 4 * len(SHARES) * (len(fills) + 1))
@@ -227,7 +227,7 @@ def _all_effects(
                 frame,
                 places[index],
                 inputs=inputs[index : index + 1],
-                references=empty[None],
+                references=empty[None].to(trained.device),
                 towards=towards[index],
                 fills=fills,
                 # a run that goes on draws the same

@@ -134,14 +134,15 @@ def _number(name: str, trial: str, *, frames: int) -> int:
 
 
 def redrawing(trained: TrainedModel, frames: Sequence[StagedFrame]) -> Redraw:
-    """Draw frames with some of their `markers` put back, as the network gets them."""
+    """Draw frames with some of their `markers` put back, as the network gets them, on its device."""
 
     def redraw(image: int, back: Bool[np.ndarray, "variants markers"]) -> Float[Tensor, "variants 3 size size"]:
         frame = frames[image]
         film = frame.scene.film
         every = np.zeros((len(back), len(film.marker_rest_px)), dtype=bool)
         every[:, frame.markers] = back
-        return trained.encode(draw_with_markers_back(film, frame.number, every).numpy(), frame.reference)
+        drawn = draw_with_markers_back(film, frame.number, every).numpy()
+        return trained.encode(drawn, frame.reference).to(trained.device)
 
     return redraw
 
