@@ -1,6 +1,6 @@
 """The whole study on simulated touch with the networks of the package: how long it takes, interrupted once.
 
-It is interrupted while it explains the second network, given again, and given a third time when all is there. Every
+It is interrupted while parts of the frames are removed, given again, and given a third time when all is there. Every
 stage that was finished before must be left as it was, and the third run must leave everything so.
 """
 
@@ -37,7 +37,7 @@ def main() -> None:
         data = ["--preset", "thesis"] if options.data is None else [str(options.data)]
         words = [sys.executable, "-m", "sliplens", "study", *data, "-o", str(output), "--trials", str(options.trials)]
         started = time.perf_counter()
-        stopped = run_until(words, output / ".explain-raw.partial" / "parts")
+        stopped = run_until(words, output, ".faithfulness-*.partial/parts/*")
         before = written(output)
         subprocess.run(words, check=True, stdout=sys.stderr)
         minutes = (time.perf_counter() - started) / 60
@@ -62,12 +62,12 @@ def main() -> None:
     print(f"{minutes:.1f} minutes, {'went on where it stopped' if told['resumed_ok'] else 'did NOT resume'}")
 
 
-def run_until(words: list[str], sign: Path) -> bool:
-    """Run a command, interrupt it once a folder holds something, and say whether it stopped as it should."""
+def run_until(words: list[str], output: Path, sign: str) -> bool:
+    """Run a command, interrupt it once its folder holds some file, and say whether it stopped as it should."""
     process = subprocess.Popen(words, stdout=sys.stderr)
     try:
         while process.poll() is None:
-            if sign.is_dir() and any(sign.iterdir()):
+            if any(output.glob(sign)):
                 process.send_signal(signal.SIGINT)
                 break
             time.sleep(_LOOK_EVERY_S)
