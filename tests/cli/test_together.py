@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from pieces_of_work import die, refuse, write
+from pieces_of_work import break_down, die, refuse, write
 
 from sliplens.cli.together import run_together
 from sliplens.errors import InputError, SliplensError
@@ -30,5 +30,10 @@ def test_a_mistake_in_one_is_raised_here_and_ends_the_others(capsys: pytest.Capt
 
 
 def test_a_process_that_is_killed_is_told_with_the_cure():
-    with pytest.raises(SliplensError, match=r"the process for one ended early \(exit code 9\).*--jobs 1"):
+    with pytest.raises(SliplensError, match=r"one was ended by signal 9, .* with --jobs 1"):
         run_together(die, ["one"], threads=1)
+
+
+def test_a_fault_of_the_program_is_not_taken_for_the_users():
+    with pytest.raises(SliplensError, match="fault of sliplens"):
+        run_together(break_down, ["one"], threads=1)

@@ -1,7 +1,11 @@
 """Work for processes of their own, which import it by this module's name."""
 
 import os
+import signal
+import time
 from pathlib import Path
+
+import torch
 
 from sliplens.cli.screen import Screen
 from sliplens.errors import InputError
@@ -9,8 +13,6 @@ from sliplens.errors import InputError
 
 def write(folder: Path, name: str, screen: Screen) -> None:
     """Write a file, and say so."""
-    import torch
-
     with screen.progress_bar(f"Writing {name}") as count:
         (folder / name).write_text(f"{os.getpid()} {torch.get_num_threads()}")
         count(1, 1)
@@ -19,14 +21,17 @@ def write(folder: Path, name: str, screen: Screen) -> None:
 
 def refuse(name: str, screen: Screen) -> None:
     """Fail by a mistake of the user, but for one name that goes on for an hour."""
-    import time
-
     if name == "slow":
         time.sleep(3600)
     screen.say(f"{name} begins")
     raise InputError(f"{name} cannot be used; use another")
 
 
-def die(name: str, screen: Screen) -> None:  # noqa: ARG001 (as all work is)
+def die(name: str, screen: Screen) -> None:
     """End as the system ends a process that takes too much memory."""
-    os._exit(9)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def break_down(name: str, screen: Screen) -> None:
+    """Fail by a mistake of the program."""
+    raise ZeroDivisionError

@@ -55,11 +55,7 @@ def run_together(work: Work, names: Sequence[str], *, threads: int) -> None:
                     except EOFError:
                         process.join()
                         del running[pipe]
-                        if process.exitcode:
-                            raise SliplensError(
-                                f"the process for {name} ended early (exit code {process.exitcode}), perhaps for want "
-                                "of memory; give the same command again with --jobs 1"
-                            ) from None
+                        _require_end(name, process.exitcode)
                         continue
                     if event[0] == "failed":
                         raise event[1]
@@ -68,6 +64,19 @@ def run_together(work: Work, names: Sequence[str], *, threads: int) -> None:
             for _, process, _ in running.values():
                 process.terminate()
                 process.join()
+
+
+def _require_end(name: str, exit_code: int | None) -> None:
+    if not exit_code:
+        return
+    if exit_code < 0:
+        raise SliplensError(
+            f"the process for {name} was ended by signal {-exit_code}, perhaps for want of memory; give the same "
+            "command again with --jobs 1"
+        )
+    raise SliplensError(
+        f"the process for {name} failed; what it printed above is a fault of sliplens, please report it"
+    )
 
 
 def _work(work: Work, name: str, threads: int, pipe: Connection) -> None:
