@@ -152,7 +152,8 @@ def _openvino(model: nn.Module, images: Tensor, batch_size: int) -> Run:
     network = known[1]
 
     def run(batches: Iterable[Tensor]) -> Iterator[Tensor]:
-        idle = [network.create_infer_request() for _ in range(torch.get_num_threads())]
+        # one more than can be worked on: the next batch is made while all cores are busy
+        idle = [network.create_infer_request() for _ in range(torch.get_num_threads() + 1)]
         busy: deque[tuple[Any, Tensor, int]] = deque()
 
         def finish() -> Tensor:
@@ -193,6 +194,8 @@ def _convert(model: nn.Module, images: Tensor, batch_size: int) -> Any:
         # one batch to a core: together they would wait for each other in every layer
         "NUM_STREAMS": threads,
         "INFERENCE_NUM_THREADS": threads,
+        # pinned, the threads of two processes share the first core and leave the second idle
+        "ENABLE_CPU_PINNING": False,
         "INFERENCE_PRECISION_HINT": "f32",  # where the processor knows bfloat16 that is the default, at 3 digits
     }
     return openvino.Core().compile_model(converted, "CPU", settings)
