@@ -111,6 +111,28 @@ def test_an_interrupted_run_goes_on_after_the_last_setting(material: Material, t
     assert (tmp_path / "result.json").read_text() == (scored / "result.json").read_text()
 
 
+def test_curves_found_in_another_way_are_kept_over_an_interruption(material: Material, tmp_path: Path):
+    count, asked = len(material.inputs), []
+
+    def draw(report) -> dict[str, Faithfulness]:
+        asked.append("drawn")
+        report(count, count)
+        return {name: straight(0.2, 0.1, frames=count) for name in influences(material)}
+
+    def stop(report) -> dict[str, Faithfulness]:
+        raise KeyboardInterrupt
+
+    true, other = Setting(fill="true", unit="marker"), Setting(fill="other", unit="marker")
+    settings = {"maps": influences(material), "settings": (), "random_orders": 2}
+    with pytest.raises(KeyboardInterrupt):
+        score_curves(material, tmp_path, further={true: draw, other: stop}, **settings)
+    score_curves(material, tmp_path, further={true: draw, other: draw}, **settings)
+    assert asked == ["drawn", "drawn"]  # the first setting once, the second once
+    told = json.loads((tmp_path / "result.json").read_text())
+    by_fill = {one["fill"]: one["srg"]["estimate"] for one in told["scores"] if one["method"] == "grad-cam"}
+    assert by_fill == pytest.approx({"true": 0.075, "other": 0.075})
+
+
 def test_a_method_is_better_only_when_the_interval_leaves_zero_out():
     rng = np.random.default_rng(0)
     level = rng.uniform(0.3, 0.5, 8)

@@ -15,7 +15,7 @@ from sliplens.provenance import hash_json, output_folder, read_json, to_jsonable
 from sliplens.recordings import Dataset
 from sliplens.simulation.intervention import rebuild_trial
 from sliplens.study.choice import Choice, choose_frames, load_choice, save_choice
-from sliplens.study.curves import SETTINGS, Influence, influences, score_curves
+from sliplens.study.curves import SETTINGS, Influence, Scoring, influences, score_curves
 from sliplens.study.explaining import explain_frames
 from sliplens.study.frames import frames_at
 from sliplens.study.judging import RANDOMISED, Setting
@@ -183,11 +183,8 @@ class Stages:
         )
 
     def _about(self, name: str) -> dict[str, Any]:
-        return {
-            **self._frames(),
-            **self.settings,
-            "weights_sha256": self.networks[name].manifest.weights_sha256,
-        }
+        weights = self.networks[name].manifest.weights_sha256
+        return {**self._frames(), **self.settings, "weights_sha256": weights}
 
     def _material(self, name: str) -> Material:
         return gather(
@@ -205,18 +202,22 @@ class Stages:
             RANDOMISED: explain_untrained(material, _CONTROL, seed=self.seed),
         }
 
-    def _true_curves(self, material: Material, maps: Influence) -> dict[Setting, Mapping[str, Faithfulness]]:
+    def _true_curves(self, material: Material, maps: Influence) -> dict[Setting, Scoring]:
         if not self._redrawn:
             return {}
-        found = true_curves(
-            material.trained,
-            material.explained,
-            self.data,
-            maps=maps,
-            random_orders=self.random_orders,
-            seed=self.seed,
-        )
-        return {Setting(fill="true", unit="marker"): found}
+
+        def put_back(report: Count) -> Mapping[str, Faithfulness]:
+            return true_curves(
+                material.trained,
+                material.explained,
+                self.data,
+                maps=maps,
+                random_orders=self.random_orders,
+                seed=self.seed,
+                on_frame=report,
+            )
+
+        return {Setting(fill="true", unit="marker"): put_back}
 
     @cached_property
     def _redrawn(self) -> bool:

@@ -6,6 +6,9 @@ from torch import Tensor
 from torch.nn import functional
 
 FLOOR = 1e-12
+CHANGE_THAT_COUNTS = 0.05
+"""Of the largest |x - b| in an image: from there on a pixel counts as changed. Ten grey levels where a black marker has
+moved from a bright pixel, which camera noise does not reach."""
 _LOW, _HIGH = 0.001, 0.999  # 0.1th and 99.9th percentile
 
 
@@ -70,6 +73,17 @@ def to_masks(
     low, high = (bound[..., None, None] for bound in percentile_bounds(maps))
     masks = ((maps - low) / high.clamp_min(FLOOR)).clamp(0, 1)
     return masks if as_published else torch.where(high < 0, torch.zeros_like(masks), masks)
+
+
+def changed_share(
+    image: Float[Tensor, "3 height width"], reference: Float[Tensor, "3 height width"]
+) -> Float[Tensor, "height width"]:
+    """How far each pixel counts as changed: 0 where the image is the reference, 1 from `CHANGE_THAT_COUNTS` on.
+
+    How much a pixel differs beyond that is not asked: the masks tell what the network makes of it.
+    """
+    change = (image - reference).abs().mean(dim=0)
+    return (change / (CHANGE_THAT_COUNTS * change.max()).clamp_min(FLOOR)).clamp(max=1)
 
 
 def pearson_r(one: Float[Tensor, "height width"], other: Float[Tensor, "height width"]) -> float:

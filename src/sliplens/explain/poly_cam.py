@@ -14,16 +14,12 @@ from sliplens.explain.health import check_approximations, check_weights
 from sliplens.explain.layers import Layer, find_layers
 from sliplens.explain.levels import combine, scale_to
 from sliplens.explain.listening import capture
-from sliplens.explain.maps import FLOOR
+from sliplens.explain.maps import changed_share
 from sliplens.explain.method import Found, Method
 from sliplens.explain.passes import Passes, prepare
 from sliplens.explain.sampling import mask_kernel
 from sliplens.explain.scores import SCORES, VARIANTS, channel_effects, supporting_share
 from sliplens.explain.subject import Held, Subject
-
-CHANGE_THAT_COUNTS = 0.05
-"""Of the largest |x - b| in an image: from there on a pixel counts as changed. Ten grey levels where a black marker has
-moved from a bright pixel, which camera noise does not reach."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +38,7 @@ class PolyCam(Method):
     A layer's map is relu(sum of weight x activation). From the last layer to the first it is divided by itself
     resized to the coarser result and back, then multiplied by that result. The finest product, normalised like a
     mask, is the saliency where the image differs from the reference, and fades to 0 where the mean of |x - b| over the
-    colours falls from `CHANGE_THAT_COUNTS` of its largest value to 0: where x equals b a mask neither shows nor hides
+    colours falls from `maps.CHANGE_THAT_COUNTS` of its largest value to 0: where x equals b a mask neither shows nor hides
     anything, however active the channel.
 
     The relevance is that saliency scaled to add up to f(x) - f(b). The scaling is a convention, not a property of the
@@ -223,17 +219,6 @@ class PolyCam(Method):
         every[:, active] = points(active)
         shares = score.weigh(as_predictions(every, variant=variant, image=image, empty=empty))
         return list(shares.split(regions.layer_sizes)), []
-
-
-def changed_share(
-    image: Float[Tensor, "3 height width"], reference: Float[Tensor, "3 height width"]
-) -> Float[Tensor, "height width"]:
-    """How far each pixel counts as changed: 0 where the image is the reference, 1 from `CHANGE_THAT_COUNTS` on.
-
-    How much a pixel differs beyond that is not asked: the masks tell what the network makes of it.
-    """
-    change = (image - reference).abs().mean(dim=0)
-    return (change / (CHANGE_THAT_COUNTS * change.max()).clamp_min(FLOOR)).clamp(max=1)
 
 
 def _activations(subject: Subject, index: int, layers: tuple[Layer, ...]) -> list[Tensor]:

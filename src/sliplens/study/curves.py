@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,10 @@ STUDY_AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
 """Fewer than `removal.AREAS`, so that many settings can be scored: the equal areas, and enough for trapezoids."""
 
 Influence = Mapping[str, Float[np.ndarray, "images height width"]]
+Report = Callable[[int, int], None]
+"""Takes the frames done, and their number."""
+Scoring = Callable[[Report], Mapping[str, Faithfulness]]
+"""Finds the curves of every map, and reports the frames done."""
 
 
 SETTINGS = (
@@ -59,7 +64,7 @@ def score_curves(
     maps: Influence,
     settings: Sequence[Setting] = SETTINGS,
     random_orders: int = RANDOM_ORDERS,
-    further: Mapping[Setting, Mapping[str, Faithfulness]] | None = None,
+    further: Mapping[Setting, Scoring] | None = None,
     seed: int = 0,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> None:
@@ -81,7 +86,8 @@ def score_curves(
     random_orders
         How many random orders.
     further
-        Curves found in another way, such as by drawing the scene anew; they are written and judged with the others.
+        What finds curves in another way, such as by drawing the scene anew; they are written and judged with the
+        others.
     seed
         Of the random orders and the noise.
     on_frame
@@ -96,44 +102,44 @@ def score_curves(
     for setting in settings:
         get_fill(setting.fill)
     units = material.units()
-    done_settings = [setting for setting in settings if setting.unit in units]
+    known = [setting for setting in settings if setting.unit in units]
     orders = 2 * len(maps) + random_orders
-    predict = material.fast(len(done_settings) * len(inputs) * orders * (len(STUDY_AREAS) - 2))
+    predict = material.fast(len(known) * len(inputs) * orders * (len(STUDY_AREAS) - 2))
+
+    def remove(setting: Setting, report: Report) -> Mapping[str, Faithfulness]:
+        return faithfulness(
+            predict,
+            inputs,
+            dict(maps),
+            units[setting.unit],
+            fill=get_fill(setting.fill),
+            references=references,
+            towards=material.towards,
+            # the same random orders under every fill
+            rng=np.random.default_rng(seed),
+            random_orders=random_orders,
+            areas=STUDY_AREAS,
+            seed=seed,
+            on_image=report,
+        )
+
+    works: dict[Setting, Scoring] = {setting: partial(remove, setting) for setting in known} | dict(further or {})
     parts = folder / "parts"
     parts.mkdir(exist_ok=True)
     found: dict[Setting, dict[str, Faithfulness]] = {}
-    for number, setting in enumerate(done_settings):
+    for number, (setting, work) in enumerate(works.items()):
         part = parts / f"{setting.fill}-{setting.unit}.npz"
         if not part.is_file():
 
             def report(done: int, _: int, before: int = number * len(inputs)) -> None:
                 if on_frame is not None:
-                    on_frame(before + done, len(done_settings) * len(inputs))
+                    on_frame(before + done, len(works) * len(inputs))
 
-            _save(
-                part,
-                faithfulness(
-                    predict,
-                    inputs,
-                    dict(maps),
-                    units[setting.unit],
-                    fill=get_fill(setting.fill),
-                    references=references,
-                    towards=material.towards,
-                    # the same random orders under every fill
-                    rng=np.random.default_rng(seed),
-                    random_orders=random_orders,
-                    areas=STUDY_AREAS,
-                    seed=seed,
-                    on_image=report,
-                ),
-            )
+            _save(part, work(report))
         found[setting] = _load(part)
-    for setting, curves in (further or {}).items():
-        found[setting] = dict(curves)
     pq.write_table(_table(found, explained), folder / CURVES_FILE)
     whole = answer_whole(predict, inputs, batch_size=64)
-    blank = {setting.fill: _answer_blank(predict, material, setting.fill, seed) for setting in done_settings}
+    blank = {setting.fill: _answer_blank(predict, material, setting.fill, seed) for setting in known}
     write_json(
         folder / RESULT_FILE,
         {
@@ -169,7 +175,10 @@ def _answer_blank(predict: Predict, material: Material, fill: str, seed: int) ->
 def _save(path: Path, found: Mapping[str, Faithfulness]) -> None:
     hidden = path.with_suffix(".part.npz")
     np.savez(
-        hidden, allow_pickle=False, areas=np.array(STUDY_AREAS), **{name: one.curves for name, one in found.items()}
+        hidden,
+        allow_pickle=False,
+        areas=next(iter(found.values())).areas,
+        **{name: one.curves for name, one in found.items()},
     )
     hidden.replace(path)
 
