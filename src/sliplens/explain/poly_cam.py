@@ -37,9 +37,8 @@ class PolyCam(Method):
 
     A layer's map is relu(sum of weight x activation). From the last layer to the first it is divided by itself
     resized to the coarser result and back, then multiplied by that result. The finest product, normalised like a
-    mask, is the saliency where the image differs from the reference, and fades to 0 where the mean of |x - b| over the
-    colours falls from `maps.CHANGE_THAT_COUNTS` of its largest value to 0: where x equals b a mask neither shows nor hides
-    anything, however active the channel.
+    mask, is the saliency where the image differs from the reference (`maps.changed_share`): where x equals b a mask
+    neither shows nor hides anything, however active the channel.
 
     The relevance is that saliency scaled to add up to f(x) - f(b). The scaling is a convention, not a property of the
     method: it gives the map the sign and unit of the others, and says nothing about how much one pixel contributes.
