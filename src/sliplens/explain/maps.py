@@ -7,8 +7,8 @@ from torch.nn import functional
 
 FLOOR = 1e-12
 CHANGE_THAT_COUNTS = 0.05
-"""Of the largest |x - b| in an image: from there on a pixel counts as changed. Where a black marker has moved off a bright
-pixel that is ten grey levels, several times the camera's noise."""
+"""Of the largest |x - b| in an image: from there on a pixel counts as changed. Where a black marker has moved off a
+bright pixel that is ten grey levels, several times the camera's noise."""
 _LOW, _HIGH = 0.001, 0.999  # 0.1th and 99.9th percentile
 
 
@@ -80,7 +80,8 @@ def changed_share(
 ) -> Float[Tensor, "height width"]:
     """How far each pixel counts as changed: 0 where the image is the reference, 1 from `CHANGE_THAT_COUNTS` on.
 
-    Between them it rises with the mean of |x - b| over the colours. How much a pixel differs beyond that is not asked: the masks tell what the network makes of it.
+    Between them it rises with the mean of |x - b| over the colours. How much a pixel differs beyond that is not asked:
+    the masks tell what the network makes of it.
     """
     change = (image - reference).abs().mean(dim=0)
     return (change / (CHANGE_THAT_COUNTS * change.max()).clamp_min(FLOOR)).clamp(max=1)
