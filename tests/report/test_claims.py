@@ -7,7 +7,7 @@ import pytest
 
 from sliplens.intervals import Difference
 from sliplens.report import load_results
-from sliplens.report.study.believing import judge_study, rank_methods
+from sliplens.report.study.believing import _tell_lead, judge_study, rank_methods
 from sliplens.report.study.claim import all_of, judge_gap, most_of
 from sliplens.report.study.claims import judge_claims
 from sliplens.report.study.evidence import compare_gain, share_of_strongest
@@ -233,6 +233,26 @@ def test_the_method_to_believe_is_the_one_that_beats_the_controls(judged, tmp_pa
     assert found.text.startswith("Believe Integrated Gradients. Under 4 of 4 fills")
     assert "ahead of Poly-CAM, the next, under untouched frame, grey, blur and true scene" in found.text
     assert "Grad-CAM does not beat the controls" in found.text
+
+
+def test_where_the_next_method_gains_more_it_is_told_with_both_means(judged, tmp_path, rng):
+    judged(Made(gains=GAINS | {"integrated-gradients": 0.4}))
+    faithful = load_results(tmp_path).study.faithfulness["difference"]
+    ranked = rank_methods(faithful)
+    turned = tuple(
+        replace(one, gap=replace(one.gap, estimate=-one.gap.estimate, low=-one.gap.high, high=-one.gap.low))
+        if one.fill == "blur"
+        and "integrated-gradients" in {one.first, one.second}
+        and "poly-cam" in {one.first, one.second}
+        else one
+        for one in faithful.comparisons
+    )
+
+    told = _tell_lead(replace(faithful, comparisons=turned), ranked[0], ranked[1:])
+
+    assert "ahead of Poly-CAM, the next, under untouched frame, grey and true scene, and behind it under blur;" in told
+    means = [f"+{one.mean_gain:.3f}" for one in ranked[:2]]
+    assert told.endswith(f"their mean gains are {means[0]} and {means[1]}.")
 
 
 def test_no_method_is_believed_where_a_control_wins(judged, tmp_path, rng):

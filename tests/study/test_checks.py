@@ -40,6 +40,19 @@ def test_a_map_that_ignores_the_network_is_found_out(material: Material, tmp_pat
     assert told["methods"]["grad-cam"]["similarity"][-1] != pytest.approx(1.0)
 
 
+def test_a_map_that_only_turns_its_sign_with_the_answers_is_as_similar(material: Material, tmp_path: Path):
+    class FollowsTheSign(ShowsTheImage):
+        """The image again, as what raises the answer of the trained network and lowers that of every other."""
+
+        def __call__(self, model: nn.Module, images: Tensor, **options: object) -> Explanation:
+            found, sign = super().__call__(model, images, **options), 1 if model is material.trained.model else -1
+            return replace(found, relevance=sign * found.relevance, prediction=sign * found.prediction)
+
+    check_randomisation(replace(material, explainers={"image": FollowsTheSign()}), tmp_path)
+    told = json.loads((tmp_path / "result.json").read_text())
+    assert told["methods"]["image"]["similarity"] == pytest.approx([1.0, 1.0, 1.0])
+
+
 def test_the_untrained_control_leaves_the_network_as_it_is(material: Material):
     before = {name: value.clone() for name, value in material.trained.model.state_dict().items()}
     first = explain_untrained(material, material.explainers["integrated-gradients"], seed=1)

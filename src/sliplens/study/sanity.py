@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sliplens.explain import Explainer, PolyCam
+from sliplens.explain import Explainer, Explanation, PolyCam
 from sliplens.faithfulness.randomisation import cascade, histogram_entropy, randomisation_scores, smooth_maps
 from sliplens.provenance import write_json
 from sliplens.study.material import Material
@@ -55,7 +55,7 @@ def check_randomisation(
         explainer = replace(whole, likeness=None) if isinstance(whole, PolyCam) else whole
 
         def explain(model: nn.Module, images: Tensor, explainer: Explainer = explainer) -> Maps:
-            return explainer(model, images, reference=references).relevance.double().cpu().numpy()
+            return _towards_target(explainer(model, images, reference=references))
 
         started = time.perf_counter()
         found = randomisation_scores(explain, material.trained.model, inputs, seed=seed, stages=STAGES)
@@ -126,10 +126,15 @@ def explain_untrained(
     for index in range(len(material.inputs)):
         one = slice(index, index + 1)
         found = explainer(model, material.inputs[one], reference=material.references[one])
-        maps.append((found.relevance * found.change.sign()[:, None, None])[0].double().cpu().numpy())
+        maps.append(_towards_target(found)[0])
         if on_frame is not None:
             on_frame(index + 1, len(material.inputs))
     return np.stack(maps)
+
+
+def _towards_target(found: Explanation) -> Maps:
+    """The part of the relevance that works towards the network's own target: the sign of another's says nothing."""
+    return (found.relevance * found.change.sign()[:, None, None]).double().cpu().numpy()
 
 
 def _untrained(model: nn.Module, *, seed: int) -> nn.Module:

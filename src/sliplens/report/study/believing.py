@@ -142,13 +142,20 @@ def _tell_none(ranked: list[Standing]) -> str:
 def _tell_lead(faithful: Faithful, best: Standing, others: list[Standing]) -> str:
     if not others:
         return ""
-    rival = others[0].method
-    gaps = _against(faithful, best.method, rival)
-    ahead = [fill_name(*one) for one, gap in gaps.items() if one in best.tested and _gains(gap)]
-    name = method_name(rival)
-    if not ahead:
+    rival = others[0]
+    gaps = _against(faithful, best.method, rival.method)
+    ahead, behind = (
+        [fill_name(*one) for one, gap in gaps.items() if one in best.tested and told(gap)]
+        for told in (_gains, lambda gap: gap.high < 0)
+    )
+    name = method_name(rival.method)
+    means = f"their mean gains are {signed(best.mean_gain, 3)} and {signed(rival.mean_gain, 3)}"
+    if not ahead and not behind:
         return f" {name}, next by its mean gain, is not told apart from it under any fill."
-    return f" It is ahead of {name}, the next, under {listed(ahead)}."
+    if not ahead:
+        return f" {name}, next by its mean gain, is ahead of it under {listed(behind)}; {means}."
+    but = f", and behind it under {listed(behind)}; {means}" if behind else ""
+    return f" It is ahead of {name}, the next, under {listed(ahead)}{but}."
 
 
 def _against(faithful: Faithful, method: str, rival: str) -> dict[tuple[str, str], Difference]:

@@ -101,7 +101,7 @@ def plate_randomisation(results: Results) -> Plate | None:
         return None
     rows, told = [], []
     with drawing_style():
-        figure = Figure(figsize=(4.6 * len(names), 3.2), layout="constrained")
+        figure = Figure(figsize=(4.6 * len(names), 3.5), layout="constrained")
         for ax, name in zip(figure.subplots(1, len(names), squeeze=False, sharey=True)[0], names, strict=True):
             for method in methods_in_order(found[name].methods):
                 one = found[name].methods[method]
@@ -123,7 +123,8 @@ def plate_randomisation(results: Results) -> Plate | None:
             ax.axhline(0, color=BLACK, linewidth=0.8, linestyle=":")
             ax.set(xlabel="Layers with new weights, from the output", ylabel="Similarity of the map (no unit)")
             ax.set_title(input_name(name))
-            ax.legend()
+        lines = {line.get_label(): line for ax in figure.axes for line in ax.get_lines() if line.get_marker() == "o"}
+        figure.legend(handles=list(lines.values()), loc="outside upper left", ncols=3)
     columns = ("input", "method", "layers", "similarity")
     return Plate(
         name="randomisation",
