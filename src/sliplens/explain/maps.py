@@ -6,9 +6,8 @@ from torch import Tensor
 from torch.nn import functional
 
 FLOOR = 1e-12
-CHANGE_THAT_COUNTS = 0.05
-"""Of the largest |x - b| in an image: from there on a pixel counts as changed. Where a black marker has moved off a
-bright pixel that is ten grey levels, several times the camera's noise."""
+CHANGE_WINDOW = 15 / 224
+"""Side of the square over which a change is averaged, as a share of the image's height: about a marker."""
 _LOW, _HIGH = 0.001, 0.999  # 0.1th and 99.9th percentile
 
 
@@ -75,16 +74,18 @@ def to_masks(
     return masks if as_published else torch.where(high < 0, torch.zeros_like(masks), masks)
 
 
-def changed_share(
+def local_change(
     image: Float[Tensor, "3 height width"], reference: Float[Tensor, "3 height width"]
 ) -> Float[Tensor, "height width"]:
-    """How far each pixel counts as changed: 0 where the image is the reference, 1 from `CHANGE_THAT_COUNTS` on.
+    """How much the image differs from the reference around each pixel.
 
-    Between them it rises with the mean of |x - b| over the colours. How much a pixel differs beyond that is not asked:
-    the masks tell what the network makes of it.
+    The mean of |x - b| over the colours and over a square of `CHANGE_WINDOW`; beyond the border the outermost pixels
+    are repeated.
     """
     change = (image - reference).abs().mean(dim=0)
-    return (change / (CHANGE_THAT_COUNTS * change.max()).clamp_min(FLOOR)).clamp(max=1)
+    reach = round(CHANGE_WINDOW * change.shape[0]) // 2
+    padded = functional.pad(change[None, None], [reach] * 4, mode="replicate")
+    return functional.avg_pool2d(padded, 2 * reach + 1, stride=1)[0, 0]
 
 
 def pearson_r(one: Float[Tensor, "height width"], other: Float[Tensor, "height width"]) -> float:

@@ -14,7 +14,7 @@ from sliplens.explain.health import check_approximations, check_weights
 from sliplens.explain.layers import Layer, find_layers
 from sliplens.explain.levels import combine, scale_to
 from sliplens.explain.listening import capture
-from sliplens.explain.maps import changed_share
+from sliplens.explain.maps import local_change
 from sliplens.explain.method import Found, Method
 from sliplens.explain.passes import Passes, prepare
 from sliplens.explain.sampling import mask_kernel
@@ -37,8 +37,8 @@ class PolyCam(Method):
 
     A layer's map is relu(sum of weight x activation). From the last layer to the first it is divided by itself
     resized to the coarser result and back, then multiplied by that result. The finest product, normalised like a
-    mask, is the saliency where the image differs from the reference (`maps.changed_share`): where x equals b a mask
-    neither shows nor hides anything, however active the channel.
+    mask, times how much the image differs from the reference thereabouts (`maps.local_change`), is the saliency: where
+    x equals b a mask neither shows nor hides anything, however active the channel.
 
     The relevance is that saliency scaled to add up to f(x) - f(b). The scaling is a convention, not a property of the
     method: it gives the map the sign and unit of the others, and says nothing about how much one pixel contributes.
@@ -150,7 +150,7 @@ class PolyCam(Method):
         level = levels[self.level if self.levels else 0]
         if SCORES[self.score].as_published:
             return level
-        return level * changed_share(subject.images[index], subject.reference[index])
+        return level * local_change(subject.images[index], subject.reference[index])
 
     def _find_layers(self, subject: Subject) -> tuple[Layer, ...]:
         image = subject.images[:1]
