@@ -1,6 +1,8 @@
 """The command line, run as a user would: every stage once, and what it says to mistakes."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,17 @@ from sliplens.recordings import Dataset
 def test_version(capsys: pytest.CaptureFixture[str]):
     assert run("--version") == 0
     assert capsys.readouterr().out.strip() == f"sliplens {__version__}"
+
+
+def test_a_reader_that_stops_reading_is_no_error():
+    asked = subprocess.Popen(
+        [sys.executable, "-m", "sliplens", "simulate", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert asked.stdout is not None
+    asked.stdout.close()
+    _, told = asked.communicate()
+    assert told == b""
+    assert asked.returncode == 1
 
 
 def test_an_unknown_command_exits_with_2(capsys: pytest.CaptureFixture[str]):

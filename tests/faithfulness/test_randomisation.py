@@ -60,6 +60,8 @@ def test_a_map_that_ignores_the_network_stays_and_a_gradient_does_not(model: nn.
     seeing = randomisation_scores(gradients, model, images, seed=0, stages=4)
     assert seeing.layers == (1, 2, 3, 4)
     assert np.all(np.abs(seeing.similarity[-1]) < 0.9)
+    known = randomisation_scores(gradients, model, images, seed=0, stages=4, before=gradients(model, images))
+    np.testing.assert_array_equal(known.similarity, seeing.similarity)
 
 
 def test_entropy_has_its_closed_forms():

@@ -12,7 +12,7 @@ from sliplens.faithfulness.looks import gini, total_variation
 from sliplens.recordings import Dataset
 from sliplens.study.looks import check_looks
 from sliplens.study.material import Material
-from sliplens.study.sanity import check_randomisation, explain_untrained
+from sliplens.study.sanity import check_randomisation, explain_untrained, load_untrained
 from sliplens.study.timing import time_explainers
 
 
@@ -30,9 +30,18 @@ class ShowsTheImage:
         )
 
 
+def with_image(material: Material, explainer: ShowsTheImage) -> Material:
+    """The material with one more method, whose maps are the images, turned to each frame's target."""
+    shown = (material.inputs.mean(dim=1).numpy() * material.towards[:, None, None]).astype(np.float32)
+    return replace(
+        material,
+        explained=replace(material.explained, relevance={"image": shown, **material.explained.relevance}),
+        explainers={"image": explainer, **material.explainers},
+    )
+
+
 def test_a_map_that_ignores_the_network_is_found_out(material: Material, tmp_path: Path):
-    blind = replace(material, explainers={"image": ShowsTheImage(), **material.explainers})
-    check_randomisation(blind, tmp_path)
+    check_randomisation(with_image(material, ShowsTheImage()), tmp_path)
     told = json.loads((tmp_path / "result.json").read_text())
     assert told["methods"]["image"]["similarity"] == pytest.approx([1.0, 1.0, 1.0])
     assert told["methods"]["image"]["complexity_rise"] == pytest.approx(0)
@@ -48,16 +57,21 @@ def test_a_map_that_only_turns_its_sign_with_the_answers_is_as_similar(material:
             found, sign = super().__call__(model, images, **options), 1 if model is material.trained.model else -1
             return replace(found, relevance=sign * found.relevance, prediction=sign * found.prediction)
 
-    check_randomisation(replace(material, explainers={"image": FollowsTheSign()}), tmp_path)
+    check_randomisation(with_image(material, FollowsTheSign()), tmp_path)
     told = json.loads((tmp_path / "result.json").read_text())
     assert told["methods"]["image"]["similarity"] == pytest.approx([1.0, 1.0, 1.0])
 
 
-def test_the_untrained_control_leaves_the_network_as_it_is(material: Material):
+def test_the_untrained_control_leaves_the_network_as_it_is(material: Material, tmp_path: Path):
     before = {name: value.clone() for name, value in material.trained.model.state_dict().items()}
-    first = explain_untrained(material, material.explainers["integrated-gradients"], seed=1)
-    again = explain_untrained(material, material.explainers["integrated-gradients"], seed=1)
-    other = explain_untrained(material, material.explainers["integrated-gradients"], seed=2)
+
+    def explain(name: str, seed: int) -> np.ndarray:
+        (tmp_path / name).mkdir()
+        explain_untrained(material, material.explainers["integrated-gradients"], tmp_path / name, seed=seed)
+        return load_untrained(tmp_path / name)
+
+    first, again, other = explain("first", 1), explain("again", 1), explain("other", 2)
+    assert first.shape == (len(material.inputs), *material.inputs.shape[-2:])
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 0
     assert all(torch.equal(value, before[name]) for name, value in material.trained.model.state_dict().items())

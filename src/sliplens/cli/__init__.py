@@ -70,14 +70,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     # threads that spin while they wait take the cores from those that work; must be set before torch is imported
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    command = tyro.cli(
-        Command,  # pyright: ignore[reportArgumentType]
-        prog="sliplens",
-        description=_DESCRIPTION,
-        args=words or ["--help"],
-    )
     try:
+        command = tyro.cli(
+            Command,  # pyright: ignore[reportArgumentType]
+            prog="sliplens",
+            description=_DESCRIPTION,
+            args=words or ["--help"],
+        )
         command.run()
+    except BrokenPipeError:
+        # whoever read it has seen enough, as `| head` does; what is still to be written on the way out goes nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except SliplensError as error:
         fail(str(error))
         return 2

@@ -56,7 +56,7 @@ class Study:
     """How many trials to look at."""
     tolerance: float = 0.03
     """Largest error of an answer in them, as a share of the margin; where too few qualify, the next best are taken."""
-    budget: float = 0.25
+    budget: float = 0.15
     """Share of the channels that poly-cam measures at first."""
     random_orders: int = 20
     """Random orders that every method has to beat."""
@@ -113,7 +113,7 @@ class Study:
         """The stages of this study on a data set, with some of its networks."""
         from sliplens.cli.study_stages import Stages
         from sliplens.recordings import Dataset
-        from sliplens.study.methods import STUDY_METHODS, study_explainers
+        from sliplens.study.methods import STUDY_METHODS, method_options, study_explainers
 
         explainers = study_explainers(self.method or STUDY_METHODS, budget=self.budget)
         return Stages(
@@ -121,7 +121,7 @@ class Study:
             data=Dataset.open(folder),
             networks=networks,
             explainers=explainers,
-            settings={"methods": list(explainers), "budget": self.budget, "seed": self.seed},
+            settings={"methods": method_options(explainers), "seed": self.seed},
             random_orders=self.random_orders,
             seed=self.seed,
             overwrite=self.overwrite,

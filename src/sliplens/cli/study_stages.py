@@ -15,15 +15,15 @@ from sliplens.provenance import hash_json, output_folder, read_json, to_jsonable
 from sliplens.recordings import Dataset
 from sliplens.simulation.intervention import rebuild_trial
 from sliplens.study.choice import Choice, choose_frames, load_choice, save_choice
-from sliplens.study.curves import SETTINGS, Influence, Scoring, influences, score_curves
+from sliplens.study.curves import SETTINGS, STUDY_AREAS, Influence, Scoring, influences, score_curves
 from sliplens.study.explaining import explain_frames
 from sliplens.study.frames import frames_at
 from sliplens.study.judging import RANDOMISED, Setting
 from sliplens.study.looks import check_looks
 from sliplens.study.material import Material, gather
-from sliplens.study.remedies import score_remedies
-from sliplens.study.sanity import check_randomisation, explain_untrained
-from sliplens.study.saved import load_explained
+from sliplens.study.remedies import STEPS, score_remedies
+from sliplens.study.sanity import STAGES, check_randomisation, explain_untrained, load_untrained
+from sliplens.study.saved import RESULT_FILE, load_explained
 from sliplens.study.scoring import load_curves, score_explanations
 from sliplens.study.states import load_markers, save_states
 from sliplens.study.timing import time_explainers
@@ -108,50 +108,57 @@ class Stages:
                 on_map=bar,
             ),
         )
-        material = self._material(name)
-        influence = cache(lambda: self._influence(material))
+        # gathered where a stage is missing: that takes longer than to see that all are there
+        material = cache(lambda: self._material(name))
+        control = self.output / f"control-{name}"
+        influence = cache(lambda: {**influences(material()), RANDOMISED: load_untrained(control)})
         works: dict[str, tuple[str, Mapping[str, Any], Work]] = {
             "score": (
                 "Deleting pixels, as the thesis did",
                 # the report reads these of every score
-                {"input": name, "source": material.explained.source, "fill": "grey"},
+                {"input": name, "source": self.data.source, "fill": "grey"},
                 lambda folder, bar: score_explanations(
-                    trained, material.explained, folder, seed=self.seed, on_curve=bar
+                    trained, material().explained, folder, seed=self.seed, on_curve=bar
                 ),
             ),
             "deletion": (
                 "Trying the thesis's remedies",
-                {},
+                {"steps": STEPS},
                 lambda folder, bar: score_remedies(
-                    material,
+                    material(),
                     folder,
-                    grey=load_curves(self.output / f"score-{name}", material.explained),
+                    grey=load_curves(self.output / f"score-{name}", material().explained),
                     seed=self.seed,
                     on_curve=bar,
                 ),
             ),
+            "control": (
+                "Explaining the network with new weights",
+                {"control": _CONTROL},
+                lambda folder, bar: explain_untrained(material(), _CONTROL, folder, seed=self.seed, on_frame=bar),
+            ),
             "faithfulness": (
                 "Removing parts under every fill",
-                {"random_orders": self.random_orders},
+                {"random_orders": self.random_orders, "areas": STUDY_AREAS, "settings": SETTINGS},
                 lambda folder, bar: score_curves(
-                    material,
+                    material(),
                     folder,
                     maps=influence(),
                     random_orders=self.random_orders,
-                    further=self._true_curves(material, influence()),
+                    further=self._true_curves(material(), influence()),
                     seed=self.seed,
                     on_frame=bar,
                 ),
             ),
             "randomisation": (
-                "Explaining networks with new weights",
-                {},
-                lambda folder, bar: check_randomisation(material, folder, seed=self.seed, on_method=bar),
+                "Drawing weights anew, layer by layer",
+                {"stages": STAGES},
+                lambda folder, bar: check_randomisation(material(), folder, seed=self.seed, on_method=bar),
             ),
             "looks": (
                 "Measuring how maps look",
                 {},
-                lambda folder, bar: check_looks(material, self.data, folder, seed=self.seed, on_method=bar),
+                lambda folder, bar: check_looks(material(), self.data, folder, seed=self.seed, on_method=bar),
             ),
         }
         if self._redrawn:
@@ -160,7 +167,7 @@ class Stages:
                 {},
                 lambda folder, bar: judge_by_truth(
                     trained,
-                    material.explained,
+                    material().explained,
                     self.data,
                     folder,
                     maps=influence(),
@@ -195,12 +202,6 @@ class Stages:
             markers=load_markers(self.output / "states"),
             explainers=self.explainers,
         )
-
-    def _influence(self, material: Material) -> Influence:
-        return {
-            **influences(material),
-            RANDOMISED: explain_untrained(material, _CONTROL, seed=self.seed),
-        }
 
     def _true_curves(self, material: Material, maps: Influence) -> dict[Setting, Scoring]:
         if not self._redrawn:
@@ -243,6 +244,6 @@ class Stages:
                 return
             with self.screen.progress_bar(title) as bar:
                 work(out.folder, bar)
-        for alarm in read_json(target / "result.json").get("alarms", []):
+        for alarm in read_json(target / RESULT_FILE).get("alarms", []):
             self.screen.say(f"  alarm: {alarm}")
         self.screen.wrote(target, title[0].lower() + title[1:])

@@ -112,11 +112,12 @@ class PolyCam(Method):
         weights, saliencies, shown, approximations = [], [], [], []
         for index in range(len(subject.images)):
             activations = _activations(subject, index, layers)
-            shares, approximation = self._weights(subject, index, activations, passes=passes, count=count)
+            shown_at = self._shown_at(subject, index)
+            shares, estimated = self._weights(subject, index, activations, shown_at, passes=passes, count=count)
             weights.append(shares)
-            approximations += approximation
-            saliencies.append(self._levels(activations, shares, like=subject.images[index]))
-            shown.append(self._shown(saliencies[-1], subject, index))
+            approximations += estimated
+            saliencies.append(combine(activations, shares, size=_size(shown_at)))
+            shown.append(saliencies[-1][self._place] * shown_at)
         levels = tuple(
             Level(
                 layer=layer.name,
@@ -141,16 +142,16 @@ class PolyCam(Method):
             },
         )
 
-    @staticmethod
-    def _levels(activations: list[Tensor], weights: list[Tensor], *, like: Tensor) -> list[Tensor]:
-        return combine(activations, weights, size=(like.shape[-2], like.shape[-1]))
+    @property
+    def _place(self) -> int:
+        """Of the level that is shown, among those that are measured."""
+        return self.level if self.levels else 0
 
-    def _shown(self, levels: list[Tensor], subject: Subject, index: int) -> Tensor:
-        """The map of one level, where the image shows something: where x = b no mask has an effect."""
-        level = levels[self.level if self.levels else 0]
+    def _shown_at(self, subject: Subject, index: int) -> Tensor:
+        """Where the image shows something: where x = b no mask has an effect."""
         if SCORES[self.score].as_published:
-            return level
-        return level * local_change(subject.images[index], subject.reference[index])
+            return torch.ones_like(subject.images[index, 0])
+        return local_change(subject.images[index], subject.reference[index])
 
     def _find_layers(self, subject: Subject) -> tuple[Layer, ...]:
         image = subject.images[:1]
@@ -174,7 +175,14 @@ class PolyCam(Method):
         )
 
     def _weights(
-        self, subject: Subject, index: int, activations: list[Tensor], *, passes: Passes, count: "_Count"
+        self,
+        subject: Subject,
+        index: int,
+        activations: list[Tensor],
+        shown_at: Tensor,
+        *,
+        passes: Passes,
+        count: "_Count",
     ) -> tuple[list[Tensor], list[Approximation]]:
         """Weight >= 0 of each channel, layer by layer, and how far they are estimates."""
         score, variant = SCORES[self.score], VARIANTS[self.variant]
@@ -206,7 +214,7 @@ class PolyCam(Method):
                 likeness=self.likeness,
                 change=change,
                 measure=effects,
-                to_map=lambda weights: self._shown(self._levels(activations, weights, like=black), subject, index),
+                to_map=lambda weights: combine(activations, weights, size=_size(shown_at))[self._place] * shown_at,
                 seed=self.seed,
             )
             count.add(len(active) - found.approximation.measured)
@@ -218,6 +226,10 @@ class PolyCam(Method):
         every[:, active] = points(active)
         shares = score.weigh(as_predictions(every, variant=variant, image=image, empty=empty))
         return list(shares.split(regions.layer_sizes)), []
+
+
+def _size(image: Tensor) -> tuple[int, int]:
+    return image.shape[-2], image.shape[-1]
 
 
 def _activations(subject: Subject, index: int, layers: tuple[Layer, ...]) -> list[Tensor]:

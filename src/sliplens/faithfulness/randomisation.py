@@ -98,6 +98,7 @@ def randomisation_scores(
     *,
     seed: int,
     stages: int = 5,
+    before: Maps | None = None,
 ) -> RandomisationScores:
     """Explain a network whose weights are drawn anew from the output on, and compare with the trained one.
 
@@ -111,13 +112,16 @@ def randomisation_scores(
         Inputs to explain.
     seed, stages
         See `cascade`.
+    before
+        Maps of the trained network, where they are there already.
 
     References
     ----------
     Adebayo et al. (2018); Hedstroem et al., *Sanity Checks Revisited* (2024): eMPRT, the rise of complexity, and its
     histogram entropy.
     """
-    before = explain(model, images)
+    if before is None:
+        before = explain(model, images)
     similarity, layers, after = [], [], before
     for step in cascade(model, seed=seed, stages=stages):
         after = explain(step.model, images)

@@ -69,6 +69,11 @@ class Dataset:
         return cls(folder=folder, trials=trials, simulated=bool(table.get("simulated")))
 
     @property
+    def source(self) -> str:
+        """Where the frames come from, as results tell it: "simulated" or "real"."""
+        return "simulated" if self.simulated else "real"
+
+    @property
     def hash(self) -> str:
         """Hash of the table, which holds the hash of every trial: the same data, the same hash."""
         return hash_json([asdict(trial) for trial in self.trials])

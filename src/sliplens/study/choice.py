@@ -170,7 +170,7 @@ def choose_frames(
             condition=condition,
             networks=len(networks),
         ),
-        source="simulated" if data.simulated else "real",
+        source=data.source,
         condition=condition,
         inputs=tuple(networks),
         levels=tuple(float(level) for level in levels),

@@ -51,9 +51,7 @@ def influences(material: Material) -> dict[str, Float[np.ndarray, "frames size s
     material
         The explanations and what was explained.
     """
-    maps = {
-        name: relevance * material.towards[:, None, None] for name, relevance in material.explained.relevance.items()
-    }
+    maps = {name: material.towards_target(name) for name in material.explained.relevance}
     return maps | {name: control(material.inputs).double().cpu().numpy() for name, control in CONTROLS.items()}
 
 

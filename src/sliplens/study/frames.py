@@ -129,7 +129,7 @@ def frames_at(trained: TrainedModel, data: Dataset, rows: Mapping[str, Sequence[
         safety_margin=np.concatenate(labels).astype(np.float32),
         images=torch.cat(images),
         references=torch.cat(references),
-        source="simulated" if data.simulated else "real",
+        source=data.source,
     )
 
 

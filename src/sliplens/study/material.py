@@ -48,6 +48,10 @@ class Material:
         """Sign of each answer's change from that on the untouched sensor, which the maps explain."""
         return np.array([np.sign(one.prediction - one.reference_prediction) for one in self.explained.frames])
 
+    def towards_target(self, method: str) -> Float[np.ndarray, "frames size size"]:
+        """The part of a method's relevance that works towards each frame's target."""
+        return self.explained.relevance[method] * self.towards[:, None, None]
+
     def fast(self, passes: int) -> Passes:
         """Make an engine ready for so many passes of the network."""
         return make_fast(self.trained, self.inputs, passes=passes)

@@ -1,6 +1,8 @@
 """The methods of a study: the thesis's three as they were run, and ours."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any
 
 from sliplens.explain import EXPLAINERS, Explainer, PolyCam
 from sliplens.study.explaining import require_methods
@@ -8,8 +10,8 @@ from sliplens.study.explaining import require_methods
 THESIS_POLY_CAM = "poly-cam-thesis"
 STUDY_METHODS = ("grad-cam", "integrated-gradients", THESIS_POLY_CAM, "poly-cam", "occlusion")
 """Grad-CAM, Integrated Gradients and Poly-CAM as the thesis ran it; Poly-CAM with the regression score, occlusion."""
-STUDY_BUDGET = 0.25
-"""Share of the channels that Poly-CAM with the regression score measures."""
+STUDY_BUDGET = 0.15
+"""Share of the channels that Poly-CAM with the regression score measures at first: more where the map asks for it."""
 
 
 def study_explainers(methods: Sequence[str] = STUDY_METHODS, *, budget: float = STUDY_BUDGET) -> dict[str, Explainer]:
@@ -34,3 +36,17 @@ def study_explainers(methods: Sequence[str] = STUDY_METHODS, *, budget: float = 
     }
     require_methods(methods, table)
     return {name: table[name] for name in methods}
+
+
+def method_options(explainers: Mapping[str, Explainer]) -> dict[str, dict[str, Any]]:
+    """Options of each explainer by name: what a map depends on beside the network and the frame."""
+    return {
+        name: {
+            one.name: getattr(explainer, one.name)
+            for one in fields(explainer)
+            # what finds markers is code, not an option
+            if not callable(getattr(explainer, one.name))
+        }
+        for name, explainer in explainers.items()
+        if is_dataclass(explainer)
+    }

@@ -13,8 +13,9 @@ from torch import Tensor, nn
 from sliplens.explain import Explainer, Explanation, PolyCam
 from sliplens.faithfulness.randomisation import cascade, histogram_entropy, randomisation_scores, smooth_maps
 from sliplens.provenance import write_json
+from sliplens.study.judging import RANDOMISED
 from sliplens.study.material import Material
-from sliplens.study.saved import RESULT_FILE, mean_of_known
+from sliplens.study.saved import MAPS_FILE, RESULT_FILE, mean_of_known, read_maps
 
 STAGES = 3
 _SMOOTH_WITHIN_S = 1.0
@@ -58,8 +59,15 @@ def check_randomisation(
             return _towards_target(explainer(model, images, reference=references))
 
         started = time.perf_counter()
-        found = randomisation_scores(explain, material.trained.model, inputs, seed=seed, stages=STAGES)
-        seconds = (time.perf_counter() - started) / (STAGES + 1) / len(inputs)
+        found = randomisation_scores(
+            explain,
+            material.trained.model,
+            inputs,
+            seed=seed,
+            stages=STAGES,
+            before=material.towards_target(name)[:frames],
+        )
+        seconds = (time.perf_counter() - started) / STAGES / len(inputs)
         similarity = [mean_of_known(row) for row in found.similarity]
         told[name] = {
             "layers": found.layers,
@@ -101,9 +109,11 @@ def _smooth_rise(
 
 
 def explain_untrained(
-    material: Material, explainer: Explainer, *, seed: int = 0, on_frame: Count | None = None
-) -> Maps:
-    """Maps of the network with all weights drawn anew: a control that every map has to beat.
+    material: Material, explainer: Explainer, folder: Path, *, seed: int = 0, on_frame: Count | None = None
+) -> None:
+    """Explain the network with all weights drawn anew: a control that every map has to beat.
+
+    Kept is the part of the relevance that works towards that network's own target.
 
     Parameters
     ----------
@@ -111,15 +121,12 @@ def explain_untrained(
         The network and the frames.
     explainer
         What explains.
+    folder
+        Gets `maps.npz` and `result.json`; must exist.
     seed
         Of the new weights.
     on_frame
         Called with the frames done and their number.
-
-    Returns
-    -------
-    maps
-        The part of the relevance that works towards that network's own target.
     """
     model = _untrained(material.trained.model, seed=seed)
     maps = []
@@ -129,7 +136,22 @@ def explain_untrained(
         maps.append(_towards_target(found)[0])
         if on_frame is not None:
             on_frame(index + 1, len(material.inputs))
-    return np.stack(maps)
+    np.savez_compressed(folder / MAPS_FILE, allow_pickle=False, **{RANDOMISED: np.stack(maps)})
+    explained = material.explained
+    write_json(
+        folder / RESULT_FILE, {"input": explained.input, "source": explained.source, "frames": len(explained.frames)}
+    )
+
+
+def load_untrained(folder: Path) -> Maps:
+    """Read what `explain_untrained` wrote.
+
+    Raises
+    ------
+    InputError
+        If it is missing or damaged.
+    """
+    return read_maps(folder / MAPS_FILE)[RANDOMISED]
 
 
 def _towards_target(found: Explanation) -> Maps:

@@ -106,8 +106,8 @@ def load_explained(folder: Path) -> Explained:
     run = read_json(folder / RUN_FILE)
     if not isinstance(result, dict) or run.get("stage") != "explain":
         raise InputError(f"{folder} holds no explanations; make them with sliplens explain")
-    images = _read_npz(folder / INPUTS_FILE)["images"]
-    maps = _read_npz(folder / MAPS_FILE)
+    images = read_maps(folder / INPUTS_FILE)["images"]
+    maps = read_maps(folder / MAPS_FILE)
     names = [frame["id"] for frame in result["frames"]]
     for method, stack in maps.items():
         if len(stack) != len(names):
@@ -127,7 +127,14 @@ def load_explained(folder: Path) -> Explained:
     )
 
 
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
+def read_maps(path: Path) -> dict[str, np.ndarray]:
+    """Read arrays of one file by name.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged.
+    """
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
