@@ -1,7 +1,8 @@
 """The whole study on simulated touch with the networks of the package: how long it takes, interrupted once.
 
 It is interrupted while parts of the frames are removed, given again, and given a third time when all is there. Every
-stage that was finished before must be left as it was, and the third run must leave everything so.
+stage that was finished before must be left as it was, and the third run must leave everything so. Most of the time goes
+into forward passes, so how many of them this machine does in a second is measured first.
 """
 
 import argparse
@@ -15,6 +16,12 @@ import time
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # the study inherits it
+
+import torch
+
+from sliplens.explain.passes import WORTH_CONVERTING, prepare
+from sliplens.models import load_checkpoint
+from sliplens.models.shipped import find_run
 
 _INTERRUPTED = 130
 _LOOK_EVERY_S = 0.5
@@ -36,6 +43,7 @@ def main() -> None:
         output = options.keep or Path(scratch) / "study"
         data = ["--preset", "thesis"] if options.data is None else [str(options.data)]
         words = [sys.executable, "-m", "sliplens", "study", *data, "-o", str(output), "--trials", str(options.trials)]
+        passes_per_s = measure_passes()
         started = time.perf_counter()
         stopped = run_until(words, output, ".faithfulness-*.partial/parts/*")
         before = written(output)
@@ -54,12 +62,29 @@ def main() -> None:
             "stages_before_interruption": len(before),
             "stages": len(after),
             "seconds_when_all_is_there": time.perf_counter() - started,
+            "passes_per_s": passes_per_s,
             "load": os.getloadavg()[2],
         }
     if options.json:
         print(json.dumps(told))
         return
+    print(f"{passes_per_s:.0f} passes a second by the engine of the study")
     print(f"{minutes:.1f} minutes, {'went on where it stopped' if told['resumed_ok'] else 'did NOT resume'}")
+
+
+def measure_passes(count: int = 1000) -> float:
+    """Forward passes a second of the difference network, by the engine that the study uses."""
+    trained = load_checkpoint(find_run(Path("chromatouch-difference")))
+    size = trained.manifest.image_size
+    images = torch.rand(16, 3, size, size, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        passes = prepare(trained.model, images, trained.model(images).reshape(-1), passes=WORTH_CONVERTING)
+    batch = images[: passes.batch_size]
+    for batches in (10, count // len(batch)):  # the first to warm up
+        started = time.perf_counter()
+        for _ in passes.run(batch for _ in range(batches)):
+            pass
+    return batches * len(batch) / (time.perf_counter() - started)
 
 
 def run_until(words: list[str], output: Path, sign: str) -> bool:

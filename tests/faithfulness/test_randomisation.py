@@ -52,6 +52,37 @@ def test_the_same_seed_draws_the_same_weights_however_many_stages(model: nn.Modu
     assert not torch.equal(other.model.state_dict()["0.weight"], ends[0].model.state_dict()["0.weight"])
 
 
+def test_new_normalisation_has_the_statistics_of_the_images_and_the_network_still_tells_them_apart():
+    torch.manual_seed(0)
+    blocks = [layer for _ in range(12) for layer in (nn.Conv2d(8, 8, 3, padding=1), nn.BatchNorm2d(8), nn.ReLU())]
+    deep = nn.Sequential(nn.Conv2d(3, 8, 1), *blocks[1:], nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(8, 1)).eval()
+    images = torch.rand(6, 3, 16, 16, generator=torch.Generator().manual_seed(2))
+    (dead,), (alive,) = (list(cascade(deep, seed=0, stages=1, images=given)) for given in (None, images))
+    for name, value in alive.model.named_parameters():
+        assert torch.equal(value, dict(dead.model.named_parameters())[name])
+    assert not any(module.training for module in alive.model.modules())
+    assert all(module.momentum == 0.1 for module in alive.model.modules() if isinstance(module, nn.BatchNorm2d))
+    with torch.no_grad():
+        assert dead.model(images).std() < 1e-6
+        assert alive.model(images).std() > 1e-3
+        before, normal = alive.model[:1](images), alive.model[1]
+    # means of 1,536 float32 numbers below 1: a few units of the seventh digit
+    torch.testing.assert_close(normal.running_mean, before.mean(dim=(0, 2, 3)), atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(normal.running_var, before.var(dim=(0, 2, 3)), atol=1e-6, rtol=1e-4)
+
+
+def test_normalisation_that_was_not_drawn_anew_keeps_its_statistics(model: nn.Module):
+    images = torch.rand(4, 3, 16, 16, generator=torch.Generator().manual_seed(2))
+    first, second, *_ = [
+        {name: value.clone() for name, value in step.model.state_dict().items()}
+        for step in cascade(model, seed=1, images=images)
+    ]
+    for name, value in model.state_dict().items():
+        if name.startswith("1."):
+            assert torch.equal(first[name], value)
+            assert torch.equal(second[name], value)
+
+
 def test_a_map_that_ignores_the_network_stays_and_a_gradient_does_not(model: nn.Module):
     images = torch.rand(3, 3, 16, 16, generator=torch.Generator().manual_seed(1))
     blind = randomisation_scores(lambda _, inputs: edges(inputs).numpy(), model, images, seed=0, stages=2)

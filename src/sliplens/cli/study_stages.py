@@ -134,7 +134,7 @@ class Stages:
             ),
             "control": (
                 "Explaining the network with new weights",
-                {"control": _CONTROL},
+                {"control": _CONTROL, "statistics": "images"},
                 lambda folder, bar: explain_untrained(material(), _CONTROL, folder, seed=self.seed, on_frame=bar),
             ),
             "faithfulness": (
@@ -152,7 +152,7 @@ class Stages:
             ),
             "randomisation": (
                 "Drawing weights anew, layer by layer",
-                {"stages": STAGES},
+                {"stages": STAGES, "statistics": "images"},
                 lambda folder, bar: check_randomisation(material(), folder, seed=self.seed, on_method=bar),
             ),
             "looks": (

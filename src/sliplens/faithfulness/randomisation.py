@@ -13,6 +13,7 @@ from sliplens.faithfulness.looks import stability
 
 Maps = Float[np.ndarray, "images height width"]
 _BINS = 100
+_BATCH_NORMS = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,10 +37,18 @@ def weighted_layers(model: nn.Module) -> list[str]:
     ]
 
 
-def cascade(model: nn.Module, *, seed: int, stages: int | None = None) -> Iterator[CascadeStep]:
+def cascade(
+    model: nn.Module,
+    *,
+    seed: int,
+    stages: int | None = None,
+    images: Float[Tensor, "batch 3 height width"] | None = None,
+) -> Iterator[CascadeStep]:
     """Draw the weights of a copy of a network anew, layer by layer from the output to the input.
 
-    Normalisation layers go back to their start too: to statistics of 0 and 1, and no scale.
+    Normalisation layers go back to their start too: to no scale, and to the statistics of some images. With statistics
+    of 0 and 1, which is where they start before any training, new weights shrink what passes through them layer by
+    layer, until a deep network gives one answer to every image and there is nothing to explain.
 
     Parameters
     ----------
@@ -49,6 +58,8 @@ def cascade(model: nn.Module, *, seed: int, stages: int | None = None) -> Iterat
         Of the new weights.
     stages
         Give so many steps, evenly spread, the last of which has all weights new; every layer if None.
+    images
+        What the statistics of new normalisation layers are of, two at least; None for 0 and 1.
 
     References
     ----------
@@ -67,7 +78,24 @@ def cascade(model: nn.Module, *, seed: int, stages: int | None = None) -> Iterat
             torch.manual_seed(seed + number)
             modules[name].reset_parameters()  # pyright: ignore[reportCallIssue]
         if number in shown:
+            if images is not None:
+                _settle(changed, [modules[new] for new in names[: number + 1]], images)
             yield CascadeStep(layer=name, randomised=number + 1, model=changed)
+
+
+@torch.no_grad()
+def _settle(model: nn.Module, changed: list[nn.Module], images: Tensor) -> None:
+    """Give batch normalisation with new weights the statistics of some images."""
+    norms = [layer for layer in changed if isinstance(layer, _BATCH_NORMS)]
+    momenta = [norm.momentum for norm in norms]
+    for norm in norms:
+        norm.reset_running_stats()
+        norm.momentum = None  # the statistics of this pass alone
+        norm.train()
+    model(images)
+    for norm, momentum in zip(norms, momenta, strict=True):
+        norm.momentum = momentum
+        norm.eval()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +151,7 @@ def randomisation_scores(
     if before is None:
         before = explain(model, images)
     similarity, layers, after = [], [], before
-    for step in cascade(model, seed=seed, stages=stages):
+    for step in cascade(model, seed=seed, stages=stages, images=images):
         after = explain(step.model, images)
         similarity.append(stability(before, after))
         layers.append(step.randomised)

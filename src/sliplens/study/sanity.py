@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sliplens.explain import Explainer, Explanation, PolyCam
+from sliplens.explain import Explainer, Explanation, IntegratedGradients, PolyCam
 from sliplens.faithfulness.randomisation import cascade, histogram_entropy, randomisation_scores, smooth_maps
 from sliplens.provenance import write_json
 from sliplens.study.judging import RANDOMISED
@@ -52,8 +52,7 @@ def check_randomisation(
     told: dict[str, Any] = {}
     alarms = []
     for number, (name, whole) in enumerate(material.explainers.items(), start=1):
-        # networks with new weights take the most passes until a likeness is reached, which a correlation does not need
-        explainer = replace(whole, likeness=None) if isinstance(whole, PolyCam) else whole
+        explainer = _shortened(whole)
 
         def explain(model: nn.Module, images: Tensor, explainer: Explainer = explainer) -> Maps:
             return _towards_target(explainer(model, images, reference=references))
@@ -96,13 +95,22 @@ def check_randomisation(
     )
 
 
+def _shortened(explainer: Explainer) -> Explainer:
+    """Without the passes that a network with new weights takes until its map is complete: a correlation needs none."""
+    if isinstance(explainer, PolyCam):
+        return replace(explainer, likeness=None)
+    if isinstance(explainer, IntegratedGradients):
+        return replace(explainer, max_steps=explainer.steps)
+    return explainer
+
+
 def _smooth_rise(
     material: Material, explain: Callable[[nn.Module, Tensor], Maps], inputs: Tensor, *, seed: int
 ) -> float | None:
     model = material.trained.model
     before, after = (
         np.array([histogram_entropy(one) for one in smooth_maps(explain, network, inputs, seed=seed)])
-        for network in (model, _untrained(model, seed=seed))
+        for network in (model, _untrained(model, inputs, seed=seed))
     )
     with np.errstate(invalid="ignore", divide="ignore"):
         return mean_of_known((after - before) / before)
@@ -128,7 +136,7 @@ def explain_untrained(
     on_frame
         Called with the frames done and their number.
     """
-    model = _untrained(material.trained.model, seed=seed)
+    model = _untrained(material.trained.model, material.inputs, seed=seed)
     maps = []
     for index in range(len(material.inputs)):
         one = slice(index, index + 1)
@@ -159,6 +167,6 @@ def _towards_target(found: Explanation) -> Maps:
     return (found.relevance * found.change.sign()[:, None, None]).double().cpu().numpy()
 
 
-def _untrained(model: nn.Module, *, seed: int) -> nn.Module:
-    *_, last = cascade(model, seed=seed, stages=1)
+def _untrained(model: nn.Module, images: Tensor, *, seed: int) -> nn.Module:
+    *_, last = cascade(model, seed=seed, stages=1, images=images)
     return last.model
