@@ -58,6 +58,7 @@ def test_new_normalisation_has_the_statistics_of_the_images_and_the_network_stil
     deep = nn.Sequential(nn.Conv2d(3, 8, 1), *blocks[1:], nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(8, 1)).eval()
     images = torch.rand(6, 3, 16, 16, generator=torch.Generator().manual_seed(2))
     (dead,), (alive,) = (list(cascade(deep, seed=0, stages=1, images=given)) for given in (None, images))
+    assert isinstance(alive.model, nn.Sequential)
     for name, value in alive.model.named_parameters():
         assert torch.equal(value, dict(dead.model.named_parameters())[name])
     assert not any(module.training for module in alive.model.modules())

@@ -70,11 +70,13 @@ def table_randomisation(randomisation: dict[str, Randomisation]) -> Table:
                     Cell(text=decimals(one.smooth_complexity_rise, 2)),
                 )
             )
+    counts = {one.layers[0] for found in randomisation.values() for one in found.methods.values() if one.layers}
+    first = f"{counts.pop()} layers new" if len(counts) == 1 else "First layers new"
     return Table(
         caption="Weights drawn anew, layer by layer from the output: similarity of the map to the trained network's "
         "(1 = unchanged: such a map does not depend on what was learned), and the rise of its complexity once all are "
         "new (eMPRT), also after smoothing (sMPRT); more is better.",
-        head=table_head("Input", "Method", "First layer new", "All layers new", "eMPRT", "sMPRT"),
+        head=table_head("Input", "Method", first, "All layers new", "eMPRT", "sMPRT"),
         rows=tuple(rows),
     )
 
