@@ -99,8 +99,8 @@ def table_times(timing: dict[str, Timing]) -> Table:
         rows.append((Cell(text=method_name(method), kind="name"), *cells, thesis))
     told = "; ".join(
         f"{input_name(name).lower()}: {one.device}"
-        f"{f' with {one.threads} threads' if one.threads and one.device == 'cpu' else ''}, {one.repeats} repeats, a "
-        f"forward pass takes {_seconds(one.forward_seconds)} s"
+        f"{f' with {one.threads} threads' if one.threads and one.device == 'cpu' else ''}, "
+        f"{one.repeats} repeats or more, a forward pass takes {_seconds(one.forward_seconds)} s"
         for name in names
         for one in [timing[name]]
     )
