@@ -31,6 +31,8 @@ from sliplens.study.truth import judge_by_truth, true_curves
 
 _CONTROL = IntegratedGradients(steps=32, max_steps=32)
 """Of the network with new weights: a control need not be complete."""
+_NEW_WEIGHTS = {"control": _CONTROL, "statistics": "images"}
+"""What the control depends on, and with it all that it is compared with."""
 
 Work = Callable[[Path, Count], object]
 
@@ -134,12 +136,12 @@ class Stages:
             ),
             "control": (
                 "Explaining the network with new weights",
-                {"control": _CONTROL, "statistics": "images"},
+                _NEW_WEIGHTS,
                 lambda folder, bar: explain_untrained(material(), _CONTROL, folder, seed=self.seed, on_frame=bar),
             ),
             "faithfulness": (
                 "Removing parts under every fill",
-                {"random_orders": self.random_orders, "areas": STUDY_AREAS, "settings": SETTINGS},
+                {"random_orders": self.random_orders, "areas": STUDY_AREAS, "settings": SETTINGS, **_NEW_WEIGHTS},
                 lambda folder, bar: score_curves(
                     material(),
                     folder,
@@ -164,7 +166,7 @@ class Stages:
         if self._redrawn:
             works["truth"] = (
                 "Putting every marker back",
-                {},
+                _NEW_WEIGHTS,
                 lambda folder, bar: judge_by_truth(
                     trained,
                     material().explained,

@@ -43,10 +43,10 @@ def method_options(explainers: Mapping[str, Explainer]) -> dict[str, dict[str, A
     return {
         name: {
             one.name: getattr(explainer, one.name)
-            for one in fields(explainer)
+            # a row that an installed package added may be any callable
+            for one in (fields(explainer) if is_dataclass(explainer) else ())
             # what finds markers is code, not an option
             if not callable(getattr(explainer, one.name))
         }
         for name, explainer in explainers.items()
-        if is_dataclass(explainer)
     }

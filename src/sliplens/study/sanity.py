@@ -15,7 +15,7 @@ from sliplens.faithfulness.randomisation import cascade, histogram_entropy, rand
 from sliplens.provenance import write_json
 from sliplens.study.judging import RANDOMISED
 from sliplens.study.material import Material
-from sliplens.study.saved import MAPS_FILE, RESULT_FILE, mean_of_known, read_maps
+from sliplens.study.saved import MAPS_FILE, RESULT_FILE, mean_of_known, read_arrays
 
 STAGES = 3
 _SMOOTH_WITHIN_S = 1.0
@@ -159,7 +159,7 @@ def load_untrained(folder: Path) -> Maps:
     InputError
         If it is missing or damaged.
     """
-    return read_maps(folder / MAPS_FILE)[RANDOMISED]
+    return read_arrays(folder / MAPS_FILE)[RANDOMISED]
 
 
 def _towards_target(found: Explanation) -> Maps:

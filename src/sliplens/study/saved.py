@@ -106,8 +106,8 @@ def load_explained(folder: Path) -> Explained:
     run = read_json(folder / RUN_FILE)
     if not isinstance(result, dict) or run.get("stage") != "explain":
         raise InputError(f"{folder} holds no explanations; make them with sliplens explain")
-    images = read_maps(folder / INPUTS_FILE)["images"]
-    maps = read_maps(folder / MAPS_FILE)
+    images = read_arrays(folder / INPUTS_FILE)["images"]
+    maps = read_arrays(folder / MAPS_FILE)
     names = [frame["id"] for frame in result["frames"]]
     for method, stack in maps.items():
         if len(stack) != len(names):
@@ -127,7 +127,7 @@ def load_explained(folder: Path) -> Explained:
     )
 
 
-def read_maps(path: Path) -> dict[str, np.ndarray]:
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Read arrays of one file by name.
 
     Raises
