@@ -98,6 +98,32 @@ def test_the_error_that_is_told_is_not_smaller_than_the_error(network, images):
         assert warned == (told.pearson_r < 0.99 or told.top_overlap < 0.9)
 
 
+@pytest.mark.parametrize("variant", ["+", "+/-"])
+def test_the_thesis_score_has_a_budget_too(network, images, variant):
+    model = network("small shufflenet")
+    exact = PolyCam(score="thesis", variant=variant)(model, images)
+    near = PolyCam(score="thesis", variant=variant, budget=0.5, likeness=Likeness(pearson_r=0.95))(model, images)
+    for index in range(len(images)):
+        assert pearson_r(exact.saliency[index], near.saliency[index]) >= 0.95
+
+
+def test_where_the_thesis_score_is_saturated_a_few_channels_give_the_exact_map(network, images):
+    model = torch.nn.Sequential(network("small shufflenet"), Raised())
+    exact = PolyCam(score="thesis")(model, images)
+    near = PolyCam(score="thesis", budget=0.1)(model, images)
+    for told in near.approximations:
+        assert told.measured == math.ceil(0.1 * told.channels)
+        assert told.pearson_r == pytest.approx(1, abs=1e-9)
+    torch.testing.assert_close(near.saliency, exact.saliency)
+
+
+class Raised(torch.nn.Module):
+    """Answers far above 17 %, from where the published score is 1."""
+
+    def forward(self, margins):
+        return margins + 5
+
+
 def test_passes_follow_the_budget(network, images):
     model = network("small shufflenet")
     seen = []

@@ -266,7 +266,6 @@ def test_warns_where_masked_images_have_no_prediction(images):
         ({"variant": "++"}, r"Poly-CAM has no variant '\+\+'; choose among \+, -, \+/-"),
         ({"score": "softmax"}, "Poly-CAM has no score 'softmax'; choose among regression, thesis"),
         ({"budget": 0.0}, "Poly-CAM's budget is 0.0; give a share of the channels, above 0 and at most 1"),
-        ({"budget": 0.5, "score": "thesis"}, "Poly-CAM has no budget for score='thesis'; leave the budget out"),
         ({"batch_size": 0}, "Poly-CAM's batch_size is 0; give at least 1"),
     ],
 )

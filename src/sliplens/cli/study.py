@@ -57,7 +57,7 @@ class Study:
     tolerance: float = 0.03
     """Largest error of an answer in them, as a share of the margin; where too few qualify, the next best are taken."""
     budget: float = 0.15
-    """Share of the channels that poly-cam measures at first."""
+    """Share of the channels that Poly-CAM measures at first, more where its map asks for it; 1 for all."""
     random_orders: int = 20
     """Random orders that every method has to beat."""
     device: str = "cpu"

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.explain.budget import Likeness, estimate_effects
+from sliplens.explain.budget import Likeness, estimate_weights
 from sliplens.explain.effects import Regions, as_predictions, measure
 from sliplens.explain.explanation import Approximation, Level, Progress
 from sliplens.explain.health import check_approximations, check_weights
@@ -18,7 +18,7 @@ from sliplens.explain.maps import local_change
 from sliplens.explain.method import Found, Method
 from sliplens.explain.passes import Passes, prepare
 from sliplens.explain.sampling import mask_kernel
-from sliplens.explain.scores import SCORES, VARIANTS, channel_effects, supporting_share
+from sliplens.explain.scores import SCORES, VARIANTS
 from sliplens.explain.subject import Held, Subject
 
 
@@ -56,7 +56,7 @@ class PolyCam(Method):
         Which level's map is the relevance, counted from the finest, 0. The thesis displayed the finest of its ten, and
         scored the fifth from the coarsest, `level=5`. Layers finer than that have no part in it, and cost no pass.
     budget
-        Share of the channels to measure at first, in (0, 1]; 1 for the exact map. Below 1 the other channels' effects
+        Share of the channels to measure at first, in (0, 1]; 1 for the exact map. Below 1 the other channels' weights
         are estimated, and `Explanation.approximations` says how many were measured and what the map is expected to have
         in common with the exact one.
     likeness
@@ -97,8 +97,6 @@ class PolyCam(Method):
             raise InputError(f"Poly-CAM's batch_size is {self.batch_size}; give at least 1")
         if not 0 < self.budget <= 1:
             raise InputError(f"Poly-CAM's budget is {self.budget}; give a share of the channels, above 0 and at most 1")
-        if self.budget < 1 and self.score != "regression":
-            raise InputError(f"Poly-CAM has no budget for score={self.score!r}; leave the budget out")
 
     @torch.no_grad()
     def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
@@ -186,7 +184,7 @@ class PolyCam(Method):
     ) -> tuple[list[Tensor], list[Approximation]]:
         """Weight >= 0 of each channel, layer by layer, and how far they are estimates."""
         score, variant = SCORES[self.score], VARIANTS[self.variant]
-        image, empty, change = subject.prediction[index], subject.reference_prediction[index], subject.change[index]
+        image, empty = subject.prediction[index], subject.reference_prediction[index]
         black = torch.zeros_like(subject.images[index])
         if score.as_published:
             empty = subject.predict(black[None])[0]
@@ -200,32 +198,30 @@ class PolyCam(Method):
         def points(channels: Int[Tensor, " some"]) -> Float[Tensor, "points some"]:
             return measure(regions, channels, passes=passes, variant=variant, on_channels=count.add)
 
-        def effects(channels: Int[Tensor, " some"]) -> Float[Tensor, " some"]:
-            return channel_effects(as_predictions(points(channels), variant=variant, image=image, empty=empty))
+        def supports(found: Float[Tensor, "points some"]) -> Float[Tensor, " some"]:
+            return score.support(as_predictions(found, variant=variant, image=image, empty=empty))
 
+        # an empty mask keeps nothing and removes nothing, which needs no pass
+        at_empty = torch.stack([empty] * variant.keep + [image] * variant.remove)[:, None]
         active = regions.active()
         count.add(sum(regions.layer_sizes) - len(active))
         if self.budget < 1 and len(active):
-            found = estimate_effects(
+            found = estimate_weights(
                 activations,
                 mask_kernel(regions, active),
                 active=active,
                 budget=self.budget,
                 likeness=self.likeness,
-                change=change,
-                measure=effects,
+                at_empty=supports(at_empty)[0],
+                measure=lambda channels: supports(points(channels)),
                 to_map=lambda weights: combine(activations, weights, size=_size(shown_at))[self._place] * shown_at,
                 seed=self.seed,
             )
             count.add(len(active) - found.approximation.measured)
-            shares = supporting_share(found.effects, change=change)
-            return list(shares.split(regions.layer_sizes)), [found.approximation]
-        # an empty mask keeps nothing and removes nothing, which needs no pass
-        known = torch.stack([empty] * variant.keep + [image] * variant.remove)
-        every = known[:, None].repeat(1, sum(regions.layer_sizes))
+            return found.weights, [found.approximation]
+        every = at_empty.repeat(1, sum(regions.layer_sizes))
         every[:, active] = points(active)
-        shares = score.weigh(as_predictions(every, variant=variant, image=image, empty=empty))
-        return list(shares.split(regions.layer_sizes)), []
+        return list(torch.relu(supports(every)).split(regions.layer_sizes)), []
 
 
 def _size(image: Tensor) -> tuple[int, int]:

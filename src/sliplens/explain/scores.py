@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sliplens.explain.layers import Layer, find_layers
-from sliplens.explain.thesis import find_published_layers, thesis_weights
+from sliplens.explain.thesis import find_published_layers, thesis_support
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,30 +62,26 @@ def channel_effects(predictions: Predictions) -> Float[Tensor, " channels"]:
     return torch.stack(effects).mean(dim=0)
 
 
-def supporting_share(effects: Float[Tensor, " channels"], *, change: Float[Tensor, ""]) -> Float[Tensor, " channels"]:
-    """The part of each effect that supports f(x) - f(b), as a share of it: relu(effect / (f(x) - f(b))).
+def _supporting_share(predictions: Predictions) -> Float[Tensor, " channels"]:
+    """Each effect as a share of f(x) - f(b), positive where it supports the change; 0 where nothing changed.
 
-    That is relu(sign(f(x) - f(b)) effect) over |f(x) - f(b)|. The division changes no map, since each is normalised,
-    and keeps the numbers clear of the floor of 1e-12 in `combine`.
+    The division changes no map, since each is normalised, and keeps the numbers clear of the floor of 1e-12 in
+    `combine`.
     """
-    return torch.relu(effects / change) if change else torch.zeros_like(effects)
+    effects, change = channel_effects(predictions), predictions.image - predictions.empty
+    return effects / change if change else torch.zeros_like(effects)
 
 
-def regression_weights(predictions: Predictions) -> Float[Tensor, " channels"]:
-    """Weight of each channel by the regression score: `supporting_share` of `channel_effects`."""
-    return supporting_share(channel_effects(predictions), change=predictions.image - predictions.empty)
-
-
-def _sigmoid_weights(predictions: Predictions) -> Float[Tensor, " channels"]:
-    return thesis_weights(predictions.image, kept=predictions.kept, removed=predictions.removed)
+def _thesis_support(predictions: Predictions) -> Float[Tensor, " channels"]:
+    return thesis_support(predictions.image, kept=predictions.kept, removed=predictions.removed)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
     """A way to weigh channels, with what belongs to it."""
 
-    weigh: Callable[[Predictions], Tensor]
-    """Weights >= 0 of the channels."""
+    support: Callable[[Predictions], Tensor]
+    """How far each channel speaks for the prediction; below 0 it speaks against it, and gets no weight."""
     layers: Callable[[nn.Module, Tensor], tuple[Layer, ...]]
     """Layers of a network, fine to coarse or as they run, found with one image."""
     as_published: bool
@@ -94,6 +90,6 @@ class Score:
 
 
 SCORES = {
-    "regression": Score(weigh=regression_weights, layers=find_layers, as_published=False),
-    "thesis": Score(weigh=_sigmoid_weights, layers=find_published_layers, as_published=True),
+    "regression": Score(support=_supporting_share, layers=find_layers, as_published=False),
+    "thesis": Score(support=_thesis_support, layers=find_published_layers, as_published=True),
 }

@@ -13,16 +13,16 @@ PERCENT = 100
 """The thesis's network answers in percent, ours in margin units."""
 
 
-def thesis_weights(
+def thesis_support(
     image: Float[Tensor, ""],
     *,
     kept: Float[Tensor, " channels"] | None,
     removed: Float[Tensor, " channels"] | None,
 ) -> Float[Tensor, " channels"]:
-    """Weights as the public code gives them to a network with one output.
+    """What the public code makes the weights of, for a network with one output; a weight is this or 0.
 
-    The score is a sigmoid s of the percentage. PCAM+: s(kept); PCAM-: relu(s(image) - s(removed)); PCAM+/-:
-    relu(s(kept) + s(image) - s(removed)). In float32 s is 1 from 17 % on, so that there the weights of PCAM+/- are all
+    The score is a sigmoid s of the percentage. PCAM+: s(kept); PCAM-: s(image) - s(removed); PCAM+/-:
+    s(kept) + s(image) - s(removed). In float32 s is 1 from 17 % on, so that there the weights of PCAM+/- are all
     1 and those of PCAM- all 0.
 
     Parameters
@@ -37,12 +37,12 @@ def thesis_weights(
     Englebert, Cornu and De Vleeschouwer, *Poly-CAM*, ICPR 2022, eqs. 8 to 10, and its public code for the sigmoid of
     a single output.
     """
-    weights = []
+    parts = []
     if kept is not None:
-        weights.append(_score(kept))
+        parts.append(_score(kept))
     if removed is not None:
-        weights.append(_score(image) - _score(removed))
-    return torch.relu(torch.stack(weights).sum(dim=0))
+        parts.append(_score(image) - _score(removed))
+    return torch.stack(parts).sum(dim=0)
 
 
 def _score(margins: Tensor) -> Tensor:
