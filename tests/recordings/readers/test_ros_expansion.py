@@ -7,7 +7,7 @@ import sys
 import textwrap
 import tracemalloc
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -198,7 +198,7 @@ def test_a_large_file_may_expand_further_than_memory_may(tmp_path, monkeypatch, 
 def test_a_database_that_makes_its_messages_up_is_refused(tmp_path, small_limit):
     bag = write_bag(tmp_path / "bag", [(7, words(8))], storage="SQLITE3", compression="NONE")
     (file,) = bag.glob("*.db3")
-    with sqlite3.connect(file) as database:
+    with closing(sqlite3.connect(file)) as database, database:
         database.executescript(
             f"""
             ALTER TABLE messages RENAME TO old;

@@ -399,7 +399,7 @@ def test_a_bag_with_any_byte_changed_raises_no_foreign_error(tmp_path, rng, reco
 
 def test_definitions_in_the_bag_are_not_needed(tmp_path, pixels, frames_of):
     path = write_bag(tmp_path / "trial", frames_of(), storage="SQLITE3")
-    with sqlite3.connect(next(path.glob("*.db3"))) as database:
+    with contextlib.closing(sqlite3.connect(next(path.glob("*.db3")))) as database, database:
         database.execute("DELETE FROM message_definitions")
     np.testing.assert_array_equal(list(read_rosbag(path).read_frames()), pixels)
 
@@ -423,7 +423,7 @@ def test_a_path_that_is_no_bag_is_refused(tmp_path, frames_of):
 
 
 def test_files_of_something_else_are_refused(tmp_path, frames_of):
-    with sqlite3.connect(tmp_path / "phone.db3") as database:
+    with contextlib.closing(sqlite3.connect(tmp_path / "phone.db3")) as database, database:
         database.execute("CREATE TABLE contacts (name TEXT)")
     (tmp_path / "video.mcap").write_bytes(b"\0\0\0\x18ftypmp42" * 20)
     for name in ("phone.db3", "video.mcap"):

@@ -31,9 +31,11 @@ def write_video(
     pixels: str = "bgr0",
     stamps_ms: list[int] | None = None,
     reordered: int = 0,
+    title: str = "",
 ) -> Path:
     """Write 25 frames a second, or milliseconds as they are given; `reordered` B-frames in a row."""
     with av.open(str(path), "w") as container:
+        container.metadata["title"] = title
         stream = container.add_stream(codec, rate=25)
         assert isinstance(stream, av.VideoStream)
         stream.height, stream.width = frames[0].shape[:2] if frames else SIZE
@@ -69,6 +71,15 @@ LOSSY = [
     ("a.mp4", "mpeg4", 2),
     ("a.avi", "mjpeg", 0),
 ]
+
+
+def test_a_title_that_is_no_utf8_does_not_matter(tmp_path):
+    frames = [np.full((*SIZE, 3), level, dtype=np.uint8) for level in (0, 255)]
+    path = write_video(tmp_path / "pull.mkv", frames, title="Gr\u00fcn")
+    coded = path.read_bytes()
+    assert "Gr\u00fcn".encode() in coded
+    path.write_bytes(coded.replace("Gr\u00fcn".encode(), b"Gr\xff\xffn"))
+    assert len(read_video(path).frame_time_s) == 2
 
 
 def test_lossless_frames_come_back_as_they_were(tmp_path: Path, rng: np.random.Generator):

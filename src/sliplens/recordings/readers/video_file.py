@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -26,6 +27,8 @@ _OPTIONS = {
         "yuv4mpegpipe,apng,gif"
     ),
 }
+# titles that are no UTF-8 must not keep a recording from being read; from PyAV 19 on they never do
+_LENIENT: dict[str, Any] = {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
 _NO_DECODER = "is coded in a way that FFmpeg cannot read; export it as FFV1 or H.264"
 _ANY_ZERO = frozenset({"mpegts", "mpeg"})
 
@@ -111,7 +114,7 @@ def _open(path: Path) -> InputContainer:
         raise RecordingError(f"{path} {'is no file' if path.exists() else 'does not exist'}; name a video file")
     try:
         # an absolute path cannot be taken for an address or a pattern of file names
-        return av.open(str(path.absolute()), options=_OPTIONS, metadata_errors="replace")
+        return av.open(str(path.absolute()), options=_OPTIONS, **_LENIENT)
     except (FFmpegError, OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise RecordingError(f"{path} cannot be read as a video ({reason}); copy or export it again") from None
