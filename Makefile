@@ -42,16 +42,23 @@ bench: $(INSTALLED) ## run every benchmark
 docs: $(INSTALLED) ## build the documentation: docs/_build/index.html
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build
 
-weights: $(INSTALLED) ## train the networks that come with the package: some two hours each on one core
+weights: $(INSTALLED) ## train the networks that come with the package: some four hours on two cores
 	$(BIN)/sliplens simulate runs/weights/varied --preset varied
 	@set -e; for input in difference raw; do \
 		$(BIN)/sliplens train runs/weights/varied -o runs/weights/small-$$input --input $$input \
 			--image-size 112 --epochs 7; \
-		$(BIN)/sliplens train runs/weights/varied -o runs/weights/chromatouch-$$input --input $$input \
+		$(BIN)/sliplens train runs/weights/varied -o runs/weights/large-$$input --input $$input \
 			--start-from runs/weights/small-$$input --epochs 2 --learning-rate 1e-3; \
-		mkdir -p src/sliplens/weights/chromatouch-$$input; \
-		cd runs/weights/chromatouch-$$input && cp model.safetensors manifest.json run.json result.json \
-			$(CURDIR)/src/sliplens/weights/chromatouch-$$input && cd $(CURDIR); \
+	done
+# trials of other days and objects, for the network that is to read sensors it never saw
+	$(BIN)/sliplens simulate runs/weights/more --preset varied --dry-trials 3060 --days 1020 --seed 1
+	$(BIN)/sliplens train runs/weights/more -o runs/weights/more-difference --input difference \
+		--start-from runs/weights/large-difference --epochs 5 --learning-rate 1e-3
+	@set -e; for kept in more-difference large-raw; do \
+		folder=src/sliplens/weights/chromatouch-$${kept#*-}; mkdir -p $$folder; \
+		for file in model.safetensors manifest.json run.json result.json; do \
+			cp runs/weights/$$kept/$$file $$folder; \
+		done; \
 	done
 
 lock: $(UV) ## pin the newest packages that fit, for every supported Python
