@@ -1,5 +1,6 @@
 """Names, colours and drawing style that all figures and tables share."""
 
+import re
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
@@ -148,6 +149,12 @@ def methods_in_order(names: Iterable[str]) -> list[str]:
     return [*in_order(found - set(CONTROLS), METHOD_NAMES), *(name for name in CONTROLS if name in found)]
 
 
+def name_methods(text: str) -> str:
+    """Write the methods in a text by name; controls are left alone, for their keys are words of their own."""
+    keys = sorted(METHOD_NAMES.keys() - {*CONTROLS, "oracle", "degraded-oracle"}, key=len, reverse=True)
+    return re.sub(rf"(?<![\w-])(?:{'|'.join(keys)})(?![\w-])", lambda key: METHOD_NAMES[key[0]], text)
+
+
 def fill_name(fill: str, unit: str = "pixel") -> str:
     """Name of what removed parts become, and of the parts where they are no pixels."""
     name = FILL_NAMES.get(fill, fill)
@@ -166,8 +173,8 @@ def conditions_in_order(names: Iterable[str]) -> list[str]:
 
 
 def percent(value: float | None, *, digits: int = 0) -> str:
-    """Write a share as a percentage, or a dash where it is not known."""
-    return UNKNOWN if value is None else f"{100 * value:.{digits}f}\N{NO-BREAK SPACE}%"
+    """Write a share as a percentage, or a dash where it is not known; what rounds to nothing is 0."""
+    return UNKNOWN if value is None else f"{decimals(100 * value, digits)}\N{NO-BREAK SPACE}%"
 
 
 def signed(value: float, digits: int) -> str:

@@ -114,14 +114,14 @@ def _believe(faithful: Faithful, results: Results) -> Statement:
     text = (
         f"Believe {method_name(best.method)}. Under {len(best.beaten)} of {len(best.tested)} fills it finds what "
         "the answer rests on, better than chance and than the best map that knows nothing of the network, beyond the "
-        "95 % interval. "
+        f"95 % interval{_tell_open(best)}. "
         f"Under {fill_name(score.fill, score.unit)} its symmetric gain is {tell_interval(score.srg)} in margin units."
     )
     text += _tell_lead(faithful, best, others)
     failing = [method_name(one.method) for one in ranked if not one.qualifies]
     if failing:
         text += f" {listed(failing)} {'does' if len(failing) == 1 else 'do'} not beat the controls under most fills."
-    text += _tell_open(best) + _tell_unfit(truth)
+    text += _tell_unfit(truth)
     text += _tell_truth(results, faithful.input, best.method)
     if faithful.alarms:
         count = len(faithful.alarms)
@@ -171,7 +171,7 @@ def _against(faithful: Faithful, method: str, rival: str) -> dict[tuple[str, str
 
 def _tell_open(best: Standing) -> str:
     lost = [fill_name(*one) for one in best.tested if one not in best.beaten]
-    return f" It does not do so under {listed(lost)}." if lost else ""
+    return f", but not under {listed(lost)}" if lost else ""
 
 
 def _unfit_fills(truth: Truth | None) -> list[str]:

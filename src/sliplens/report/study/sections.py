@@ -24,7 +24,7 @@ from sliplens.report.study.score_tables import table_agreement, table_equal_area
 from sliplens.report.study.sound_figures import plate_randomisation, plate_removal_curves
 from sliplens.report.study.state_figures import plate_contact_states, plate_fields_beside_saliency
 from sliplens.report.study.truth_figures import plate_truth
-from sliplens.report.style import input_name, inputs_in_order
+from sliplens.report.style import input_name, inputs_in_order, name_methods
 from sliplens.report.tables import Table, table_accuracy
 from sliplens.report.workspace import Results
 
@@ -232,8 +232,9 @@ def _alarms(name: str, alarms: Sequence[str]) -> Notes | None:
     if not alarms:
         return None
     title = f"Alarms, {input_name(name).lower()}"
+    shown = map(name_methods, alarms)
     # the same fill can be found wanting by two scores
-    sentences = tuple(dict.fromkeys(f"{one[:1].upper()}{one[1:].rstrip('.')}." for one in alarms))
+    sentences = tuple(dict.fromkeys(f"{one[:1].upper()}{one[1:].rstrip('.')}." for one in shown))
     return Notes(title=title, sentences=sentences, tone="caution")
 
 
