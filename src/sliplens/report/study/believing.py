@@ -117,12 +117,11 @@ def _believe(faithful: Faithful, results: Results) -> Statement:
         f"95 % interval{_tell_open(best)}. "
         f"Under {fill_name(score.fill, score.unit)} its symmetric gain is {tell_interval(score.srg)} in margin units."
     )
-    text += _tell_lead(faithful, best, others)
+    text += _tell_lead(faithful, best, others) + _tell_truth(results, faithful.input, best.method)
     failing = [method_name(one.method) for one in ranked if not one.qualifies]
     if failing:
         text += f" {listed(failing)} {'does' if len(failing) == 1 else 'do'} not beat the controls under most fills."
     text += _tell_unfit(truth)
-    text += _tell_truth(results, faithful.input, best.method)
     if faithful.alarms:
         count = len(faithful.alarms)
         text += f" {count} {'alarm' if count == 1 else 'alarms'} about these scores: see beside their table."
