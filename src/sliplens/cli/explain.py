@@ -170,7 +170,12 @@ class Explain:
                 row.append(lay(picture, saliency) if np.isfinite(saliency).all() else None)
                 if row[-1] is not None:
                     write_png(overlays / f"{frame.id}.png", row[-1])
-        titles = [f"{percent(frame.safety_margin)}, read {percent(frame.prediction)}" for frame in explained.frames]
+        titles = [
+            # of recorded images the margin need not be known
+            ("" if frame.safety_margin is None else f"true {percent(frame.safety_margin)}, ")
+            + f"read {percent(frame.prediction)}"
+            for frame in explained.frames
+        ]
         with drawing_style():
             draw_panel(rows, titles=titles).savefig(folder / "panel.png")
 
