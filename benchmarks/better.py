@@ -22,23 +22,22 @@ import torch
 from torch import Tensor
 
 from sliplens.errors import SliplensError
-from sliplens.explain import PolyCam, capture, find_layers
-from sliplens.explain.levels import combine
-from sliplens.explain.occlusion import marker_regions
-from sliplens.explain.passes import prepare
-from sliplens.explain.places import markers_in_recording
-from sliplens.explain.still import still
-from sliplens.explain.thesis import find_published_layers
+from sliplens.explainers import PolyCam, capture, find_layers
+from sliplens.explainers.channels import combine
+from sliplens.explainers.frozen_model import still
+from sliplens.explainers.occlusion import marker_regions, markers_in_recording
+from sliplens.explainers.poly_cam_thesis import find_published_layers
 from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.localisation import relevance_mass, relevance_rank
 from sliplens.faithfulness.removal import faithfulness
 from sliplens.faithfulness.units import Units, pixel_units, tile_units
+from sliplens.files import machine, versions
 from sliplens.intervals import paired_difference
 from sliplens.models import TrainedModel, load_checkpoint
-from sliplens.models.shipped import find_run
-from sliplens.provenance import machine, versions
+from sliplens.models.checkpoint import find_run
+from sliplens.models.engines import prepare
 from sliplens.recordings import Dataset, Recording
-from sliplens.recordings.truth import SLIPS
+from sliplens.recordings.trial import SLIPS
 from sliplens.simulation import SimulationRecipe, simulate_dataset
 
 NETWORKS = ("chromatouch-difference", "chromatouch-raw")

@@ -16,10 +16,10 @@ import numpy as np
 import torch
 
 from sliplens.errors import SliplensError
-from sliplens.explain.passes import prepare
 from sliplens.faithfulness import deletion_curves, get_fill, random_order
 from sliplens.models import load_checkpoint
-from sliplens.models.shipped import find_run
+from sliplens.models.checkpoint import find_run
+from sliplens.models.engines import prepare
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 IMAGES, LOOPED = 42, 2

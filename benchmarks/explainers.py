@@ -15,9 +15,9 @@ import torch
 from torch import Tensor, nn
 from torchvision import models
 
-from sliplens.explain import EXPLAINERS, GradCam, IntegratedGradients, Occlusion
-from sliplens.export.extras import missing_packages
-from sliplens.provenance import machine, versions
+from sliplens.explainers import EXPLAINERS, GradCam, IntegratedGradients, Occlusion
+from sliplens.extras import missing_packages
+from sliplens.files import machine, versions
 
 STEPS = 50
 INSTALLED = [name for name in EXPLAINERS if name != "lrp" or not missing_packages("zennit")]

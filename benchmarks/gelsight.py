@@ -41,10 +41,10 @@ from rich.progress import track
 from torch import Tensor, nn
 
 from sliplens.errors import SliplensError
+from sliplens.extras import import_cv2
 from sliplens.markers import MarkerStatus, track_markers
 from sliplens.markers.estimators import affine_parts
-from sliplens.markers.opencv import import_cv2
-from sliplens.recordings.readers.gelsight import list_gelsight_clips, read_gelsight_clip
+from sliplens.recordings.formats.gelsight import list_gelsight_clips, read_gelsight_clip
 
 FRAMES, STRIDE = 24, 12
 SMALL = (48, 64)

@@ -18,8 +18,8 @@ import av
 import numpy as np
 
 from sliplens.cli.labelling import LabelOptions, write_trials
+from sliplens.recordings.formats.video import read_video
 from sliplens.recordings.importing import About
-from sliplens.recordings.readers.video import read_video
 
 HEIGHT, WIDTH, FRAMES_PER_S, FORCES_PER_S = 480, 640, 30, 500
 

@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int
 from torch import nn
 
 from sliplens.simulation import CHROMATOUCH, PRESETS, TrialPlan, plan_trials
-from sliplens.simulation.dome import Dome
+from sliplens.simulation.geometry import Dome
 from sliplens.simulation.information import (
     Touch,
     margin_bound,

@@ -21,8 +21,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # must be set before torch 
 
 import numpy as np
 
+from sliplens.extras import import_cv2
 from sliplens.markers import MarkerStatus, Tracker, Tracks, detect_markers, track_markers
-from sliplens.markers.opencv import import_cv2
 from sliplens.recordings import Recording
 from sliplens.simulation import SENSORS, SimulationRecipe, plan_trials, simulate_trial
 

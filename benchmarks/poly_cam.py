@@ -23,11 +23,11 @@ import torch
 from torch import Tensor, nn
 
 from sliplens.errors import SliplensError
-from sliplens.explain import Explanation, PolyCam, capture, find_layers
-from sliplens.explain.maps import pearson_r, resize, to_masks, top_overlap
+from sliplens.explainers import Explanation, PolyCam, capture, find_layers
+from sliplens.explainers.maps import pearson_r, resize, to_masks, top_overlap
+from sliplens.files import machine, versions
 from sliplens.models import TrainedModel, load_checkpoint
-from sliplens.models.shipped import find_run
-from sliplens.provenance import machine, versions
+from sliplens.models.checkpoint import find_run
 from sliplens.recordings import Dataset
 from sliplens.simulation import SimulationRecipe, simulate_dataset
 from sliplens.study import frames_from_dataset, frames_from_folder

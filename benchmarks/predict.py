@@ -21,10 +21,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sliplens.errors import SliplensError
-from sliplens.export import ENGINES, Engine, make_engine
-from sliplens.export.onnx_file import difference
+from sliplens.files import machine, versions
 from sliplens.models import Manifest, TrainedModel, build_model
-from sliplens.provenance import machine, versions
+from sliplens.models.engines import ENGINES, Engine, make_engine
+from sliplens.models.onnx import difference
 
 WARM_UP = 5
 ENCODED = ((224, 224), (480, 640))

@@ -15,11 +15,12 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # must be set before torch is imported
 
-from sliplens.datasets import get_encoding, load_frames
 from sliplens.models import load_checkpoint
+from sliplens.models.encodings import get_encoding
 from sliplens.recordings import Dataset
 from sliplens.simulation import PRESETS, simulate_dataset
 from sliplens.training import evaluate, fit, get_recipe
+from sliplens.training.data import load_frames
 
 INPUTS = ("difference", "raw")
 # what the thesis reports (Table 1)

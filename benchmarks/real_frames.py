@@ -15,7 +15,7 @@ import numpy as np
 
 from sliplens.errors import SliplensError
 from sliplens.models import load_checkpoint
-from sliplens.models.shipped import find_run
+from sliplens.models.checkpoint import find_run
 from sliplens.study import frames_from_folder
 
 NETWORK = "chromatouch-difference"

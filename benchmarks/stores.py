@@ -23,9 +23,9 @@ import zarr
 from zarr.codecs import BloscCodec
 
 from sliplens.images.files import decode_png, encode_png
-from sliplens.recordings.pixels import decode_pixels, encode_pixels
+from sliplens.recordings.store import decode_pixels, encode_pixels
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SimulationRecipe, plan_trials, simulate_trial
-from sliplens.simulation.flat_pad import FlatPad
+from sliplens.simulation.geometry import FlatPad
 
 _ROW_GROUP = 16
 _SHARD = 16

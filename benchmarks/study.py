@@ -19,9 +19,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # the study inherits it
 
 import torch
 
-from sliplens.explain.passes import WORTH_CONVERTING, prepare
 from sliplens.models import load_checkpoint
-from sliplens.models.shipped import find_run
+from sliplens.models.checkpoint import find_run
+from sliplens.models.engines import WORTH_CONVERTING, prepare
 
 _INTERRUPTED = 130
 _LOOK_EVERY_S = 0.5

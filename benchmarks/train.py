@@ -18,11 +18,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from sliplens.datasets import FrameSet, get_augmentation, get_encoding
+from sliplens.files import machine, versions
 from sliplens.models import build_model
-from sliplens.models.heads import margin_loss
-from sliplens.provenance import machine, versions
+from sliplens.models.backbones import margin_loss
+from sliplens.models.encodings import get_encoding
 from sliplens.training import TrainConfig, TrainProgress, fit, get_recipe
+from sliplens.training.data import FrameSet, get_augmentation
 
 
 def make_frames(count: int, *, size: int, trial: str, generator: torch.Generator) -> FrameSet:

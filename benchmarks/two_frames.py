@@ -25,12 +25,12 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
-from sliplens.datasets import load_frames
 from sliplens.errors import SliplensError
 from sliplens.models import TrainedModel, load_checkpoint
-from sliplens.models.shipped import find_run
+from sliplens.models.checkpoint import find_run
 from sliplens.simulation import PRESETS, SimulationRecipe, simulate_dataset
 from sliplens.training import evaluate
+from sliplens.training.data import load_frames
 from sliplens.training.evaluate import regression_scores
 
 VIEWS = {"one frame": (0.0,), "and one 0.5 s earlier": (0.0, 0.5), "8 frames over 2.2 s": tuple(np.linspace(0, 2.2, 8))}

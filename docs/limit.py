@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from sliplens.report.style import BLUE, GREY, ORANGE, drawing_style
+from sliplens.plots.style import BLUE, GREY, ORANGE, drawing_style
 
 NOISE_PX = 0.1
 MODELS: dict[str, Literal["-", "--"]] = {"calibrated": "-", "half-space": "--"}

@@ -6,10 +6,9 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec
 
-from sliplens.report.overlay import overlay_saliency, plot_colour_bar, stretch_saliency
-from sliplens.report.panels import choose_frames
+from sliplens.plots.saliency import choose_frames, overlay_saliency, plot_colour_bar, stretch_saliency
+from sliplens.plots.style import method_name, methods_in_order, percent
 from sliplens.report.results import load_results
-from sliplens.report.style import method_name, methods_in_order, percent
 
 
 def draw(workspace: Path) -> Figure:

@@ -17,7 +17,7 @@ from realism.measures import (
     top_over_bottom,
 )
 from realism.scene import PUBLISHED, SEEN, Simulated
-from sliplens.report.style import BLACK, BLUE, ORANGE, SOURCE_NAMES, drawing_style
+from sliplens.plots.style import BLACK, BLUE, ORANGE, SOURCE_NAMES, drawing_style
 
 _STYLES = (("Real", BLACK, "o"), ("Simulated", ORANGE, "s"))
 _LIFT_UNTOUCHED, _LIFT = 8, 1.4

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 from sliplens._version import __version__
 
 if TYPE_CHECKING:
-    from sliplens.models.shipped import load
+    from sliplens.models.checkpoint import load
 
 __all__ = ["__version__", "load"]
 
@@ -13,7 +13,7 @@ __all__ = ["__version__", "load"]
 def __getattr__(name: str) -> Any:
     """Find `load` when it is asked for: importing sliplens alone imports neither torch nor NumPy."""
     if name == "load":
-        from sliplens.models.shipped import load  # noqa: PLC0415 (that is the point)
+        from sliplens.models.checkpoint import load  # noqa: PLC0415 (that is the point)
 
         return load
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

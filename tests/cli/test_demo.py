@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from sliplens.cli import demo, main
-from sliplens.provenance import read_json
+from sliplens.files import read_json
 
 SMALL = ("--dry-trials", "8", "--wet-trials", "1", "--frames-per-trial", "24", "--days", "2", "--image-size", "32")
 

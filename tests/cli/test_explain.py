@@ -10,10 +10,10 @@ from PIL import Image
 
 from sliplens.cli.explain import Explain
 from sliplens.errors import InputError, SliplensError
-from sliplens.explain import EXPLAINERS
-from sliplens.explain.occlusion import marker_regions
+from sliplens.explainers import EXPLAINERS
+from sliplens.explainers.occlusion import marker_regions
+from sliplens.files import read_json
 from sliplens.images import list_images, read_image
-from sliplens.provenance import read_json
 from sliplens.recordings import Dataset
 from sliplens.study import load_explained
 
@@ -102,7 +102,7 @@ def test_markers_are_occluded_where_each_frame_has_them(
         asked.append(f"{recording.trial}-f{row:04d}")
         return MARKERS + len(asked)  # elsewhere in every frame
 
-    monkeypatch.setattr("sliplens.explain.places.markers_in_recording", places)
+    monkeypatch.setattr("sliplens.explainers.occlusion.markers_in_recording", places)
     run(difference_run, small_dataset.folder, "-o", tmp_path / "maps", "--method", "occlusion-marker")
     explained = load_explained(tmp_path / "maps")
     assert asked == [frame.id for frame in explained.frames]
@@ -127,7 +127,7 @@ def test_markers_are_found_in_camera_frames_only(
         seen.append(frame)
         return MARKERS
 
-    monkeypatch.setattr("sliplens.explain.places.markers_in_frame", places)
+    monkeypatch.setattr("sliplens.explainers.occlusion.markers_in_frame", places)
     paths = list_images(difference_folder)
     run(raw_run, "--frames", difference_folder, "--reference", paths[0], *words)
     assert all(np.array_equal(one, read_image(path)) for one, path in zip(seen, paths, strict=True))

@@ -8,10 +8,10 @@ import tyro
 
 from sliplens.cli.export import Export
 from sliplens.errors import InputError
-from sliplens.export.extras import import_onnxruntime
-from sliplens.provenance import RUN_FILE
+from sliplens.extras import import_onnxruntime
+from sliplens.files import RUN_FILE
 from sliplens.recordings import Dataset
-from sliplens.recordings.readers import ReadOptions, open_captures
+from sliplens.recordings.formats import ReadOptions, open_captures
 
 
 def refused(message: str, *words: object) -> None:
@@ -75,7 +75,7 @@ def test_a_failure_leaves_nothing_behind(small_dataset: Dataset, tmp_path: Path,
         (folder / "half").write_text("")
         raise InputError("the disk is full")
 
-    monkeypatch.setattr("sliplens.recordings.writers.lerobot.write_lerobot", fail)
+    monkeypatch.setattr("sliplens.recordings.formats.lerobot_export.write_lerobot", fail)
     refused("the disk is full", small_dataset.folder, "-o", tmp_path / "out", "--lerobot")
     assert not names(tmp_path)
 
@@ -101,7 +101,7 @@ def test_the_wrong_kind_of_source_is_told(difference_run: Path, small_dataset: D
 
 
 def test_without_the_extra_the_cure_is_told(difference_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("sliplens.export.extras.find_spec", lambda name: None if name != "onnx" else name)
+    monkeypatch.setattr("sliplens.extras.find_spec", lambda name: None if name != "onnx" else name)
     refused(
         r'needs onnxscript and onnxruntime, which are not installed; install with `pip install "sliplens\[onnx\]"`',
         difference_run,

@@ -13,9 +13,8 @@ from command_line import refused, run
 
 from sliplens.images import write_png
 from sliplens.recordings import Dataset, Recording
-from sliplens.recordings.headers import read_labelling
-from sliplens.recordings.readers import ReadOptions
-from sliplens.recordings.store import write_trial
+from sliplens.recordings.formats import ReadOptions
+from sliplens.recordings.store import read_labelling, write_trial
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 FORCE_RATE = 500

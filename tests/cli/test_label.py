@@ -10,10 +10,9 @@ from command_line import refused, run
 
 from sliplens.images import write_png
 from sliplens.recordings import ContactState, Dataset, Recording
+from sliplens.recordings.capture import forces_path, load_forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.headers import read_labelling
-from sliplens.recordings.samples import forces_path, load_forces
-from sliplens.recordings.store import load_recording, save_recording
+from sliplens.recordings.store import load_recording, read_labelling, save_recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 

@@ -9,7 +9,7 @@ import tyro
 from sliplens import __version__
 from sliplens.cli.predict import Predict
 from sliplens.errors import InputError, SliplensError
-from sliplens.provenance import hash_file
+from sliplens.files import hash_file
 from sliplens.recordings import Dataset
 
 

@@ -78,7 +78,7 @@ def test_without_an_output_the_viewer_opens(small_dataset: Dataset, monkeypatch:
         stream.save(tmp_path / "sent.rrd")
 
     monkeypatch.setattr(rerun.RecordingStream, "connect_grpc", connect)
-    monkeypatch.setattr("sliplens.report.viewer.start_viewer", lambda: "rerun+http://127.0.0.1:1/proxy")
+    monkeypatch.setattr("sliplens.plots.viewer.start_viewer", lambda: "rerun+http://127.0.0.1:1/proxy")
     View(data=small_dataset.folder, trial="test-wet-7").run()
     assert name_of(tmp_path / "sent.rrd") == "test-wet-7"
     # whoever opens it is told what it tells others

@@ -6,7 +6,7 @@ import torch
 
 from sliplens.errors import InputError
 from sliplens.faithfulness import FILLS, get_fill
-from sliplens.faithfulness.noisy_linear import NOISE_SD, noisy_linear
+from sliplens.faithfulness.fills import NOISE_SD, noisy_linear
 
 ALL = torch.ones(1, 40, 40, dtype=torch.bool)
 

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from sliplens.errors import ImageError, InputError
 from sliplens.markers import KINDS, MarkerKind, detect_markers
-from sliplens.markers.refine import measure_spots
+from sliplens.markers.detect import measure_spots
 
 KIND = {"chromatouch": "chromatouch", "flat-gel": "gelsight-mini"}
 

@@ -9,13 +9,11 @@ from sliplens.markers.estimators import (
     ESTIMATORS,
     FieldTrial,
     affine_parts,
+    displacement_entropy,
+    edge_over_centre,
     field_trial,
     find_hold,
     get_estimator,
-)
-from sliplens.markers.estimators.features import (
-    displacement_entropy,
-    edge_over_centre,
     mean_shear,
     rigid_residual,
     stick_area,

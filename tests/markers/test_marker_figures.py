@@ -6,8 +6,7 @@ from matplotlib.quiver import Quiver
 
 from sliplens.errors import InputError, SaliencyError
 from sliplens.markers import compute_field, interpolate_field, track_markers
-from sliplens.recordings import ContactState
-from sliplens.report.marker_figures import (
+from sliplens.plots.markers import (
     MarkedFrame,
     choose_states,
     draw_contact_states,
@@ -15,6 +14,7 @@ from sliplens.report.marker_figures import (
     plot_arrows,
     plot_field,
 )
+from sliplens.recordings import ContactState
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 import numpy as np
 
-from sliplens.markers.signs import resolve_signs
+from sliplens.markers.doublets import resolve_signs
 
 GRID = np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0)), axis=-1).reshape(-1, 2) * 10
 

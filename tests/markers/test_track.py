@@ -119,7 +119,7 @@ def test_what_cannot_be_followed_is_refused_in_one_sentence(dots, grid):
 
 @pytest.mark.real
 def test_dots_of_a_real_gel_stay_where_they_are_while_nothing_moves(reference_folder):
-    from sliplens.recordings.readers.gelsight import read_gelsight_clip  # noqa: PLC0415 (decoding comes with it)
+    from sliplens.recordings.formats.gelsight import read_gelsight_clip  # noqa: PLC0415 (decoding comes with it)
 
     path = reference_folder / "gelsight_mini_slip" / "noslip" / "tennis_ball__exp_num_6" / "camera_0.avi"
     if not path.is_file():

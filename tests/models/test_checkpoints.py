@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from sliplens.errors import CheckpointError, ImageError, InputError
+from sliplens.files import hash_file
 from sliplens.models import load_checkpoint
-from sliplens.provenance import hash_file
 
 
 @pytest.fixture

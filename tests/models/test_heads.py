@@ -5,9 +5,9 @@ from scipy import stats
 
 from sliplens.errors import ModelError
 from sliplens.models import build_model
+from sliplens.models.backbones import HistogramRegressor, histogram_targets, margin_loss
 from sliplens.models.calibration import Calibration, conformal_offset, fit_temperature, quantiles
-from sliplens.models.checkpoints import Estimate
-from sliplens.models.heads import HistogramRegressor, histogram_targets, margin_loss
+from sliplens.models.checkpoint import Estimate
 
 
 def test_a_label_becomes_the_share_of_a_gaussian_in_each_bin():

@@ -7,7 +7,7 @@ from scipy.stats import spearmanr
 
 import sliplens
 from sliplens.errors import InputError
-from sliplens.models.shipped import find_run, shipped_names
+from sliplens.models.checkpoint import find_run, shipped_names
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 from sliplens.study import frames_from_folder
 

@@ -10,7 +10,7 @@ import pytest
 
 from sliplens.cli import main
 from sliplens.recordings import ContactState, Dataset, Recording
-from sliplens.recordings.checking import check_dataset
+from sliplens.recordings.check import check_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
 from sliplens.simulation import FLAT_GEL, SimulationRecipe, simulate_dataset

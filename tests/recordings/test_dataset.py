@@ -12,9 +12,15 @@ import pytest
 from sliplens.errors import InputError, RecordingError
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.dataset import write_dataset_table
-from sliplens.recordings.pixels import ROW_GROUP, decode_pixels, encode_frames
-from sliplens.recordings.recording import SIGNALS
-from sliplens.recordings.store import load_recording, read_frames, save_recording
+from sliplens.recordings.store import (
+    ROW_GROUP,
+    decode_pixels,
+    encode_frames,
+    load_recording,
+    read_frames,
+    save_recording,
+)
+from sliplens.recordings.trial import SIGNALS
 
 
 def test_a_trial_comes_back_without_loss(tmp_path: Path, recording: Recording):

@@ -12,8 +12,7 @@ from hypothesis.extra import numpy as arrays
 
 from sliplens.errors import RecordingError
 from sliplens.recordings import Recording
-from sliplens.recordings.pixels import decode_pixels, encode_pixels
-from sliplens.recordings.store import load_recording, save_recording
+from sliplens.recordings.store import decode_pixels, encode_pixels, load_recording, save_recording
 
 shapes = st.one_of(
     arrays.array_shapes(min_dims=2, max_dims=2), st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3))

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from sliplens.errors import InputError
 from sliplens.recordings import Dataset
-from sliplens.recordings.checking import check_dataset
+from sliplens.recordings.check import check_dataset
 from sliplens.recordings.dataset import DATASET_FILE
 from sliplens.recordings.splits import (
     PRESETS,

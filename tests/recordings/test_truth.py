@@ -9,8 +9,7 @@ import pytest
 
 from sliplens.errors import RecordingError
 from sliplens.recordings import GroundTruth, Recording
-from sliplens.recordings.headers import read_header
-from sliplens.recordings.store import load_recording, save_recording
+from sliplens.recordings.store import load_recording, read_header, save_recording
 
 
 @pytest.fixture

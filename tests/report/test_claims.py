@@ -7,10 +7,8 @@ import pytest
 
 from sliplens.intervals import Difference
 from sliplens.report import load_results
-from sliplens.report.study.believing import _tell_lead, judge_study, rank_methods
-from sliplens.report.study.claim import all_of, judge_gap, most_of
-from sliplens.report.study.claims import judge_claims
-from sliplens.report.study.evidence import compare_gain, share_of_strongest
+from sliplens.report.study.believing import _tell_lead, compare_gain, judge_study, rank_methods, share_of_strongest
+from sliplens.report.study.claims import all_of, judge_claims, judge_gap, most_of
 
 from .made_up import write_run
 from .study_results import (

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from sliplens.intervals import bootstrap_difference
-from sliplens.report.compare import agreement, compare_deletion, compare_errors
-from sliplens.report.records import DeletionCurve, Predictions
+from sliplens.report.tables import agreement, compare_deletion, compare_errors
+from sliplens.results.records import DeletionCurve, Predictions
 
 
 def predictions(error: np.ndarray, *, order: np.ndarray | None = None) -> Predictions:

@@ -7,16 +7,15 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from sliplens.report import (
-    Results,
-    load_results,
+from sliplens.plots.errors import (
     plot_bins,
     plot_faithfulness,
     plot_learning_curves,
     plot_margin_over_time,
     plot_predictions,
 )
-from sliplens.report.style import BLUE, INPUT_COLOURS, ORANGE
+from sliplens.plots.style import BLUE, INPUT_COLOURS, ORANGE
+from sliplens.report import Results, load_results
 
 
 @pytest.fixture(scope="module")

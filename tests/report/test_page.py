@@ -10,9 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from sliplens.errors import InputError
+from sliplens.plots.saliency import build_panel, choose_frames
 from sliplens.report import build_report, load_results
-from sliplens.report.panels import build_panel, choose_frames
-from sliplens.report.records import ExplainedFrame
+from sliplens.results.records import ExplainedFrame
 
 HOSTILE = "<script>alert(1)</script>"
 

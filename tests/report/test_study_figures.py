@@ -9,14 +9,23 @@ from matplotlib.figure import Figure
 
 from sliplens.errors import InputError
 from sliplens.faithfulness.deletion import deletion_order
+from sliplens.plots.style import ORANGE, SKY
 from sliplens.report import load_results
-from sliplens.report.study.grids import Cell, draw_grid
-from sliplens.report.study.plates import Plate, show_plate, write_plates
+from sliplens.report.study.plates import (
+    Cell,
+    Plate,
+    bright_pictures,
+    draw_grid,
+    explained_of,
+    gone,
+    show_plate,
+    shown_frames,
+    told_frame,
+    write_plates,
+)
 from sliplens.report.study.removal_figures import plate_removal
-from sliplens.report.study.score_tables import table_scores
-from sliplens.report.study.shown import bright_pictures, explained_of, gone, shown_frames, told_frame
-from sliplens.report.study.truth_figures import paint_effects
-from sliplens.report.style import ORANGE, SKY
+from sliplens.report.study.state_figures import paint_effects
+from sliplens.report.study.tables import table_scores
 
 from .study_results import METHODS, Made, write_choice, write_faithfulness
 

@@ -7,7 +7,6 @@ import pytest
 
 from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, Nuisances, SimulationRecipe, plan_trials
-from sliplens.simulation.best_reading import NOISE_PX, marker_readings, reading_gain
 from sliplens.simulation.information import (
     MARGIN,
     Sensitivity,
@@ -17,7 +16,7 @@ from sliplens.simulation.information import (
     prior_sigma,
     visible_markers,
 )
-from sliplens.simulation.intervention import FilmedTrial
+from sliplens.simulation.intervention import NOISE_PX, FilmedTrial, marker_readings, reading_gain
 from sliplens.simulation.nuisances import Grasp
 from sliplens.simulation.trials import prepare_trial
 

@@ -8,7 +8,7 @@ import pytest
 
 from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, Nuisances
-from sliplens.simulation.flat_pad import FlatPad
+from sliplens.simulation.geometry import FlatPad
 from sliplens.simulation.information import (
     MARGIN,
     NUISANCES,

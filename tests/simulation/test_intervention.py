@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.provenance import output_folder
+from sliplens.files import output_folder
 from sliplens.recordings import Dataset, Recording
 from sliplens.simulation import (
     CHROMATOUCH,

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from sliplens.errors import ContactError
 from sliplens.mechanics import stick_ratio
 from sliplens.recordings import ContactState
-from sliplens.simulation.loading import load_at_margins, load_grasp
+from sliplens.simulation.loading import load_at_margins, load_grasp, slide
 from sliplens.simulation.nuisances import Grasp, Nuisances, draw_day, draw_grasp
-from sliplens.simulation.sliding import slide
 
 FRAMES = 800
 FEW = settings(max_examples=25)

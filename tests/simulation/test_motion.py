@@ -9,7 +9,7 @@ import pytest
 from sliplens.errors import ContactError
 from sliplens.mechanics import contact_radius, reduced_modulus, stick_displacement, stick_ratio
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL
-from sliplens.simulation.flat_pad import FlatPad
+from sliplens.simulation.geometry import FlatPad
 from sliplens.simulation.loading import load_at_margins, load_grasp
 from sliplens.simulation.motion import move_markers
 from sliplens.simulation.nuisances import Grasp

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL
-from sliplens.simulation.noise import mix_noise, pick_noise
 from sliplens.simulation.rendering import add_slices, scatter
+from sliplens.simulation.sensor import mix_noise, pick_noise
 
 FRAMES, SIZE = 400, 64
 

@@ -10,11 +10,9 @@ from hypothesis import strategies as st
 
 from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SENSORS
-from sliplens.simulation.dome import Dome
-from sliplens.simulation.flat_pad import FlatPad
-from sliplens.simulation.geometry import pixel_grid
-from sliplens.simulation.look import MarkerLook, draw_look
+from sliplens.simulation.geometry import Dome, FlatPad, pixel_grid
 from sliplens.simulation.nuisances import nominal_unit
+from sliplens.simulation.sensor import MarkerLook, draw_look
 
 DOME, PAD = cast("Dome", CHROMATOUCH.geometry), cast("FlatPad", FLAT_GEL.geometry)
 

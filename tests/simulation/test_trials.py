@@ -18,7 +18,7 @@ from sliplens.simulation import (
     simulate_trial,
 )
 from sliplens.simulation.filming import prepare_film
-from sliplens.simulation.flat_pad import FlatPad
+from sliplens.simulation.geometry import FlatPad
 from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.nuisances import Day, Grasp, nominal_unit
 

@@ -5,14 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sliplens.files import output_folder
 from sliplens.models import TrainedModel, load_checkpoint
-from sliplens.provenance import output_folder
 from sliplens.recordings import Dataset
 from sliplens.study import explain_frames, load_explained
 from sliplens.study.choice import Choice, choose_frames
-from sliplens.study.frames import frames_at
-from sliplens.study.material import Material, gather
-from sliplens.study.methods import study_explainers
+from sliplens.study.explaining import frames_at
+from sliplens.study.material import Material, gather, study_explainers
 from sliplens.study.states import MarkedFrame
 
 METHODS = ("grad-cam", "integrated-gradients")

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from sliplens.explain import Explanation, IntegratedGradients
-from sliplens.faithfulness.looks import gini, total_variation
+from sliplens.explainers import Explanation, IntegratedGradients
+from sliplens.faithfulness.map_quality import gini, total_variation
 from sliplens.recordings import Dataset
-from sliplens.study.looks import check_looks
+from sliplens.study.map_quality import check_looks
 from sliplens.study.material import Material
-from sliplens.study.sanity import check_randomisation, explain_untrained, load_untrained
+from sliplens.study.randomisation import check_randomisation, explain_untrained, load_untrained
 from sliplens.study.timing import time_explainers
 
 

@@ -10,8 +10,16 @@ import torch
 from sliplens.faithfulness import get_fill
 from sliplens.faithfulness.removal import Faithfulness
 from sliplens.intervals import paired_difference
-from sliplens.study.curves import STUDY_AREAS, influences, score_curves
-from sliplens.study.judging import EQUAL_AREAS, RANDOMISED, Setting, judge_curves, ranking_alarms
+from sliplens.study.curves import (
+    EQUAL_AREAS,
+    RANDOMISED,
+    STUDY_AREAS,
+    Setting,
+    influences,
+    judge_curves,
+    ranking_alarms,
+    score_curves,
+)
 from sliplens.study.material import Material
 
 PIXELS = Setting(fill="grey", unit="pixel")

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from sliplens.errors import CheckpointError, InputError, SaliencyError
+from sliplens.files import output_folder
 from sliplens.models import TrainedModel, load_checkpoint
-from sliplens.provenance import output_folder
 from sliplens.recordings import Dataset
 from sliplens.study import Explained, explain_frames, frames_from_dataset, load_explained, score_explanations
 

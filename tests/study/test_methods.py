@@ -2,7 +2,7 @@
 
 import pytest
 
-from sliplens.study.methods import STUDY_METHODS, THESIS_POLY_CAM, as_the_thesis_ran, method_options, study_explainers
+from sliplens.study.material import STUDY_METHODS, THESIS_POLY_CAM, as_the_thesis_ran, method_options, study_explainers
 
 
 @pytest.mark.parametrize("budget", [0.2, 1.0])

@@ -9,8 +9,7 @@ import torch
 
 from sliplens.faithfulness import deletion_order
 from sliplens.study.material import Material
-from sliplens.study.remedies import score_remedies
-from sliplens.study.scoring import load_curves, score_explanations
+from sliplens.study.scoring import load_curves, score_explanations, score_remedies
 
 STEPS = 8
 

@@ -15,17 +15,15 @@ from sliplens.errors import CheckpointError, InputError
 from sliplens.faithfulness.controls import CONTROLS
 from sliplens.faithfulness.true_fill import SHARES
 from sliplens.faithfulness.units import unit_means
+from sliplens.files import output_folder
 from sliplens.models import Manifest, TrainedModel
-from sliplens.provenance import output_folder
 from sliplens.recordings import Dataset
 from sliplens.simulation import CHROMATOUCH, SimulationRecipe, simulate_dataset
-from sliplens.simulation.best_reading import marker_readings
 from sliplens.simulation.information import visible_markers
-from sliplens.simulation.intervention import draw_with_markers_back
+from sliplens.simulation.intervention import draw_with_markers_back, marker_readings
 from sliplens.study import Explained, ExplainedFrame, frames_from_dataset
-from sliplens.study.truth import judge_by_truth, true_curves
-from sliplens.study.truth_effects import shuffle_half
-from sliplens.study.truth_scenes import find_places, redrawing, stage_frames
+from sliplens.study.scenes import find_places, redrawing, stage_frames
+from sliplens.study.truth import judge_by_truth, shuffle_half, true_curves
 
 SIZE = 112
 RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=20, seed=5)

@@ -243,6 +243,6 @@ def test_what_cannot_be_compared_is_refused_at_once(data: Dataset, network: Path
     monkeypatch.setattr(Dataset, "open", lambda _: alone)
     assert "has no training trials to fit baselines on" in refused(capsys, *command, "all")
     monkeypatch.undo()
-    monkeypatch.setattr("sliplens.markers.opencv.find_spec", lambda _: None)
+    monkeypatch.setattr("sliplens.extras.find_spec", lambda _: None)
     assert "OpenCV, which is not installed" in refused(capsys, *command, "all")
     assert not list(tmp_path.iterdir())

@@ -6,11 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sliplens.datasets import get_encoding, load_frames
 from sliplens.errors import RecordingError
 from sliplens.models import load_checkpoint
+from sliplens.models.encodings import get_encoding
 from sliplens.recordings import Dataset
 from sliplens.training import evaluate, regression_scores
+from sliplens.training.data import load_frames
 
 MARGINS = arrays(np.float64, 30, elements=st.floats(0, 1))
 

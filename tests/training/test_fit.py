@@ -4,13 +4,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from sliplens.datasets import FrameSet, get_encoding, load_frames
 from sliplens.errors import InputError, ModelError
 from sliplens.models import load_checkpoint
+from sliplens.models.encodings import get_encoding
 from sliplens.recordings import Dataset
 from sliplens.training import TrainConfig, TrainProgress, evaluate, fit
+from sliplens.training.data import EpochShuffle, FrameSet, load_frames
 from sliplens.training.fit import TrainResult, require_same_kind
-from sliplens.training.samplers import EpochShuffle
 
 CONFIG = TrainConfig(image_size=32, epochs=3, batch_size=11, seed=3)
 

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.provenance import output_folder
+from sliplens.files import output_folder
 from sliplens.training.hardware import Hardware, follow_folder
 
 VARIABLES = ("RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "WORLD_SIZE", "TORCHELASTIC_RUN_ID")

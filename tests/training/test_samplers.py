@@ -1,6 +1,6 @@
 import pytest
 
-from sliplens.training.samplers import EpochShuffle, EvenShares
+from sliplens.training.data import EpochShuffle, EvenShares
 
 
 def test_each_epoch_has_an_order_of_its_own_that_repeats():

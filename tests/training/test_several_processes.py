@@ -12,11 +12,11 @@ import torch
 from safetensors.torch import load_file
 from torch import distributed
 
-from sliplens.datasets import get_encoding, load_frames
 from sliplens.models import load_checkpoint
+from sliplens.models.encodings import get_encoding
 from sliplens.recordings import Dataset
 from sliplens.training import evaluate
-from sliplens.training.samplers import EpochShuffle
+from sliplens.training.data import EpochShuffle, load_frames
 
 pytestmark = pytest.mark.skipif(
     not (distributed.is_available() and distributed.is_gloo_available()),

@@ -9,10 +9,11 @@ from unittest.mock import patch
 import torch
 from torch import Tensor, nn
 
-from sliplens.datasets import FrameSet, get_encoding, load_frames
 from sliplens.errors import ModelError
+from sliplens.models.encodings import get_encoding
 from sliplens.recordings import Dataset
 from sliplens.training import TrainConfig, fit
+from sliplens.training.data import FrameSet, load_frames
 from sliplens.training.fit import TrainResult
 from sliplens.training.hardware import Hardware
 

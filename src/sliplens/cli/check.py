@@ -23,7 +23,7 @@ class Check:
     def run(self) -> None:
         """Check and say what is wrong, and where."""
         from sliplens.recordings import Dataset
-        from sliplens.recordings.checking import check_dataset
+        from sliplens.recordings.check import check_dataset
 
         data = Dataset.open(self.data)
         with progress_bar("Checking trials") as bar:

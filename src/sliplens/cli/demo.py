@@ -17,7 +17,7 @@ from sliplens.cli.score import Score
 from sliplens.cli.simulate import Simulate
 from sliplens.cli.train import Train
 from sliplens.errors import InputError
-from sliplens.provenance import read_json, require_folder, to_jsonable, write_json
+from sliplens.files import read_json, require_folder, to_jsonable, write_json
 
 INPUTS = ("difference", "raw")
 _PLAN = "plan.json"
@@ -180,9 +180,9 @@ def _measure_rates(image_size: int) -> _Rates:
     """
     import torch
 
-    from sliplens.explain.passes import prepare
-    from sliplens.explain.still import still
+    from sliplens.explainers.frozen_model import still
     from sliplens.models import build_model
+    from sliplens.models.engines import prepare
 
     with torch.random.fork_rng(devices=[]), torch.no_grad():
         model = build_model()

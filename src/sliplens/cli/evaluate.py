@@ -11,7 +11,7 @@ import tyro
 from sliplens.cli.console import print_table, progress_bar, say, unchanged, wrote
 from sliplens.cli.devices import require_device
 from sliplens.errors import InputError
-from sliplens.provenance import output_folder, to_jsonable, write_json
+from sliplens.files import output_folder, to_jsonable, write_json
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -56,12 +56,12 @@ class Evaluate:
         """Evaluate and write the scores."""
         import pyarrow.parquet as pq
 
-        from sliplens.datasets import load_frames
         from sliplens.models import load_checkpoint
-        from sliplens.models.shipped import find_run
+        from sliplens.models.checkpoint import find_run
+        from sliplens.plots.errors import draw_evaluation
         from sliplens.recordings import Dataset
-        from sliplens.report.evaluation import draw_evaluation
         from sliplens.training import evaluate
+        from sliplens.training.data import load_frames
 
         require_device(self.device)
         trained = load_checkpoint(find_run(self.model), device=self.device)
@@ -111,9 +111,9 @@ class Evaluate:
 
     def _plan_baselines(self, data: "Dataset", trials: "Sequence[TrialInfo]") -> "_Plan":
         """Check all that may be wrong before anything is computed."""
+        from sliplens.extras import import_cv2
+        from sliplens.markers.detect import get_kind
         from sliplens.markers.estimators import ESTIMATORS, get_estimator
-        from sliplens.markers.kinds import get_kind
-        from sliplens.markers.opencv import import_cv2
         from sliplens.training.baselines import choose_training, marker_kind
 
         names = tuple(ESTIMATORS) if self.baselines == ("all",) else self.baselines

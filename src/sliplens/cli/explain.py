@@ -10,10 +10,10 @@ import tyro
 from sliplens.cli.console import print_table, progress_bar, say, unchanged, wrote
 from sliplens.cli.devices import require_device
 from sliplens.errors import InputError
-from sliplens.provenance import output_folder, read_json
+from sliplens.files import output_folder, read_json
 
 if TYPE_CHECKING:
-    from sliplens.explain import Explainer
+    from sliplens.explainers import Explainer
     from sliplens.models import TrainedModel
     from sliplens.study import ChosenFrames, Explained
 
@@ -67,7 +67,7 @@ class Explain:
     def run(self) -> None:
         """Explain and write the maps."""
         from sliplens.models import load_checkpoint
-        from sliplens.models.shipped import find_run
+        from sliplens.models.checkpoint import find_run
         from sliplens.study import explain_frames
         from sliplens.study.explaining import require_methods
 
@@ -113,7 +113,7 @@ class Explain:
 
     def _table(self, trained: "TrainedModel", chosen: "ChosenFrames") -> "dict[str, Explainer | Sequence[Explainer]]":
         """The explainers with the options that were asked for."""
-        from sliplens.explain import EXPLAINERS, ExpectedGradients, PolyCam
+        from sliplens.explainers import EXPLAINERS, ExpectedGradients, PolyCam
 
         free = [index for index, margin in enumerate(chosen.safety_margin) if margin >= _FULL_STICK]
         background = trained.encoding.normalise(chosen.images[free]) if free else None
@@ -128,8 +128,8 @@ class Explain:
 
     def _occlude_markers(self, trained: "TrainedModel", chosen: "ChosenFrames") -> "list[Explainer]":
         """Occlusion by marker, frame by frame: where the simulator put them, else where they are found."""
-        from sliplens.explain import Occlusion
-        from sliplens.explain.places import markers_in_frame, markers_in_recording
+        from sliplens.explainers import Occlusion
+        from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
         from sliplens.images import list_images, read_image
         from sliplens.recordings import Dataset
 
@@ -154,9 +154,8 @@ class Explain:
         import numpy as np
 
         from sliplens.images import write_png
-        from sliplens.report.explained_pictures import draw_panel, overlay_jet
-        from sliplens.report.overlay import overlay_saliency, stretch_saliency
-        from sliplens.report.style import drawing_style, method_name, percent
+        from sliplens.plots.saliency import draw_panel, overlay_jet, overlay_saliency, stretch_saliency
+        from sliplens.plots.style import drawing_style, method_name, percent
 
         lay = overlay_jet if self.colours == "jet" else lambda one, two: overlay_saliency(one, stretch_saliency(two))
         inputs = 255 * trained.encoding.normalise(explained.images)
@@ -205,7 +204,7 @@ def _hash_images(chosen: "ChosenFrames") -> str:
 
 
 def _print_methods() -> None:
-    from sliplens.explain import EXPLAINERS
+    from sliplens.explainers import EXPLAINERS
 
     rows = []
     for name, explainer in EXPLAINERS.items():

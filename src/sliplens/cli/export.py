@@ -53,10 +53,10 @@ class Export:
             self._export_data(kinds[0])
 
     def _export_network(self) -> None:
-        from sliplens.export import export_onnx
-        from sliplens.export.extras import ONNX_PACKAGES, require_packages
+        from sliplens.extras import ONNX_PACKAGES, require_packages
         from sliplens.models import load_checkpoint
-        from sliplens.models.shipped import find_run
+        from sliplens.models.checkpoint import find_run
+        from sliplens.models.onnx import export_onnx
 
         if _is_data(self.source) and not _is_run(self.source):
             raise InputError(
@@ -82,7 +82,7 @@ class Export:
         )
 
     def _export_data(self, kind: str) -> None:
-        from sliplens.export.folders import exported_folder
+        from sliplens.files import exported_folder
         from sliplens.recordings import Dataset
 
         if _is_run(self.source) and not _is_data(self.source):
@@ -114,10 +114,10 @@ class Export:
 
 def _writer(kind: str) -> Callable[..., None]:
     if kind == "mcap":
-        from sliplens.recordings.writers.mcap import write_mcap
+        from sliplens.recordings.formats.mcap import write_mcap
 
         return write_mcap
-    from sliplens.recordings.writers.lerobot import write_lerobot
+    from sliplens.recordings.formats.lerobot_export import write_lerobot
 
     return write_lerobot
 

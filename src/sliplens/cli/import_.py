@@ -10,7 +10,7 @@ import tyro
 from sliplens.cli.console import OUT, say, unchanged, wrote
 from sliplens.cli.labelling import LabelOptions, show_found, summary, write_trials
 from sliplens.errors import InputError
-from sliplens.provenance import output_folder, write_json
+from sliplens.files import output_folder, write_json
 
 if TYPE_CHECKING:
     from sliplens.recordings.capture import Capture
@@ -129,7 +129,7 @@ class Import:
             wrote(self.output / "audit", "a page a trial: look at them before you train")
 
     def _open(self) -> "list[Capture]":
-        from sliplens.recordings.readers import ReadOptions, open_captures
+        from sliplens.recordings.formats import ReadOptions, open_captures
 
         options = ReadOptions(
             forces=self.forces,

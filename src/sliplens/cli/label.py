@@ -10,7 +10,7 @@ import tyro
 from sliplens.cli.console import progress_bar, unchanged, wrote
 from sliplens.cli.labelling import LabelOptions, draw_audit_page, show_found, summary, write_trials
 from sliplens.errors import InputError
-from sliplens.provenance import output_folder, write_json
+from sliplens.files import output_folder, write_json
 
 if TYPE_CHECKING:
     from sliplens.recordings.capture import Capture
@@ -38,8 +38,8 @@ class Label:
     def run(self) -> None:
         """Label anew, write, and show what was found."""
         from sliplens.recordings import Dataset
+        from sliplens.recordings.formats.stored import read_stored
         from sliplens.recordings.importing import About
-        from sliplens.recordings.readers.stored import read_stored
         from sliplens.recordings.splits import SPLITS_FILE
 
         data = Dataset.open(self.data)
@@ -80,7 +80,7 @@ class Label:
     def _audit(self) -> None:
         from sliplens.recordings import Dataset
         from sliplens.recordings.dataset import trial_path
-        from sliplens.recordings.headers import read_labelling
+        from sliplens.recordings.store import read_labelling
 
         data, folder = Dataset.open(self.data), (self.output or self.data) / "audit"
         told = {info.trial: read_labelling(trial_path(self.data, info.trial)) for info in data.trials}

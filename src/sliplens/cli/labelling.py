@@ -76,10 +76,10 @@ def write_trials(
     """Write the trials of a data set that are not there yet; give what the labels of each rest on."""
     import numpy as np
 
+    from sliplens.recordings.capture import forces_path
     from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-    from sliplens.recordings.headers import read_labelling
     from sliplens.recordings.importing import import_trial
-    from sliplens.recordings.samples import forces_path
+    from sliplens.recordings.store import read_labelling
 
     found, table, done = {}, [], 0
     settings = options.settings()
@@ -114,8 +114,8 @@ def write_trials(
 
 def draw_audit_page(trial: Path, picture: Path, labelling: dict[str, Any]) -> None:
     """Draw the page of a trial from which to judge its labels."""
+    from sliplens.plots.audit import write_audit
     from sliplens.recordings.store import load_recording, read_frames
-    from sliplens.report.audit import write_audit
 
     # all numbers, but only the pixels that the page shows: memory stays small however long the trial
     write_audit(load_recording(trial, pixels=False), labelling, picture, read_frames=partial(read_frames, trial))

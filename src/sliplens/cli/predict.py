@@ -10,10 +10,10 @@ from sliplens._version import __version__
 from sliplens.cli.console import OUT, progress_bar, say, wrote
 from sliplens.cli.devices import require_device
 from sliplens.errors import InputError
-from sliplens.provenance import hash_file
+from sliplens.files import hash_file
 
 if TYPE_CHECKING:
-    from sliplens.export.sources import SourceOptions
+    from sliplens.models.sources import SourceOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,11 +57,11 @@ class Predict:
 
     def run(self) -> None:
         """Predict and write."""
-        from sliplens.export import fastest_engine, make_engine
-        from sliplens.export.prediction import write_predictions
-        from sliplens.export.sources import open_source
         from sliplens.models import load_checkpoint
-        from sliplens.models.shipped import find_run
+        from sliplens.models.checkpoint import find_run
+        from sliplens.models.engines import fastest_engine, make_engine
+        from sliplens.models.predict import write_predictions
+        from sliplens.models.sources import open_source
 
         self._check()
         run = find_run(self.model)
@@ -96,8 +96,8 @@ class Predict:
         require_device(self.device)
 
     def _options(self) -> "SourceOptions":
-        from sliplens.export.sources import SourceOptions
-        from sliplens.recordings.readers import ReadOptions
+        from sliplens.models.sources import SourceOptions
+        from sliplens.recordings.formats import ReadOptions
 
         return SourceOptions(
             split=self.split,

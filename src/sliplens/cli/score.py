@@ -8,7 +8,7 @@ import tyro
 
 from sliplens.cli.console import print_table, progress_bar, say, unchanged, wrote
 from sliplens.cli.devices import require_device
-from sliplens.provenance import hash_file, output_folder
+from sliplens.files import hash_file, output_folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,7 @@ class Score:
         """Score and write the curves."""
         from sliplens.faithfulness import get_fill
         from sliplens.models import load_checkpoint
-        from sliplens.models.shipped import find_run
+        from sliplens.models.checkpoint import find_run
         from sliplens.study import load_explained, score_explanations
         from sliplens.study.scoring import require_same_network
 

@@ -9,7 +9,7 @@ import tyro
 from sliplens.cli.console import print_table, progress_bar, unchanged, wrote
 from sliplens.cli.devices import require_device
 from sliplens.errors import InputError
-from sliplens.provenance import output_folder, write_json
+from sliplens.files import output_folder, write_json
 
 if TYPE_CHECKING:
     from sliplens.simulation import SimulationRecipe, TrialPlan
@@ -113,16 +113,16 @@ class Simulate:
     def _require_pictures(self) -> None:
         """Refuse a wrong suffix before anything is simulated."""
         if self.preview is not None:
-            from sliplens.report.pages import require_picture_path
+            from sliplens.plots.layout import require_picture_path
 
             require_picture_path(self.preview, example="sheet.png")
         if self.video is not None:
-            from sliplens.report.clip import require_clip_path
+            from sliplens.plots.clip import require_clip_path
 
             require_clip_path(self.video)
 
     def _draw_preview(self, path: Path, recipe: "SimulationRecipe", plans: "list[TrialPlan]") -> None:
-        from sliplens.report.contact_sheet import write_contact_sheet
+        from sliplens.plots.contact_sheet import write_contact_sheet
         from sliplens.simulation import simulate_trial
 
         recordings = []
@@ -135,7 +135,7 @@ class Simulate:
         wrote(path, f"{len(recordings)} of the trials that this recipe makes")
 
     def _draw_video(self, path: Path, plans: "tuple[TrialPlan, ...]") -> None:
-        from sliplens.report.clip import write_clip
+        from sliplens.plots.clip import write_clip
         from sliplens.simulation import simulate_trial
         from sliplens.simulation.loading import TRIAL_S
 

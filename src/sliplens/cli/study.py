@@ -72,7 +72,7 @@ class Study:
 
     def run(self) -> None:
         """Run every stage that is not there yet, and draw the report."""
-        from sliplens.study.methods import STUDY_METHODS, study_explainers
+        from sliplens.study.material import STUDY_METHODS, study_explainers
 
         if (self.data is None) == (self.preset is None):
             raise InputError("name a data set, or --preset thesis to simulate one")
@@ -113,7 +113,7 @@ class Study:
         """The stages of this study on a data set, with some of its networks."""
         from sliplens.cli.study_stages import Stages
         from sliplens.recordings import Dataset
-        from sliplens.study.methods import STUDY_METHODS, method_options, study_explainers
+        from sliplens.study.material import STUDY_METHODS, method_options, study_explainers
 
         explainers = study_explainers(self.method or STUDY_METHODS, budget=self.budget)
         return Stages(
@@ -137,7 +137,7 @@ class Study:
             If it was trained on another input.
         """
         from sliplens.models import load_checkpoint
-        from sliplens.models.shipped import find_run
+        from sliplens.models.checkpoint import find_run
 
         trained = load_checkpoint(find_run(self._named()[name]), device=self.device)
         if trained.manifest.input != name:

@@ -8,23 +8,28 @@ from typing import Any
 
 from sliplens.cli.screen import Count, Screen, Terminal
 from sliplens.errors import InputError
-from sliplens.explain import Explainer, IntegratedGradients
+from sliplens.explainers import Explainer, IntegratedGradients
 from sliplens.faithfulness.removal import Faithfulness
+from sliplens.files import hash_json, output_folder, read_json, to_jsonable
 from sliplens.models import TrainedModel
-from sliplens.provenance import hash_json, output_folder, read_json, to_jsonable
 from sliplens.recordings import Dataset
 from sliplens.simulation.intervention import rebuild_trial
 from sliplens.study.choice import Choice, choose_frames, load_choice, save_choice
-from sliplens.study.curves import SETTINGS, STUDY_AREAS, Influence, Scoring, influences, score_curves
-from sliplens.study.explaining import explain_frames
-from sliplens.study.frames import frames_at
-from sliplens.study.judging import RANDOMISED, Setting
-from sliplens.study.looks import check_looks
+from sliplens.study.curves import (
+    RANDOMISED,
+    SETTINGS,
+    STUDY_AREAS,
+    Influence,
+    Scoring,
+    Setting,
+    influences,
+    score_curves,
+)
+from sliplens.study.explaining import RESULT_FILE, explain_frames, frames_at, load_explained
+from sliplens.study.map_quality import check_looks
 from sliplens.study.material import Material, gather
-from sliplens.study.remedies import STEPS, score_remedies
-from sliplens.study.sanity import STAGES, check_randomisation, explain_untrained, load_untrained
-from sliplens.study.saved import RESULT_FILE, load_explained
-from sliplens.study.scoring import load_curves, score_explanations
+from sliplens.study.randomisation import STAGES, check_randomisation, explain_untrained, load_untrained
+from sliplens.study.scoring import STEPS, load_curves, score_explanations, score_remedies
 from sliplens.study.states import load_markers, save_states
 from sliplens.study.timing import time_explainers
 from sliplens.study.truth import judge_by_truth, true_curves

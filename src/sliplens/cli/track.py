@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from sliplens.markers.sources import MarkedTrial
-    from sliplens.markers.table import TrackWriter
+    from sliplens.markers.tracks import TrackWriter
 
 _CLIP_RATE_HZ = 25.0
 
@@ -57,10 +57,10 @@ class Track:
 
     def run(self) -> None:
         """Follow and write."""
-        from sliplens.markers.kinds import get_kind
-        from sliplens.markers.opencv import import_cv2
-        from sliplens.markers.table import track_writer
-        from sliplens.report.marker_clip import clip_writer
+        from sliplens.extras import import_cv2
+        from sliplens.markers.detect import get_kind
+        from sliplens.markers.tracks import track_writer
+        from sliplens.plots.clip import clip_writer
 
         self._check()
         get_kind(self.markers)
@@ -98,7 +98,7 @@ class Track:
 
     def _open(self) -> "list[MarkedTrial]":
         from sliplens.markers.sources import open_marked
-        from sliplens.recordings.readers import ReadOptions
+        from sliplens.recordings.formats import ReadOptions
 
         trials = open_marked(
             self.source,

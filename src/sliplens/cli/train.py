@@ -9,13 +9,13 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from sliplens.cli.console import OUT, progress_bar, unchanged, wrote
 from sliplens.cli.training import TrainingJob, choose_trials
-from sliplens.provenance import output_folder, write_json
+from sliplens.files import output_folder, write_json
 
 if TYPE_CHECKING:
     from lightning.pytorch.loggers import Logger
 
-    from sliplens.datasets import FrameSet
     from sliplens.training import TrainProgress
+    from sliplens.training.data import FrameSet
     from sliplens.training.fit import TrainResult
 
 
@@ -78,7 +78,7 @@ class Train:
     def run(self) -> None:
         """Train and write the run; of several processes the first writes and speaks, the others help."""
         from sliplens.models import load_checkpoint
-        from sliplens.models.shipped import find_run
+        from sliplens.models.checkpoint import find_run
         from sliplens.recordings import Dataset
         from sliplens.training import TrainConfig, get_recipe
         from sliplens.training.fit import require_same_kind
@@ -109,8 +109,8 @@ class Train:
             job.follow(folder)
 
     def _lead(self, job: "TrainingJob") -> None:
-        from sliplens.cli.curves import draw_learning_curve
-        from sliplens.training.loggers import open_logger
+        from sliplens.plots.errors import draw_learning_curve
+        from sliplens.training.hardware import open_logger
 
         told = {"input": self.input, "condition": self.condition, "data_hash": job.data.hash}
         if job.start is not None:

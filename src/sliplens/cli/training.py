@@ -13,10 +13,10 @@ from sliplens.errors import RecordingError
 if TYPE_CHECKING:
     from lightning.pytorch.loggers import Logger
 
-    from sliplens.datasets import FrameSet
     from sliplens.models import TrainedModel
     from sliplens.recordings import Dataset, TrialInfo
     from sliplens.training import TrainConfig, TrainProgress
+    from sliplens.training.data import FrameSet
     from sliplens.training.fit import TrainResult
     from sliplens.training.hardware import Hardware
 
@@ -37,7 +37,8 @@ class TrainingJob:
         self, *, scratch: Path, on_trial: Callable[[int, int], None] | None = None
     ) -> tuple["FrameSet", "FrameSet"]:
         """Frames to train and to validate on."""
-        from sliplens.datasets import get_encoding, load_frames
+        from sliplens.models.encodings import get_encoding
+        from sliplens.training.data import load_frames
 
         plan = ((self.train_trials, self.config.untouched_share), (self.validation_trials, 0.0))
         total, loaded = sum(len(trials) for trials, _ in plan), []

@@ -34,9 +34,8 @@ class View:
 
     def run(self) -> None:
         """Open the viewer, or write its file."""
+        from sliplens.plots.viewer import open_viewer, require_rerun, require_rrd_path, write_rrd
         from sliplens.recordings import Dataset
-        from sliplens.report.viewer import open_viewer, write_rrd
-        from sliplens.report.viewer_process import require_rerun, require_rrd_path
 
         require_rerun()
         if self.output is not None:

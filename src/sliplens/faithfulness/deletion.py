@@ -9,8 +9,8 @@ from torch import Tensor
 
 from sliplens.arrays import require_saliency
 from sliplens.errors import InputError
-from sliplens.faithfulness.answering import Predict, Removal, answer_removals, answer_whole
 from sliplens.faithfulness.fills import Fill
+from sliplens.faithfulness.removal import Predict, Removal, answer_removals, answer_whole
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sliplens.faithfulness.looks import stability
+from sliplens.faithfulness.map_quality import stability
 
 Maps = Float[np.ndarray, "images height width"]
 _BINS = 100

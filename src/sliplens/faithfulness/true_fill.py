@@ -12,8 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.faithfulness.answering import Predict, answer_whole
-from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness, RemovalCurves
+from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness, Predict, RemovalCurves, answer_whole
 
 Redraw: TypeAlias = Callable[[int, Bool[np.ndarray, "variants markers"]], Float[Tensor, "variants 3 height width"]]
 """From the number of an image, and the markers that are put back in each variant, to the network's inputs."""

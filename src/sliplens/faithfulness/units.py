@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 
 from sliplens.arrays import require_saliency
 from sliplens.errors import InputError
-from sliplens.explain.occlusion import marker_regions, tile_regions
+from sliplens.explainers.occlusion import marker_regions, tile_regions
 
 Units = Int[np.ndarray, "height width"]
 """Number of the unit that each pixel belongs to, from 0."""

@@ -9,7 +9,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from sliplens.errors import ImageError, InputError
-from sliplens.provenance import require_folder
+from sliplens.files import require_folder
 
 IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"})
 

@@ -1,9 +1,8 @@
 """Markers: found, followed, and what their displacement tells of the grip."""
 
-from sliplens.markers.detect import Markers, detect_markers
+from sliplens.markers.detect import KINDS, Appearance, MarkerKind, Markers, detect_markers
 from sliplens.markers.displacement import DisplacementField, compute_field, interpolate_field
 from sliplens.markers.doublets import Doublets, fit_doublets
-from sliplens.markers.kinds import KINDS, Appearance, MarkerKind
 from sliplens.markers.track import Tracker, track_markers
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame, Tracks
 

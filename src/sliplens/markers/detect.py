@@ -1,15 +1,353 @@
 """Markers of a frame: where they are, how large, and how well they are seen."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from sliplens.errors import ImageError
-from sliplens.markers.appearance import FEWEST, find_appearance, refine_appearance
-from sliplens.markers.kinds import Appearance, MarkerKind, get_kind
-from sliplens.markers.opencv import import_cv2
-from sliplens.markers.refine import Shapes, measure_spots
+from sliplens.errors import ImageError, InputError
+from sliplens.extras import import_cv2
+
+Contrast: TypeAlias = Literal["dark", "light", "colour"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkerKind:
+    """How the markers of a sensor differ from what they are printed on.
+
+    Raises
+    ------
+    InputError
+        If the radii are not a positive low and a larger high, or a channel's weight is negative.
+    """
+
+    name: str
+    contrasts: tuple[Contrast, ...]
+    """How they may stand out; where there are several, the frame decides."""
+    radius_px: tuple[float, float] = (2.0, 40.0)
+    """Smallest and largest radius that is looked for, in pixels."""
+    channels: tuple[float, float, float] | None = None
+    """Weights of red, green and blue, by which centres are measured; found from the markers themselves if None."""
+
+    def __post_init__(self) -> None:
+        """Check what cannot be looked for."""
+        low, high = self.radius_px
+        if not 0 < low < high:
+            raise InputError(f"markers of {self.name} have radii from {low:g} to {high:g} px; give a low and a high")
+        if self.channels is not None and (min(self.channels) < 0 or sum(self.channels) <= 0):
+            raise InputError(f"the channels of {self.name} weigh {self.channels}; give none less than 0, and one more")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Appearance:
+    """How the markers of one sensor look to its camera, as one frame showed it."""
+
+    weights: Float32[np.ndarray, "3"]
+    """Of red, green and blue; their sum is high on a marker, whatever its colour, and in grey levels."""
+    radius_px: float
+    """Median over the markers."""
+    contrast: float
+    """Median over the markers, in weighted grey levels."""
+
+
+KINDS = {
+    "chromatouch": MarkerKind(
+        name="chromatouch",
+        contrasts=("dark",),
+        # red speckles most, and the lamps' glare is blue: green measures best
+        channels=(0.2, 0.8, 0.0),
+    ),
+    "gelsight-mini": MarkerKind(name="gelsight-mini", contrasts=("dark",), channels=(1.0, 1.0, 1.0)),
+    "tactip": MarkerKind(name="tactip", contrasts=("light",), channels=(1.0, 1.0, 1.0)),
+    "auto": MarkerKind(name="auto", contrasts=("dark", "light", "colour")),
+}
+"""Presets by name: the magenta dots of the ChromaTouch, the black ones of a GelSight Mini, the white pins of a TacTip;
+`auto` looks for whatever is round and stands out alike in many places."""
+
+
+def get_kind(name: str) -> MarkerKind:
+    """Preset of a name.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    if name not in KINDS:
+        raise InputError(f"markers {name!r} are not known; choose {', '.join(KINDS)}")
+    return KINDS[name]
+
+
+FEWEST = 4
+"""Markers without which a pattern cannot be told from dirt."""
+_BRIGHT, _DARK, _EXPOSED = 250, 5, 0.5
+_GREY = np.array([1, 1, 1], dtype=np.float32) / 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Spots:
+    """Round spots that stand out in one way."""
+
+    labels: Int[np.ndarray, "height width"]
+    """Number of the component that each pixel belongs to."""
+    chosen: Int[np.ndarray, " spots"]
+    """Components that are round."""
+    radius_px: float
+    score: float
+    """How well they agree with markers: many, alike, and little else."""
+
+
+def find_appearance(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind) -> Appearance:
+    """Find the colour, size and contrast of a frame's markers.
+
+    Spots are what passes Otsu's threshold over the local background; those that are round and of one size tell the
+    colour in which markers differ from what surrounds them. Its direction is the weight of the channels, unless the
+    kind names them.
+
+    Parameters
+    ----------
+    frame
+        Of the untouched sensor, or nearly so: RGB.
+    kind
+        What to look for.
+
+    Raises
+    ------
+    ImageError
+        If the frame is over- or underexposed, or fewer than 4 round spots are found.
+    """
+    _require_exposed(frame)
+    tries: list[tuple[Contrast, _Spots]] = [
+        (contrast, spots) for contrast in kind.contrasts if (spots := _find_spots(frame, kind, contrast))
+    ]
+    if not tries:
+        raise ImageError(
+            f"fewer than {FEWEST} markers of kind {kind.name} were found in a frame of {frame.shape[0]} x "
+            f"{frame.shape[1]} pixels; name another kind, or use a frame in which the markers are seen"
+        )
+    contrast, spots = max(tries, key=lambda one: one[1].score)
+    weights = _weights(frame, spots, kind, contrast)
+    signal = frame.astype(np.float32) @ weights
+    inside = np.isin(spots.labels, spots.chosen)
+    level = float(np.median(signal[inside]) - np.median(signal[spots.labels == 0]))
+    # spots end where they pass the threshold, markers where half of their contrast is left: measured when refined
+    return Appearance(weights=weights, radius_px=spots.radius_px, contrast=max(level, 1.0))
+
+
+def refine_appearance(
+    appearance: Appearance, *, radius_px: Float[np.ndarray, " markers"], contrast: Float[np.ndarray, " markers"]
+) -> Appearance:
+    """Correct a first impression by what was measured on the markers themselves."""
+    return replace(appearance, radius_px=float(np.median(radius_px)), contrast=float(np.median(contrast)))
+
+
+def _require_exposed(frame: UInt8[np.ndarray, "height width 3"]) -> None:
+    for what, share in (
+        ("saturated", np.mean(frame.min(axis=-1) >= _BRIGHT)),
+        ("black", np.mean(frame.max(axis=-1) <= _DARK)),
+    ):
+        if share > _EXPOSED:
+            raise ImageError(
+                f"{100 * share:.0f} % of the frame is {what}, so that no marker can be told; mend the exposure or name "
+                "another frame"
+            )
+
+
+def _find_spots(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind, contrast: Contrast) -> _Spots | None:
+    cv2 = import_cv2()
+    height, width = frame.shape[:2]
+    pixels = frame.astype(np.float32)
+    # odd, and wide enough that markers make up little of what they are compared with
+    side = 2 * (min(height, width) // 6) + 1
+    if contrast == "colour":
+        chroma = np.stack([pixels[..., 0] - pixels[..., 1], pixels[..., 2] - pixels[..., :2].mean(axis=-1)], axis=-1)
+        chroma = cv2.GaussianBlur(chroma, (0, 0), 1.0)
+        over = np.linalg.norm(chroma - cv2.blur(chroma, (side, side)), axis=-1)
+    else:
+        grey = cv2.GaussianBlur(pixels @ _GREY, (0, 0), 0.8)
+        over = (grey - cv2.blur(grey, (side, side))) * (1 if contrast == "light" else -1)
+    over = np.maximum(over, 0)
+    top = float(np.percentile(over, 99.5))
+    if top < 4:  # grey levels: less is noise
+        return None
+    scaled = np.minimum(over * (255 / top), 255).astype(np.uint8)
+    _, mask = cv2.threshold(scaled, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
+    if count <= FEWEST:
+        return None
+    round_ones = _round(stats, kind, (height, width))
+    if round_ones.sum() < FEWEST:
+        return None
+    area = stats[:, cv2.CC_STAT_AREA].astype(float)
+    # weighed by area: specks are many, and small
+    alike = round_ones & (np.abs(np.log(area / _weighted_median(area[round_ones]))) < np.log(2.5))
+    chosen = np.flatnonzero(alike)
+    if len(chosen) < FEWEST:
+        return None
+    spread = float(np.std(np.log(area[chosen])))
+    share = float(area[chosen].sum() / area[1:].sum())
+    outstanding = float(np.median(over[np.isin(labels, chosen)]) / (np.median(over[mask == 0]) + 1))
+    return _Spots(
+        labels=labels.astype(np.int64),
+        chosen=chosen,
+        radius_px=float(np.sqrt(np.median(area[chosen]) / np.pi)),
+        score=np.sqrt(len(chosen)) * share * outstanding / (0.1 + spread),
+    )
+
+
+def _round(stats: np.ndarray, kind: MarkerKind, size: tuple[int, int]) -> Bool[np.ndarray, " components"]:
+    left, top, width, height, area = stats[:, :5].astype(float).T
+    radius = np.sqrt(area / np.pi)
+    low, high = kind.radius_px
+    inside = (left > 0) & (top > 0) & (left + width < size[1]) & (top + height < size[0])
+    fill = area / (width * height)
+    shape = (np.maximum(width, height) < 1.7 * np.minimum(width, height)) & (fill > 0.55) & (fill < 0.95)
+    return inside & shape & (radius >= low) & (radius <= min(high, min(size) / 8)) & (np.arange(len(stats)) > 0)
+
+
+def _weighted_median(area: Float[np.ndarray, " spots"]) -> float:
+    order = np.sort(area)
+    return float(order[np.searchsorted(np.cumsum(order), order.sum() / 2)])
+
+
+def _weights(
+    frame: UInt8[np.ndarray, "height width 3"], spots: _Spots, kind: MarkerKind, contrast: Contrast
+) -> Float32[np.ndarray, "3"]:
+    cv2 = import_cv2()
+    if kind.channels is not None and contrast != "colour":
+        weights = np.array(kind.channels) / sum(kind.channels)
+        return (weights if contrast == "light" else -weights).astype(np.float32)
+    core = np.isin(spots.labels, spots.chosen).astype(np.uint8)
+    reach = 2 * round(spots.radius_px) + 1
+    near = cv2.dilate(core, np.ones((reach, reach), np.uint8)) > 0
+    around = near & (spots.labels == 0)
+    colour = np.median(frame[core > 0], axis=0) - np.median(frame[around], axis=0)
+    if contrast == "colour":
+        # shadows change the brightness alone: what is left tells markers from them
+        colour = colour - colour.mean()
+    # a step from background to marker keeps its size in grey levels
+    return (colour / np.abs(colour).sum()).astype(np.float32)
+
+
+_INNER, _OUTER = 1.55, 2.1  # radii of the ring in which the background is seen
+_CORE = 0.5  # radii, of what is surely marker
+_REACH = 1.6  # radii, beyond which nothing belongs to the marker
+_LOW, _HIGH = 0.25, 0.75  # of the contrast: below is background, above marker, however it speckles
+_ROUNDS = 3  # of moving the window onto what it found
+_SLOPE_SHARE = 0.5  # of the contrast that the background may change by across a radius
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shapes:
+    """What was measured on spots."""
+
+    centre_px: Float[np.ndarray, "spots 2"]
+    radius_px: Float[np.ndarray, " spots"]
+    contrast: Float[np.ndarray, " spots"]
+    roundness: Float[np.ndarray, " spots"]
+    """Shorter over longer axis, 1 for a disc."""
+    noise: Float[np.ndarray, " spots"]
+    """Standard deviation of the background around it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Window:
+    """What windows of one size share; pixels in one row."""
+
+    half: int
+    x: Float32[np.ndarray, " pixels"]
+    y: Float32[np.ndarray, " pixels"]
+    ring: Bool[np.ndarray, " pixels"]
+    means: Float32[np.ndarray, "pixels 4"]
+    """Averages over the ring (level, slope along x, slope along y) and over the core."""
+    plane: Float32[np.ndarray, "3 pixels"]
+    """1, x and y."""
+    moments: Float32[np.ndarray, "pixels 6"]
+    """1, x, y, x^2, y^2 and xy."""
+
+
+@lru_cache(maxsize=32)
+def _window(radius_px: float) -> _Window:
+    half = int(np.ceil(_OUTER * radius_px))
+    y, x = (axis.ravel().astype(np.float32) for axis in np.mgrid[-half : half + 1, -half : half + 1])
+    distance = np.hypot(x, y)
+    ring, core = (distance > _INNER * radius_px) & (distance < _OUTER * radius_px), distance <= _CORE * radius_px
+    means = [ring / ring.sum(), ring * x / (x[ring] @ x[ring]), ring * y / (y[ring] @ y[ring]), core / core.sum()]
+    one = np.ones_like(x)
+    return _Window(
+        half=half,
+        x=x,
+        y=y,
+        ring=ring,
+        means=np.stack(means, axis=1).astype(np.float32),
+        plane=np.stack([one, x, y]),
+        moments=np.stack([one, x, y, x * x, y * y, x * y], axis=1),
+    )
+
+
+def measure_spots(
+    signal: Float32[np.ndarray, "height width"], near_px: Float[np.ndarray, "spots 2"], *, radius_px: float
+) -> Shapes:
+    """Measure the spots near some places: centroid and area of what passes half of the contrast.
+
+    The background is a plane, fitted in a ring around each spot. A pixel counts as marker from a quarter (not at all)
+    to three quarters (wholly) of the contrast: so speckle inside a marker does not move its centre, while its edge
+    still does by fractions of a pixel.
+
+    Parameters
+    ----------
+    signal
+        High on markers.
+    near_px
+        x, y of each spot, to about a third of a radius.
+    radius_px
+        About how large they are.
+    """
+    window = _window(round(max(radius_px, 1.5), 1))
+    height, width = signal.shape
+    pad = window.half + 1
+    padded = np.pad(signal, pad, mode="edge")
+    whole = np.clip(np.round(near_px), 0, (width - 1, height - 1)).astype(np.int64)
+    patches = _cut(padded, whole, window, pad)
+    level, slope_x, slope_y, core = (patches @ window.means).T
+    contrast = core - level
+    limit = _SLOPE_SHARE * np.abs(contrast) / radius_px
+    slopes = np.stack([level, np.clip(slope_x, -limit, limit), np.clip(slope_y, -limit, limit)], axis=1)
+    patches -= slopes @ window.plane
+    noise = patches[:, window.ring].std(axis=1)
+    patches *= (1 / ((_HIGH - _LOW) * np.where(contrast > 1e-3, contrast, 1e-3)))[:, None]
+    patches -= np.float32(_LOW / (_HIGH - _LOW))
+    share = np.clip(patches, 0, 1, out=patches)
+    offset = np.zeros((len(whole), 2), dtype=np.float32)
+    moments = np.ones((len(whole), 6), dtype=np.float32)
+    for _ in range(_ROUNDS):
+        x, y = window.x - offset[:, :1], window.y - offset[:, 1:]
+        near = np.sqrt(x * x + y * y)
+        part = share * np.clip(np.subtract(_REACH * radius_px + 0.5, near, out=near), 0, 1, out=near)
+        moments = part @ window.moments
+        moments[:, 1:] /= np.maximum(moments[:, :1], 1e-6)
+        offset = moments[:, 1:3]
+    mass, mean_x, mean_y, mean_xx, mean_yy, mean_xy = moments.T
+    spread_x, spread_y = mean_xx - mean_x**2, mean_yy - mean_y**2
+    middle, half = (spread_x + spread_y) / 2, np.hypot((spread_x - spread_y) / 2, mean_xy - mean_x * mean_y)
+    return Shapes(
+        centre_px=(whole + offset).astype(np.float64),
+        radius_px=np.sqrt(mass / np.pi).astype(np.float64),
+        contrast=contrast.astype(np.float64),
+        roundness=np.sqrt(np.clip((middle - half) / np.maximum(middle + half, 1e-9), 0, 1)).astype(np.float64),
+        noise=noise.astype(np.float64),
+    )
+
+
+def _cut(
+    padded: Float32[np.ndarray, "rows columns"], whole: Int[np.ndarray, "spots 2"], window: _Window, pad: int
+) -> Float32[np.ndarray, "spots pixels"]:
+    steps = np.arange(-window.half, window.half + 1) + pad
+    rows, columns = whole[:, 1, None] + steps, whole[:, 0, None] + steps
+    return padded[rows[:, :, None], columns[:, None, :]].reshape(len(whole), (2 * window.half + 1) ** 2)
+
 
 _SMALL_RADIUS = 3.0  # pixels: spots are looked for in frames reduced so far, and measured in the frame itself
 _LEAST_RESPONSE = 0.15  # of the markers' own

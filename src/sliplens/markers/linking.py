@@ -3,10 +3,201 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from sliplens.markers.matching import Pairing, likely_shifts, pair
-from sliplens.markers.neighbours import Neighbours, predict_from_neighbours
+_NEIGHBOURS = 8
+_FEWEST = 3
+_STIFFNESS = 0.3  # of the prior that holds slopes down where few neighbours are left
+
+
+@dataclass(frozen=True, kw_only=True)
+class Neighbours:
+    """The nearest markers of each marker at rest."""
+
+    index: Int[np.ndarray, "markers neighbours"]
+    offset: Float[np.ndarray, "markers neighbours 2"]
+    """From the marker, over the pitch."""
+    pitch_px: Float[np.ndarray, " markers"]
+    """Distance of the nearest one."""
+
+
+def find_neighbours(place_px: Float[np.ndarray, "markers 2"]) -> Neighbours:
+    """Find the nearest eight markers of each, or all others where there are fewer.
+
+    Parameters
+    ----------
+    place_px
+        x, y of at least two markers.
+    """
+    distance = np.linalg.norm(place_px[:, None] - place_px[None], axis=-1)
+    np.fill_diagonal(distance, np.inf)
+    count = min(_NEIGHBOURS, len(place_px) - 1)
+    index = np.argsort(distance, axis=1, kind="stable")[:, :count]
+    pitch = distance.min(axis=1)
+    offset = (place_px[index] - place_px[:, None]) / pitch[:, None, None]
+    return Neighbours(index=index, offset=offset, pitch_px=pitch)
+
+
+def predict_from_neighbours(
+    neighbours: Neighbours, displacement_px: Float[np.ndarray, "markers 2"], known: Bool[np.ndarray, " markers"]
+) -> Float[np.ndarray, "markers 2"]:
+    """Displacement of each marker as its neighbours alone tell it, in pixels.
+
+    A plane through the known neighbours' displacements, the near ones weighing most, its slopes held down a little;
+    NaN where fewer than three neighbours are known.
+
+    Parameters
+    ----------
+    neighbours
+        Of the markers at rest.
+    displacement_px
+        x, y of each marker; what is not known may be NaN.
+    known
+        Which markers may be believed.
+    """
+    usable = known[neighbours.index]
+    values = np.where(usable[..., None], displacement_px[neighbours.index], 0.0)
+    squared = (neighbours.offset**2).sum(axis=-1)
+    weight = np.where(usable, np.exp(-squared / (2 * 1.5**2)), 0.0)
+    terms = np.concatenate([np.ones((*weight.shape, 1)), neighbours.offset], axis=-1)
+    weighted = terms * weight[..., None]
+    normal = np.swapaxes(weighted, 1, 2) @ terms
+    normal[:, [1, 2], [1, 2]] += _STIFFNESS * 0.1
+    normal[:, 0, 0] += 1e-9  # a marker without neighbours is answered below
+    fit = np.linalg.solve(normal, np.swapaxes(weighted, 1, 2) @ values)
+    return np.where(usable.sum(axis=1)[:, None] >= _FEWEST, fit[:, 0], np.nan)
+
+
+GATE = 0.45
+"""Pitches, within which a marker may be taken for the one predicted: less than half, so that no other is nearer."""
+_VOTES = 6  # shifts that are looked at
+_FURTHEST = 5.0  # pitches
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pairing:
+    """Found spots for predicted markers."""
+
+    spot: Int[np.ndarray, " markers"]
+    """Which spot each marker is; -1 for none."""
+    support: float
+    """Share of the markers expected in view that have a spot."""
+    spread_px: float
+    """How unlike steps are where they are most alike: a touch bends the skin in places, a wrong match spoils all. The
+    lower quartile of the steps' distances from what their neighbours' steps say, or the lower fifth of those from the
+    commonest step, whichever is less."""
+    step_px: Float[np.ndarray, "markers 2"]
+    """From where each was; NaN without a spot."""
+
+    @property
+    def paired(self) -> Bool[np.ndarray, " markers"]:
+        """Markers with a spot."""
+        return self.spot >= 0
+
+
+def pair(
+    predicted_px: Float[np.ndarray, "markers 2"],
+    found_px: Float[np.ndarray, "spots 2"],
+    *,
+    from_px: Float[np.ndarray, "markers 2"],
+    neighbours: Neighbours,
+    expected: Bool[np.ndarray, " markers"],
+) -> Pairing:
+    """Pair markers and spots that are nearest to each other, and that lead back to where they came from.
+
+    Forward: a marker's spot is the nearest to its predicted place, and the marker the nearest to the spot, less than
+    0.45 of the pitch away. Backward: the spot, moved back by the step that the marker's neighbours made, must lie less
+    than 0.45 of the pitch from this marker's own place.
+
+    Parameters
+    ----------
+    predicted_px
+        Where each marker is expected; NaN if nowhere.
+    found_px
+        What was found.
+    from_px
+        Where each marker was before; NaN where it was not seen.
+    neighbours
+        Of the markers at rest.
+    expected
+        Markers that should be in view.
+    """
+    spot = _mutual(predicted_px, found_px, reach_px=GATE * neighbours.pitch_px)
+    step = np.full(predicted_px.shape, np.nan)
+    if len(found_px):
+        step = np.where(spot[:, None] >= 0, found_px[spot] - from_px, np.nan)
+    known = np.all(np.isfinite(step), axis=1)
+    told = predict_from_neighbours(neighbours, step, known)
+    error = np.linalg.norm(step - told, axis=1)
+    astray = error > GATE * neighbours.pitch_px
+    spot, step = np.where(astray, -1, spot), np.where(astray[:, None], np.nan, step)
+    error = error[np.isfinite(error) & ~astray]
+    bent = float(np.quantile(error, 0.25)) if len(error) else np.inf
+    seen = expected & (spot >= 0)
+    return Pairing(
+        spot=spot,
+        support=float(seen.sum() / max(1, expected.sum())),
+        spread_px=min(bent, _from_commonest(step[np.all(np.isfinite(step), axis=1)])),
+        step_px=step,
+    )
+
+
+def _from_commonest(steps: Float[np.ndarray, "steps 2"]) -> float:
+    """Lower fifth of the steps' distances from the commonest one: the skin far from a touch moves as one."""
+    if not len(steps):
+        return np.inf
+    apart = np.hypot(*np.moveaxis(steps[:, None] - steps[None], -1, 0))
+    fifth = int(0.2 * (len(steps) - 1))
+    return float(np.partition(apart, fifth, axis=1)[:, fifth].min())
+
+
+def _mutual(
+    predicted_px: Float[np.ndarray, "markers 2"],
+    found_px: Float[np.ndarray, "spots 2"],
+    *,
+    reach_px: Float[np.ndarray, " markers"],
+) -> Int[np.ndarray, " markers"]:
+    if not len(found_px):
+        return np.full(len(predicted_px), -1)
+    distance = np.linalg.norm(predicted_px[:, None] - found_px[None], axis=-1)
+    distance = np.where(np.isfinite(distance), distance, np.inf)
+    nearest = distance.argmin(axis=1)
+    back = distance.argmin(axis=0)
+    markers = np.arange(len(predicted_px))
+    good = (back[nearest] == markers) & (distance[markers, nearest] < reach_px)
+    return np.where(good, nearest, -1)
+
+
+def likely_shifts(
+    places_px: Float[np.ndarray, "markers 2"], found_px: Float[np.ndarray, "spots 2"], *, pitch_px: float
+) -> Float[np.ndarray, "shifts 2"]:
+    """Shifts that bring many markers onto spots at once, most votes first.
+
+    Every pair of marker and spot votes for its difference; votes within a third of the pitch count together.
+    """
+    ways = (found_px[None] - places_px[:, None]).reshape(-1, 2)
+    # longer ones leave hardly any marker in view
+    ways = ways[np.abs(ways).max(axis=1) < _FURTHEST * pitch_px]
+    if not len(ways):
+        return np.zeros((0, 2))
+    cell = pitch_px / 3
+    keys = np.round(ways / cell).astype(np.int64)
+    cells, inverse, votes = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    # a peak may lie on the border of cells: neighbours lend their votes
+    near = (
+        np.abs(cells[:, None] - cells[None]).max(axis=-1) <= 1 if len(cells) < 4000 else np.eye(len(cells), dtype=bool)
+    )
+    total = near @ votes
+    shifts: list[np.ndarray] = []
+    for at in np.argsort(-total, kind="stable"):
+        if len(shifts) == _VOTES:
+            break
+        chosen = near[at][inverse.ravel()]
+        shift = np.median(ways[chosen], axis=0)
+        if all(np.linalg.norm(shift - other) > 0.5 * pitch_px for other in shifts):
+            shifts.append(shift)
+    return np.array(shifts)
+
 
 _CALM_STEP = 0.2  # pitches: a larger step may be one the other way round a regular grid
 _CALM_SPREAD = 2.5  # times the usual one
@@ -139,3 +330,143 @@ def _pair(
 
 def _in_view(place_px: Float[np.ndarray, "markers 2"], size: tuple[int, int]) -> Bool[np.ndarray, " markers"]:
     return np.all((place_px >= 0) & (place_px <= np.array([size[1] - 1, size[0] - 1])), axis=1)
+
+
+_STRAY_PITCHES, _STRAY_SPREADS = 0.3, 6.0
+_ROUNDS = 6
+_ADJACENT, _NEAR = 1.6, 2.3  # pitches: next to each other, and so near that they may still contradict each other
+_ALIKE = 0.5  # pitches, of displacement between two that stand together
+_STRAIN = 0.55  # pixels of relative displacement per pixel of distance: more is no skin, but a wrong match
+
+
+def drop_strays(
+    neighbours: Neighbours, shift_px: Float[np.ndarray, "markers 2"], sound: Bool[np.ndarray, " markers"]
+) -> tuple[Bool[np.ndarray, " markers"], Float[np.ndarray, "markers 2"]]:
+    """Drop markers that stray from their neighbours, worst first: one stray makes all round it look astray.
+
+    Parameters
+    ----------
+    neighbours
+        Of the markers at rest.
+    shift_px
+        Displacement of each; NaN where it has none.
+    sound
+        Which may be believed so far.
+
+    Returns
+    -------
+    tuple
+        Which may still be believed, and what the neighbours that remain say of each displacement.
+    """
+    sound = sound.copy()
+    told = predict_from_neighbours(neighbours, shift_px, sound)
+    while True:
+        error = np.where(sound, np.linalg.norm(shift_px - told, axis=1), np.nan)
+        if not np.isfinite(error).any():
+            return sound, told
+        limit = np.maximum(_STRAY_PITCHES * neighbours.pitch_px, _STRAY_SPREADS * np.nanmedian(error))
+        excess = np.nan_to_num(error / limit)
+        if excess.max() <= 1:
+            return sound, told
+        # several at a time where they are no neighbours of each other
+        sound &= ~((excess > 1) & (excess >= excess[neighbours.index].max(axis=1)))
+        told = predict_from_neighbours(neighbours, shift_px, sound)
+
+
+def drop_contradicting(
+    neighbours: Neighbours, shift_px: Float[np.ndarray, "markers 2"], sound: Bool[np.ndarray, " markers"]
+) -> Bool[np.ndarray, " markers"]:
+    """Drop groups that agree among themselves but contradict the largest group.
+
+    A part of a grid that moved by most of a pitch is matched wrongly as a whole: no marker in it strays from the next.
+    But where it meets the rest, the skin would have to be torn or folded.
+
+    Parameters
+    ----------
+    neighbours
+        Of the markers at rest.
+    shift_px
+        Displacement of each; NaN where it has none.
+    sound
+        Which may be believed so far.
+    """
+    both = sound[:, None] & sound[neighbours.index]
+    apart = np.linalg.norm(neighbours.offset, axis=-1)
+    relative = np.linalg.norm(shift_px[neighbours.index] - shift_px[:, None], axis=-1) / neighbours.pitch_px[:, None]
+    torn = both & (relative > _STRAIN * apart)
+    against = torn & (apart < _NEAR)
+    if not against.any():
+        return sound
+    joined = both & (relative < _ALIKE) & (apart < _ADJACENT)
+    label = np.arange(len(sound))
+    while True:
+        # each takes the lowest label of its group, until none changes; bonds hold both ways
+        lowest = label.copy()
+        ends = np.where(joined, label[neighbours.index], len(label)).min(axis=1)
+        np.minimum(lowest, ends, out=lowest)
+        np.minimum.at(lowest, neighbours.index[joined], np.broadcast_to(lowest[:, None], joined.shape)[joined])
+        if np.array_equal(lowest, label):
+            break
+        label = lowest
+    largest = np.bincount(label[sound]).argmax()
+    main = label == largest
+    rows, columns = np.nonzero(against)
+    others = neighbours.index[rows, columns]
+    wrong = {int(label[one]) for one, other in zip(rows, others, strict=True) if main[one] != main[other]}
+    wrong |= {int(label[other]) for one, other in zip(rows, others, strict=True) if main[one] != main[other]}
+    return sound & (main | ~np.isin(label, list(wrong)))
+
+
+def match_left_over(
+    neighbours: Neighbours,
+    spot: Int[np.ndarray, " markers"],
+    sound: Bool[np.ndarray, " markers"],
+    told_px: Float[np.ndarray, "markers 2"],
+    *,
+    rest_px: Float[np.ndarray, "markers 2"],
+    found_px: Float[np.ndarray, "spots 2"],
+) -> Int[np.ndarray, " markers"]:
+    """Match markers that are not sound with spots that no sound one has, from known ground outwards.
+
+    Where the skin moves more than half a pitch in one step, the nearest spot is the next marker's. Neighbours still
+    move alike: from those that are sound each marker's place is told, and once it is found it tells of the next.
+
+    Parameters
+    ----------
+    neighbours
+        Of the markers at rest.
+    spot
+        Which spot each marker has; -1 for none.
+    sound
+        Which are believed.
+    told_px
+        Displacement of each as its sound neighbours tell it; NaN where they do not.
+    rest_px, found_px
+        x, y of the markers at rest, and of the spots.
+
+    Returns
+    -------
+    Int[np.ndarray, " markers"]
+        Spots, those of the sound markers as they were.
+    """
+    believed, spot = sound.copy(), np.where(sound, spot, -1)
+    shift = (
+        np.where(sound[:, None], found_px[spot] - rest_px, np.nan) if len(found_px) else np.full_like(rest_px, np.nan)
+    )
+    for _ in range(_ROUNDS):
+        free = np.setdiff1d(np.arange(len(found_px)), spot[believed])
+        open_ones = np.flatnonzero(~believed & np.all(np.isfinite(told_px), axis=1))
+        if not len(free) or not len(open_ones):
+            break
+        places = rest_px[open_ones] + told_px[open_ones]
+        distance = np.linalg.norm(places[:, None] - found_px[free][None], axis=-1)
+        nearest, back = distance.argmin(axis=1), distance.argmin(axis=0)
+        rows = np.arange(len(open_ones))
+        good = (back[nearest] == rows) & (distance[rows, nearest] < GATE * neighbours.pitch_px[open_ones])
+        if not good.any():
+            break
+        taken = open_ones[good]
+        spot[taken], believed[taken] = free[nearest[good]], True
+        shift[taken] = found_px[spot[taken]] - rest_px[taken]
+        told_px = predict_from_neighbours(neighbours, shift, believed)
+    return spot

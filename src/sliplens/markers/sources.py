@@ -15,8 +15,8 @@ from sliplens.images.files import IMAGE_SUFFIXES
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import DATASET_FILE, trial_path
-from sliplens.recordings.readers import ReadOptions, open_captures
-from sliplens.recordings.readers.image_frames import read_frame
+from sliplens.recordings.formats import ReadOptions, open_captures
+from sliplens.recordings.formats.images import read_frame
 from sliplens.recordings.store import load_recording, stream_frames
 
 Frame = UInt8[np.ndarray, "height width 3"]

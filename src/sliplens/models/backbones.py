@@ -1,10 +1,112 @@
 """Backbones: any TorchVision classifier, with the outputs that its head needs."""
 
+import math
+
+import torch
 import torchvision
-from torch import nn
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
 
 from sliplens.errors import ModelError
-from sliplens.models.heads import HistogramRegressor, head_outputs
+
+BINS = 60
+LOWEST, HIGHEST = -0.1, 1.1
+"""Of the histogram: beyond [0, 1] by what a label's own width needs, so that its mean is not pulled inwards."""
+_WIDTH_RATIO = 0.75
+"""Standard deviation of a label over the width of a bin, as Farebrother et al. recommend."""
+
+
+class HistogramRegressor(nn.Module):
+    """A network whose answer is a histogram over the safety margin; it returns the mean (HL-Gauss).
+
+    Parameters
+    ----------
+    backbone
+        Takes (batch, 3, height, width) and returns (batch, `bins`) logits.
+    bins, lowest, highest
+        Bins of one width, and the margins between which they lie.
+
+    References
+    ----------
+    Imani & White, *Improving Regression Performance with Distributional Losses* (2018); Farebrother et al., *Stop
+    Regressing* (2024), whose width of a label is taken.
+    """
+
+    edges: Tensor
+    temperature: Tensor
+
+    def __init__(
+        self, backbone: nn.Module, *, bins: int = BINS, lowest: float = LOWEST, highest: float = HIGHEST
+    ) -> None:
+        super().__init__()
+        self.backbone = backbone
+        self.register_buffer("edges", torch.linspace(lowest, highest, bins + 1))
+        self.register_buffer("temperature", torch.tensor(1.0))
+
+    @property
+    def centres(self) -> Float[Tensor, " bins"]:
+        """Margins in the middle of the bins."""
+        return (self.edges[1:] + self.edges[:-1]) / 2
+
+    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch 1"]:
+        """Mean of the distribution: the safety margin."""
+        return (self.probabilities(images) @ self.centres)[:, None]
+
+    def probabilities(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch bins"]:
+        """Distribution over the bins, at the temperature that was fitted."""
+        return torch.softmax(self.backbone(images) / self.temperature, dim=-1)
+
+    def loss(
+        self, images: Float[Tensor, "batch 3 height width"], labels: Float[Tensor, " batch"]
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, " batch"]]:
+        """Cross-entropy against each label as a Gaussian of the bins' width, and the margins that were told."""
+        logits = self.backbone(images).float()
+        loss = functional.cross_entropy(logits, histogram_targets(labels, self.edges))
+        return loss, torch.softmax(logits / self.temperature, dim=-1) @ self.centres
+
+
+def histogram_targets(margins: Float[Tensor, " batch"], edges: Float[Tensor, " edges"]) -> Float[Tensor, "batch bins"]:
+    """Share of a Gaussian round each label that falls into each bin; each row sums to 1.
+
+    Parameters
+    ----------
+    margins
+        Labels.
+    edges
+        Of bins of one width, rising.
+    """
+    sigma = _WIDTH_RATIO * (edges[1] - edges[0])
+    below = 0.5 * (1 + torch.erf((edges - margins[:, None]) / (math.sqrt(2) * sigma)))
+    return (below[:, 1:] - below[:, :-1]) / (below[:, -1:] - below[:, :1])
+
+
+def margin_loss(
+    model: nn.Module, images: Float[Tensor, "batch 3 height width"], labels: Float[Tensor, " batch"]
+) -> tuple[Float[Tensor, ""], Float[Tensor, " batch"]]:
+    """What a training makes small, cross-entropy for a histogram, else the mean squared error; and what was told."""
+    if isinstance(model, HistogramRegressor):
+        return model.loss(images, labels)
+    margins = model(images).reshape(len(images)).float()
+    return functional.mse_loss(margins, labels), margins
+
+
+HEADS = {"point": 1, "histogram": BINS}
+"""Outputs of the backbone by head."""
+
+
+def head_outputs(head: str) -> int:
+    """Outputs that a head needs of its backbone.
+
+    Raises
+    ------
+    ModelError
+        If there is no head of that name; the message lists those there are.
+    """
+    if head not in HEADS:
+        raise ModelError(f"there is no head named {head!r}; choose one of {', '.join(HEADS)}")
+    return HEADS[head]
+
 
 DEFAULT_BACKBONE = "shufflenet_v2_x1_0"
 

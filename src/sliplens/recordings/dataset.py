@@ -8,12 +8,10 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from sliplens.errors import RecordingError
-from sliplens.provenance import hash_file, hash_json, read_json, require_folder, write_json
-from sliplens.recordings.headers import read_header
-from sliplens.recordings.parquet import reading
-from sliplens.recordings.recording import Recording
-from sliplens.recordings.samples import forces_path
-from sliplens.recordings.store import SCHEMA_VERSION, load_recording
+from sliplens.files import hash_file, hash_json, read_json, require_folder, write_json
+from sliplens.recordings.capture import forces_path
+from sliplens.recordings.store import SCHEMA_VERSION, load_recording, read_header, reading
+from sliplens.recordings.trial import Recording
 
 DATASET_FILE = "dataset.json"
 

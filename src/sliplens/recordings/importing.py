@@ -11,9 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.capture import Capture, Forces
-from sliplens.recordings.given import GIVEN_SIGNALS, GivenLabels
-from sliplens.recordings.headers import OBJECT, require_labelling
+from sliplens.recordings.capture import GIVEN_SIGNALS, Capture, Forces, GivenLabels, save_forces
 from sliplens.recordings.labels import (
     Labels,
     LabelSettings,
@@ -22,8 +20,7 @@ from sliplens.recordings.labels import (
     label_trial,
     measure_motion,
 )
-from sliplens.recordings.samples import save_forces
-from sliplens.recordings.store import encode_frames, write_trial
+from sliplens.recordings.store import OBJECT, encode_frames, require_labelling, write_trial
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,19 +8,17 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from sliplens.errors import InputError
-from sliplens.report.drawing import Picture, draw_picture
-from sliplens.report.overlay import plot_colour_bar
-from sliplens.report.pages import written_whole
-from sliplens.report.records import Run
+from sliplens.plots.layout import Picture, draw_picture, written_whole
+from sliplens.plots.saliency import plot_colour_bar
+from sliplens.plots.style import input_name, method_name, source_name
 from sliplens.report.results import READERS, load_results
 from sliplens.report.sections import Section, build_sections
-from sliplens.report.study.believing import judge_study
-from sliplens.report.study.evidence import tell_interval
+from sliplens.report.study.believing import judge_study, tell_interval
 from sliplens.report.study.plates import FOLDER, Plate, write_plates
 from sliplens.report.study.sections import build_study_page
-from sliplens.report.style import input_name, method_name, source_name
 from sliplens.report.verdict import Statement, judge
 from sliplens.report.workspace import Results
+from sliplens.results.records import Run
 
 _TEMPLATE = "report.html.j2"
 

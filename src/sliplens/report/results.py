@@ -5,16 +5,18 @@ from pathlib import Path
 from typing import Any
 
 from sliplens.errors import InputError
-from sliplens.provenance import RUN_FILE, read_json, require_folder
-from sliplens.report.fields import Fields
-from sliplens.report.files import (
+from sliplens.files import RUN_FILE, read_json, require_folder
+from sliplens.report.study.readers import STUDY_READERS, gather_study
+from sliplens.report.workspace import Results
+from sliplens.results.fields import Fields
+from sliplens.results.files import (
     read_deletion,
     read_learning_curve,
     read_pictures,
     read_predictions,
     read_saliency,
 )
-from sliplens.report.records import (
+from sliplens.results.records import (
     BinScore,
     ConditionScores,
     Evaluation,
@@ -28,8 +30,6 @@ from sliplens.report.records import (
     SplitCount,
     Training,
 )
-from sliplens.report.study.readers import STUDY_READERS, gather_study
-from sliplens.report.workspace import Results
 
 RESULT_FILE = "result.json"
 

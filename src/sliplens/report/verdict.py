@@ -6,9 +6,7 @@ from typing import Literal
 import numpy as np
 
 from sliplens.intervals import FEWEST_UNITS
-from sliplens.report.compare import agreement, compare_errors
-from sliplens.report.records import Explained, Scored
-from sliplens.report.style import (
+from sliplens.plots.style import (
     CONTROL,
     conditions_in_order,
     decimals,
@@ -19,9 +17,10 @@ from sliplens.report.style import (
     percent,
     source_name,
 )
-from sliplens.report.tables import against_control
+from sliplens.report.tables import against_control, agreement, compare_errors
 from sliplens.report.thesis import NETWORK_PIXELS
 from sliplens.report.workspace import Results
+from sliplens.results.records import Explained, Scored
 
 Tone = Literal["good", "plain", "caution"]
 

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sliplens.report.records import Evaluation, Explained, Run, Scored, Simulation, Training
 from sliplens.report.study.records import Study
+from sliplens.results.records import Evaluation, Explained, Run, Scored, Simulation, Training
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,8 +1,7 @@
 """Simulated trials of a marker-based fingertip, with exact labels."""
 
 from sliplens.simulation.nuisances import Nuisances
-from sliplens.simulation.plan import FrameTotals, SimulationRecipe, TrialPlan, plan_trials
-from sliplens.simulation.presets import PRESETS
+from sliplens.simulation.plan import PRESETS, FrameTotals, SimulationRecipe, TrialPlan, plan_trials
 from sliplens.simulation.sensor import CHROMATOUCH, FLAT_GEL, SENSORS, Sensor
 from sliplens.simulation.stream import SimulatedFrame, SimulatedFrames
 from sliplens.simulation.trials import simulate_dataset, simulate_trial

@@ -10,14 +10,11 @@ from torch import Tensor
 
 from sliplens.mechanics import normal_slope
 from sliplens.simulation.geometry import pixel_grid
-from sliplens.simulation.lighting import brightness, empty_view, haze, relief
 from sliplens.simulation.loading import Loading
-from sliplens.simulation.look import draw_look
 from sliplens.simulation.motion import Motion, move_markers
-from sliplens.simulation.noise import Noise, NoisePicks, pick_noise
 from sliplens.simulation.nuisances import Day, Grasp, Unit
-from sliplens.simulation.rendering import Scene, draw_texture, render
-from sliplens.simulation.sensor import Sensor
+from sliplens.simulation.rendering import Scene, brightness, draw_texture, empty_view, haze, relief, render
+from sliplens.simulation.sensor import Noise, NoisePicks, Sensor, draw_look, pick_noise
 
 _BATCHES = {"cpu": 4, "cuda": 512}
 """Frames drawn at once: few enough for a processor's caches, many enough for a GPU."""

@@ -1,26 +1,31 @@
 """A stored simulated trial made anew, so that markers can be put back while all else, the noise too, stays."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from sliplens._version import __version__
-from sliplens.errors import InputError
-from sliplens.provenance import RUN_FILE, read_json
+from sliplens.errors import ContactError, InputError
+from sliplens.files import RUN_FILE, read_json
 from sliplens.recordings import Recording
 from sliplens.simulation.filming import Film, batches
-from sliplens.simulation.information import Touch
+from sliplens.simulation.information import (
+    MARGIN,
+    Touch,
+    marker_sensitivity,
+    prior_sigma,
+    visible_markers,
+)
 from sliplens.simulation.loading import Loading
-from sliplens.simulation.look import draw_look
-from sliplens.simulation.noise import NoisePicks
 from sliplens.simulation.nuisances import Nuisances
 from sliplens.simulation.plan import FrameTotals, SimulationRecipe, TrialPlan, plan_trials
-from sliplens.simulation.sensor import SENSORS
+from sliplens.simulation.sensor import SENSORS, NoisePicks, draw_look
 from sliplens.simulation.trials import prepare_trial
 
 _ROUNDING = 1
@@ -209,3 +214,91 @@ def marker_outlines(film: Film, frame: int) -> Outlines:
         now_px=film.marker_px[frame],
         now_radius_px=radius(motion.scale[frame], motion.pressure[frame], motion.touch[frame : frame + 1], frame + 1),
     )
+
+
+NOISE_PX = 0.1
+"""Of each coordinate of a marker that is followed in images of this noise, as in docs/limit.md."""
+_NEAREST_END = 0.02
+"""Margins nearer to 0 or 1 are read with the gain of this one, or of one less this: the ends have no derivative."""
+
+
+def reading_gain(
+    jacobian: Float[np.ndarray, "coordinates unknowns"],
+    unknowns: tuple[str, ...],
+    *,
+    noise_px: float,
+    prior: Mapping[str, float],
+) -> Float[np.ndarray, " coordinates"]:
+    """Gain of the best linear estimator of the margin: how far its reading moves with each coordinate, per pixel.
+
+    The margin's row of (J^T J / sigma^2 + diag(1 / prior^2))^-1 J^T / sigma^2: with infinite priors the best linear
+    unbiased estimator, else the posterior mean.
+
+    Parameters
+    ----------
+    jacobian, unknowns
+        Derivatives of the coordinates, as in `Sensitivity`; the margin first.
+    noise_px, prior
+        As for `margin_bound`.
+
+    Raises
+    ------
+    ContactError
+        If the noise or a standard deviation is not positive.
+    """
+    sigma = {MARGIN: np.inf, **prior}
+    if not (noise_px > 0 and min(sigma.values()) > 0):
+        raise ContactError("noise and priors must be positive; leave out of `prior` what is known")
+    kept = [index for index, name in enumerate(unknowns) if name in sigma]
+    # a prior is one more observation
+    rows = np.concatenate([jacobian[:, kept] / noise_px, np.diag([1 / sigma[unknowns[index]] for index in kept])])
+    # metres, radians and shares in one matrix: each in its own unit length
+    scale = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
+    return np.linalg.pinv(rows / scale)[0, : len(jacobian)] / (scale[0] * noise_px)
+
+
+def marker_readings(
+    trial: FilmedTrial, frame: int, *, noise_px: float = NOISE_PX
+) -> tuple[Int[np.ndarray, " markers"], Float[np.ndarray, " markers"]]:
+    """What each marker that lies wholly in the image adds to the best reading of a frame's margin.
+
+    Parameters
+    ----------
+    trial
+        The trial.
+    frame
+        A frame in contact.
+    noise_px
+        Standard deviation of each coordinate, in pixels.
+
+    Returns
+    -------
+    markers, effects
+        Numbers of the markers, and the reading as it is less the reading with that marker put back, in margin units.
+
+    Raises
+    ------
+    ContactError
+        If the frame has no contact.
+    """
+    margin = float(trial.loading.safety_margin[frame])
+    if np.isnan(margin):
+        raise ContactError(
+            f"frame {frame} of {trial.plan.trial} has no contact, and so no margin; choose another frame"
+        )
+    recipe, motion = trial.plan.recipe, trial.film.motion
+    sensitivity = marker_sensitivity(
+        np.array([np.clip(margin, _NEAREST_END, 1 - _NEAREST_END)]),
+        sensor=recipe.sensor,
+        touch=trial.touch(frame),
+        displacement=recipe.resolved_displacement,
+    )
+    gain = reading_gain(
+        sensitivity.jacobian[0],
+        sensitivity.unknowns,
+        noise_px=noise_px,
+        prior=prior_sigma(recipe.nuisances, wet=trial.plan.condition == "wet"),
+    )
+    seen = visible_markers(recipe.sensor)
+    moved = (motion.centres_px[frame] - motion.rest_px)[seen]
+    return seen, (gain.reshape(-1, 2) * moved).sum(axis=1)

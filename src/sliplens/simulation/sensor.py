@@ -1,14 +1,201 @@
 """What is simulated: fingertips with markers, as records."""
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from sliplens.errors import ContactError
 from sliplens.mechanics import reduced_modulus
-from sliplens.simulation.dome import Dome
-from sliplens.simulation.flat_pad import FlatPad
-from sliplens.simulation.geometry import Geometry, require_positive
-from sliplens.simulation.look import MarkerLook, Rgb
-from sliplens.simulation.noise import Noise
+from sliplens.simulation.geometry import Dome, FlatPad, Geometry, require_positive
+from sliplens.simulation.nuisances import Unit
+
+_FIELDS = 32
+_PLAY_PX = 64
+"""How much larger than a frame the fields are: a frame's window lies anywhere in them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise:
+    """Standard deviation of one frame's noise by channel, in grey levels, and its smoothness."""
+
+    background: tuple[float, float, float]
+    marker: tuple[float, float, float]
+    edge: float
+    """How far the noise of a marker's edge, where the video's compression rings, exceeds that inside: at a share s of
+    marker in the pixel the noise has s (1 + edge (1 - s)) of the marker's excess over the background's."""
+    smoothness: float
+    """Weight w of the neighbour's noise in a pixel; the lag-1 correlation is w / (1 + w^2)."""
+    red_in_green: float
+    """Correlation of red and green, which the camera's debayering ties together."""
+    grain: tuple[float, float, float]
+    """Unevenness of the print, which moves with a marker, over its contrast."""
+    ragged_px: tuple[float, float, float]
+    """Unevenness of a marker's edge."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoisePicks:
+    """Which two fields of the bank each frame adds, and where their windows begin (row, column)."""
+
+    field: Int[np.ndarray, "frames 2"]
+    corner: Int[np.ndarray, "frames 2 2"]
+
+    def at(self, frames: slice) -> "NoisePicks":
+        """Picks of some of the frames."""
+        return NoisePicks(field=self.field[frames], corner=self.corner[frames])
+
+
+def pick_noise(frames: int, *, rng: np.random.Generator) -> NoisePicks:
+    """Draw two different fields and their windows for each frame."""
+    first = rng.integers(_FIELDS, size=frames)
+    second = (first + rng.integers(1, _FIELDS, size=frames)) % _FIELDS
+    return NoisePicks(field=np.stack([first, second], axis=-1), corner=rng.integers(_PLAY_PX + 1, size=(frames, 2, 2)))
+
+
+def mix_noise(
+    picks: NoisePicks, *, noise: Noise, image_size_px: int, device: str | torch.device
+) -> Float[Tensor, "3 frames size size"]:
+    """Noise of unit variance for each frame.
+
+    The sum of two windows out of 32 fields repeats after some 10^10 frames, costs two reads and an addition, and is the
+    same on every device.
+
+    Parameters
+    ----------
+    picks
+        From `pick_noise`.
+    noise
+        Its smoothness and the correlation of its channels.
+    image_size_px
+        Height and width of the frames.
+    device
+        Where to compute.
+    """
+    bank = _noise_bank(noise, image_size_px + _PLAY_PX, str(device))
+    return sum(  # pyright: ignore[reportReturnType] - of two tensors, never of none
+        torch.stack(
+            [
+                bank[:, field, row : row + image_size_px, column : column + image_size_px]
+                for field, (row, column) in zip(picks.field[:, part], picks.corner[:, part], strict=True)
+            ],
+            dim=1,
+        )
+        for part in (0, 1)
+    )
+
+
+@lru_cache(maxsize=4)
+def _noise_bank(noise: Noise, side: int, device: str) -> Float[Tensor, "3 fields side side"]:
+    """Fields of variance 1/2, smooth over neighbours, red and green alike in part; always the same ones."""
+    white = np.random.default_rng(0).standard_normal((3, _FIELDS, side + 1, side + 1), dtype=np.float32)
+    rows = white[:, :, :-1] + noise.smoothness * white[:, :, 1:]
+    smooth = rows[..., :-1] + noise.smoothness * rows[..., 1:]
+    smooth /= (1 + noise.smoothness**2) * np.sqrt(2)
+    smooth[1] = noise.red_in_green * smooth[0] + np.sqrt(1 - noise.red_in_green**2) * smooth[1]
+    return torch.from_numpy(smooth).to(device)
+
+
+Rgb: TypeAlias = tuple[float, float, float]
+_NONE: Rgb = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkerLook:
+    """Markers of a sensor, by channel in the order of the image file.
+
+    Raises
+    ------
+    ContactError
+        If a radius or an edge is not positive.
+    """
+
+    radius_px: Rgb
+    """Dye may bleed: a marker wider in red than in blue draws the orange rim of the ChromaTouch's difference images."""
+    edge_px: Rgb
+    """Width of the logistic edge of a marker in focus."""
+    contrast: Rgb
+    """Grey levels by which a marker is darker than the background."""
+    defocus_px: Rgb = _NONE
+    """Width that the untouched gel's defocus adds in quadrature; pressing takes it away."""
+    focus_tilt: tuple[float, float] = (0.0, 0.0)
+    """Growth of the defocus along x and y, per radius of the contact's sphere."""
+    squeeze: Rgb = _NONE
+    """Growth of a marker under the peak pressure of the nominal grasp."""
+    aslant_fade: Rgb = _NONE
+    """Share of its contrast that a marker seen edge-on loses, growing with the squared sine of its slope."""
+    pressed_fade: Rgb = _NONE
+    """Share of its contrast that a marker loses in a nominal contact."""
+
+    def __post_init__(self) -> None:
+        """Check what cannot occur."""
+        for name, values in (("marker radius", self.radius_px), ("marker edge", self.edge_px)):
+            require_positive(
+                {f"{name} in {channel}": one for channel, one in zip(("red", "green", "blue"), values, strict=True)}
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrawnMarkers:
+    """Markers as they are drawn, by frame, marker and channel."""
+
+    radius_px: Float[np.ndarray, "frames markers 3"]
+    edge_px: Float[np.ndarray, "frames markers 3"]
+    """Width of the logistic edge."""
+    contrast: Float[np.ndarray, "frames markers 3"]
+    """Over the sensor's own."""
+
+
+def draw_look(
+    look: MarkerLook,
+    *,
+    geometry: Geometry,
+    unit: Unit,
+    scale: Float[np.ndarray, "frames markers"],
+    pressure: Float[np.ndarray, "frames markers"],
+    touch: Float[np.ndarray, " frames"],
+    blur_px: Float[np.ndarray, " frames"],
+) -> DrawnMarkers:
+    """Look of the markers under a load.
+
+    A pressed marker is paler, for the object behind the thin skin throws light back, and it is sharp: pressing brings
+    the gel into the focus that the untouched one is out of, most in red and to one side of the image. Markers seen
+    aslant are paler, too.
+
+    Parameters
+    ----------
+    look, geometry
+        The sensor's.
+    unit
+        The built sensor's own sizes and contrasts.
+    scale
+        Size of each marker over its size at rest.
+    pressure
+        Pressure over the peak of the nominal grasp's.
+    touch
+        Indentation over that of the nominal grasp; 0 without contact.
+    blur_px
+        Standard deviation of the blur that the trial adds.
+    """
+    rest = geometry.marker_positions()
+    aslant = 1 - geometry.slope_cosine(rest)[:, None] ** 2
+    pressed = np.minimum(touch, 1)[:, None, None]
+    tilt = np.maximum(1 + rest[:, :2] @ np.asarray(look.focus_tilt) / geometry.sphere_radius_m, 0)
+    defocus = (1 - pressed) * tilt[:, None] * np.asarray(look.defocus_px)
+    # the standard deviation of a logistic edge is 1.81 widths
+    blur = blur_px[:, None, None] / 1.81
+    size = geometry.marker_scale() * unit.radius_factor * scale
+    return DrawnMarkers(
+        radius_px=size[..., None] * (1 + pressure[..., None] * np.asarray(look.squeeze)) * np.asarray(look.radius_px),
+        edge_px=np.sqrt(np.asarray(look.edge_px) ** 2 + defocus**2 + blur**2),
+        contrast=unit.contrast_factor[:, None]
+        * (1 - np.asarray(look.aslant_fade) * aslant)
+        * (1 - np.asarray(look.pressed_fade) * pressed),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,8 +9,7 @@ import torch
 from sliplens.errors import InputError
 from sliplens.recordings import Dataset, GroundTruth, Recording
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.headers import read_header
-from sliplens.recordings.store import save_recording
+from sliplens.recordings.store import read_header, save_recording
 from sliplens.simulation.filming import Film, batches, prepare_film
 from sliplens.simulation.loading import Loading, load_grasp
 from sliplens.simulation.nuisances import draw_grasp, draw_unit

@@ -1,8 +1,15 @@
 """The experiment: pick frames, explain them, score the explanations, keep what was found."""
 
-from sliplens.study.explaining import Progress, explain_frames
-from sliplens.study.frames import ChosenFrames, frames_from_dataset, frames_from_folder
-from sliplens.study.saved import Explained, ExplainedFrame, load_explained
+from sliplens.study.explaining import (
+    ChosenFrames,
+    Explained,
+    ExplainedFrame,
+    Progress,
+    explain_frames,
+    frames_from_dataset,
+    frames_from_folder,
+    load_explained,
+)
 from sliplens.study.scoring import ScoreResult, score_explanations
 
 __all__ = [

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from sliplens.errors import InputError, RecordingError
+from sliplens.files import read_json, write_json
 from sliplens.models import TrainedModel
-from sliplens.provenance import read_json, write_json
 from sliplens.recordings import Dataset
-from sliplens.study.frames import DEFAULT_LEVELS, nearest_frame
-from sliplens.study.saved import RESULT_FILE
+from sliplens.study.explaining import DEFAULT_LEVELS, RESULT_FILE, nearest_frame
 
 SCORED_LEVELS = (0.4, 0.2, 0.0)
 """Margins at which the thesis scores: near slip, where there is much to explain."""

@@ -1,22 +1,77 @@
 """What the scores of one network work on: its explanations, what was explained, and the fastest way to ask it."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sliplens.explain import Explainer
-from sliplens.explain.passes import Passes, prepare
+from sliplens.explainers import EXPLAINERS, Explainer, Likeness, PolyCam
 from sliplens.faithfulness.units import Units, marker_units, pixel_units, tile_units
 from sliplens.models import TrainedModel
+from sliplens.models.engines import Passes, prepare
 from sliplens.recordings import Dataset
 from sliplens.study.choice import Pick
-from sliplens.study.frames import frames_at
-from sliplens.study.saved import Explained
+from sliplens.study.explaining import Explained, frames_at, require_methods
 from sliplens.study.states import MarkedFrame, network_places
+
+THESIS_POLY_CAM = "poly-cam-thesis"
+STUDY_METHODS = ("grad-cam", "integrated-gradients", THESIS_POLY_CAM, "poly-cam", "occlusion")
+"""Grad-CAM, Integrated Gradients and Poly-CAM as the thesis ran it; Poly-CAM with the regression score, occlusion."""
+STUDY_BUDGET = 0.15
+"""Share of the channels that Poly-CAM measures at first: more where the map asks for it."""
+_AS_PUBLISHED = Likeness(pearson_r=0.999, top_overlap=0.97)
+"""Of the thesis's map, compared with what was published; its weights are nearly all 1, so that this costs little."""
+
+
+def study_explainers(methods: Sequence[str] = STUDY_METHODS, *, budget: float = STUDY_BUDGET) -> dict[str, Explainer]:
+    """Explainers of a study by name.
+
+    Parameters
+    ----------
+    methods
+        Rows of `EXPLAINERS`, or `poly-cam-thesis`: the public code's score, layers, and the map that the thesis scored.
+    budget
+        Of Poly-CAM, with either score; see `PolyCam`.
+
+    Raises
+    ------
+    InputError
+        If a method is unknown; the message lists those there are.
+    """
+    table = {
+        **EXPLAINERS,
+        "poly-cam": PolyCam(budget=budget),
+        THESIS_POLY_CAM: PolyCam(score="thesis", level=5, budget=budget, likeness=_AS_PUBLISHED),
+    }
+    require_methods(methods, table)
+    return {name: table[name] for name in methods}
+
+
+def as_the_thesis_ran(explainers: Mapping[str, Explainer]) -> dict[str, Explainer]:
+    """The same, but the thesis's Poly-CAM with all its channels: for what it costs, not for what it shows."""
+    return {
+        name: replace(one, budget=1.0) if name == THESIS_POLY_CAM and isinstance(one, PolyCam) else one
+        for name, one in explainers.items()
+    }
+
+
+def method_options(explainers: Mapping[str, Explainer]) -> dict[str, dict[str, Any]]:
+    """Options of each explainer by name: what a map depends on beside the network and the frame."""
+    return {
+        name: {
+            one.name: getattr(explainer, one.name)
+            # a row that an installed package added may be any callable
+            for one in (fields(explainer) if is_dataclass(explainer) else ())
+            # what finds markers is code, not an option
+            if not callable(getattr(explainer, one.name))
+        }
+        for name, explainer in explainers.items()
+    }
+
 
 _TILE_PX = 16
 _PARITY_IMAGES = 4

@@ -11,12 +11,12 @@ import pyarrow.parquet as pq
 from jaxtyping import Float
 
 from sliplens.errors import ImageError, InputError
+from sliplens.files import write_json
 from sliplens.images import absolute_difference, write_png
 from sliplens.markers import track_markers
-from sliplens.provenance import write_json
 from sliplens.recordings import Dataset, Recording
 from sliplens.study.choice import Choice, Pick
-from sliplens.study.saved import RESULT_FILE
+from sliplens.study.explaining import RESULT_FILE
 
 MARKERS_FILE = "markers.parquet"
 

@@ -8,10 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sliplens.provenance import write_json
-from sliplens.study.material import Material
-from sliplens.study.methods import as_the_thesis_ran
-from sliplens.study.saved import RESULT_FILE
+from sliplens.files import write_json
+from sliplens.study.explaining import RESULT_FILE
+from sliplens.study.material import Material, as_the_thesis_ran
 
 _REPEATS, _SLOW_REPEATS, _SLOW_S = 5, 3, 3.0
 

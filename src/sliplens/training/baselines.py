@@ -14,8 +14,7 @@ from sliplens.markers.estimators import FieldTrial, field_trial, get_estimator
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import trial_path
 from sliplens.recordings.store import load_recording, stream_frames
-from sliplens.training.evaluate import RegressionScores, regression_scores
-from sliplens.training.lead_time import LeadTimes, lead_times
+from sliplens.training.evaluate import LeadTimes, RegressionScores, lead_times, regression_scores
 
 _KEYS = ("trial", "condition", "frame", "time_s", "safety_margin")
 

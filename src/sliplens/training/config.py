@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Literal
 
-from sliplens.datasets.augmentation import get_augmentation
 from sliplens.errors import InputError
-from sliplens.models.backbones import DEFAULT_BACKBONE
-from sliplens.models.heads import head_outputs
+from sliplens.models.backbones import DEFAULT_BACKBONE, head_outputs
+from sliplens.training.data import get_augmentation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +25,7 @@ class TrainConfig:
     """Its name, kept in the manifest."""
     backbone: str = DEFAULT_BACKBONE
     head: str = "point"
-    """What the network answers with; see `sliplens.models.heads`."""
+    """What the network answers with; see `sliplens.models.backbones`."""
     image_size: int = 224
     epochs: int = 25
     batch_size: int = 64

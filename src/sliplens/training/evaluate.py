@@ -1,18 +1,142 @@
 """How well a network reads the safety margin: errors by condition and by bins of the margin."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
 from jaxtyping import Bool, Float
 
-from sliplens.datasets import FrameSet
 from sliplens.errors import RecordingError
 from sliplens.models import TrainedModel
-from sliplens.models.checkpoints import Estimate, join_estimates
-from sliplens.training.lead_time import LeadTimes, lead_times
-from sliplens.training.reliability import auroc, coverages
+from sliplens.models.checkpoint import Estimate, join_estimates
+from sliplens.training.data import FrameSet
+
+
+def coverage(
+    low: Float[np.ndarray, " frames"], high: Float[np.ndarray, " frames"], labels: Float[np.ndarray, " frames"]
+) -> float:
+    """Share of the labels that lie in their intervals, ends included."""
+    return float(np.mean((labels >= low) & (labels <= high)))
+
+
+def coverages(
+    estimate: Estimate, labels: Float[np.ndarray, " frames"], rows: Bool[np.ndarray, " frames"]
+) -> dict[str, float]:
+    """Coverage of the intervals of every calibrated level, on some of the frames; empty without a calibration."""
+    if estimate.calibration is None:
+        return {}
+    found = {}
+    for level in estimate.calibration.offsets:
+        interval = estimate.interval(float(level))
+        assert interval is not None
+        found[level] = coverage(interval[0][rows], interval[1][rows], labels[rows])
+    return found
+
+
+def auroc(positive: Float[np.ndarray, " _"], negative: Float[np.ndarray, " _"]) -> float | None:
+    """Area under the receiver operating characteristic: how often a positive scores above a negative; ties count half.
+
+    Parameters
+    ----------
+    positive, negative
+        Scores of the two classes.
+
+    Returns
+    -------
+    float or None
+        0.5 where the scores tell nothing apart; None where a class is empty.
+
+    References
+    ----------
+    Hanley & McNeil, *Radiology* 143 (1982) 29: the area is the Mann-Whitney statistic over the number of pairs.
+    """
+    if not (len(positive) and len(negative)):
+        return None
+    ordered = np.sort(negative)
+    below = np.searchsorted(ordered, positive, side="left")
+    not_above = np.searchsorted(ordered, positive, side="right")
+    return float((below + not_above).mean() / 2 / len(negative))
+
+
+THRESHOLD = 0.2
+"""A margin below it is an alarm: people hold 20 to 40 % above the least force."""
+_FALSE_ABOVE = 2.0
+"""An alarm that begins while the true margin is above so many thresholds is false, not early."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeadTimes:
+    """Warnings before the first gross slip of each trial."""
+
+    trials: int
+    """Trials that slip."""
+    warned: int
+    """Of these, trials with a true alarm before the slip."""
+    median_ms: float | None
+    """From the first true alarm to the slip, over the warned trials; None if there is none."""
+    ideal_ms: float | None
+    """The same for the true margin itself, over the trials that slip."""
+    false_per_minute: float
+    """Alarms that begin while the true margin is above twice the threshold, by the minute of labelled touch."""
+    threshold: float = THRESHOLD
+
+
+def lead_times(
+    trial: Sequence[str],
+    time_s: Float[np.ndarray, " frames"],
+    labels: Float[np.ndarray, " frames"],
+    predictions: Float[np.ndarray, " frames"],
+    *,
+    threshold: float = THRESHOLD,
+) -> LeadTimes:
+    """Measure warnings on the labelled frames of some trials.
+
+    A slip is the first frame of a trial with margin 0; what comes after is left out.
+
+    Parameters
+    ----------
+    trial
+        Name of each frame's trial; the frames of a trial follow each other in time.
+    time_s, labels, predictions
+        Time, true and predicted margin of each frame.
+    threshold
+        A prediction below it is an alarm.
+    """
+    names = np.array(trial)
+    leads, ideals, slips, false, minutes = [], [], 0, 0, 0.0
+    for name in dict.fromkeys(trial):
+        rows = np.flatnonzero(names == name)
+        order = rows[np.argsort(time_s[rows], kind="stable")]
+        slipped = labels[order] <= 0
+        slips_at = int(np.argmax(slipped)) if slipped.any() else None
+        before = order if slips_at is None else order[:slips_at]
+        if not len(before):
+            continue
+        alarms = predictions[before] < threshold
+        begins = np.flatnonzero(alarms & ~np.insert(alarms[:-1], 0, False))
+        is_false = labels[before][begins] > _FALSE_ABOVE * threshold
+        false += int(is_false.sum())
+        minutes += float(time_s[before[-1]] - time_s[before[0]]) / 60
+        if slips_at is None:
+            continue
+        slips += 1
+        slip_s = float(time_s[order[slips_at]])
+        # an alarm that began in vain and never ended is true from where the margin is low on
+        due = alarms & (labels[before] <= _FALSE_ABOVE * threshold)
+        if due.any():
+            leads.append(1e3 * (slip_s - float(time_s[before[np.argmax(due)]])))
+        low = labels[before] < threshold
+        ideals.append(1e3 * (slip_s - float(time_s[before[np.argmax(low)]])) if low.any() else 0.0)
+    return LeadTimes(
+        trials=slips,
+        warned=len(leads),
+        median_ms=float(np.median(leads)) if leads else None,
+        ideal_ms=float(np.median(ideals)) if ideals else None,
+        false_per_minute=false / minutes if minutes > 0 else 0.0,
+        threshold=threshold,
+    )
+
 
 BIN_COUNT = 10
 

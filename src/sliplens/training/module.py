@@ -17,10 +17,10 @@ from pytorch_optimizer import Ranger21
 from torch import Tensor, distributed, nn
 from torchmetrics import MeanSquaredError
 
-from sliplens.datasets import Augmentation
 from sliplens.errors import ModelError
-from sliplens.models.heads import margin_loss
+from sliplens.models.backbones import margin_loss
 from sliplens.training.config import TrainConfig
+from sliplens.training.data import Augmentation
 
 _NAMED_ROWS = 3
 """Frames of a batch that a message names."""

@@ -6,7 +6,7 @@ import pytest
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labels import Found, infer_axes
-from sliplens.recordings.labels.contact import apply_axes, magnitude
+from sliplens.recordings.labels.axes import apply_axes, magnitude
 
 from .conftest import NORMAL_N, TOUCH_S, Trial
 

@@ -6,7 +6,7 @@ import pytest
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labels import ContactForces, Found, ImageMotion, apply_axes, estimate_friction, given_friction
-from sliplens.recordings.labels.change import fit_break
+from sliplens.recordings.labels.friction import fit_break
 
 from .conftest import SLIP_S, STATIC, Trial
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sliplens.recordings.labels import image_motion, measure_motion
-from sliplens.recordings.labels.motion import soften
+from sliplens.recordings.labels.lag import soften
 
 
 @pytest.mark.parametrize("size", [(224, 224), (480, 640), (61, 83), (20, 16)])

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sliplens.recordings.labels.contact import ContactForces, magnitude
+from sliplens.recordings.labels.axes import ContactForces, magnitude
 from sliplens.recordings.labels.smoothing import half_window, mean_force
 
 _NO_FLAG = 1e-6

@@ -9,13 +9,12 @@ from jaxtyping import Bool, Float
 
 from sliplens.errors import RecordingError
 from sliplens.mechanics import safety_margin, stick_ratio
-from sliplens.recordings.labels.axes import ForceAxes
-from sliplens.recordings.labels.contact import ContactForces
+from sliplens.recordings.labels.axes import ContactForces, ForceAxes
 from sliplens.recordings.labels.friction import FrictionEstimate
 from sliplens.recordings.labels.interpolation import FrameForces, interpolate_forces
 from sliplens.recordings.labels.lag import Lag
 from sliplens.recordings.labels.smoothing import mean_force, typical_step
-from sliplens.recordings.recording import ContactState
+from sliplens.recordings.trial import ContactState
 
 _CONTACT_SIGMAS = 8.0
 """Least normal force of a contact, in standard deviations of its noise."""

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.labels.motion import measure_motion, soften
+from sliplens.recordings.labels.lag import measure_motion, soften
 
 _STILL_TIMES = 1.5
 """A frame that moves by so many times what the stillest quarter of its fellows do is not still."""

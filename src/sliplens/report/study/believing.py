@@ -1,17 +1,18 @@
 """Which explanation to believe here, and why: the verdict that a study comes to."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Float64
 
-from sliplens.intervals import FEWEST_UNITS, Difference
-from sliplens.report.study.evidence import controls, settings, tell_interval
-from sliplens.report.study.localised import Truth
-from sliplens.report.study.scored import Faithful
-from sliplens.report.style import (
+from sliplens.intervals import FEWEST_UNITS, Difference, paired_difference
+from sliplens.plots.style import (
     CONTROLS,
     FILL_NAMES,
+    UNIT_NAMES,
     fill_name,
+    in_order,
     input_name,
     inputs_in_order,
     listed,
@@ -19,8 +20,131 @@ from sliplens.report.style import (
     methods_in_order,
     signed,
 )
+from sliplens.report.study.localised import Effects, Truth
+from sliplens.report.study.scored import Faithful, RemovalCurve
 from sliplens.report.verdict import Statement, judge_accuracy, tell_scale
 from sliplens.report.workspace import Results
+from sliplens.results.records import DeletionCurve
+
+
+def compare_gain(first: RemovalCurve, second: RemovalCurve, *, rng: np.random.Generator) -> Difference | None:
+    """Symmetric relevance gain of the first less that of the second, over the frames both have; None without any."""
+    _, here, there = np.intersect1d(first.frame_ids, second.frame_ids, return_indices=True)
+    if len(here) == 0:
+        return None
+    return paired_difference(first.srg[here], second.srg[there], trials=first.trials[here], rng=rng)
+
+
+def compare_mean_gain(
+    firsts: Sequence[RemovalCurve], seconds: Sequence[RemovalCurve], *, rng: np.random.Generator
+) -> Difference | None:
+    """Compare as `compare_gain` does, the gain of each frame averaged over several methods first.
+
+    Parameters
+    ----------
+    firsts, seconds
+        Curves of the same methods in the same order, of one network and of another.
+    """
+    shared = sorted(set.intersection(*(set(curve.frame_ids) for curve in (*firsts, *seconds))))
+    if not shared:
+        return None
+    means = [
+        np.mean([curve.srg[np.searchsorted(curve.frame_ids, shared)] for curve in curves], axis=0)
+        for curves in (firsts, seconds)
+    ]
+    trials = firsts[0].trials[np.searchsorted(firsts[0].frame_ids, shared)]
+    return paired_difference(means[0], means[1], trials=trials, rng=rng)
+
+
+def gain_over_chance(curve: RemovalCurve, *, rng: np.random.Generator) -> Difference:
+    """Symmetric relevance gain with its interval: a map that tells nothing has 0."""
+    return paired_difference(curve.srg, np.zeros(len(curve.frame_ids)), trials=curve.trials, rng=rng)
+
+
+def compare_thesis_score(
+    first: DeletionCurve, second: DeletionCurve, trials: dict[str, str], *, rng: np.random.Generator
+) -> Difference | None:
+    """Deletion score of the first less that of the second, over the frames whose trial is known; None without any.
+
+    Parameters
+    ----------
+    first, second
+        Of two methods, or of two inputs.
+    trials
+        Trial of each frame that counts.
+    """
+    ids, here, there = np.intersect1d(first.frame_ids, second.frame_ids, return_indices=True)
+    known = np.array([name in trials for name in ids], dtype=bool)
+    if not known.any():
+        return None
+    means = [one.scores.mean(axis=1)[rows[known]] for one, rows in ((first, here), (second, there))]
+    names = np.array([trials[name] for name in ids[known]])
+    return paired_difference(means[0], means[1], trials=names, rng=rng)
+
+
+def share_of_strongest(effects: Effects, *, count: int, rng: np.random.Generator) -> Difference | None:
+    """Share of a network's effects, in size, that its strongest markers hold; trials are resampled.
+
+    None where no marker has any effect.
+
+    Parameters
+    ----------
+    effects
+        Of every marker, in margin units.
+    count
+        How many markers are the strongest.
+    """
+    ids, first, member = np.unique(effects.frame_id, return_index=True, return_inverse=True)
+    shares, kept = [], []
+    for frame in range(len(ids)):
+        sizes = np.sort(np.abs(effects.network[member == frame]))[::-1]
+        if sizes.sum() > 0:
+            shares.append(sizes[:count].sum() / sizes.sum())
+            kept.append(effects.trial[first[frame]])
+    if not shares:
+        return None
+    return paired_difference(np.array(shares), np.zeros(len(shares)), trials=np.array(kept), rng=rng)
+
+
+def settings(faithful: Faithful) -> list[tuple[str, str]]:
+    """Fills and units that were scored, in the order they are read."""
+    found = {(fill, unit) for fill, unit, _ in faithful.curves}
+    fills = in_order({fill for fill, _ in found}, FILL_NAMES)
+    units = in_order({unit for _, unit in found}, UNIT_NAMES)
+    return [(fill, unit) for unit in units for fill in fills if (fill, unit) in found]
+
+
+def controls(faithful: Faithful) -> set[str]:
+    """Names of the maps that know nothing of the network."""
+    return {score.method for score in faithful.scores if score.control}
+
+
+def best_control(faithful: Faithful, fill: str, unit: str) -> str | None:
+    """Name the control with the highest gain under a fill and unit."""
+    gains = {
+        name: faithful.curves[key]
+        for name in sorted(controls(faithful))
+        if (key := (fill, unit, name)) in faithful.curves
+    }
+    return max(gains, key=lambda name: float(gains[name].srg.mean()), default=None)
+
+
+def mean_at(curve: RemovalCurve, area: float) -> tuple[float, float]:
+    """Mean change where a share of the image is gone: most influential first, and in random order."""
+    places: Float64[np.ndarray, " areas"] = curve.areas
+    most, chance = (float(np.interp(area, places, values.mean(axis=0))) for values in (curve.most_first, curve.random))
+    return most, chance
+
+
+def tell_interval(gap: Difference, *, digits: int = 3, scale: float = 1.0) -> str:
+    """Write an estimate with its 95 % interval."""
+    values: Float[np.ndarray, 3] = scale * np.array([gap.estimate, gap.low, gap.high])
+    return f"{signed(values[0], digits)} ({signed(values[1], digits)} to {signed(values[2], digits)})"
+
+
+def tell_bounds(gap: Difference, *, digits: int = 3) -> str:
+    """Write the ends of a 95 % interval."""
+    return f"{signed(gap.low, digits)} to {signed(gap.high, digits)}"
 
 
 @dataclass(frozen=True, kw_only=True)

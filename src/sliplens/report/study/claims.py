@@ -5,32 +5,377 @@ References
 Polak, *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning*, sections 5.2 to 5.4 and 6.
 """
 
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
 import numpy as np
 
-from sliplens.report.study.claim import (
-    Answer,
-    Claim,
-    Finding,
-    all_of,
-    judge_gap,
-    most_of,
-    tell_first,
-    tell_settings,
-    untested,
+from sliplens.intervals import Difference
+from sliplens.plots.style import (
+    CONTROLS,
+    decimals,
+    fill_name,
+    input_name,
+    inputs_in_order,
+    listed,
+    method_name,
+    percent,
 )
-from sliplens.report.study.evidence import (
+from sliplens.report.study.believing import (
     best_control,
     compare_gain,
+    compare_mean_gain,
     compare_thesis_score,
     gain_over_chance,
     mean_at,
     settings,
+    share_of_strongest,
+    tell_interval,
 )
-from sliplens.report.study.input_claim import RIVALS, claim_difference, poly_cams, scored_trials
-from sliplens.report.study.looked_claims import claim_edges, claim_noisy
+from sliplens.report.study.localised import Truth
+from sliplens.report.study.records import Looks
 from sliplens.report.study.scored import Faithful
-from sliplens.report.style import fill_name, input_name, inputs_in_order, method_name, percent
+from sliplens.report.thesis import THESIS_POLY_CAM
 from sliplens.report.workspace import Results
+
+Outcome = Literal["holds", "does not hold", "undecided"]
+OUTCOMES: tuple[Outcome, ...] = ("holds", "does not hold", "undecided")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One comparison: where, of what, its number with an interval if there is one, and what it says of the claim.
+
+    Attributes
+    ----------
+    where
+        Fill and unit, or the score.
+    value
+        Number where no interval is kept.
+    outcome
+        None where the comparison is told but does not decide.
+    """
+
+    where: str
+    compared: str
+    gap: Difference | None = None
+    value: str = ""
+    outcome: Outcome | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """What one network, or both together, say of a claim."""
+
+    subject: str
+    outcome: Outcome
+    text: str
+    findings: tuple[Finding, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Claim:
+    """A claim of the thesis, in our words, with an answer for each network."""
+
+    layout: ClassVar[str] = "claim"
+
+    id: str
+    title: str
+    test: str
+    answers: tuple[Answer, ...]
+
+
+def judge_gap(gap: Difference | None) -> Outcome:
+    """Positive for sure, negative for sure, or neither."""
+    if gap is None or not gap.sure:
+        return "undecided"
+    return "holds" if gap.estimate > 0 else "does not hold"
+
+
+def all_of(outcomes: Iterable[Outcome]) -> Outcome:
+    """Join parts that must all hold: one that does not is enough."""
+    found = set(outcomes)
+    if "does not hold" in found:
+        return "does not hold"
+    return "holds" if found == {"holds"} else "undecided"
+
+
+def most_of(outcomes: Sequence[Outcome]) -> Outcome:
+    """Join settings: more than half of them agree, and none says the opposite."""
+    opposites: dict[Outcome, Outcome] = {"holds": "does not hold", "does not hold": "holds"}
+    for outcome, opposite in opposites.items():
+        if 2 * outcomes.count(outcome) > len(outcomes) and opposite not in outcomes:
+            return outcome
+    return "undecided"
+
+
+def tell_settings(by_setting: dict[str, Outcome]) -> str:
+    """Say under which settings a claim holds, does not, or stays open."""
+    parts = []
+    for outcome in OUTCOMES:
+        names = [name for name, found in by_setting.items() if found == outcome]
+        if names:
+            parts.append(f"{outcome} under {listed(names)}")
+    text = "; ".join(parts)
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def tell_first(findings: list[Finding]) -> str:
+    """Write the intervals of the first setting."""
+    told = [one for one in findings if one.gap is not None and one.where == findings[0].where]
+    parts = [f"{one.compared}: {tell_interval(one.gap)}" for one in told if one.gap is not None]
+    return f"Under {findings[0].where}, {'; '.join(parts)}." if parts else ""
+
+
+def untested(name: str, why: str = "its explanations were not scored; `sliplens study` does that") -> Answer:
+    """Answer that stays open, and why; the name is that of an input, or empty for both networks."""
+    subject = input_name(name) if name else "Both networks"
+    return Answer(subject=subject, outcome="undecided", text=f"Not tested: {why}.")
+
+
+POLY_CAM, RIVALS = "poly-cam", ("grad-cam", "integrated-gradients")
+"""What the thesis compared."""
+
+
+def claim_difference(results: Results, *, rng: np.random.Generator) -> Claim:
+    """Test it on the same frames, evidence lost in margin units."""
+    found = results.study.faithfulness
+    if not {"difference", "raw"} <= set(found):
+        answers = [untested("", "the explanations of both networks are needed, and those of one are there")]
+    else:
+        answers = [_compare_inputs(found["difference"], found["raw"], results, rng=rng)]
+    return Claim(
+        id="difference",
+        title="Difference images give more faithful explanations than raw images",
+        test="Tested on the same frames, evidence lost in margin units: holds under a fill where the SRG averaged over "
+        "the methods is larger for difference images, beyond the 95 % interval.",
+        answers=tuple(answers),
+    )
+
+
+def _compare_inputs(difference: Faithful, raw: Faithful, results: Results, *, rng: np.random.Generator) -> Answer:
+    findings, by_setting, claimed = [], {}, (*RIVALS, poly_cams(difference)[0])
+    for fill, unit in settings(difference):
+        methods = [one for one in claimed if (fill, unit, one) in difference.curves and (fill, unit, one) in raw.curves]
+        if not methods:
+            continue
+        where = fill_name(fill, unit)
+        pairs = {one: (difference.curves[fill, unit, one], raw.curves[fill, unit, one]) for one in methods}
+        gap = compare_mean_gain(*zip(*pairs.values(), strict=True), rng=rng)
+        by_setting[where] = judge_gap(gap)
+        compared = f"SRG, mean of {len(pairs)} methods, difference less raw"
+        findings.append(Finding(where=where, compared=compared, gap=gap, outcome=by_setting[where]))
+        findings += [
+            Finding(
+                where=where,
+                compared=f"SRG of {method_name(one)}, difference less raw",
+                gap=compare_gain(*pair, rng=rng),
+            )
+            for one, pair in pairs.items()
+        ]
+    if not by_setting:
+        return untested("", "no method was scored on both inputs under one fill")
+    findings += _thesis_score_of_inputs(results, rng=rng)
+    return Answer(
+        subject="Both networks",
+        outcome=most_of(list(by_setting.values())),
+        text=f"{tell_settings(by_setting)} {tell_first(findings)}",
+        findings=tuple(findings),
+    )
+
+
+def _thesis_score_of_inputs(results: Results, *, rng: np.random.Generator) -> list[Finding]:
+    scored = {name: one for (name, source), one in results.scores.items() if source == results.study.source}
+    if not {"difference", "raw"} <= set(scored):
+        return []
+    trials, first, second = scored_trials(results, "difference"), scored["difference"].curves, scored["raw"].curves
+    return [
+        Finding(
+            where="score of the thesis",
+            compared=f"D of {method_name(one)}, difference less raw (below zero = more faithful)",
+            gap=compare_thesis_score(first[one], second[one], trials, rng=rng),
+        )
+        for one in (*RIVALS, THESIS_POLY_CAM, POLY_CAM)
+        if one in first and one in second
+    ]
+
+
+def poly_cams(faithful: Faithful) -> list[str]:
+    """Poly-CAM as in the thesis, and ours: the claim is of the first, and the second is what is used now."""
+    scored = {method for _, _, method in faithful.curves}
+    return [one for one in (THESIS_POLY_CAM, POLY_CAM) if one in scored] or [POLY_CAM]
+
+
+def scored_trials(results: Results, name: str) -> dict[str, str]:
+    """Trial of each scored frame of an input."""
+    faithful = results.study.faithfulness.get(name)
+    if faithful is not None:
+        return {
+            frame: str(trial)
+            for curve in faithful.curves.values()
+            for frame, trial in zip(curve.frame_ids, curve.trials, strict=True)
+        }
+    choice = results.study.choice
+    return {} if choice is None else {frame.id: frame.trial for frame in choice.frames if frame.scored}
+
+
+_NOISY = "integrated-gradients"
+_MEASURES = {"total_variation": 1, "noise_stability": -1}  # sign: noisier is more of it, or less
+_MEASURE_NAMES = {"total_variation": "total variation", "noise_stability": "stability under sensor noise"}
+_LOOKERS = ("poly-cam", THESIS_POLY_CAM)  # the finer of the two first: edges are finer than its coarse map
+_TWO = 2
+
+
+def claim_noisy(results: Results) -> Claim:
+    """Integrated Gradients is noisy: rougher than the other methods, and less stable under sensor noise."""
+    answers = []
+    for name in inputs_in_order(results.study.inputs)[::-1]:
+        looks = results.study.looks.get(name)
+        answers.append(
+            Answer(
+                subject=input_name(name),
+                outcome="undecided",
+                text="Not tested: the looks of the maps were not measured; `sliplens study` does that.",
+            )
+            if looks is None
+            else _noisiest(looks)
+        )
+    return Claim(
+        id="noisy",
+        title="Integrated Gradients is noisy",
+        test="Tested by numbers: holds where its maps have a larger total variation than those of every other method, "
+        "beyond the 95 % interval, and are the least stable under sensor noise (means over few frames, no interval).",
+        answers=tuple(answers),
+    )
+
+
+def _noisiest(looks: Looks) -> Answer:
+    subject = input_name(looks.input)
+    findings, outcomes, parts = [], [], []
+    for measure, sign in _MEASURES.items():
+        values = {
+            name: value
+            for name, found in looks.methods.items()
+            if name not in CONTROLS and (value := found[measure]) is not None
+        }
+        own = values.pop(_NOISY, None)
+        if own is None or not values:
+            return Answer(subject=subject, outcome="undecided", text=f"Not tested: {_MEASURE_NAMES[measure]} of "
+                          f"{method_name(_NOISY)} and of another method are not both known.")  # fmt: skip
+        noisier = [name for name, value in values.items() if sign * own > sign * value]
+        outcome: Outcome = "holds" if len(noisier) == len(values) else "undecided" if noisier else "does not hold"
+        gaps = _rougher(looks, values) if measure == "total_variation" else {}
+        if gaps:
+            outcome = all_of(judge_gap(gap) for gap in gaps.values())
+            findings += [
+                Finding(
+                    where=_MEASURE_NAMES[measure],
+                    compared=f"{method_name(_NOISY)} less {method_name(name)}",
+                    gap=gap,
+                    outcome=judge_gap(gap),
+                )
+                for name, gap in gaps.items()
+            ]
+        outcomes.append(outcome)
+        others = listed([f"{method_name(name)} {decimals(value, 3)}" for name, value in values.items()])
+        parts.append(f"{_MEASURE_NAMES[measure]} {decimals(own, 3)} ({others})")
+        findings.append(
+            Finding(
+                where=_MEASURE_NAMES[measure],
+                compared=f"{method_name(_NOISY)} against {others}",
+                value=decimals(own, 3),
+                outcome=outcome,
+            )
+        )
+    text = listed(parts)
+    return Answer(
+        subject=subject, outcome=all_of(outcomes), text=f"{text[:1].upper()}{text[1:]}.", findings=tuple(findings)
+    )
+
+
+def _rougher(looks: Looks, others: Iterable[str]) -> dict[str, Difference]:
+    """How much rougher its maps are than those of the others, where that was compared."""
+    gaps = {}
+    for name in others:
+        if (_NOISY, name) in looks.rougher:
+            gaps[name] = looks.rougher[_NOISY, name]
+        elif (name, _NOISY) in looks.rougher:
+            gap = looks.rougher[name, _NOISY]
+            gaps[name] = Difference(estimate=-gap.estimate, low=-gap.high, high=-gap.low, units=gap.units)
+    return gaps
+
+
+def claim_edges(results: Results, *, rng: np.random.Generator) -> Claim:
+    """The network looks at the edges of two markers: they hold most of its effects, and maps lie on edges."""
+    answers = []
+    for name in inputs_in_order(results.study.inputs)[::-1]:
+        truth = results.study.truth.get(name)
+        answers.append(
+            Answer(
+                subject=input_name(name),
+                outcome="undecided",
+                text="Not tested: only simulated touch tells what each marker does, and no such result is here.",
+            )
+            if truth is None
+            else _looks_at_two(truth, rng=rng)
+        )
+    return Claim(
+        id="two-markers",
+        title="The network looks at the edges of two markers",
+        test="Tested on simulated touch in two parts, both needed: putting back a marker at a time, the strongest two "
+        "hold more than half of all change of the answer; and Poly-CAM's relevance lies on marker edges more than "
+        "their share of the image.",
+        answers=tuple(answers),
+    )
+
+
+def _looks_at_two(truth: Truth, *, rng: np.random.Generator) -> Answer:
+    share = share_of_strongest(truth.effects, count=_TWO, rng=rng)
+    looker = next((name for name in _LOOKERS if name in truth.methods), _LOOKERS[0])
+    found = truth.methods.get(looker)
+    mass, area = None if found is None else found.mass["edges"], truth.areas["edges"]
+    on_edges: Outcome = "undecided" if mass is None or area is None else "holds" if mass > area else "does not hold"
+    gap = None if found is None else found.edges
+    if gap is not None:
+        on_edges = judge_gap(gap)
+    two: Outcome = "undecided"
+    if share is not None:
+        half = type(share)(estimate=share.estimate - 0.5, low=share.low - 0.5, high=share.high - 0.5, units=share.units)
+        two = judge_gap(half)
+    told = (
+        "no marker changes the answer"
+        if share is None
+        else f"{percent(share.estimate)} of the change of the answer ({percent(share.low)} to {percent(share.high)})"
+    )
+    on_edges_told = (
+        "No Poly-CAM map was held against the truth."
+        if mass is None
+        else f"{method_name(looker)} puts {percent(mass)} of its relevance on edges, which cover {percent(area)} of "
+        "the image."
+    )
+    markers = len(np.unique(truth.effects.marker))
+    return Answer(
+        subject=input_name(truth.input),
+        outcome=all_of((two, on_edges)),
+        text=f"The two strongest of up to {markers} markers hold {told}. {on_edges_told}",
+        findings=(
+            Finding(
+                where="each marker put back",
+                compared="share of the two strongest markers",
+                gap=share,
+                outcome=two,
+            ),
+            Finding(
+                where="relevance mass",
+                compared=f"on edges, less their {percent(area)} of the image",
+                value="" if gap is not None else percent(mass),
+                gap=gap,
+                outcome=on_edges,
+            ),
+        ),
+    )
+
 
 GRAD_CAM = "grad-cam"
 _SMALL_AREA = 0.05

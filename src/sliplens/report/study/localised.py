@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int
 
 from sliplens.intervals import Difference
-from sliplens.report.records import Run
+from sliplens.results.records import Run
 
 REGIONS = ("markers", "slip_annulus", "edges")
 

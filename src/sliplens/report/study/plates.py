@@ -5,13 +5,123 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sliplens.report.drawing import Chart, figure_picture
-from sliplens.report.pages import save_page, written_whole
+from sliplens.plots.contact_sheet import TIMES, brighten, brightening
+from sliplens.plots.layout import Chart, figure_picture, place_axes, place_text, save_page, written_whole
+from sliplens.plots.saliency import choose_frames, overlay_saliency, plot_colour_bar, stretch_saliency
+from sliplens.plots.style import GREY, drawing_style
+from sliplens.report.workspace import Results
+from sliplens.results.records import DeletionCurve, Explained
+
+CELL_IN = 1.5
+_GAP_IN, _LEFT_IN, _HEAD_IN, _WORDS_IN, _BAR_IN = 0.06, 1.25, 0.42, 0.2, 0.75
+_EDGE_IN = 0.1
+_HEAD_LETTERS = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """A picture, and words below it."""
+
+    picture: UInt8[np.ndarray, "height width 3"] | None
+    words: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """A figure of pictures, its axes by row and column, and where the next thing below may begin."""
+
+    figure: Figure
+    axes: list[list[Axes]]
+    bottom_in: float
+
+
+def draw_grid(
+    rows: Sequence[tuple[str, Sequence[Cell]]],
+    *,
+    heads: Sequence[str] = (),
+    below_in: float = 0.0,
+    bar: bool = False,
+    cell_in: float = CELL_IN,
+    least_width_in: float = 0.0,
+) -> Grid:
+    """Draw pictures in rows.
+
+    Parameters
+    ----------
+    rows
+        Name and cells of each.
+    heads
+        Of the columns, of up to two lines.
+    below_in
+        Inches to leave free below.
+    bar
+        Add the colours of saliency at the bottom.
+    cell_in
+        Width of a picture.
+    least_width_in
+        Of the figure.
+    """
+    columns = max(len(cells) for _, cells in rows)
+    worded = [any(cell.words for cell in cells) for _, cells in rows]
+    shape = next((cell.picture.shape for _, cells in rows for cell in cells if cell.picture is not None), (1, 1, 3))
+    high = cell_in * shape[0] / shape[1]
+    head = _HEAD_IN if heads else _EDGE_IN
+    rest = len(rows) * (high + _GAP_IN) + sum(worded) * _WORDS_IN
+    width = max(least_width_in, _LEFT_IN + columns * (cell_in + _GAP_IN) + _EDGE_IN)
+    height = head + rest + below_in + (_BAR_IN if bar else 0) + _EDGE_IN
+    with drawing_style():
+        figure = Figure(figsize=(width, height))
+        axes, top = [], head
+        for (name, cells), has_words in zip(rows, worded, strict=True):
+            place_text(
+                figure, _LEFT_IN - 0.1, top + high / 2, name, ha="right", va="center", fontsize=9, wrap=True,
+                parse_math=False,
+            )  # fmt: skip
+            axes.append([])
+            for column, cell in enumerate(cells):
+                left = _LEFT_IN + column * (cell_in + _GAP_IN)
+                ax = place_axes(figure, left, top, cell_in, high)
+                _show(cell.picture, ax=ax)
+                axes[-1].append(ax)
+                if cell.words:
+                    place_text(
+                        figure, left + cell_in / 2, top + high + 0.03, cell.words, ha="center", fontsize=7.5,
+                        parse_math=False,
+                    )  # fmt: skip
+            top += high + _GAP_IN + (_WORDS_IN if has_words else 0)
+        for column, words in enumerate(heads):
+            place = _LEFT_IN + column * (cell_in + _GAP_IN) + cell_in / 2
+            lines = words if "\n" in words else fill(words, _HEAD_LETTERS)
+            place_text(figure, place, head - 0.06, lines, ha="center", va="bottom", fontsize=9, parse_math=False)
+        if bar:
+            plot_colour_bar(ax=place_axes(figure, _LEFT_IN, top + 0.14, min(4.2, width - _LEFT_IN - _EDGE_IN), 0.14))
+    return Grid(figure=figure, axes=axes, bottom_in=top)
+
+
+def show_map(
+    picture: UInt8[np.ndarray, "height width 3"], saliency: Float[np.ndarray, "height width"]
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Lay a map over its picture, stretched for viewing."""
+    return overlay_saliency(picture, stretch_saliency(saliency))
+
+
+def _show(picture: UInt8[np.ndarray, "height width 3"] | None, *, ax: Axes) -> None:
+    ax.set(xticks=[], yticks=[])
+    ax.grid(visible=False)
+    ax.spines[:].set_visible(False)
+    if picture is None:
+        ax.text(0.5, 0.5, "no frame", transform=ax.transAxes, ha="center", va="center", fontsize=8, color=GREY)
+    else:
+        ax.imshow(picture, interpolation="none")
+
 
 FOLDER = "figures"
 """Beside the page."""
@@ -90,3 +200,77 @@ def _cells(column: Sequence[Any] | np.ndarray) -> list[Any]:
     values = column.tolist() if isinstance(column, np.ndarray) else list(column)
     # nine digits: more would be noise of the arithmetic, and differ between machines
     return [f"{value:.9g}" if isinstance(value, float) else value for value in values]
+
+
+THESIS_LEVEL = 0.2
+"""Margin of the frame that the thesis compares methods on (Fig. 8)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShownFrame:
+    """A frame of a panel: the margin it stands for, and its place among the explained frames."""
+
+    level: float
+    index: int
+
+
+def explained_of(results: Results, name: str) -> Explained | None:
+    """Find the explained frames of the study's source."""
+    return results.explanations.get((name, results.study.source))
+
+
+def shown_frames(results: Results, explained: Explained) -> list[ShownFrame]:
+    """Frames of one trial from full stick to full slip; without a choice, those a panel would show."""
+    places = {frame.id: index for index, frame in enumerate(explained.frames)}
+    choice = results.study.choice
+    rows = [frame for frame in choice.frames if frame.shown and frame.id in places] if choice else []
+    if rows:
+        first = rows[0].trial
+        found = [ShownFrame(level=row.level, index=places[row.id]) for row in rows if row.trial == first]
+        return sorted(found, key=lambda one: -one.level)
+    _, chosen = choose_frames(explained.frames)
+    return [ShownFrame(level=level, index=index) for level, index in chosen if level is not None and index is not None]
+
+
+def bright_pictures(
+    explained: Explained, indices: Sequence[int]
+) -> tuple[dict[int, UInt8[np.ndarray, "height width 3"]], str]:
+    """Pictures of some frames, and what to call them: differences are made brighter all alike, or little would be seen.
+
+    Parameters
+    ----------
+    explained
+        Frames with their pictures.
+    indices
+        Which of them.
+    """
+    pictures = {index: explained.pictures[index] for index in indices}
+    if explained.input != "difference":
+        return pictures, "Input"
+    factor = brightening([one[None] for one in pictures.values()])
+    name = "Input" if factor == 1 else f"Input {TIMES}\N{NO-BREAK SPACE}{factor:g}"
+    return {index: brighten(one, factor) for index, one in pictures.items()}, name
+
+
+def told_frame(explained: Explained, curves: dict[str, DeletionCurve]) -> int | None:
+    """Pick the frame that deletion is shown on: the first of those scored whose label is nearest to 20 %."""
+    scored = {name for curve in curves.values() for name in curve.frame_ids}
+    labels = {
+        index: abs(frame.safety_margin - THESIS_LEVEL)
+        for index, frame in enumerate(explained.frames)
+        if frame.id in scored and frame.safety_margin is not None
+    }
+    # labels of frames looked for at one level differ by chance: the first trial's will do
+    return min(labels, key=lambda index: (round(labels[index], 2), index), default=None)
+
+
+def removal_order(saliency: np.ndarray) -> Int[np.ndarray, " pixels"]:
+    """Flat indices from most to least salient, ties to the later pixel first, as the score removes them."""
+    return np.argsort(saliency.ravel(), kind="stable")[::-1]
+
+
+def gone(saliency: np.ndarray, pixels: int) -> Bool[np.ndarray, "height width"]:
+    """Mark the most salient pixels of a map."""
+    mask = np.zeros(saliency.size, dtype=bool)
+    mask[removal_order(saliency)[:pixels]] = True
+    return mask.reshape(saliency.shape)

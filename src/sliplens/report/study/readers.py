@@ -5,8 +5,6 @@ from typing import Any
 
 from sliplens.errors import InputError
 from sliplens.intervals import Difference
-from sliplens.report.fields import Fields
-from sliplens.report.records import Run
 from sliplens.report.study.localised import REGIONS, Localisation, MetaTest, Truth
 from sliplens.report.study.records import (
     LOOKS,
@@ -23,6 +21,8 @@ from sliplens.report.study.records import (
 )
 from sliplens.report.study.scored_readers import read_faithful, read_gap, read_interval, read_remedies
 from sliplens.report.study.tables_on_disk import read_effects, read_state_frames, read_truth_maps
+from sliplens.results.fields import Fields
+from sliplens.results.records import Run
 
 
 def _read_choice(run: Run, fields: Fields) -> Choice:

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from sliplens.intervals import Difference
-from sliplens.report.records import Run
 from sliplens.report.study.localised import Truth
 from sliplens.report.study.scored import Faithful, Remedies
+from sliplens.results.records import Run
 
 
 @dataclass(frozen=True, kw_only=True)

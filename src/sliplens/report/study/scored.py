@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from sliplens.intervals import Difference
-from sliplens.report.records import DeletionCurve, Run
+from sliplens.results.records import DeletionCurve, Run
 
 Key = tuple[str, str, str]
 """Fill, unit and method."""

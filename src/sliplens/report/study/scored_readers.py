@@ -4,8 +4,6 @@ from typing import Any
 
 from sliplens.errors import InputError
 from sliplens.intervals import Difference
-from sliplens.report.fields import Fields
-from sliplens.report.records import Run
 from sliplens.report.study.scored import (
     Agreement,
     Comparison,
@@ -16,6 +14,8 @@ from sliplens.report.study.scored import (
     VariantScore,
 )
 from sliplens.report.study.tables_on_disk import read_removal_curves, read_variant_curves
+from sliplens.results.fields import Fields
+from sliplens.results.records import Run
 
 
 def read_interval(fields: Fields, key: str) -> Difference | None:

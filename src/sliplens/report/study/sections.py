@@ -5,26 +5,40 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sliplens.plots.style import input_name, inputs_in_order, name_methods
 from sliplens.report.blocks import Notes
 from sliplens.report.sections import Block, Section, recipe_section
 from sliplens.report.study.claims import judge_claims
-from sliplens.report.study.curve_figures import plate_bins, plate_each_frame, plate_faithfulness
-from sliplens.report.study.method_figures import plate_methods, plate_poly_cam, plate_states
-from sliplens.report.study.other_tables import (
+from sliplens.report.study.plates import Plate, show_plate
+from sliplens.report.study.removal_figures import (
+    plate_deletion,
+    plate_highlighted,
+    plate_randomisation,
+    plate_removal,
+    plate_removal_curves,
+    removal_methods,
+)
+from sliplens.report.study.saliency_figures import (
+    plate_bins,
+    plate_each_frame,
+    plate_faithfulness,
+    plate_methods,
+    plate_poly_cam,
+    plate_states,
+)
+from sliplens.report.study.state_figures import plate_contact_states, plate_fields_beside_saliency, plate_truth
+from sliplens.report.study.tables import (
+    table_agreement,
+    table_equal_areas,
     table_localisation,
     table_looks,
     table_meta,
     table_randomisation,
+    table_remedies,
+    table_scores,
     table_times,
     table_trials,
 )
-from sliplens.report.study.plates import Plate, show_plate
-from sliplens.report.study.removal_figures import plate_deletion, plate_highlighted, plate_removal, removal_methods
-from sliplens.report.study.score_tables import table_agreement, table_equal_areas, table_remedies, table_scores
-from sliplens.report.study.sound_figures import plate_randomisation, plate_removal_curves
-from sliplens.report.study.state_figures import plate_contact_states, plate_fields_beside_saliency
-from sliplens.report.study.truth_figures import plate_truth
-from sliplens.report.style import input_name, inputs_in_order, name_methods
 from sliplens.report.tables import Table, table_accuracy
 from sliplens.report.workspace import Results
 

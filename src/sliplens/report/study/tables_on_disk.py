@@ -10,12 +10,12 @@ from jaxtyping import Float, UInt8
 
 from sliplens.errors import ImageError, InputError
 from sliplens.images import read_image
-from sliplens.report.fields import Fields
-from sliplens.report.files import read_table
-from sliplens.report.records import DeletionCurve
 from sliplens.report.study.localised import Effects
 from sliplens.report.study.records import StateFrame
 from sliplens.report.study.scored import Key, RemovalCurve
+from sliplens.results.fields import Fields
+from sliplens.results.files import read_table
+from sliplens.results.records import DeletionCurve
 
 _CURVES = ("most_first", "least_first", "random")
 

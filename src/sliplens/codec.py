@@ -1,0 +1,337 @@
+"""Records on disk, typed as they are declared: JSON for what is short, Parquet for columns, NPZ for arrays.
+
+A record is a frozen dataclass. What it declares is what its file must hold: a field that is missing, of another type or
+not finite is told in one sentence with its place and its cure, by msgspec for JSON and by jaxtyping for arrays.
+"""
+
+import zipfile
+from collections.abc import Mapping
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import AbstractArray, jaxtyped
+
+from sliplens.errors import InputError
+from sliplens.files import write_json
+
+RESULT_FILE = "result.json"
+ARRAYS_FILE = "arrays.npz"
+
+Record = TypeVar("Record")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Columns:
+    """Base of a table: a record whose fields are arrays of one length, a value a row.
+
+    Text columns are declared as `np.ndarray`, numbers with their jaxtyping type (`Float64[np.ndarray, " rows"]`).
+    NaN stands where a number is unknown.
+    """
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(getattr(self, fields(self)[0].name))
+
+    def table(self) -> pa.Table:
+        """Arrow table with a column a field; NaN stays NaN. `.to_pandas()` where pandas is installed."""
+        return pa.table({field.name: getattr(self, field.name) for field in fields(self)})
+
+
+def to_builtins(value: object) -> Any:
+    """What JSON can hold of a record: mappings, lists, texts, numbers.
+
+    Parameters
+    ----------
+    value
+        Record, or anything made of records, mappings, sequences, paths, texts and numbers. Arrays have no
+        form in JSON: declare short ones as tuples, and long ones as fields of a result (`save_result`).
+    """
+    return msgspec.to_builtins(value, enc_hook=_encode, str_keys=True)
+
+
+def save_record(record: object, path: Path) -> None:
+    """Write a record as one indented JSON file, whole or not at all.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite: JSON has no NaN.
+    """
+    write_json(path, to_builtins(record))
+
+
+def load_record(path: Path, kind: type[Record], *, command: str) -> Record:
+    """Read what `save_record` wrote.
+
+    Parameters
+    ----------
+    path
+        JSON file.
+    kind
+        Dataclass that it holds.
+    command
+        Command that makes the file again, for the sentence that tells of a mistake.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, is not JSON, or holds something else than the record declares.
+    """
+    return from_builtins(_read_json(path, command=command), kind, where=path, command=command)
+
+
+def from_builtins(values: object, kind: type[Record], *, where: Path | str, command: str) -> Record:
+    """Record from what JSON holds of it (`to_builtins`).
+
+    Raises
+    ------
+    InputError
+        If it holds something else than the record declares.
+    """
+    try:
+        return msgspec.convert(values, kind, dec_hook=_decode)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{where} {_told(error)}; make it again with `{command}`") from None
+
+
+def save_result(result: object, folder: Path) -> None:
+    """Write a result into a folder: `result.json`, a Parquet file for each field of `Columns`, `arrays.npz` for arrays.
+
+    Parameters
+    ----------
+    result
+        Frozen dataclass; its `Columns` and array fields are stored beside the JSON, named as the fields are.
+    folder
+        Folder to write to; must exist.
+    """
+    assert is_dataclass(result)
+    short, arrays = {}, {}
+    for field in fields(result):
+        value = getattr(result, field.name)
+        if isinstance(value, Columns):
+            save_columns(value, folder / f"{field.name}.parquet")
+        elif isinstance(value, np.ndarray):
+            arrays[field.name] = value
+        elif _is_array_mapping(value):
+            arrays |= {f"{field.name}/{name}": array for name, array in value.items()}
+        else:
+            short[field.name] = value
+    if arrays:
+        save_arrays(arrays, folder / ARRAYS_FILE)
+    save_record(short, folder / RESULT_FILE)  # last: a folder with this file is whole
+
+
+def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
+    """Read what `save_result` wrote.
+
+    Parameters
+    ----------
+    folder
+        Folder of the result.
+    kind
+        Dataclass that it holds.
+    command
+        Command that makes the folder again.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or damaged, or holds something else than the record declares.
+    """
+    path = folder / RESULT_FILE
+    values = _read_json(path, command=command)
+    if not isinstance(values, dict):
+        raise InputError(f"{path} holds no JSON object; make it again with `{command}`")
+    declared = get_type_hints(kind)
+    beside: dict[str, object] = {}
+    arrays: Mapping[str, np.ndarray] | None = None
+    for name, hint in declared.items():
+        if isinstance(hint, type) and issubclass(hint, Columns):
+            beside[name] = load_columns(folder / f"{name}.parquet", hint, command=command)
+        elif _is_array(hint) or _is_array_mapping_type(hint):
+            if arrays is None:
+                arrays = load_arrays(folder / ARRAYS_FILE, command=command)
+            beside[name] = _pick_arrays(arrays, name, hint, path=folder / ARRAYS_FILE, command=command)
+    # one dataclass of what is in the JSON, so that msgspec checks it as declared; defaults are kept
+    inside = [field for field in fields(kind) if field.name not in beside]  # pyright: ignore[reportArgumentType]
+    partial = msgspec.defstruct(
+        kind.__name__, [(field.name, declared[field.name], _default(field)) for field in inside], kw_only=True
+    )
+    told = from_builtins(values, partial, where=path, command=command)
+    return kind(**{field.name: getattr(told, field.name) for field in inside}, **beside)
+
+
+def save_columns(columns: Columns, path: Path) -> None:
+    """Write columns as a Parquet file, whole or not at all."""
+    part = path.with_name(path.name + ".part")
+    pq.write_table(columns.table(), part, compression="zstd")
+    part.replace(path)
+
+
+_Columns = TypeVar("_Columns", bound=Columns)
+
+
+def load_columns(path: Path, kind: type[_Columns], *, command: str) -> _Columns:
+    """Read what `save_columns` wrote.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged, lacks a column, or a column is of another type or has gaps.
+    """
+    cure = f"make it again with `{command}`"
+    names = [field.name for field in fields(kind)]
+    try:
+        table = pq.read_table(path, columns=names)
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; {cure}") from None
+    except (pa.ArrowException, OSError, ValueError, LookupError) as error:
+        raise InputError(f"{path} is not a readable table ({_one_line(error)}); {cure}") from None
+    absent = [name for name in names if name not in table.column_names]
+    if absent:
+        raise InputError(f"{path} lacks the column {absent[0]!r}; {cure}")
+    values = {}
+    for name, hint in get_type_hints(kind).items():
+        column = table[name]
+        if column.null_count:
+            raise InputError(f"{path} has gaps in the column {name!r}; {cure}")
+        if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
+            value = np.array(column.to_pylist(), dtype=str)
+        else:
+            value = column.to_numpy()
+        if _is_array(hint) and not _is_of(value, hint):
+            raise InputError(f"{path} holds {column.type} as {name!r} where {_shown(hint)} belongs; {cure}")
+        if hint is np.ndarray and value.dtype.kind != "U":
+            raise InputError(f"{path} holds {column.type} as {name!r} where texts belong; {cure}")
+        values[name] = value
+    return kind(**values)
+
+
+def save_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> None:
+    """Write arrays as a compressed NPZ file, whole or not at all."""
+    part = path.with_name(path.name + ".part")
+    with part.open("wb") as stream:
+        np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
+    part.replace(path)
+
+
+def load_arrays(path: Path, *, command: str) -> dict[str, np.ndarray]:
+    """Read what `save_arrays` wrote.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged.
+    """
+    cure = f"make it again with `{command}`"
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive}
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; {cure}") from None
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path} cannot be read as arrays ({_one_line(error)}); {cure}") from None
+
+
+def _pick_arrays(arrays: Mapping[str, np.ndarray], name: str, hint: Any, *, path: Path, command: str) -> object:
+    start = f"{name}/"
+    if _is_array(hint):
+        picked, kind = {name: arrays.get(name)}, hint
+    else:
+        picked = {key: array for key, array in arrays.items() if key.startswith(start)}
+        kind = get_args(hint)[1]
+    for key, array in picked.items():
+        if array is None:
+            raise InputError(f"{path} lacks {key!r}; make it again with `{command}`")
+        if not _is_of(array, kind):
+            raise InputError(
+                f"{path} holds {array.dtype} of shape {array.shape} as {key!r} where {_shown(kind)} belongs; "
+                f"make it again with `{command}`"
+            )
+    return picked[name] if _is_array(hint) else {key.removeprefix(start): array for key, array in picked.items()}
+
+
+def _is_array(hint: object) -> bool:
+    return isinstance(hint, type) and (issubclass(hint, AbstractArray) or hint is np.ndarray)
+
+
+def _is_array_mapping_type(hint: object) -> bool:
+    return get_origin(hint) in {dict, Mapping} and _is_array(get_args(hint)[1])
+
+
+def _is_array_mapping(value: object) -> bool:
+    return isinstance(value, Mapping) and bool(value) and all(isinstance(item, np.ndarray) for item in value.values())
+
+
+def _is_of(array: np.ndarray, kind: Any) -> bool:
+    # a context of its own: "rows" of one array need not be as many as "rows" of another
+    with jaxtyped("context"):
+        return isinstance(array, kind)
+
+
+def _shown(hint: Any) -> str:
+    return getattr(hint, "__name__", str(hint)).replace("ndarray, ", "")
+
+
+def _default(field: Field[Any]) -> Any:
+    if field.default_factory is not MISSING:
+        return msgspec.field(default_factory=field.default_factory)
+    return msgspec.NODEFAULT if field.default is MISSING else field.default
+
+
+def _encode(value: object) -> object:
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return dict(value)
+    raise NotImplementedError(f"{type(value).__name__} has no form in JSON")
+
+
+def _decode(kind: Any, value: object) -> object:
+    if kind is Path:
+        return Path(str(value))
+    raise NotImplementedError(f"{kind} has no form in JSON")
+
+
+def _read_json(path: Path, *, command: str) -> object:
+    try:
+        return msgspec.json.decode(path.read_bytes())
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; make it with `{command}`") from None
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{path} is not valid JSON ({_one_line(error)}); make it again with `{command}`") from None
+
+
+def _told(error: msgspec.ValidationError) -> str:
+    """What msgspec found, in the words of this package: "holds str at trials[2].day where int belongs"."""
+    text, _, place = str(error).partition(" - at ")
+    place = place.strip("`").removeprefix("$").removeprefix(".") or "its top"
+    return f"is not what was written: {text[0].lower()}{text[1:]} at {place}"
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]
+
+
+__all__ = [
+    "ARRAYS_FILE",
+    "RESULT_FILE",
+    "Columns",
+    "from_builtins",
+    "load_arrays",
+    "load_columns",
+    "load_record",
+    "load_result",
+    "save_arrays",
+    "save_columns",
+    "save_record",
+    "save_result",
+    "to_builtins",
+]

@@ -1,0 +1,269 @@
+"""The layers of a network whose maps are explained, found by running it."""
+
+import weakref
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
+from itertools import groupby
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sliplens.errors import ModelError
+from sliplens.explainers.frozen_model import still
+
+
+@contextmanager
+def capture(model: nn.Module, names: Sequence[str], *, differentiable: bool = False) -> Iterator[dict[str, Tensor]]:
+    """Keep the output of each named module of every forward pass made inside, and always take the hooks off again.
+
+    Parameters
+    ----------
+    model
+        Network to listen to.
+    names
+        Modules, by their names in `model.named_modules()`. Of a module called twice the last output is kept.
+    differentiable
+        Start the graph anew at each kept output, so that the gradient of the prediction with respect to it can be
+        taken and the backward pass stops there. With several modules only the last one's gradient is whole.
+
+    Yields
+    ------
+    dict[str, Tensor]
+        Outputs by name, filled by the forward pass.
+    """
+    outputs: dict[str, Tensor] = {}
+    modules = dict(model.named_modules())
+
+    def listen(name: str):  # noqa: ANN202 (a hook, typed by torch)
+        def hook(_module: nn.Module, _arguments: object, output: Tensor) -> Tensor:
+            outputs[name] = output.detach().requires_grad_(differentiable)
+            # the rest of the network gets a copy: an in-place ReLU would overwrite what is kept
+            return outputs[name].clone()
+
+        return hook
+
+    with ExitStack() as stack:
+        for name in names:
+            stack.callback(modules[name].register_forward_hook(listen(name)).remove)
+        yield outputs
+
+
+_MAP_AXES = 4
+Shape = tuple[int, int, int]
+"""Channels, rows and columns of a map."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layer:
+    """A module whose output is a map."""
+
+    name: str
+    """Its name in `model.named_modules()`."""
+    channels: int
+    height: int
+    """Rows of the map."""
+    width: int
+    """Columns of the map."""
+
+
+@dataclass
+class _Call:
+    """One call of a module, with the calls made inside it in the order in which they ran."""
+
+    name: str
+    module: nn.Module
+    input_shape: Shape | None
+    output_shape: Shape | None = None
+    inner: list["_Call"] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A module on the network's main path."""
+
+    name: str
+    shape: Shape
+    has_parameters: bool
+
+
+def find_layers(
+    model: nn.Module, images: Float[Tensor, "batch 3 height width"], *, names: Sequence[str] | None = None
+) -> tuple[Layer, ...]:
+    """Find the layers to explain, in the order in which they run: fine to coarse in the usual network.
+
+    The network is run once and its main path followed: the modules that the network itself calls, looking into
+    plain `Sequential` containers, wrappers whose output is no map, and blocks that shrink the map by more than two,
+    but not into blocks and their branches. Neighbours on the path whose maps have the same channels, height and width
+    are one layer, represented by the last; a layer without parameters (pooling) only repeats the one before and is
+    left out, as are 1 x 1 maps. So each resolution and width gives its last map, whether the pooling that follows is a
+    module or a function. For TorchVision's ShuffleNetV2 these are conv1, stage2, stage3, stage4 and conv5, for its
+    ResNet-18 relu and layer1 to layer4.
+
+    Parameters
+    ----------
+    model
+        Network; it is held `still` for the pass.
+    images
+        Images to run it on; one is enough.
+    names
+        Take these modules instead, by their names in `model.named_modules()`.
+
+    Raises
+    ------
+    ModelError
+        If a name is unknown or its module gives no map, or if the network has no layer with a map.
+    """
+    root = _record(model, images)
+    layers = _distinct(_main_path(root))
+    if names is not None:
+        return _named(model, root, names, found=layers)
+    if not layers:
+        raise ModelError(
+            f"{type(model).__name__} has no layer with a spatial map for images of {images.shape[-2]} x "
+            f"{images.shape[-1]} pixels; use larger images, a convolutional network, or integrated gradients"
+        )
+    return layers
+
+
+def recall_layers(
+    model: nn.Module, images: Float[Tensor, "batch 3 height width"], *, names: Sequence[str] | None = None
+) -> tuple[Layer, ...]:
+    """What `find_layers` found the last time for this network, these names and images of this size, else find them.
+
+    A search costs a pass with hooks on every module, as much as a whole Grad-CAM. It is made again when a module was
+    added, taken away or replaced.
+
+    Parameters
+    ----------
+    model, images, names
+        As for `find_layers`.
+
+    Raises
+    ------
+    ModelError
+        As `find_layers`.
+    """
+    modules = tuple((name, weakref.ref(module)) for name, module in model.named_modules())
+    key = (modules, tuple(images.shape[1:]), None if names is None else tuple(names))
+    known = _FOUND.get(model)
+    if known is None or known[0] != key:
+        _FOUND[model] = known = (key, find_layers(model, images, names=names))
+    return known[1]
+
+
+_FOUND: weakref.WeakKeyDictionary[nn.Module, tuple[object, tuple[Layer, ...]]] = weakref.WeakKeyDictionary()
+
+
+def map_calls(model: nn.Module, images: Float[Tensor, "batch 3 height width"]) -> list[tuple[str, Shape | None]]:
+    """Names of all modules in the order in which their calls end, with the shape of their output.
+
+    Parameters
+    ----------
+    model
+        Network; it is held `still` for the pass.
+    images
+        Images to run it on; one is enough.
+
+    Returns
+    -------
+    list
+        Name, and (channels, height, width) of the output where it is a map, else None.
+    """
+    return [(call.name, call.output_shape) for call in _finished(_record(model, images))]
+
+
+def _record(model: nn.Module, images: Tensor) -> _Call:
+    """Run the network and return the tree of its module calls."""
+    top = _Call("", model, None)
+    open_calls = [top]
+
+    def enter(name: str):  # noqa: ANN202 (a hook, typed by torch)
+        def hook(module: nn.Module, arguments: tuple[object, ...]) -> None:
+            call = _Call(name, module, _map_shape(arguments[0] if arguments else None))
+            open_calls[-1].inner.append(call)
+            open_calls.append(call)
+
+        return hook
+
+    def leave(_module: nn.Module, _arguments: object, output: object) -> None:
+        open_calls.pop().output_shape = _map_shape(output)
+
+    with ExitStack() as stack, torch.no_grad(), still(model):
+        for name, module in model.named_modules():
+            stack.callback(module.register_forward_pre_hook(enter(name)).remove)
+            stack.callback(module.register_forward_hook(leave).remove)
+        model(images[:1])
+    return top.inner[0]
+
+
+def _map_shape(value: object) -> Shape | None:
+    """(channels, height, width) of a map, else None."""
+    if not isinstance(value, Tensor) or value.ndim != _MAP_AXES:
+        return None
+    channels, height, width = value.shape[1:]
+    return channels, height, width
+
+
+def _is_spatial(shape: Shape | None) -> bool:
+    return shape is not None and shape[1] * shape[2] > 1
+
+
+def _main_path(call: _Call) -> list[_Step]:
+    # the exact forward: a subclass that overrides it may do more than run its items in a row
+    is_sequence = type(call.module).forward is nn.Sequential.forward
+    if not (call.name == "" or is_sequence or call.output_shape is None or _shrinks_repeatedly(call)):
+        has_parameters = next(call.module.parameters(), None) is not None
+        return [_Step(call.name, call.output_shape, has_parameters)]
+    steps = [step for inner in call.inner for step in _main_path(inner)]
+    if steps and is_sequence and call.name and call.output_shape is not None:
+        steps[-1] = replace(steps[-1], name=call.name)  # the same tensor under the name people know
+    return steps
+
+
+def _shrinks_repeatedly(call: _Call) -> bool:
+    if not call.inner or call.input_shape is None or call.output_shape is None:
+        return False
+    return call.input_shape[1] > 2 * call.output_shape[1] + 1 or call.input_shape[2] > 2 * call.output_shape[2] + 1
+
+
+def _distinct(steps: list[_Step]) -> tuple[Layer, ...]:
+    layers = []
+    for shape, group in groupby(steps, key=lambda step: step.shape):
+        members = list(group)
+        if _is_spatial(shape) and any(step.has_parameters for step in members):
+            layers.append(_layer(members[-1].name, shape))
+    return tuple(layers)
+
+
+def _layer(name: str, shape: Shape) -> Layer:
+    return Layer(name=name, channels=shape[0], height=shape[1], width=shape[2])
+
+
+def _named(model: nn.Module, root: _Call, names: Sequence[str], *, found: tuple[Layer, ...]) -> tuple[Layer, ...]:
+    known = [name for name, _ in model.named_modules() if name]
+    shapes: dict[str, Shape | None] = {}
+    for call in _finished(root):
+        shapes.pop(call.name, None)  # a module called twice counts where it ended last
+        shapes[call.name] = call.output_shape
+    for name in names:
+        if name not in known:
+            choices = [layer.name for layer in found] + get_close_matches(name, known, n=3)
+            raise ModelError(
+                f"{type(model).__name__} has no layer {name!r}; choose among {', '.join(dict.fromkeys(choices))} "
+                "or another name of model.named_modules()"
+            )
+        if not _is_spatial(shapes.get(name)):
+            choices = ", ".join(layer.name for layer in found)
+            raise ModelError(f"layer {name!r} gives no spatial map; choose among {choices or 'none'}")
+    if not names:
+        raise ModelError("the list of layers is empty; name at least one, or pass None to have them found")
+    return tuple(_layer(name, shape) for name, shape in shapes.items() if shape is not None and name in names)
+
+
+def _finished(call: _Call) -> Iterator[_Call]:
+    for inner in call.inner:
+        yield from _finished(inner)
+    yield call

@@ -1,0 +1,238 @@
+"""Class activation maps that keep their sign."""
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sliplens.errors import ModelError
+from sliplens.explainers.activations import Layer, capture, recall_layers
+from sliplens.explainers.contract import Found, Method, require_at_least_one
+from sliplens.explainers.explanation import Progress, check_slopes
+from sliplens.explainers.frozen_model import Held
+from sliplens.explainers.maps import spread
+
+
+def grad_cam_map(
+    activations: Float[Tensor, "batch channels rows columns"],
+    gradients: Float[Tensor, "batch channels rows columns"],
+) -> Float[Tensor, "batch rows columns"]:
+    """Grad-CAM before any ReLU: sum over c of alpha_c A_c, alpha_c the mean over space of df/dA_c.
+
+    In margin units for each cell: for a head f = bias + w . mean over space of A, alpha_c = w_c / (rows x columns), so
+    the cells add up to f - bias without any further normalisation.
+
+    Parameters
+    ----------
+    activations
+        A, the output of a layer.
+    gradients
+        df/dA in margin units over the activation's.
+
+    References
+    ----------
+    Selvaraju et al., *Grad-CAM: Visual explanations from deep networks via gradient-based localization*, ICCV 2017,
+    eqs. 1 and 2, without the ReLU of eq. 2: a regressor's negative evidence is evidence.
+    """
+    return (gradients.mean(dim=(2, 3), keepdim=True) * activations).sum(dim=1)
+
+
+def hires_cam_map(
+    activations: Float[Tensor, "batch channels rows columns"],
+    gradients: Float[Tensor, "batch channels rows columns"],
+) -> Float[Tensor, "batch rows columns"]:
+    """HiResCAM: sum over c of df/dA_c A_c, cell by cell, in margin units; Grad-CAM where the gradient is constant.
+
+    Parameters
+    ----------
+    activations, gradients
+        A, the output of a layer, and df/dA.
+
+    References
+    ----------
+    Draelos and Carin, *Use HiResCAM instead of Grad-CAM for faithful explanations of convolutional neural networks*,
+    2020, eq. 3.
+    """
+    return (gradients * activations).sum(dim=1)
+
+
+def layer_cam_map(
+    activations: Float[Tensor, "batch channels rows columns"],
+    gradients: Float[Tensor, "batch channels rows columns"],
+) -> Float[Tensor, "batch rows columns"]:
+    """LayerCAM before its last ReLU: sum over c of relu(df/dA_c) A_c, cell by cell, in margin units.
+
+    Parameters
+    ----------
+    activations, gradients
+        A, the output of a layer, and df/dA.
+
+    References
+    ----------
+    Jiang et al., *LayerCAM: Exploring hierarchical class activation maps for localization*, IEEE TIP 2021, eqs. 4 to 6,
+    without the ReLU of eq. 6.
+    """
+    return (torch.relu(gradients) * activations).sum(dim=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Cam(Method):
+    """One layer's cells, weighted by the gradient at the image.
+
+    The published maps weigh the activations A(x). They add up to f(x) less what the layers behind it add on their own:
+    for a classifier's logit that is evidence, for a regressor it is mostly the level that every image has. What sets x
+    apart from the reference is the contrast A(x) - A(b), weighted by the same gradient.
+    The map is bilinear between the layer's cells and keeps their total.
+    """
+
+    layer: str | None = None
+    contrast: bool = True
+    batch_size: int = 32
+
+    method: ClassVar[str]
+    complete: ClassVar[bool]
+    """Whether the contrast adds up to f(x) - f(b) for a head linear in the mean over space."""
+
+    def __post_init__(self) -> None:
+        require_at_least_one(type(self).__name__, batch_size=self.batch_size)
+
+    @abstractmethod
+    def _cells(self, activations: Tensor, gradients: Tensor, *, change: Tensor) -> Tensor:
+        """Relevance of the layer's cells in margin units."""
+
+    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
+        layer = self._find_layer(held)
+        parts, predictions, empty_predictions = [], [], []
+        empty = empty_prediction = None
+        for part in torch.arange(len(held.images)).split(self.batch_size):
+            # images and references in one pass; one reference for all is looked at once
+            shared = held.references[: 0 if parts else 1]
+            references = held.references[part] if len(held.references) > 1 else shared
+            seen = _differentiate(held, torch.cat([held.images[part], references]), count=len(part), layer=layer)
+            activations, prediction = seen.activations[: len(part)], seen.predictions[: len(part)]
+            if len(references):
+                empty, empty_prediction = seen.activations[len(part) :], seen.predictions[len(part) :]
+            assert empty is not None  # the first pass has references
+            assert empty_prediction is not None
+            change = (prediction - empty_prediction)[:, None, None, None]
+            contrast = activations - empty if self.contrast else activations
+            cells = self._cells(contrast, seen.gradients, change=change)
+            parts.append(spread(cells, (held.images.shape[-2], held.images.shape[-1])))
+            predictions.append(prediction)
+            empty_predictions.append(empty_prediction.expand_as(prediction))
+            if on_progress is not None:
+                on_progress(sum(map(len, parts)), len(held.images))
+        subject = held.predicted(torch.cat(predictions), torch.cat(empty_predictions))
+        relevance = torch.cat(parts)
+        return Found(
+            subject=subject,
+            relevance=relevance,
+            method=self.method,
+            complete=self.contrast and self.complete,
+            target=f"{'f(x) - f(reference)' if self.contrast else 'f(x)'}, through layer {layer.name}",
+            findings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=subject.change.tolist()),
+        )
+
+    def _find_layer(self, held: Held) -> Layer:
+        names = None if self.layer is None else (self.layer,)
+        try:
+            return recall_layers(held.model, held.images[:1], names=names)[-1]
+        except ModelError:
+            held.predict_all()  # a model that gives no number has a greater fault than one without layers
+            raise
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Seen:
+    """One pass of images, followed by references, and the gradients at the images."""
+
+    activations: Tensor
+    gradients: Tensor
+    predictions: Tensor
+
+
+def _differentiate(held: Held, batch: Tensor, *, count: int, layer: Layer) -> _Seen:
+    """Activations and predictions of a batch, and the gradients of the first `count` predictions in them."""
+    with capture(held.model, [layer.name], differentiable=True) as outputs:
+        predictions = held.predict(batch)
+    if not predictions.requires_grad:
+        raise ModelError(
+            f"the output does not depend on layer {layer.name!r}; choose a layer on the path to the output"
+        )
+    (gradients,) = torch.autograd.grad(predictions[:count].sum(), outputs[layer.name])
+    return _Seen(
+        activations=outputs[layer.name].detach(), gradients=gradients[:count], predictions=predictions.detach()
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class GradCam(_Cam):
+    """Grad-CAM of one layer against the reference, signed, in margin units.
+
+    The relevance of a cell is sum over c of alpha_c (A_c(x) - A_c(b)), alpha_c at x (`grad_cam_map`), which for a head
+    linear in the mean over space adds up to f(x) - f(b) exactly, whatever the bias. It takes one pass of the image
+    and the reference together, a backward pass from the output to the layer, and, the first time, one pass to find the
+    layer.
+
+    Parameters
+    ----------
+    layer
+        Name of the layer; by default the last one with a map, as `find_layers` finds it.
+    contrast
+        Take the reference's activations off. False gives the published map, which does not depend on the reference and
+        has no completeness gap; the reference then only decides what `saliency` shows.
+    batch_size
+        Images in one pass.
+    """
+
+    method: ClassVar[str] = "grad-cam"
+    complete: ClassVar[bool] = True
+
+    def _cells(self, activations: Tensor, gradients: Tensor, *, change: Tensor) -> Tensor:  # noqa: ARG002 (a slot)
+        return grad_cam_map(activations, gradients)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HiResCam(_Cam):
+    """HiResCAM of one layer against the reference, signed, in margin units.
+
+    As Grad-CAM, but each cell is weighted by its own gradient (`hires_cam_map`), so that the map shows where the layers
+    behind look. With the mean over space as head the two are the same.
+
+    Parameters
+    ----------
+    layer, contrast, batch_size
+        As for `GradCam`.
+    """
+
+    method: ClassVar[str] = "hires-cam"
+    complete: ClassVar[bool] = True
+
+    def _cells(self, activations: Tensor, gradients: Tensor, *, change: Tensor) -> Tensor:  # noqa: ARG002 (a slot)
+        return hires_cam_map(activations, gradients)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayerCam(_Cam):
+    """LayerCAM of one layer against the reference, signed, in margin units.
+
+    The published map keeps the cells and channels whose gradient is positive, those that raise a class. A regressor's
+    prediction may have fallen, so kept are those whose gradient points the way the prediction went: with
+    s = sign(f(x) - f(b)) the map is s sum over c of relu(s df/dA_c) (A_c(x) - A_c(b)). The rest is left out, so the map
+    adds up to nothing in particular and has no completeness gap.
+
+    Parameters
+    ----------
+    layer, contrast, batch_size
+        As for `GradCam`.
+    """
+
+    method: ClassVar[str] = "layer-cam"
+    complete: ClassVar[bool] = False
+
+    def _cells(self, activations: Tensor, gradients: Tensor, *, change: Tensor) -> Tensor:
+        sign = change.sign()
+        return sign[:, 0] * layer_cam_map(activations, sign * gradients)

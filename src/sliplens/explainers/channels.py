@@ -1,0 +1,256 @@
+"""The effect of each channel's region on the prediction: masked images, made as they are needed."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from sliplens.explainers.activations import Layer, find_layers
+from sliplens.explainers.maps import FLOOR, resize, to_masks
+from sliplens.explainers.poly_cam_thesis import find_published_layers, thesis_support
+from sliplens.models.engines import Passes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """Which of the two points of a channel's effect are measured."""
+
+    keep: bool
+    """Predict the image with only the channel's region kept."""
+    remove: bool
+    """Predict the image with the channel's region removed."""
+
+    @property
+    def passes(self) -> int:
+        """Masked images a channel."""
+        return self.keep + self.remove
+
+
+VARIANTS = {
+    "+": Variant(keep=True, remove=False),
+    "-": Variant(keep=False, remove=True),
+    "+/-": Variant(keep=True, remove=True),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Predictions:
+    """Predictions of one image and of its masked versions, in margin units."""
+
+    image: Float[Tensor, ""]
+    """f(x)."""
+    empty: Float[Tensor, ""]
+    """f(b), the image with everything removed."""
+    kept: Float[Tensor, " channels"] | None
+    """f(b + (x - b) M) for each channel's mask M, or None where the variant has no such pass."""
+    removed: Float[Tensor, " channels"] | None
+    """f(b + (x - b)(1 - M)), or None."""
+
+
+def channel_effects(predictions: Predictions) -> Float[Tensor, " channels"]:
+    """Effect of each channel's region in margin units: 0 for the empty mask, f(x) - f(b) for the full one.
+
+    The mean of what the region adds to the reference, f(b + (x - b) M) - f(b), and of what the image loses without it,
+    f(x) - f(b + (x - b)(1 - M)), or the one of them that was measured. Unlike a softmax or sigmoid of the output it
+    is signed and does not saturate.
+    """
+    effects = []
+    if predictions.kept is not None:
+        effects.append(predictions.kept - predictions.empty)
+    if predictions.removed is not None:
+        effects.append(predictions.image - predictions.removed)
+    return torch.stack(effects).mean(dim=0)
+
+
+def _supporting_share(predictions: Predictions) -> Float[Tensor, " channels"]:
+    """Each effect as a share of f(x) - f(b), positive where it supports the change; 0 where nothing changed.
+
+    The division changes no map, since each is normalised, and keeps the numbers clear of the floor of 1e-12 in
+    `combine`.
+    """
+    effects, change = channel_effects(predictions), predictions.image - predictions.empty
+    return effects / change if change else torch.zeros_like(effects)
+
+
+def _thesis_support(predictions: Predictions) -> Float[Tensor, " channels"]:
+    return thesis_support(predictions.image, kept=predictions.kept, removed=predictions.removed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Score:
+    """A way to weigh channels, with what belongs to it."""
+
+    support: Callable[[Predictions], Tensor]
+    """How far each channel speaks for the prediction; below 0 it speaks against it, and gets no weight."""
+    layers: Callable[[nn.Module, Tensor], tuple[Layer, ...]]
+    """Layers of a network, fine to coarse or as they run, found with one image."""
+    as_published: bool
+    """Masks as the public code makes them, blended with black; otherwise empty for what is nowhere active, blended
+    with the reference."""
+
+
+SCORES = {
+    "regression": Score(support=_supporting_share, layers=find_layers, as_published=False),
+    "thesis": Score(support=_thesis_support, layers=find_published_layers, as_published=True),
+}
+
+
+def layer_map(
+    activations: Float[Tensor, "channels rows columns"], weights: Float[Tensor, " channels"]
+) -> Float[Tensor, "rows columns"]:
+    """Sum of weight x activation over the channels, above zero."""
+    return torch.relu(torch.einsum("c,chw->hw", weights, activations))
+
+
+def combine(
+    activations: Sequence[Float[Tensor, "_channels _rows _columns"]],
+    weights: Sequence[Float[Tensor, " _channels"]],
+    *,
+    size: tuple[int, int],
+) -> list[Float[Tensor, "height width"]]:
+    """Turn the channel weights of every layer into one saliency a layer, in [0, 1], resized to the image.
+
+    From the last layer to the first a layer's map is divided by itself resized to the coarser result and back (LNorm),
+    then multiplied by that result; a level's saliency is this product normalised like a mask.
+
+    Parameters
+    ----------
+    activations, weights
+        Those of each layer, fine to coarse.
+    size
+        Height and width of the image in pixels.
+
+    References
+    ----------
+    Englebert, Cornu and De Vleeschouwer, *Poly-CAM*, ICPR 2022, section III, and its public code.
+    """
+    saliencies = []
+    coarser: Tensor | None = None
+    for activation, weight in zip(reversed(activations), reversed(weights), strict=True):
+        product = layer_map(activation, weight)
+        if coarser is not None:
+            here = product.shape[-2], product.shape[-1]
+            smooth = resize(resize(product, (coarser.shape[-2], coarser.shape[-1])), here)
+            product = torch.relu(product / smooth.clamp_min(FLOOR) * resize(coarser, here))
+        saliencies.append(resize(to_masks(product), size))
+        coarser = product
+    return saliencies[::-1]
+
+
+def scale_to(
+    saliencies: Float[Tensor, "batch height width"], *, total: Float[Tensor, " batch"]
+) -> Float[Tensor, "batch height width"]:
+    """Scale each map so that it adds up to its total; a map of zeros stays."""
+    sums = saliencies.sum(dim=(1, 2))
+    factor = torch.where(sums == 0, torch.zeros_like(sums), total / sums)
+    return saliencies * factor[:, None, None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Regions:
+    """One image and the regions of all its channels, those of every layer in a row."""
+
+    image: Float[Tensor, "3 height width"]
+    """x."""
+    empty: Float[Tensor, "3 height width"]
+    """b, what is shown outside a region."""
+    masks: tuple[Float[Tensor, "_channels _rows _columns"], ...]
+    """M, in [0, 1], at the resolution of each layer."""
+
+    @classmethod
+    def of(
+        cls,
+        activations: list[Float[Tensor, "_channels _rows _columns"]],
+        *,
+        image: Float[Tensor, "3 height width"],
+        empty: Float[Tensor, "3 height width"],
+        as_published: bool = False,
+    ) -> "Regions":
+        """Regions from the activations of each layer; see `to_masks`."""
+        return cls(image=image, empty=empty, masks=tuple(to_masks(a, as_published=as_published) for a in activations))
+
+    @property
+    def layer_sizes(self) -> list[int]:
+        """Channels of each layer."""
+        return [len(masks) for masks in self.masks]
+
+    def active(self) -> Int[Tensor, " some"]:
+        """Channels whose mask is not empty; an empty one keeps nothing and removes nothing. A mask of NaN is active."""
+        return torch.nonzero(torch.cat([(masks != 0).flatten(1).any(dim=1) for masks in self.masks])).flatten()
+
+    def at_image_size(self, channels: Int[Tensor, " some"]) -> Float[Tensor, "some height width"]:
+        """Masks of some channels, in rising order, resized to the image."""
+        size = self.image.shape[-2], self.image.shape[-1]
+        parts, first = [], 0
+        for masks in self.masks:
+            inside = channels[(channels >= first) & (channels < first + len(masks))] - first
+            if len(inside):
+                parts.append(resize(masks[inside], size))
+            first += len(masks)
+        return torch.cat(parts)
+
+    def blends(self, channels: Int[Tensor, " some"], *, variant: Variant) -> Float[Tensor, "images 3 height width"]:
+        """Masked images of some channels, in rising order: all that are kept, then all that are removed."""
+        content = (self.image - self.empty) * self.at_image_size(channels)[:, None]
+        return torch.cat([self.empty + content] * variant.keep + [self.image - content] * variant.remove)
+
+
+def measure(
+    regions: Regions,
+    channels: Int[Tensor, " some"],
+    *,
+    passes: Passes,
+    variant: Variant,
+    on_channels: Callable[[int], None],
+) -> Float[Tensor, "points some"]:
+    """Predictions of the masked images of some channels; memory is bounded by the batch of the passes.
+
+    Parameters
+    ----------
+    regions
+        The image and its masks.
+    channels
+        Which, in rising order.
+    passes
+        The network.
+    variant
+        Which points are predicted.
+    on_channels
+        Called with the number of channels done since the last call.
+
+    Returns
+    -------
+    Tensor
+        One row for what is kept and one for what is removed, as far as the variant has them.
+    """
+    parts = channels.split(max(1, passes.batch_size // variant.passes))
+
+    def batches() -> Iterator[Tensor]:
+        for part in parts:
+            # in pieces, where even one channel's images are more than a batch
+            yield from regions.blends(part, variant=variant).split(passes.batch_size)
+
+    waiting, found = list(parts), []
+    pieces: list[Tensor] = []
+    for answers in passes.run(batches()):
+        pieces.append(answers)
+        if sum(map(len, pieces)) == variant.passes * len(waiting[0]):
+            found.append(torch.cat(pieces).reshape(variant.passes, -1))
+            on_channels(len(waiting.pop(0)))
+            pieces = []
+    return torch.cat(found, dim=1) if found else regions.image.new_zeros(variant.passes, 0)
+
+
+def as_predictions(
+    points: Float[Tensor, "points channels"], *, variant: Variant, image: Float[Tensor, ""], empty: Float[Tensor, ""]
+) -> Predictions:
+    """Name the rows that `measure` returns."""
+    rows = iter(points)
+    return Predictions(
+        image=image,
+        empty=empty,
+        kept=next(rows) if variant.keep else None,
+        removed=next(rows) if variant.remove else None,
+    )

@@ -1,0 +1,241 @@
+"""Sentences that tell a reader when a map should not be trusted."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, Shaped
+from torch import Tensor, nn
+
+Progress = Callable[[int, int], None]
+"""Called with the pieces of work done and their total, after each piece."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """What one layer contributed to a map that is built layer by layer."""
+
+    layer: str
+    """Name of the layer in the network."""
+    saliency: Float[Tensor, "batch height width"]
+    """Map in [0, 1] as it stood at this layer, resized to the image."""
+    weights: Float[Tensor, "batch channels"]
+    """Weight of each channel, >= 0: for the regression score a share of f(x) - f(reference)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Approximation:
+    """What an approximate map has in common with the exact one, as far as its own measurements tell."""
+
+    measured: int
+    """Channels whose effect was measured."""
+    channels: int
+    """Channels that an exact map would measure."""
+    pearson_r: float
+    """Expected correlation with the exact map over the pixels; NaN where the map is constant."""
+    top_overlap: float
+    """Expected share of the strongest tenth of the pixels that is the exact map's too."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explanation:
+    """Why a network predicts f(x) rather than f(reference), for a batch of images."""
+
+    relevance: Float[Tensor, "batch height width"]
+    """Signed contribution of each pixel in margin units (float32): above zero where it raises the prediction."""
+    method: str
+    """Key of the explainer in `EXPLAINERS`."""
+    target: str
+    """What the relevance adds up to, in words."""
+    prediction: Float[Tensor, " batch"]
+    """f(x), the safety margin of each image."""
+    reference_prediction: Float[Tensor, " batch"]
+    """f(reference), the safety margin of what each image is compared with."""
+    completeness_gap: Float[Tensor, " batch"] | None = None
+    """|sum of the relevance - (f(x) - f(reference))| in margin units; None where the sum is not promised."""
+    seconds: float
+    """Wall-clock time of the whole call, every image together, the device waited for."""
+    warnings: tuple[str, ...] = ()
+    """What a reader should know before trusting the maps, one sentence each."""
+    levels: tuple[Level, ...] = ()
+    """The map layer by layer, fine to coarse, where the method has levels and was asked to keep them."""
+    approximations: tuple[Approximation, ...] = ()
+    """For each image what its map has in common with the exact one; empty where the map is exact."""
+    engine: str = "plain"
+    """What ran the network: as it is (`plain`), or an engine of `passes` that was found to answer as it does."""
+
+    @property
+    def change(self) -> Float[Tensor, " batch"]:
+        """f(x) - f(reference), the difference that is explained, in margin units."""
+        return self.prediction - self.reference_prediction
+
+    @property
+    def saliency(self) -> Float[Tensor, "batch height width"]:
+        """The supporting evidence in [0, 1], for viewing: 1 at the strongest pixel of each image.
+
+        A regressor has no winning class, so "supporting" is read off the difference that is explained: with
+        s = sign(f(x) - f(reference)) the map is relu(s * relevance) over its largest value. Where the margin falls
+        below the reference's (s = -1) the pixels that lower it are shown, which a plain ReLU would hide. A map
+        without supporting evidence stays zero, and so does every map where f(x) = f(reference).
+        """
+        supporting = torch.relu(self.change.sign().to(self.relevance.dtype)[:, None, None] * self.relevance)
+        peak = supporting.amax(dim=(1, 2), keepdim=True)
+        return supporting / torch.where(peak > 0, peak, torch.ones_like(peak))
+
+
+@runtime_checkable
+class Explainer(Protocol):
+    """A frozen dataclass whose fields are the options of a method and whose call explains a batch."""
+
+    def __call__(
+        self,
+        model: nn.Module,
+        images: Shaped[Tensor, "*batch channels height width"],
+        *,
+        reference: Shaped[Tensor, "..."] | None = None,
+        on_progress: Progress | None = None,
+    ) -> Explanation:
+        """Explain f(x) - f(reference) of a regressor with one output.
+
+        Parameters
+        ----------
+        model
+            Network from images (batch, 3, height, width) to one safety margin each, (batch,) or (batch, 1).
+            It is put into evaluation mode for the call and given back as it was.
+        images
+            Images x, float in [0, 1], shape (batch, 3, height, width).
+        reference
+            What the images are compared with, float in [0, 1], one for all (3, height, width) or one each
+            (batch, 3, height, width); by default zeros, the untouched sensor of difference images.
+        on_progress
+            Called with the pieces of work done and their total.
+
+        Raises
+        ------
+        ImageError
+            If the images or the reference have a wrong shape, type or range, or hold NaN.
+        ModelError
+            If the network has several outputs, predicts NaN, or lacks a layer that the method needs.
+        """
+        ...
+
+
+CLOSE = 0.02  # margin units; a difference below the regressor's own error explains nothing
+GAP = 0.01  # share of |f(x) - f(reference)| that may stay unexplained
+LOWEST, HIGHEST = -0.1, 1.1  # margins that a regressor tells of data like its own, with its error
+ALIKE_R, ALIKE_TOP = 0.99, 0.9  # what an approximate map should have in common with the exact one
+FLAT = 0.1  # share of |f(x) - f(reference)| that gradients at the image must make up, all of one sign
+
+
+def check_maps(
+    relevance: Float[Tensor, "batch height width"],
+    *,
+    prediction: Float[Tensor, " batch"],
+    reference_prediction: Float[Tensor, " batch"],
+    completeness_gap: Float[Tensor, " batch"] | None,
+) -> tuple[str, ...]:
+    """List what is wrong with each map, one sentence a finding, in the order of the images.
+
+    Parameters
+    ----------
+    relevance
+        Signed maps in margin units.
+    prediction, reference_prediction
+        f(x) and f(reference) in margin units.
+    completeness_gap
+        |sum of the relevance - (f(x) - f(reference))| in margin units, or None where it is not promised.
+    """
+    findings = []
+    for index, (image_map, high, low) in enumerate(
+        zip(relevance, prediction.tolist(), reference_prediction.tolist(), strict=True)
+    ):
+        change = high - low
+        if abs(change) < CLOSE:
+            findings.append(
+                f"image {index}: f(x) = {high:.3g} is within {CLOSE} of f(reference) = {low:.3g}, "
+                "so there is next to nothing to explain"
+            )
+        if not LOWEST <= low <= HIGHEST:
+            findings.append(
+                f"image {index}: f(reference) = {low:.3g} is no safety margin, so the reference lies far from the data "
+                "and the map shows the way from there"
+            )
+        if not torch.isfinite(image_map).all():
+            findings.append(f"image {index}: the map holds NaN or infinity and must not be shown or scored")
+        elif not image_map.any():
+            findings.append(f"image {index}: the map is zero everywhere and says nothing about the image")
+        if completeness_gap is not None:
+            gap = float(completeness_gap[index])
+            if gap > GAP * abs(change):
+                findings.append(
+                    f"image {index}: the map leaves {gap:.2g} of f(x) - f(reference) = {change:.2g} unexplained, "
+                    f"more than {GAP:.0%}"
+                )
+    return tuple(findings)
+
+
+def check_weights(
+    layers: Sequence[str], weights: Sequence[Sequence[Float[Tensor, " _channels"]]], *, change: Sequence[float]
+) -> Iterator[str]:
+    """List what is wrong with the weights of the channels, one sentence for each image and layer.
+
+    Parameters
+    ----------
+    layers
+        Names.
+    weights
+        For each image those of each layer.
+    change
+        f(x) - f(reference) of each image in margin units.
+    """
+    for index, (shares, difference) in enumerate(zip(weights, change, strict=True)):
+        for layer, weight in zip(layers, shares, strict=True):
+            bad = int((~weight.isfinite()).sum())
+            if bad:
+                yield (
+                    f"image {index}: {bad} of {len(weight)} channels of layer {layer} have no finite weight, "
+                    "so the model cannot predict every masked image"
+                )
+            elif difference and not weight.any():
+                yield (f"image {index}: no channel of layer {layer} supports f(x) - f(reference), so the map is zero")
+            elif difference and len(weight) > 1 and bool((weight == weight[0]).all()):
+                yield (
+                    f"image {index}: every channel of layer {layer} has the weight {float(weight[0]):.3g}, "
+                    "so the masked passes chose nothing and the map shows activity only"
+                )
+
+
+def check_approximations(approximations: Sequence[Approximation]) -> Iterator[str]:
+    """Say where an approximate map is not expected to be like the exact one."""
+    for index, one in enumerate(approximations):
+        if not (one.pearson_r >= ALIKE_R and one.top_overlap >= ALIKE_TOP):
+            yield (
+                f"image {index}: with {one.measured} of {one.channels} channels measured the map is expected to "
+                f"correlate with the exact one at {one.pearson_r:.3f} and to share {one.top_overlap:.0%} of its "
+                "strongest pixels; raise the budget"
+            )
+
+
+def check_slopes(sizes: Sequence[float], *, change: Sequence[float]) -> Iterator[str]:
+    """Say where the gradients at an image are next to nothing, though there is something to explain.
+
+    Gradient times contrast is as large as what it explains where the network is linear: the sum of its sizes is then at
+    least |f(x) - f(reference)|. Where that sum is below a tenth of it, the gradients would not explain more than a
+    tenth even if all of them pulled one way: the network is saturated at the image, and its slope there has little to
+    do with how the prediction came about.
+
+    Parameters
+    ----------
+    sizes
+        Sum of |gradient x contrast| of each image in margin units.
+    change
+        f(x) - f(reference) of each image in margin units.
+    """
+    for index, (size, difference) in enumerate(zip(sizes, change, strict=True)):
+        if abs(difference) >= CLOSE and size < FLAT * abs(difference):
+            yield (
+                f"image {index}: the gradients at the image make up {size / abs(difference):.2g} of "
+                f"f(x) - f(reference) = {difference:.2g}, less than {FLAT:g}: the network is saturated there, so "
+                "compare with poly-cam or occlusion, which need no gradient"
+            )

@@ -1,0 +1,295 @@
+"""SmoothGrad: the gradient averaged over noisy copies of the image."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from captum import attr
+from jaxtyping import Float
+from torch import Tensor
+
+from sliplens.errors import InputError
+from sliplens.explainers.contract import Found, Method, require_at_least_one
+from sliplens.explainers.explanation import Progress, check_slopes
+from sliplens.explainers.frozen_model import Held, Subject, holding, require_images
+
+_NODES = 4  # of a piece; the slope along the path has kinks, on which more nodes to a piece are wasted
+_ROUNDING = 1e-6  # of |f|: a gap that float32 predictions cannot resolve is no gap
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """What the gradients from a reference to an image add up to."""
+
+    relevance: Float[Tensor, "height width"]
+    """In margin units."""
+    slope: float
+    """Of the last piece, next to the image: what its relevance would be, sign left out, if it were the whole line."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class IntegratedGradients(Method):
+    """Integrated Gradients along the straight line from the reference, with as many steps as completeness needs.
+
+    Relevance is (x - b) times the integral over t in [0, 1] of df/dx at b + t (x - b), summed over the channels; it
+    adds up to f(x) - f(b) when the integral is exact.
+
+    The line is cut into pieces. Each has a completeness gap of its own, between its part of the integral and the change
+    of f from its start to its end, which two forward passes tell. While the gaps add up to more than `tolerance` the
+    pieces with the largest are halved. A trained network needs that: its slope along the line is ten times the mean
+    where the contact appears and has a kink wherever a ReLU opens, so that nodes spread over the whole line miss the
+    sum by some percent even when there are 128.
+
+    Each image is refined on its own, so a batch gives what its images alone would give.
+
+    Parameters
+    ----------
+    steps
+        Steps (Gauss-Legendre nodes) to start with, four to a piece.
+    max_steps
+        Most steps; an image that needs more keeps its gap and a warning. Equal to `steps` for one rule over the whole
+        line, as it was published.
+    tolerance
+        Completeness gap allowed, as a share of |f(x) - f(b)|.
+    batch_size
+        Steps in one pass.
+
+    References
+    ----------
+    Sundararajan, Taly and Yan, *Axiomatic attribution for deep networks*, ICML 2017, eq. 1; each piece by Captum.
+    """
+
+    steps: int = 32
+    max_steps: int = 1024
+    tolerance: float = 0.01
+    batch_size: int = 32
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.steps <= self.max_steps:
+            raise InputError(
+                f"integrated gradients has steps = {self.steps} and max_steps = {self.max_steps}; "
+                "give 1 <= steps <= max_steps"
+            )
+        if self.batch_size < 1:
+            raise InputError(f"integrated gradients' batch_size is {self.batch_size}; give at least 1")
+        if not self.tolerance > 0:
+            raise InputError(f"integrated gradients' tolerance is {self.tolerance}; give a share above 0")
+
+    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
+        subject = held.predict_all()
+        ends = torch.stack([subject.reference_prediction, subject.prediction], dim=1)
+        slopes = []
+
+        def integral(index: int) -> Tensor:
+            line = self.integrate(
+                subject, subject.images[index], subject.reference[index], ends=(ends[index, 0], ends[index, 1])
+            )
+            slopes.append(line.slope)
+            return line.relevance
+
+        return Found(
+            subject=subject,
+            relevance=subject.each_image(integral, on_progress=on_progress),
+            method="integrated-gradients",
+            complete=True,
+            findings=check_slopes(slopes, change=subject.change.tolist()),
+        )
+
+    def integrate(
+        self,
+        subject: Subject,
+        image: Float[Tensor, "3 height width"],
+        reference: Float[Tensor, "3 height width"],
+        *,
+        ends: tuple[Float[Tensor, ""], Float[Tensor, ""]],
+    ) -> "Line":
+        """Relevance of one image against one reference.
+
+        Parameters
+        ----------
+        subject
+            The network.
+        image, reference
+            x and b.
+        ends
+            f(b) and f(x).
+        """
+        change = float(ends[1] - ends[0])
+        allowed = max(self.tolerance * abs(change), _ROUNDING * max(abs(float(end)) for end in ends))
+        fixed = self.steps == self.max_steps
+        pieces, nodes = (1, self.steps) if fixed else (max(1, self.steps // _NODES), min(self.steps, _NODES))
+        path = _Path(subject, image, reference, nodes=nodes, batch_size=self.batch_size)
+        edges = torch.linspace(0, 1, pieces + 1, dtype=torch.float64, device=image.device)
+        heights = torch.cat([ends[0][None], path.predict(edges[1:-1]), ends[1][None]]).double()
+        starts, stops, rises = edges[:-1], edges[1:], heights.diff()
+        parts, used = path.integrate(starts, stops), pieces * nodes
+        while True:
+            gaps = parts.sum(dim=(1, 2)).double() - rises
+            rooms = (self.max_steps - used) // (2 * nodes)
+            if abs(float(gaps.sum())) <= allowed or rooms == 0:
+                last = int(stops.argmax())
+                slope = parts[last].abs().sum() / (stops[last] - starts[last])
+                return Line(relevance=parts.sum(dim=0), slope=float(slope))
+            shares, order = gaps.abs().sort(descending=True)
+            # the fewest pieces that hold half of all gaps
+            count = min(int((shares.cumsum(0) < shares.sum() / 2).sum()) + 1, rooms)
+            split, kept = order[:count], order[count:]
+            middles = (starts[split] + stops[split]) / 2
+            rise = path.predict(middles).double() - path.predict(starts[split]).double()
+            new_starts, new_stops = torch.cat([starts[split], middles]), torch.cat([middles, stops[split]])
+            starts, stops = torch.cat([starts[kept], new_starts]), torch.cat([stops[kept], new_stops])
+            rises = torch.cat([rises[kept], rise, rises[split] - rise])
+            parts = torch.cat([parts[kept], path.integrate(new_starts, new_stops)])
+            used += 2 * nodes * count
+
+
+class _Path:
+    """The straight line from a reference to an image."""
+
+    def __init__(self, subject: Subject, image: Tensor, reference: Tensor, *, nodes: int, batch_size: int) -> None:
+        self._subject, self._image, self._reference = subject, image, reference
+        self._nodes, self._batch_size = nodes, batch_size
+        self._captum = attr.IntegratedGradients(subject.predict)
+
+    def _at(self, times: Tensor) -> Tensor:
+        shares = times.to(self._image.dtype)[:, None, None, None]
+        return self._reference + shares * (self._image - self._reference)
+
+    @torch.no_grad()
+    def predict(self, times: Tensor) -> Tensor:
+        """Predictions at some points, 0 the reference and 1 the image."""
+        parts = [self._subject.predict(self._at(part)) for part in times.split(self._batch_size) if len(part)]
+        return torch.cat(parts) if parts else self._image.new_zeros(0)
+
+    def integrate(self, starts: Tensor, stops: Tensor) -> Tensor:
+        """Relevance (pieces, height, width) of each piece of the line."""
+        together = max(1, self._batch_size // self._nodes)
+        found = []
+        for start, stop in zip(starts.split(together), stops.split(together), strict=True):
+            contributions = self._captum.attribute(
+                self._at(stop),
+                baselines=self._at(start),
+                n_steps=self._nodes,
+                internal_batch_size=max(len(start), min(self._batch_size, len(start) * self._nodes)),
+            )
+            found.append(contributions.detach().sum(dim=1))
+        return torch.cat(found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExpectedGradients(Method):
+    """Expected Gradients: the mean of Integrated Gradients over a background of references.
+
+    "Why this margin rather than that of frames without slip?": no single frame has to stand for no slip. The relevance
+    adds up to f(x) less the mean of f over the background. The published method draws references and points of the
+    line at random; here the background is gone through and each line integrated until it is complete, which gives the
+    same in the limit, without noise and without a seed.
+
+    Parameters
+    ----------
+    background
+        Frames without slip as the network takes them, float in [0, 1], shape (frames, 3, height, width); the call's
+        reference is then not used. Without one the call's reference is the whole background, and a warning says so.
+    integrated
+        How each line is integrated.
+
+    References
+    ----------
+    Erion et al., *Improving performance of deep learning models with axiomatic attribution priors and expected
+    gradients*, Nature Machine Intelligence 2021, eq. 3.
+    """
+
+    background: Float[Tensor, "frames 3 height width"] | None = None
+    integrated: IntegratedGradients = field(default_factory=IntegratedGradients)
+
+    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
+        alone = held.predict_all()
+        if self.background is None:
+            frames, heights = alone.reference[:, None], alone.reference_prediction[:, None]
+        else:
+            # checked as images are, and brought to the network's type
+            with holding(held.model, require_images(self.background), reference=None) as behind:
+                heights = behind.predict_all().prediction.expand(len(alone.images), -1)
+                frames = behind.images.expand(len(alone.images), -1, -1, -1, -1)
+        subject = alone.predicted(alone.prediction, heights.mean(dim=1))
+
+        def mean_over(index: int) -> Tensor:
+            image, end = subject.images[index], subject.prediction[index]
+            pairs = zip(frames[index], heights[index], strict=True)
+            lines = [self.integrated.integrate(subject, image, frame, ends=(start, end)) for frame, start in pairs]
+            return torch.stack([line.relevance for line in lines]).mean(dim=0)
+
+        only = ("no background was given, so the reference alone stands for it, as in integrated gradients",)
+        return Found(
+            subject=subject,
+            relevance=subject.each_image(mean_over, on_progress=on_progress),
+            method="expected-gradients",
+            complete=True,
+            target="f(x) - f(reference)" if self.background is None else "f(x) - mean of f over the background",
+            findings=only if self.background is None else (),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SmoothGrad(Method):
+    """SmoothGrad times what the image adds to the reference, signed, in margin units.
+
+    Relevance is (x - b) times the mean of df/dx over x plus normal noise, summed over the channels. The gradient alone,
+    which was published, has another unit than the other maps and lights up where the image equals the reference. The
+    relevance is what the linear model through x says; for a linear network it adds up to f(x) - f(b), for any other to
+    nothing in particular, so it has no completeness gap.
+
+    Parameters
+    ----------
+    samples
+        Noisy copies of each image.
+    noise
+        Standard deviation of the noise, in units of the input's range [0, 1].
+    batch_size
+        Copies in one pass.
+    seed
+        Of the noise, the same for each image.
+
+    References
+    ----------
+    Smilkov et al., *SmoothGrad: removing noise by adding noise*, 2017, section 3; computed by Captum.
+    """
+
+    samples: int = 32
+    noise: float = 0.1
+    batch_size: int = 32
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        require_at_least_one("SmoothGrad", samples=self.samples, batch_size=self.batch_size)
+        if not self.noise >= 0:
+            raise InputError(f"SmoothGrad's noise is {self.noise}; give a standard deviation of at least 0")
+
+    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
+        subject = held.predict_all()
+        tunnel = attr.NoiseTunnel(attr.Saliency(subject.predict))
+
+        def smoothed(index: int) -> Tensor:
+            image, empty = subject.images[index, None], subject.reference[index, None]
+            # Captum draws from the global state, which is given back as it was
+            with torch.random.fork_rng(devices=[image.device] if image.is_cuda else []):
+                torch.manual_seed(self.seed)
+                gradient: Any = tunnel.attribute(
+                    image,
+                    nt_type="smoothgrad",
+                    nt_samples=self.samples,
+                    nt_samples_batch_size=min(self.batch_size, self.samples),
+                    stdevs=float(self.noise),
+                    abs=False,
+                )
+            return (gradient.detach() * (image - empty)).sum(dim=1)[0]
+
+        relevance = subject.each_image(smoothed, on_progress=on_progress)
+        return Found(
+            subject=subject,
+            relevance=relevance,
+            method="smooth-grad",
+            complete=False,
+            target="the linear model of f at x",
+            findings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=subject.change.tolist()),
+        )

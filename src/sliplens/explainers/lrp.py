@@ -1,0 +1,140 @@
+"""Layer-wise relevance propagation through zennit, an extra."""
+
+import operator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, fx, nn
+
+from sliplens.explainers.contract import Found, Method
+from sliplens.explainers.explanation import Progress
+from sliplens.explainers.frozen_model import Held
+from sliplens.extras import require_packages
+from sliplens.models.backbones import HistogramRegressor
+from sliplens.models.engines import fold_batch_norm
+
+_KEPT = 0.1  # share of f(x) by which the relevance may miss it without a warning
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lrp(Method):
+    """Layer-wise relevance propagation: alpha-1-beta-0 in convolutions, epsilon in linear layers, flat in the first.
+
+    The prediction is handed back from layer to layer, each giving its inputs their share of its output. A histogram
+    has no share of its own: its mean is handed to the logits as gradient times logit. Biases keep their share, and
+    the prediction itself is handed back, not its difference from the reference, so there is no completeness gap, and
+    the reference only decides what `saliency` shows.
+
+    Works on a copy whose batch normalisation is folded into the convolutions, and whose means over space and sums of
+    branches, functions in TorchVision's networks, are made modules: zennit knows rules for modules only, and would
+    hand relevance back from a mean in equal parts, and twice from a sum.
+
+    Parameters
+    ----------
+    batch_size
+        Images in one pass.
+
+    References
+    ----------
+    Bach et al., *On pixel-wise explanations for non-linear classifier decisions by layer-wise relevance propagation*,
+    PLOS ONE 2015, eqs. 58 and 60; the composite as in Anders et al., *Software for dataset-wide XAI*, 2021 (zennit).
+    """
+
+    batch_size: int = 32
+
+    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
+        require_packages("zennit", extra="lrp", purpose="LRP")
+        subject = held.predict_all()
+        copy = fold_batch_norm(subject.model)
+        for module in copy.modules():
+            if isinstance(module, fx.GraphModule):
+                _name_functions(module)
+        parts, done = [], 0
+        for part in subject.images.split(self.batch_size):
+            parts.append(_propagate(copy, part))
+            done += len(part)
+            if on_progress is not None:
+                on_progress(done, len(subject.images))
+        relevance = torch.cat(parts)
+        shares = (relevance.sum(dim=(1, 2)) / subject.prediction).tolist()
+        return Found(
+            subject=subject,
+            relevance=relevance,
+            method="lrp",
+            complete=False,
+            target="f(x)",
+            findings=[
+                f"image {index}: LRP hands back {share:.3g} times f(x); biases keep some of it, products make more"
+                for index, share in enumerate(shares)
+                if not abs(share - 1) <= _KEPT
+            ],
+        )
+
+
+class _Sum(nn.Module):
+    """A sum of two branches, by the module that zennit has a rule for."""
+
+    def __init__(self, inner: nn.Module) -> None:
+        super().__init__()
+        self.inner = inner
+
+    def forward(self, one: Tensor, other: Tensor) -> Tensor:
+        return self.inner(torch.stack(torch.broadcast_tensors(one, other), dim=-1))
+
+
+class _Mean(nn.Module):
+    """A mean over space, by the module that zennit has a rule for."""
+
+    def __init__(self, *, keepdim: bool) -> None:
+        super().__init__()
+        self.inner, self.keepdim = nn.AdaptiveAvgPool2d(1), keepdim
+
+    def forward(self, images: Tensor) -> Tensor:
+        pooled = self.inner(images)
+        return pooled if self.keepdim else pooled.flatten(1)
+
+
+def _name_functions(module: fx.GraphModule) -> None:
+    """Replace sums of two branches and means over space by modules."""
+    from zennit.layer import Sum  # noqa: PLC0415  # pyright: ignore[reportMissingImports] (an extra)
+
+    for place, node in enumerate(list(module.graph.nodes)):
+        branches = [argument for argument in node.args if isinstance(argument, fx.Node)]
+        if node.op == "call_function" and node.target in {operator.add, operator.iadd, torch.add}:
+            replacement = _Sum(Sum()) if len(branches) == 2 else None
+        elif node.op == "call_method" and node.target == "mean" and _over_space(node):
+            replacement = _Mean(keepdim=bool(node.kwargs.get("keepdim", False)))
+        else:
+            replacement = None
+        if replacement is not None:
+            module.add_submodule(name := f"lrp_{place}", replacement)
+            with module.graph.inserting_after(node):
+                named = module.graph.call_module(name, tuple(branches))
+            node.replace_all_uses_with(named)
+            module.graph.erase_node(node)
+    module.recompile()
+
+
+def _over_space(node: fx.Node) -> bool:
+    dims = node.kwargs.get("dim", node.args[1] if len(node.args) > 1 else None)
+    return isinstance(dims, list | tuple) and tuple(dims) in {(2, 3), (-2, -1)}
+
+
+def _propagate(model: nn.Module, images: Tensor) -> Tensor:
+    from zennit.composites import EpsilonPlusFlat  # noqa: PLC0415  # pyright: ignore[reportMissingImports] (an extra)
+
+    composite: Any = EpsilonPlusFlat()
+    images = images.clone().requires_grad_()
+    with composite.context(model) as changed:
+        if isinstance(changed, HistogramRegressor):
+            logits = changed.backbone(images)
+            free = logits.detach().requires_grad_()
+            mean = torch.softmax(free / changed.temperature, dim=-1) @ changed.centres
+            (slopes,) = torch.autograd.grad(mean.sum(), free)
+            output, start = logits, slopes * free.detach()
+        else:
+            output = changed(images)
+            start = output.detach()
+        (relevance,) = torch.autograd.grad(output, images, grad_outputs=start)
+    return relevance.sum(dim=1)

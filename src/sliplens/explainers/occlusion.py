@@ -1,0 +1,213 @@
+"""Occlusion: what the prediction loses when a part of the image is replaced by the reference."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from captum import attr
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from sliplens.errors import InputError
+from sliplens.explainers.contract import Found, Method, require_at_least_one
+from sliplens.explainers.explanation import Progress
+from sliplens.explainers.frozen_model import Held
+from sliplens.markers import detect_markers
+from sliplens.models.engines import prepare
+from sliplens.recordings import Recording
+
+
+def find_markers(
+    image: Float[Tensor, "3 height width"], reference: Float[Tensor, "3 height width"]
+) -> Float[Tensor, "markers 2"]:
+    """Places (x, y) of the markers that an image shows, in pixels.
+
+    Parameters
+    ----------
+    image, reference
+        As a network takes them, in [0, 1]; the reference tells whether the markers show at all.
+
+    Raises
+    ------
+    InputError
+        If the image is a difference image, or OpenCV is missing.
+    ImageError
+        If too few markers are found.
+    """
+    if not float(reference.std(dim=(1, 2)).max()):
+        # a uniform reference is that of differences, in which a marker shows twice or, at rest, not at all
+        raise InputError(
+            "markers do not show in difference images; give their places (markers_px), or explain camera frames "
+            "or a data set, where they are found in the raw frames"
+        )
+    pixels = (255 * image).round().clamp(0, 255).to(torch.uint8)
+    return torch.from_numpy(detect_markers(pixels.permute(1, 2, 0).cpu().numpy()).centre_px)
+
+
+def markers_in_frame(frame: UInt8[np.ndarray, "height width 3"], *, image_size: int) -> Float[Tensor, "markers 2"]:
+    """Places (x, y) of the markers of a camera frame, in pixels of the network's square image.
+
+    Raises
+    ------
+    InputError
+        If OpenCV is missing.
+    ImageError
+        If too few markers are found.
+    """
+    return _scaled(detect_markers(frame).centre_px, frame.shape[:2], image_size)
+
+
+def markers_in_recording(recording: Recording, row: int, *, image_size: int) -> Float[Tensor, "markers 2"]:
+    """Places (x, y) of the markers in one frame of a trial, in pixels of the network's square image.
+
+    The simulator's own where the trial has a truth, else found in the frame.
+
+    Raises
+    ------
+    InputError
+        If OpenCV is missing where markers have to be found.
+    ImageError
+        If too few markers are found.
+    """
+    if recording.truth is None:
+        return markers_in_frame(recording.frames[row], image_size=image_size)
+    return _scaled(recording.truth.marker_px[row], recording.frames.shape[1:3], image_size)
+
+
+def _scaled(places_px: np.ndarray, size: tuple[int, ...], image_size: int) -> Tensor:
+    # pixel centres are whole numbers in both images
+    scale = image_size / np.array([size[1], size[0]])
+    return torch.from_numpy((places_px.astype(np.float64) + 0.5) * scale - 0.5)
+
+
+Places: TypeAlias = Float[Tensor, "markers 2"]
+FindPlaces: TypeAlias = Callable[[Float[Tensor, "3 height width"], Float[Tensor, "3 height width"]], Places]
+"""From an image and its reference, in [0, 1], to x and y of its markers in pixels."""
+
+
+def tile_regions(size: tuple[int, int], *, tile_px: int) -> Int[Tensor, "height width"]:
+    """Number of the square tile in which each pixel lies; tiles at the right and lower border may be smaller."""
+    rows, columns = (torch.arange(length) // tile_px for length in size)
+    return rows[:, None] * (int(columns.max()) + 1) + columns
+
+
+def marker_regions(
+    size: tuple[int, int], centres_px: Float[Tensor, "markers 2"], *, radius_px: float | None = None
+) -> Int[Tensor, "height width"]:
+    """Number of the marker that each pixel belongs to, and one number more for the pixels between the markers.
+
+    Parameters
+    ----------
+    size
+        Height and width of the image in pixels.
+    centres_px
+        x and y of the markers in the image that the network sees; pixel centres lie at whole numbers.
+    radius_px
+        How far a marker reaches; by default half of the median distance between neighbours. A pixel within reach of
+        two belongs to the nearer.
+    """
+    rows, columns = (torch.arange(length, dtype=torch.float64) for length in size)
+    pixels = torch.stack(torch.broadcast_tensors(columns, rows[:, None]), dim=-1).reshape(-1, 2)
+    centres = centres_px.double()
+    if radius_px is None:
+        between = torch.cdist(centres, centres).fill_diagonal_(torch.inf).amin(dim=1)
+        radius_px = float(between.median()) / 2
+    distance, nearest = torch.cdist(pixels, centres).min(dim=1)
+    return torch.where(distance <= radius_px, nearest, len(centres)).reshape(size)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Occlusion(Method):
+    """Occlusion by tile, or by marker where the markers' places are given, signed, in margin units.
+
+    The relevance of a region is f(x) - f(x with the region as in the reference), spread evenly over its pixels. Nothing
+    is assumed of the network, and nothing outside its data is shown to it as far as the reference is one of them. For a
+    linear network the regions add up to f(x) - f(b); where they work together, or stand in for each other, they do not,
+    so there is no completeness gap.
+
+    Parameters
+    ----------
+    tile_px
+        Side of a tile in pixels.
+    markers_px
+        x and y of the markers in the image that the network sees, (markers, 2), or what finds them in each image, such
+        as `find_markers`; they are then the regions, and what lies between them is one more.
+    radius_px
+        How far a marker reaches; see `marker_regions`.
+    batch_size
+        Occluded images in one pass.
+
+    References
+    ----------
+    Zeiler and Fergus, *Visualizing and understanding convolutional networks*, ECCV 2014, section 4.2; by Captum.
+    """
+
+    tile_px: int = 16
+    markers_px: Places | FindPlaces | None = None
+    radius_px: float | None = None
+    batch_size: int = 32
+
+    def __post_init__(self) -> None:
+        require_at_least_one("occlusion", batch_size=self.batch_size)
+        if self.tile_px < 1:
+            raise InputError(f"occlusion's tile_px is {self.tile_px}; give at least 1 pixel")
+        if isinstance(self.markers_px, Tensor):
+            self._require_reach(self.markers_px)
+        if self.radius_px is not None and not self.radius_px > 0:
+            raise InputError(f"occlusion's radius_px is {self.radius_px}; give a radius above 0 pixels")
+
+    @torch.no_grad()
+    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
+        subject = held.predict_all()
+        tiles = -(-subject.images.shape[-2] // self.tile_px) * -(-subject.images.shape[-1] // self.tile_px)
+        passes = prepare(
+            subject.model,
+            torch.cat([subject.images[:1], subject.reference[:1]]),
+            torch.stack([subject.prediction[0], subject.reference_prediction[0]]),
+            # markers are about as many
+            passes=len(subject.images) * tiles,
+        )
+
+        def predict(images: Tensor) -> Tensor:
+            return torch.cat(list(passes.run(images.split(passes.batch_size))))
+
+        captum = attr.FeatureAblation(predict)
+
+        def lost(index: int) -> Tensor:
+            image, empty = subject.images[index], subject.reference[index]
+            regions = self._regions(image, empty).to(image.device)
+            effects = captum.attribute(
+                image[None],
+                baselines=empty[None],
+                feature_mask=regions[None, None],
+                perturbations_per_eval=self.batch_size,
+            )
+            # Captum gives every pixel and channel the whole effect of its region
+            return effects[0, 0] / regions.flatten().bincount()[regions]
+
+        by_tile = self.markers_px is None
+        return Found(
+            subject=subject,
+            relevance=subject.each_image(lost, on_progress=on_progress),
+            method="occlusion" if by_tile else "occlusion-marker",
+            complete=False,
+            target="f(x) - f(x with one region as in the reference), "
+            + (f"tiles of {self.tile_px} px" if by_tile else "markers"),
+            more={"engine": passes.engine},
+        )
+
+    def _regions(self, image: Tensor, empty: Tensor) -> Tensor:
+        size = image.shape[-2], image.shape[-1]
+        if self.markers_px is None:
+            return tile_regions(size, tile_px=self.tile_px)
+        places = self.markers_px if isinstance(self.markers_px, Tensor) else self.markers_px(image, empty)
+        self._require_reach(places)
+        return marker_regions(size, places, radius_px=self.radius_px)
+
+    def _require_reach(self, places: Places) -> None:
+        if not len(places) or (self.radius_px is None and len(places) < 2):
+            raise InputError(
+                f"occlusion has {len(places)} marker(s) and no radius_px; a single one's reach must be given"
+            )

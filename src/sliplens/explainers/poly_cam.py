@@ -1,0 +1,243 @@
+"""Poly-CAM for a regressor: channel masks, scored by what they keep and what they remove."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sliplens.errors import InputError
+from sliplens.explainers.activations import Layer, capture, find_layers
+from sliplens.explainers.channels import SCORES, VARIANTS, Regions, as_predictions, combine, measure, scale_to
+from sliplens.explainers.contract import Found, Method
+from sliplens.explainers.explanation import Approximation, Level, Progress, check_approximations, check_weights
+from sliplens.explainers.frozen_model import Held, Subject
+from sliplens.explainers.maps import local_change
+from sliplens.explainers.poly_cam_budget import Likeness, estimate_weights, mask_kernel
+from sliplens.models.engines import Passes, prepare
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolyCam(Method):
+    """Poly-CAM with the regression score.
+
+    A channel's mask M (its activation between its extreme percentiles, resized to the image) blends the image x with
+    the reference b. Its effect in margin units is measured at one or both ends,
+
+        kept     f(b + (x - b) M) - f(b)                "+"
+        removed  f(x) - f(b + (x - b) (1 - M))          "-"
+
+    and their mean is "+/-": 0 for the empty mask, f(x) - f(b) for the full one. A channel's weight is
+    relu(effect / (f(x) - f(b))), the part that supports the change.
+
+    A layer's map is relu(sum of weight x activation). From the last layer to the first it is divided by itself
+    resized to the coarser result and back, then multiplied by that result. The finest product, normalised like a
+    mask, times how much the image differs from the reference thereabouts (`maps.local_change`), is the saliency: where
+    x equals b a mask neither shows nor hides anything, however active the channel.
+
+    The relevance is that saliency scaled to add up to f(x) - f(b). The scaling is a convention, not a property of the
+    method: it gives the map the sign and unit of the others, and says nothing about how much one pixel contributes.
+
+    Parameters
+    ----------
+    variant
+        "+", "-" or "+/-"; the last costs two passes a channel, the others one.
+    score
+        What the masked predictions are turned into, a key of `SCORES`: `thesis` is what the public code did to a
+        network with one output, for comparison with old figures; it takes no reference, and explains nothing.
+    layers
+        Names of the layers; by default those that belong to the score.
+    level
+        Which level's map is the relevance, counted from the finest, 0. The thesis displayed the finest of its ten, and
+        scored the fifth from the coarsest, `level=5`. Layers finer than that have no part in it, and cost no pass.
+    budget
+        Share of the channels to measure at first, in (0, 1]; 1 for the exact map. Below 1 the other channels' weights
+        are estimated, and `Explanation.approximations` says how many were measured and what the map is expected to have
+        in common with the exact one.
+    likeness
+        What that should be: more channels are measured until it is expected, all of them if need be. None to stop at
+        the budget, whatever the map is like.
+    engine
+        What runs the masked images; see `passes.prepare`.
+    batch_size
+        Masked images in one pass; None for what suits the engine.
+    levels
+        Keep the saliency and the weights of each layer in the explanation, those finer than `level` too.
+    seed
+        Of the draws that tell the error of a map with a budget.
+
+    References
+    ----------
+    Englebert, Cornu and De Vleeschouwer, *Poly-CAM: High resolution class activation map for convolutional neural
+    networks*, ICPR 2022. The regression score and the budget are ours.
+    """
+
+    variant: str = "+/-"
+    score: str = "regression"
+    layers: tuple[str, ...] | None = None
+    level: int = 0
+    budget: float = 1.0
+    likeness: Likeness | None = Likeness()  # noqa: RUF009 (frozen)
+    engine: str = "auto"
+    batch_size: int | None = None
+    levels: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.variant not in VARIANTS:
+            raise InputError(f"Poly-CAM has no variant {self.variant!r}; choose among {', '.join(VARIANTS)}")
+        if self.score not in SCORES:
+            raise InputError(f"Poly-CAM has no score {self.score!r}; choose among {', '.join(SCORES)}")
+        if self.batch_size is not None and self.batch_size < 1:
+            raise InputError(f"Poly-CAM's batch_size is {self.batch_size}; give at least 1")
+        if not 0 < self.budget <= 1:
+            raise InputError(f"Poly-CAM's budget is {self.budget}; give a share of the channels, above 0 and at most 1")
+
+    @torch.no_grad()
+    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
+        """Progress counts the channels of every image."""
+        subject = held.predict_all()
+        layers = self._find_layers(subject)
+        channels = sum(layer.channels for layer in layers)
+        count = _Count(total=len(subject.images) * channels, report=on_progress)
+        # one engine for all rounds and images
+        passes = self._prepare(subject, round(self.budget * channels))
+        weights, saliencies, shown, approximations = [], [], [], []
+        for index in range(len(subject.images)):
+            activations = _activations(subject, index, layers)
+            shown_at = self._shown_at(subject, index)
+            shares, estimated = self._weights(subject, index, activations, shown_at, passes=passes, count=count)
+            weights.append(shares)
+            approximations += estimated
+            saliencies.append(combine(activations, shares, size=_size(shown_at)))
+            shown.append(saliencies[-1][self._place] * shown_at)
+        levels = tuple(
+            Level(
+                layer=layer.name,
+                saliency=torch.stack([maps[depth] for maps in saliencies]).float(),
+                weights=torch.stack([shares[depth] for shares in weights]).float(),
+            )
+            for depth, layer in enumerate(layers)
+        )
+        return Found(
+            subject=subject,
+            relevance=scale_to(torch.stack(shown), total=subject.change),
+            method="poly-cam",
+            complete=True,
+            findings=(
+                *check_weights([layer.name for layer in layers], weights, change=subject.change.tolist()),
+                *check_approximations(approximations),
+            ),
+            more={
+                "levels": levels if self.levels else (),
+                "approximations": tuple(approximations),
+                "engine": passes.engine,
+            },
+        )
+
+    @property
+    def _place(self) -> int:
+        """Of the level that is shown, among those that are measured."""
+        return self.level if self.levels else 0
+
+    def _shown_at(self, subject: Subject, index: int) -> Tensor:
+        """Where the image shows something: where x = b no mask has an effect."""
+        if SCORES[self.score].as_published:
+            return torch.ones_like(subject.images[index, 0])
+        return local_change(subject.images[index], subject.reference[index])
+
+    def _find_layers(self, subject: Subject) -> tuple[Layer, ...]:
+        image = subject.images[:1]
+        if self.layers is None:
+            layers = SCORES[self.score].layers(subject.model, image)
+        else:
+            layers = find_layers(subject.model, image, names=self.layers)
+        if not 0 <= self.level < len(layers):
+            raise InputError(f"Poly-CAM has no level {self.level} for {len(layers)} layers; count from 0, the finest")
+        # a level is made of its own layer and the coarser ones: the finer ones are measured only where they are kept
+        return layers if self.levels else layers[self.level :]
+
+    def _prepare(self, subject: Subject, channels: int) -> Passes:
+        return prepare(
+            subject.model,
+            torch.cat([subject.images[:1], subject.reference[:1]]),
+            torch.stack([subject.prediction[0], subject.reference_prediction[0]]),
+            passes=len(subject.images) * channels * VARIANTS[self.variant].passes,
+            engine=self.engine,
+            batch_size=self.batch_size,
+        )
+
+    def _weights(
+        self,
+        subject: Subject,
+        index: int,
+        activations: list[Tensor],
+        shown_at: Tensor,
+        *,
+        passes: Passes,
+        count: "_Count",
+    ) -> tuple[list[Tensor], list[Approximation]]:
+        """Weight >= 0 of each channel, layer by layer, and how far they are estimates."""
+        score, variant = SCORES[self.score], VARIANTS[self.variant]
+        image, empty = subject.prediction[index], subject.reference_prediction[index]
+        black = torch.zeros_like(subject.images[index])
+        if score.as_published:
+            empty = subject.predict(black[None])[0]
+        regions = Regions.of(
+            activations,
+            image=subject.images[index],
+            empty=black if score.as_published else subject.reference[index],
+            as_published=score.as_published,
+        )
+
+        def points(channels: Int[Tensor, " some"]) -> Float[Tensor, "points some"]:
+            return measure(regions, channels, passes=passes, variant=variant, on_channels=count.add)
+
+        def supports(found: Float[Tensor, "points some"]) -> Float[Tensor, " some"]:
+            return score.support(as_predictions(found, variant=variant, image=image, empty=empty))
+
+        # an empty mask keeps nothing and removes nothing, which needs no pass
+        at_empty = torch.stack([empty] * variant.keep + [image] * variant.remove)[:, None]
+        active = regions.active()
+        count.add(sum(regions.layer_sizes) - len(active))
+        if self.budget < 1 and len(active):
+            found = estimate_weights(
+                activations,
+                mask_kernel(regions, active),
+                active=active,
+                budget=self.budget,
+                likeness=self.likeness,
+                at_empty=supports(at_empty)[0],
+                measure=lambda channels: supports(points(channels)),
+                to_map=lambda weights: combine(activations, weights, size=_size(shown_at))[self._place] * shown_at,
+                seed=self.seed,
+            )
+            count.add(len(active) - found.approximation.measured)
+            return found.weights, [found.approximation]
+        every = at_empty.repeat(1, sum(regions.layer_sizes))
+        every[:, active] = points(active)
+        return list(torch.relu(supports(every)).split(regions.layer_sizes)), []
+
+
+def _size(image: Tensor) -> tuple[int, int]:
+    return image.shape[-2], image.shape[-1]
+
+
+def _activations(subject: Subject, index: int, layers: tuple[Layer, ...]) -> list[Tensor]:
+    with capture(subject.model, [layer.name for layer in layers]) as outputs:
+        subject.predict(subject.images[index, None])
+    return [outputs[layer.name][0] for layer in layers]
+
+
+@dataclass
+class _Count:
+    """Channels done, reported as they are."""
+
+    total: int
+    report: Progress | None
+    done: int = 0
+
+    def add(self, channels: int) -> None:
+        self.done += channels
+        if self.report is not None and channels:
+            self.report(self.done, self.total)

@@ -1,0 +1,483 @@
+"""Estimators of the safety margin from the marker field: one interface, one row a paper."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import final
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from sliplens.errors import InputError
+from sliplens.markers.tracks import Tracks
+
+_FEWEST = 6
+_PRESSED_SHARE = 0.9  # of the trial's own largest spread: from here on the press is done, creep aside
+_PULL_PX = 0.2  # of the inner markers' mean motion: several times its noise
+_INNER_SHARE = 1 / 3  # of the markers: what surely touches
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldTrial:
+    """Displacements of one trial; pixel coordinates are (x, y).
+
+    Raises
+    ------
+    InputError
+        If there are fewer than 6 markers, sizes disagree, or the frame of the hold is not one of the trial.
+    """
+
+    rest_px: Float[np.ndarray, "_ 2"]
+    displacement_px: Float[np.ndarray, "_ _ 2"]
+    """From T_0, by frame and marker; NaN where a marker was not followed."""
+    hold: int
+    """Last frame before the pull: slip is told by what moves from there, not from T_0."""
+
+    def __post_init__(self) -> None:
+        """Check what every estimator needs."""
+        if len(self.rest_px) < _FEWEST:
+            raise InputError(f"{len(self.rest_px)} markers are too few to tell slip, at least {_FEWEST} are needed")
+        if self.displacement_px.shape[1:] != self.rest_px.shape:
+            raise InputError(
+                f"{len(self.rest_px)} markers at rest but displacements of {self.displacement_px.shape[1]}; give both "
+                "for the same markers"
+            )
+        if not 0 <= self.hold < len(self.displacement_px):
+            raise InputError(f"frame {self.hold} of the hold is not one of {len(self.displacement_px)}")
+
+    def __len__(self) -> int:
+        """Count the frames."""
+        return len(self.displacement_px)
+
+    @property
+    def increment_px(self) -> Float[np.ndarray, "frames markers 2"]:
+        """Displacement since the end of normal loading; what came before it counts as none."""
+        moved = self.displacement_px - self.displacement_px[self.hold]
+        moved[: self.hold] = np.where(np.isnan(moved[: self.hold]), np.nan, 0.0)
+        return moved
+
+    @property
+    def spread(self) -> Float[np.ndarray, " frames"]:
+        """Divergence of the field since T_0, in pixels per pixel: how far the skin is pressed apart."""
+        return affine_parts(self.rest_px, self.displacement_px)[:, 2]
+
+    @property
+    def inner(self) -> Bool[np.ndarray, " markers"]:
+        """The third of the markers nearest to where pressing moved nothing: what touches for sure."""
+        return self._by_distance(0.0, _INNER_SHARE)
+
+    @property
+    def outer(self) -> Bool[np.ndarray, " markers"]:
+        """The next third: the edge of the contact."""
+        return self._by_distance(_INNER_SHARE, 2 * _INNER_SHARE)
+
+    def _by_distance(self, low: float, high: float) -> Bool[np.ndarray, " markers"]:
+        return _ring(self.rest_px, self.displacement_px[self.hold], low, high)
+
+
+def _ring(
+    rest_px: Float[np.ndarray, "markers 2"], pressed_px: Float[np.ndarray, "markers 2"], low: float, high: float
+) -> Bool[np.ndarray, " markers"]:
+    """Markers between two shares of all, ranked by their distance from where pressing moved nothing."""
+    distance = np.linalg.norm(rest_px - pressed_centre(rest_px, pressed_px), axis=1)
+    rank = np.argsort(np.argsort(distance, kind="stable"), kind="stable") / len(distance)
+    return (rank >= low) & (rank < high)
+
+
+def affine_parts(
+    rest_px: Float[np.ndarray, "markers 2"], displacement_px: Float[np.ndarray, "frames markers 2"]
+) -> Float[np.ndarray, "frames 6"]:
+    """Least-squares parts of a field: mean x and y, divergence, curl, and the two parts of pure shear.
+
+    The Helmholtz-Hodge decomposition of an affine field: its source-free, its curl-free and its harmonic part (a shift
+    and a deviator), about the middle of the markers. Means are in pixels, the rest in pixels per pixel; NaN where fewer
+    than 3 markers are known.
+
+    References
+    ----------
+    Zhang, Kan, Yang, Tse and Wang, *Effective Estimation of Contact Force and Torque for Vision-based Tactile Sensor
+    with Helmholtz-Hodge Decomposition*, 2019.
+    """
+    offset = rest_px - rest_px.mean(axis=0)
+    terms = np.concatenate([np.ones((len(offset), 1)), offset], axis=1)
+    known = np.all(np.isfinite(displacement_px), axis=-1)
+    weighted = terms[None] * known[..., None]
+    normal = np.swapaxes(weighted, 1, 2) @ terms + 1e-9 * np.eye(3)
+    fit = np.linalg.solve(normal, np.swapaxes(weighted, 1, 2) @ np.where(known[..., None], displacement_px, 0))
+    (mean_x, mean_y), (xx, yx), (xy, yy) = (fit[:, row].T for row in range(3))
+    parts = np.stack([mean_x, mean_y, xx + yy, yx - xy, xx - yy, xy + yx], axis=1)
+    return np.where(known.sum(axis=1)[:, None] >= 3, parts, np.nan)
+
+
+def pressed_centre(
+    rest_px: Float[np.ndarray, "markers 2"], displacement_px: Float[np.ndarray, "markers 2"]
+) -> Float[np.ndarray, "2"]:
+    """Where pressing moved nothing sideways, by the affine fit; the middle of the markers where it says nothing."""
+    middle = rest_px.mean(axis=0)
+    mean_x, mean_y, divergence, *_ = affine_parts(rest_px, displacement_px[None])[0]
+    if not np.isfinite(divergence) or abs(divergence) < 1e-3:
+        return middle
+    reach = np.abs(rest_px - middle).max() / 2
+    return middle - np.clip(2 * np.array([mean_x, mean_y]) / divergence, -reach, reach)
+
+
+def find_hold(rest_px: Float[np.ndarray, "markers 2"], displacement_px: Float[np.ndarray, "frames markers 2"]) -> int:
+    """Find the last frame before the pull: pressed, and the inner markers not yet moved by 0.2 px on average.
+
+    Pressing ends where the divergence first comes to nine tenths of the trial's largest; a trial without any has its
+    first frame for its hold. It looks at the whole trial: a live reader is told by the hand when it begins to pull.
+    """
+    parts = affine_parts(rest_px, displacement_px)
+    spread = np.nan_to_num(parts[:, 2], nan=-np.inf)
+    if not np.isfinite(spread).any() or spread.max() <= 0:
+        return 0
+    settled = int(np.argmax(spread >= _PRESSED_SHARE * spread.max()))
+    inner = _ring(rest_px, displacement_px[settled], 0.0, _INNER_SHARE)
+    moved = affine_parts(rest_px[inner], displacement_px[settled:, inner] - displacement_px[settled, inner])[:, :2]
+    later = np.flatnonzero(np.nan_to_num(np.linalg.norm(moved, axis=1), nan=0.0) > _PULL_PX)
+    return settled + max(int(later[0]) - 1, 0) if len(later) else settled
+
+
+def field_trial(tracks: Tracks, *, hold: int | None = None) -> FieldTrial:
+    """Displacements of a tracked trial, its hold found by `find_hold` if it is not given.
+
+    Raises
+    ------
+    InputError
+        If fewer than 6 markers of the reference frame were tracked, or the frame is not one of the trial.
+    """
+    kept = tracks.from_reference
+    rest, displacement = tracks.rest_px[kept], tracks.displacement_px[:, kept]
+    return FieldTrial(
+        rest_px=rest, displacement_px=displacement, hold=find_hold(rest, displacement) if hold is None else hold
+    )
+
+
+_BINS, _BIN_PX = 48, 0.25
+_STILL_PX = 0.05
+"""Added where a motion is divided by: half the noise of a marker."""
+
+
+def mean_shear(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
+    """Mean motion of all markers since the hold, in pixels: the trivial reading of a pull."""
+    return np.linalg.norm(_mean(trial.increment_px), axis=-1)[:, None]
+
+
+def shear_over_divergence(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
+    """Mean motion over divergence, in pixels: a pull for a press, as a ratio of forces is."""
+    spread = np.maximum(trial.spread, 0.1 * max(float(np.nanmax(trial.spread)), 1e-6))
+    return mean_shear(trial) / spread[:, None]
+
+
+def rigid_residual(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
+    """Largest, and root mean square, distance of the contact's markers from a rigid motion t + w x r, in pixels.
+
+    Where the contact sticks, it moves as the object does; where it slips, it is left behind. The paper calls it slip
+    when the largest distance passes a threshold; here the margin is fitted to it, and to the root mean square, which
+    one bad marker moves less.
+
+    References
+    ----------
+    Dong, Ma, Donlon and Rodriguez, *Maintaining Grasps within Slipping Bounds by Monitoring Incipient Slip*, ICRA 2019.
+    """
+    distance = _from_rigid(trial, trial.inner | trial.outer)
+    known = np.isfinite(distance).any(axis=1)
+    largest, rms = np.full(len(trial), np.nan), np.full(len(trial), np.nan)
+    largest[known] = np.nanmax(distance[known], axis=1)
+    rms[known] = np.sqrt(np.nanmean(distance[known] ** 2, axis=1))
+    return np.stack([largest, rms], axis=1)
+
+
+def stick_area(trial: FieldTrial, *, tolerance_px: float) -> Float[np.ndarray, "frames 1"]:
+    """Share of the contact's markers that move with the rigid motion of its middle, within a tolerance in pixels.
+
+    References
+    ----------
+    Sui et al., *Incipient Slip Detection Method for Soft Objects with Vision-Based Tactile Sensor*, Measurement 2022:
+    the ratio of the areas of stick and contact tells how near slip is.
+    """
+    distance = _from_rigid(trial, trial.inner)
+    contact = trial.inner | trial.outer
+    known = np.isfinite(distance) & contact
+    count = known.sum(axis=1)
+    share = ((distance < tolerance_px) & known).sum(axis=1) / np.maximum(count, 1)
+    return np.where(count > 0, share, np.nan)[:, None]
+
+
+def displacement_entropy(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
+    """Entropy H = -sum p ln p of the histogram of motions since the hold, and its change to the next frame.
+
+    Bins of a quarter pixel, the last one open: a width taken from the trial's own largest motion would tell of frames
+    that are still to come.
+
+    References
+    ----------
+    Yuan, Li, Srinivasan and Adelson, *Measurement of Shear and Slip with a GelSight Tactile Sensor*, ICRA 2015; for the
+    rate Hu et al., *Learning to Detect Slip through Tactile Estimation of the Contact Force Field and its Entropy*,
+    arXiv:2303.00935.
+    """
+    length = np.linalg.norm(trial.increment_px, axis=-1)
+    bins = np.minimum(length / _BIN_PX, _BINS - 1)
+    entropy = np.full(len(trial), np.nan)
+    for frame, row in enumerate(bins):
+        known = row[np.isfinite(row)].astype(int)
+        if len(known):
+            share = np.bincount(known, minlength=_BINS) / len(known)
+            entropy[frame] = -np.sum(share[share > 0] * np.log(share[share > 0]))
+    return np.stack([entropy, np.diff(entropy, prepend=entropy[:1])], axis=1)
+
+
+def edge_over_centre(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
+    """Motion of the contact's edge over that of its middle since the hold, and the motion of the middle in pixels.
+
+    Slip begins at the edge: it falls behind the middle.
+
+    References
+    ----------
+    Khamis, Albero, Salerno, Idil, Loizou and Redmond, *PapillArray: An incipient slip sensor for dexterous robotic or
+    prosthetic manipulation*, Sensors and Actuators A 2018.
+    """
+    moved = trial.increment_px
+    way = _mean(moved)
+    way = way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), _STILL_PX)
+    along = (moved * way[:, None]).sum(axis=-1)
+    middle, edge = (_mean(along[:, zone, None])[:, 0] for zone in (trial.inner, trial.outer))
+    return np.stack([(edge + _STILL_PX) / (np.maximum(middle, 0) + _STILL_PX), middle], axis=1)
+
+
+def helmholtz_hodge(trial: FieldTrial) -> Float[np.ndarray, "frames 8"]:
+    """Parts of the field since T_0 and since the hold: divergence, curl, shift and deviators, by least squares.
+
+    Divergence and curl since T_0; length of the mean motion since the hold, and divergence, curl and deviator of that
+    motion, all, and its mean over the inner markers alone.
+
+    References
+    ----------
+    Zhang, Kan, Yang, Tse and Wang, 2019 (see `affine_parts`).
+    """
+    whole, since = (affine_parts(trial.rest_px, field) for field in (trial.displacement_px, trial.increment_px))
+    inner = np.linalg.norm(_mean(trial.increment_px[:, trial.inner]), axis=-1)
+    scale = float(np.linalg.norm(trial.rest_px - trial.rest_px.mean(axis=0), axis=1).max())
+    shift = np.linalg.norm(since[:, :2], axis=1)
+    deviator = np.hypot(since[:, 4], since[:, 5])
+    shapes = np.stack([whole[:, 2], whole[:, 3], since[:, 2], since[:, 3], deviator], axis=1) * scale
+    ratio = shift / np.maximum(shapes[:, 0], 1.0)
+    return np.concatenate([shapes, shift[:, None], inner[:, None], ratio[:, None]], axis=1)
+
+
+def _from_rigid(trial: FieldTrial, fitted: Bool[np.ndarray, " markers"]) -> Float[np.ndarray, "frames markers"]:
+    """Distance of each motion since the hold from the small rigid motion that fits some markers best."""
+    moved, place = trial.increment_px, trial.rest_px + trial.displacement_px[trial.hold]
+    known = np.all(np.isfinite(moved), axis=-1) & np.all(np.isfinite(place), axis=-1)
+    used = known & fitted
+    count = np.maximum(used.sum(axis=1), 1)[:, None]
+    place = np.where(np.isfinite(place), place, 0)
+    middle = (used[..., None] * place).sum(axis=1) / count
+    shift = np.where(used[..., None], moved, 0).sum(axis=1) / count
+    arm = place[None] - middle[:, None]
+    rest = np.where(known[..., None], moved, 0) - shift[:, None]
+    turn = (used * (arm[..., 0] * rest[..., 1] - arm[..., 1] * rest[..., 0])).sum(axis=1)
+    turn = turn / np.maximum((used * (arm**2).sum(axis=-1)).sum(axis=1), 1e-9)
+    left = rest - turn[:, None, None] * np.stack([-arm[..., 1], arm[..., 0]], axis=-1)
+    distance = np.linalg.norm(left, axis=-1)
+    return np.where(known & (used.sum(axis=1) >= 2)[:, None], distance, np.nan)
+
+
+def _mean(values: Float[np.ndarray, "frames markers axes"]) -> Float[np.ndarray, "frames axes"]:
+    """Mean over the markers that are known; NaN where none is."""
+    known = np.all(np.isfinite(values), axis=-1)
+    count = known.sum(axis=1)[:, None]
+    total = np.where(known[..., None], values, 0).sum(axis=1)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+_RIDGE = 1e-3
+_HERTZ = 1.5  # exponent of the sphere, physics of Cattaneo and Mindlin
+_TOLERANCES_PX = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0, 1.5)
+
+Margins = Float[np.ndarray, " frames"]
+
+
+class MarginEstimator(ABC):
+    """Reads the safety margin of every frame of a trial, after it was fitted on others."""
+
+    def fit(self, trials: Sequence[FieldTrial], margins: Sequence[Float[np.ndarray, " _"]]) -> "MarginEstimator":
+        """Fit on training trials; gives itself.
+
+        Parameters
+        ----------
+        trials
+            Fields of the trials.
+        margins
+            Safety margin of each frame of each trial, in [0, 1]; NaN where there is no label.
+
+        Raises
+        ------
+        InputError
+            If no frame is labelled, or a trial has another number of frames than margins.
+        """
+        if len(trials) != len(margins) or any(len(one) != len(own) for one, own in zip(trials, margins, strict=False)):
+            raise InputError("trials and margins do not match; give a margin for every frame of every trial")
+        labels = np.concatenate([*margins, np.zeros(0)])
+        if not np.isfinite(labels).any():
+            raise InputError("no frame of the training trials has a label; give trials with safety margins")
+        self._mean = float(np.nanmean(labels))
+        self._fit(trials, labels)
+        return self
+
+    def estimate(self, trial: FieldTrial) -> Margins:
+        """Safety margin of each frame, in [0, 1]; the training mean where the field tells nothing.
+
+        Raises
+        ------
+        InputError
+            If the estimator was not fitted.
+        """
+        if not hasattr(self, "_mean"):
+            raise InputError("the estimator was not fitted; call fit with training trials first")
+        value = self._estimate(trial)
+        return np.clip(np.where(np.isfinite(value), value, self._mean), 0, 1)
+
+    @abstractmethod
+    def _fit(self, trials: Sequence[FieldTrial], labels: Float[np.ndarray, " all_frames"]) -> None: ...
+
+    @abstractmethod
+    def _estimate(self, trial: FieldTrial) -> Margins: ...
+
+
+@final
+class Constant(MarginEstimator):
+    """The mean margin of the training frames: what a reader without any touch would say."""
+
+    def _fit(self, trials: Sequence[FieldTrial], labels: Float[np.ndarray, " all_frames"]) -> None:
+        """Nothing but the mean is needed."""
+
+    def _estimate(self, trial: FieldTrial) -> Margins:
+        return np.full(len(trial), self._mean)
+
+
+@final
+class FeatureRegression(MarginEstimator):
+    """Ridge regression of the margin on a few numbers of the field, their squares and products.
+
+    Parameters
+    ----------
+    features
+        Gives (frames, features) of a trial.
+    """
+
+    def __init__(self, features: Callable[[FieldTrial], np.ndarray]) -> None:
+        self._features = features
+
+    def _fit(self, trials: Sequence[FieldTrial], labels: Float[np.ndarray, " all_frames"]) -> None:
+        values = np.concatenate([self._features(trial) for trial in trials])
+        usable = np.isfinite(labels) & np.all(np.isfinite(values), axis=1)
+        if not usable.any():
+            raise InputError("no labelled frame of the training trials has a field; follow more markers")
+        self._middle, self._scale = values[usable].mean(axis=0), values[usable].std(axis=0) + 1e-9
+        terms = self._terms(values[usable])
+        normal = terms.T @ terms / len(terms) + _RIDGE * np.eye(terms.shape[1])
+        self._weights = np.linalg.solve(normal, terms.T @ (labels[usable] - self._mean) / len(terms))
+
+    def _estimate(self, trial: FieldTrial) -> Margins:
+        return self._mean + self._terms(self._features(trial)) @ self._weights
+
+    def _terms(self, values: np.ndarray) -> np.ndarray:
+        # what lies far outside the training frames is taken for their border
+        unit = np.clip((values - self._middle) / self._scale, -5, 5)
+        rows, columns = np.triu_indices(unit.shape[1])
+        return np.concatenate([np.ones((len(unit), 1)), unit, unit[:, rows] * unit[:, columns]], axis=1)
+
+
+@final
+class StickArea(MarginEstimator):
+    """Sui's share of markers that stick, its tolerance chosen on the training trials.
+
+    References
+    ----------
+    See `stick_area`; the margin is a quadratic in the share, for the relation depends on the contact's shape: for a
+    sphere the area ratio is Gamma^(2/3).
+    """
+
+    def _fit(self, trials: Sequence[FieldTrial], labels: Float[np.ndarray, " all_frames"]) -> None:
+        tries = []
+        margins = np.split(labels, np.cumsum([len(trial) for trial in trials])[:-1])
+        for tolerance in _TOLERANCES_PX:
+            one = FeatureRegression(partial(stick_area, tolerance_px=tolerance)).fit(trials, margins)
+            answer = np.concatenate([one.estimate(trial) for trial in trials])
+            tries.append((float(np.nanmean((answer - labels) ** 2)), one))
+        self._best = min(tries, key=lambda pair: pair[0])[1]
+
+    def _estimate(self, trial: FieldTrial) -> Margins:
+        return self._best.estimate(trial)
+
+
+@final
+class Eccentricity(MarginEstimator):
+    """Ikeda's eccentricity e = delta_t / a: how far the contact's middle has moved, for how far it is pressed.
+
+    Gamma = (1 - delta_t / delta_full)^1.5 for a sphere, with delta_full = mu (2 - nu) delta / (2 (1 - nu)): full slip
+    begins when the tangential displacement of the stuck middle reaches a multiple of the indentation delta, which for a
+    sphere is a^2 over its radius, a being the contact's. Both are read in pixels: delta_t is the mean motion of the
+    inner markers since the hold, delta is taken in proportion to the divergence since T_0, and the factor between them,
+    which holds the friction, is fitted on the training trials.
+
+    References
+    ----------
+    Ikeda, Kurita, Ueda, Matsumoto and Ogasawara, *Grip Force Control for an Elastic Finger using Vision-based Incipient
+    Slip Feedback*, IROS 2004; Obinata et al., *Vision Based Tactile Sensor Using Transparent Elastic Fingertip for
+    Dexterous Handling*, 2007. Johnson, *Contact Mechanics* (1985), section 7.2.
+    """
+
+    def _fit(self, trials: Sequence[FieldTrial], labels: Float[np.ndarray, " all_frames"]) -> None:
+        ratio = np.concatenate([self._ratio(trial) for trial in trials])
+        usable = np.isfinite(labels) & np.isfinite(ratio)
+        if not usable.any():
+            raise InputError("no labelled frame of the training trials has a field; follow more markers")
+        tries = np.geomspace(1e-2, 1e2, 400) * max(float(np.median(ratio[usable])), 1e-3)
+        errors = [np.mean((self._margin(ratio[usable], full) - labels[usable]) ** 2) for full in tries]
+        self._full = float(tries[int(np.argmin(errors))])
+
+    def _estimate(self, trial: FieldTrial) -> Margins:
+        return self._margin(self._ratio(trial), self._full)
+
+    @staticmethod
+    def _ratio(trial: FieldTrial) -> Margins:
+        moved = trial.increment_px[:, trial.inner]
+        known = np.all(np.isfinite(moved), axis=-1)
+        count = known.sum(axis=1)
+        mean = np.where(known[..., None], moved, 0).sum(axis=1) / np.maximum(count, 1)[:, None]
+        pressed = np.maximum(trial.spread, 0.1 * max(float(np.nanmax(trial.spread)), 1e-6))
+        return np.where(count > 0, np.linalg.norm(mean, axis=1) / pressed, np.nan)
+
+    @staticmethod
+    def _margin(ratio: np.ndarray, full: float) -> np.ndarray:
+        return np.clip(1 - ratio / full, 0, 1) ** _HERTZ
+
+
+ESTIMATORS: dict[str, Callable[[], MarginEstimator]] = {
+    "constant": Constant,
+    "mean-shear": partial(FeatureRegression, mean_shear),
+    "shear-over-divergence": partial(FeatureRegression, shear_over_divergence),
+    "ikeda-eccentricity": Eccentricity,
+    "sui-stick-area": StickArea,
+    "dong-rigid-residual": partial(FeatureRegression, rigid_residual),
+    "yuan-entropy": partial(FeatureRegression, displacement_entropy),
+    "khamis-edge-centre": partial(FeatureRegression, edge_over_centre),
+    "helmholtz-hodge": partial(FeatureRegression, helmholtz_hodge),
+}
+"""Estimators by name, unfitted: the first three are trivial, the others named for their papers."""
+
+
+def get_estimator(name: str) -> MarginEstimator:
+    """Unfitted estimator of a name.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    if name not in ESTIMATORS:
+        raise InputError(f"estimator {name!r} is not known; choose {', '.join(ESTIMATORS)}")
+    return ESTIMATORS[name]()

@@ -1,0 +1,286 @@
+"""Networks that come with the package, trained on simulated touch."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, fields
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from sliplens.errors import CheckpointError, ImageError, InputError
+from sliplens.files import hash_file, read_json, require_folder, write_json
+from sliplens.models.backbones import HistogramRegressor, build_model
+from sliplens.models.calibration import Calibration, quantiles
+from sliplens.models.encodings import Encoding, get_encoding
+
+WEIGHTS_FILE = "model.safetensors"
+MANIFEST_FILE = "manifest.json"
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manifest:
+    """What a checkpoint is: enough to feed it right, and to tell where it comes from."""
+
+    backbone: str
+    input: str
+    image_size: int
+    frame_size: tuple[int, int]
+    sensor: str
+    data_hash: str
+    head: str = "point"
+    recipe: str = ""
+    target: str = "safety_margin"
+    weights_sha256: str = ""
+    schema_version: int = SCHEMA_VERSION
+    metrics: dict[str, Any] = field(default_factory=dict)
+    calibration: dict[str, Any] | None = None
+    """See `Calibration`; None where none was found."""
+    versions: dict[str, str] = field(default_factory=dict)
+    trained_on: tuple[str, ...] = ()
+    """First 12 hex digits of the hash of every trial that trained or validated it, or what it started from."""
+    started_from: str = ""
+    """Hash of the weights it started from; empty for random ones."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainedModel:
+    """A network with its manifest; in evaluation mode."""
+
+    model: nn.Module
+    manifest: Manifest
+
+    @property
+    def device(self) -> torch.device:
+        """Where the network runs; inputs are brought there, answers come back."""
+        return next(self.model.parameters(), torch.empty(0)).device
+
+    @property
+    def encoding(self) -> Encoding:
+        """The input the network was trained on."""
+        return get_encoding(self.manifest.input)
+
+    def encode(
+        self, frames: UInt8[np.ndarray, "batch height width 3"], reference: UInt8[np.ndarray, "_ _ 3"]
+    ) -> Float[Tensor, "batch 3 size size"]:
+        """Encode frames as the network was trained on them.
+
+        Raises
+        ------
+        ImageError
+            If the frames are not of the size the network's sensor has.
+        """
+        self.require_frame_size(frames.shape[1:3])
+        return self.encoding.encode(frames, reference, image_size=self.manifest.image_size)
+
+    def require_frame_size(self, size: tuple[int, ...]) -> None:
+        """Refuse frames of another sensor.
+
+        Raises
+        ------
+        ImageError
+            Naming both sizes.
+        """
+        if tuple(size) != tuple(self.manifest.frame_size):
+            raise ImageError(
+                f"frames are {size[0]} x {size[1]} pixels but the network was trained on "
+                f"{self.manifest.frame_size[0]} x {self.manifest.frame_size[1]}; use frames of the same sensor"
+            )
+
+    @torch.no_grad()
+    def predict(self, inputs: Float[Tensor, "batch 3 size size"], *, batch_size: int = 64) -> Float[Tensor, " batch"]:
+        """Safety margin of encoded frames; not clipped, so that an answer outside [0, 1] shows as what it is."""
+        answers = [self.model(batch.to(self.device)).reshape(len(batch)) for batch in inputs.split(batch_size)]
+        return torch.cat(answers).cpu() if answers else torch.empty(0)
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """How sure the network may be; None for one that was never calibrated."""
+        found = self.manifest.calibration
+        return None if found is None else Calibration.from_json(found)
+
+    @torch.no_grad()
+    def estimate(self, inputs: Float[Tensor, "batch 3 size size"], *, batch_size: int = 64) -> "Estimate":
+        """Safety margin of encoded frames, with how sure it is."""
+        if isinstance(self.model, HistogramRegressor):
+            parts = [self.model.probabilities(batch.to(self.device)) for batch in inputs.split(batch_size)]
+            bins = len(self.model.edges) - 1
+            probabilities = torch.cat(parts) if parts else torch.empty((0, bins), device=self.device)
+            return Estimate(
+                margin=(probabilities @ self.model.centres).double().cpu().numpy(),
+                probabilities=probabilities.double().cpu().numpy(),
+                edges=self.model.edges.double().cpu().numpy(),
+                calibration=self.calibration,
+            )
+        margin = self.predict(inputs, batch_size=batch_size).double().cpu().numpy()
+        return Estimate(margin=margin, calibration=self.calibration)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """Safety margins of some frames, and how sure they are."""
+
+    margin: Float[np.ndarray, " frames"]
+    calibration: Calibration | None
+    probabilities: Float[np.ndarray, "frames bins"] | None = None
+    """Over the margin; None for a network that answers with one number."""
+    edges: Float[np.ndarray, " edges"] | None = None
+    """Of the bins, in margin units."""
+
+    @property
+    def sigma(self) -> Float[np.ndarray, " frames"] | None:
+        """Standard deviation of each distribution; None where there is none."""
+        if self.probabilities is None or self.edges is None:
+            return None
+        centres = (self.edges[1:] + self.edges[:-1]) / 2
+        spread = (centres[None] - self.margin[:, None]) ** 2
+        return np.sqrt((self.probabilities * spread).sum(axis=1))
+
+    def interval(self, level: float) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]] | None:
+        """Margins between which each label lies with a level of confidence, within [0, 1]; None if not calibrated.
+
+        Raises
+        ------
+        ModelError
+            If the level is not one that was calibrated.
+        """
+        if self.calibration is None:
+            return None
+        offset = self.calibration.offset(level)
+        low = high = self.margin
+        if self.probabilities is not None and self.edges is not None:
+            low, high = (
+                quantiles(self.probabilities, self.edges, share) for share in ((1 - level) / 2, (1 + level) / 2)
+            )
+        # a label lies in [0, 1], so cutting there loses none
+        return np.clip(low - offset, 0, 1), np.clip(high + offset, 0, 1)
+
+
+def join_estimates(parts: Sequence[Estimate]) -> Estimate:
+    """Join the estimates of one network, in their order; there must be one at least."""
+    told = [part.probabilities for part in parts if part.probabilities is not None]
+    return Estimate(
+        margin=np.concatenate([part.margin for part in parts]),
+        probabilities=np.concatenate(told) if told else None,
+        edges=parts[0].edges,
+        calibration=parts[0].calibration,
+    )
+
+
+def save_checkpoint(folder: Path, model: nn.Module, manifest: Manifest) -> None:
+    """Write weights and manifest into a folder; the manifest, which makes it a checkpoint, comes last."""
+    weights = folder / WEIGHTS_FILE
+    part = weights.with_name(weights.name + ".part")
+    save_file({name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}, part)
+    part.replace(weights)
+    write_json(folder / MANIFEST_FILE, asdict(manifest) | {"weights_sha256": hash_file(weights)})
+
+
+def load_checkpoint(folder: Path, *, device: str = "cpu") -> TrainedModel:
+    """Load a checkpoint written by `save_checkpoint`.
+
+    Raises
+    ------
+    InputError
+        If the folder or its manifest is missing.
+    CheckpointError
+        If the manifest is of another schema, the weights were changed or damaged, or they do not fit the backbone.
+    """
+    require_folder(folder, what="the run")
+    manifest = _read_manifest(folder / MANIFEST_FILE)
+    weights = folder / WEIGHTS_FILE
+    if not weights.is_file():
+        raise CheckpointError(f"{weights} is missing; train the network again or copy the whole folder")
+    if hash_file(weights) != manifest.weights_sha256:
+        raise CheckpointError(f"{weights} is not the file its manifest describes; copy the whole folder again")
+    model = build_model(manifest.backbone, head=manifest.head)
+    try:
+        model.load_state_dict(load_file(weights, device="cpu"))
+    except (SafetensorError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise CheckpointError(
+            f"{weights} does not hold a {manifest.backbone} with a {manifest.head} head ({reason})"
+        ) from None
+    # channels last: depthwise convolutions run up to half as fast again on a CPU
+    model = model.to(device, memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
+    return TrainedModel(model=model, manifest=manifest)
+
+
+def _read_manifest(path: Path) -> Manifest:
+    values = read_json(path)
+    if not isinstance(values, dict) or values.get("schema_version") != SCHEMA_VERSION:
+        raise CheckpointError(f"{path} is not a sliplens manifest of schema {SCHEMA_VERSION}")
+    known = {item.name for item in fields(Manifest)}
+    missing = {"backbone", "input", "image_size", "frame_size", "weights_sha256"} - set(values)
+    if missing:
+        raise CheckpointError(f"{path} is incomplete (it lacks {', '.join(sorted(missing))}); train the network again")
+    size, frame = values["image_size"], values["frame_size"]
+    if not isinstance(size, int) or not isinstance(frame, list) or [type(side) for side in frame] != [int, int]:
+        raise CheckpointError(f"{path} gives no usable image_size or frame_size; train the network again")
+    given: dict[str, Any] = {name: value for name, value in values.items() if name in known}
+    given["frame_size"] = (frame[0], frame[1])
+    given["trained_on"] = tuple(str(one) for one in values.get("trained_on", ()))
+    try:
+        manifest = Manifest(**given)
+    except TypeError as error:
+        raise CheckpointError(f"{path} is incomplete ({error}); train the network again") from None
+    get_encoding(manifest.input)
+    if manifest.calibration is not None:
+        Calibration.from_json(manifest.calibration)
+    return manifest
+
+
+def shipped_names() -> list[str]:
+    """Names of the networks that come with the package."""
+    return sorted(folder.name for folder in _weights().iterdir() if (folder / MANIFEST_FILE).is_file())
+
+
+def load(name: str, *, device: str = "cpu") -> TrainedModel:
+    """Load a network that comes with the package, by its name.
+
+    Parameters
+    ----------
+    name
+        One of `shipped_names`, such as `chromatouch-difference`.
+    device
+        Where to put it.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name; the message lists those there are.
+    """
+    if name not in shipped_names():
+        raise InputError(f"no network named {name!r} comes with sliplens; choose {_choices()}")
+    return load_checkpoint(_weights() / name, device=device)
+
+
+def find_run(run: Path) -> Path:
+    """Folder of a network: the one that is named, else the one of that name that comes with the package.
+
+    Raises
+    ------
+    InputError
+        If there is neither.
+    """
+    if run.exists():
+        return run
+    if str(run) in shipped_names():
+        return _weights() / str(run)
+    shipped = f", or name {_choices()}, which comes with sliplens" if shipped_names() else ""
+    raise InputError(f"the run {run} does not exist; check the path{shipped}")
+
+
+def _weights() -> Path:
+    # the package is installed as files, never as an archive: its weights are mapped into memory from there
+    return Path(str(files("sliplens"))) / "weights"
+
+
+def _choices() -> str:
+    return " or ".join(shipped_names()) or "none"

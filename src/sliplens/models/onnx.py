@@ -1,0 +1,261 @@
+"""ONNX files: the network alone, all that is needed to feed it in the metadata, checked before it appears."""
+
+import json
+import warnings
+from collections.abc import Iterator
+from copy import deepcopy
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sliplens._version import __version__
+from sliplens.errors import InputError, ModelError
+from sliplens.extras import ONNX_PACKAGES, import_onnxruntime, require_packages
+from sliplens.files import to_jsonable
+from sliplens.models import TrainedModel
+from sliplens.models.backbones import HistogramRegressor
+from sliplens.models.checkpoint import Estimate
+
+if TYPE_CHECKING:
+    from onnx import ModelProto
+
+
+INPUT = "image"
+MARGIN, PROBABILITIES = "margin", "probabilities"
+
+
+class Answers(nn.Module):
+    """A network that returns its margins, and the probabilities behind them where it has a histogram.
+
+    Parameters
+    ----------
+    model
+        As in a `TrainedModel`.
+    """
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(
+        self, image: Float[Tensor, "batch 3 height width"]
+    ) -> tuple[Float[Tensor, " batch"]] | tuple[Float[Tensor, " batch"], Float[Tensor, "batch bins"]]:
+        """Margins, and probabilities if any."""
+        if isinstance(self.model, HistogramRegressor):
+            probabilities = self.model.probabilities(image)
+            return probabilities @ self.model.centres, probabilities
+        return (self.model(image)[:, 0],)
+
+
+def answer_names(model: nn.Module) -> tuple[str, ...]:
+    """Names of what `Answers` returns, in its order."""
+    return (MARGIN, PROBABILITIES) if isinstance(model, HistogramRegressor) else (MARGIN,)
+
+
+def bin_edges(model: nn.Module) -> Float[np.ndarray, " edges"] | None:
+    """Edges of the bins of a histogram, in margin units; None for one number."""
+    return model.edges.double().cpu().numpy() if isinstance(model, HistogramRegressor) else None
+
+
+def to_estimate(trained: TrainedModel, answers: tuple[np.ndarray, ...]) -> Estimate:
+    """Estimate of a network from what `Answers` returned."""
+    margin, *rest = (np.asarray(answer, dtype=np.float64) for answer in answers)
+    return Estimate(
+        margin=margin,
+        probabilities=rest[0] if rest else None,
+        edges=bin_edges(trained.model),
+        calibration=trained.calibration,
+    )
+
+
+@torch.inference_mode()
+def run_network(network: nn.Module, inputs: Float[Tensor, "batch 3 height width"]) -> tuple[np.ndarray, ...]:
+    """Answers of an `Answers` network that is where the inputs are."""
+    return tuple(answer.cpu().numpy() for answer in network(inputs))
+
+
+OPSET = 18
+"""Of the file: the oldest that torch writes without converting, read by ONNX Runtime from 1.14 on."""
+TOLERANCE = 1e-4
+"""By how much an answer may differ from the network's own, times its size where that is above 1."""
+MANIFEST, INPUT_NOTES, OUTPUT_NOTES = "sliplens.manifest", "sliplens.input", "sliplens.output"
+_COMPARED = {
+    "difference": "|T_n - T_0|",
+    "amplitude": "|T_n - T_0|",
+    "signed": "floor(T_n / 2) + 128 - floor(T_0 / 2)",
+    "raw": "T_n",
+}
+
+
+def export_onnx(trained: TrainedModel, path: Path) -> None:
+    """Write a network as an ONNX file; it appears when ONNX Runtime gives the same answers, or not at all.
+
+    Input `image` is float32 (batch, 3, size, size), encoded and normalised; outputs are `margin` (batch,) and, for a
+    histogram, `probabilities` (batch, bins). The batch may be of any size. Properties of the model, as JSON:
+    `sliplens.manifest`, `sliplens.input` (how frames become an input) and `sliplens.output` (edges of the bins).
+
+    Parameters
+    ----------
+    trained
+        The network; it stays where it is.
+    path
+        File to write; one that is there is replaced.
+
+    Raises
+    ------
+    InputError
+        If a package is missing.
+    ModelError
+        If torch cannot export the network, or an answer differs by more than `TOLERANCE`.
+    """
+    require_packages(*ONNX_PACKAGES, extra="onnx", purpose="an ONNX file")
+    model = deepcopy(trained.model).to("cpu", memory_format=torch.contiguous_format)  # pyright: ignore[reportCallIssue]
+    network, size = Answers(model).eval(), trained.manifest.image_size
+    proto = _convert(network, size=size, backbone=trained.manifest.backbone)
+    _describe(proto, trained)
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_bytes(proto.SerializeToString())
+        check_parity(part, network, size=size)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _convert(network: Answers, *, size: int, backbone: str) -> "ModelProto":
+    # two images: torch takes a batch of one for a constant
+    example = torch.zeros(2, 3, size, size)
+    with warnings.catch_warnings():
+        # of torch about its own parts; what counts is checked afterwards
+        warnings.simplefilter("ignore")
+        try:
+            program = torch.onnx.export(
+                network,
+                (example,),
+                dynamo=True,
+                input_names=[INPUT],
+                output_names=list(answer_names(network.model)),
+                dynamic_shapes={INPUT: {0: torch.export.Dim("batch", min=1)}},
+                opset_version=OPSET,
+                external_data=False,
+                verbose=False,
+            )
+        except (torch.onnx.OnnxExporterError, RuntimeError, ValueError, TypeError) as error:
+            reason = next(iter(str(error).strip().splitlines()), "no reason told")
+            raise ModelError(
+                f"torch {torch.__version__} cannot export a {backbone} ({reason}); train another backbone"
+            ) from None
+    if program is None:
+        raise ModelError(f"torch {torch.__version__} exported nothing; install torch 2.9 or later")
+    return program.model_proto
+
+
+def _describe(proto: "ModelProto", trained: TrainedModel) -> None:
+    # torch notes where in whose source files each node was made
+    values = (*proto.graph.input, *proto.graph.output, *proto.graph.value_info, *proto.graph.initializer)
+    for part in (proto, proto.graph, *proto.graph.node, *values):
+        del part.metadata_props[:]
+        part.doc_string = ""
+    proto.producer_name, proto.producer_version = "sliplens", __version__
+    manifest, encoding = trained.manifest, trained.encoding
+    edges = bin_edges(trained.model)
+    properties: dict[str, Any] = {
+        MANIFEST: asdict(manifest),
+        INPUT_NOTES: {
+            "encoding": encoding.name,
+            "frame_size": manifest.frame_size,
+            "channels": "RGB",
+            "compare": _COMPARED.get(encoding.name, encoding.name),
+            "image_size": manifest.image_size,
+            "resize": "bilinear, antialiased, pixel centres at halves, rounded to 8 bits",
+            "scale": "the image's own maximum, at least 1" if encoding.own_maximum else "255",
+            "neutral": encoding.neutral,
+        },
+        OUTPUT_NOTES: {
+            "margin": "safety margin; 1 full stick, 0 onset of full slip; not clipped",
+            "bin_edges": None if edges is None else edges.tolist(),
+        },
+    }
+    for key, value in properties.items():
+        proto.metadata_props.add(key=key, value=json.dumps(to_jsonable(value)))
+
+
+def check_parity(path: Path, network: Answers, *, size: int) -> None:
+    """Check that ONNX Runtime answers as the network does, on black, white and noise, alone and in a batch.
+
+    Parameters
+    ----------
+    path
+        ONNX file.
+    network
+        What it should hold, on the processor.
+    size
+        Height and width of the input, in pixels.
+
+    Raises
+    ------
+    ModelError
+        If an answer differs by more than `TOLERANCE`, or ONNX Runtime cannot run the file.
+    """
+    runtime = import_onnxruntime()
+    names, differences = list(answer_names(network.model)), []
+    try:
+        session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        answers = [(inputs, session.run(names, {INPUT: inputs.numpy()})) for inputs in _trial_inputs(size)]
+    except Exception as error:  # its errors have no other base
+        reason = str(error).splitlines()[0]
+        raise ModelError(
+            f"ONNX Runtime cannot run the exported network ({reason}); nothing was written, export it with other "
+            "versions of torch and onnxscript"
+        ) from None
+    for inputs, found in answers:
+        differences += map(difference, found, run_network(network, inputs))
+    worst = max(differences, key=lambda value: float("inf") if np.isnan(value) else value)
+    if not worst <= TOLERANCE:  # a NaN is not
+        raise ModelError(
+            f"the exported network answers {worst:.2g} off the trained one, {TOLERANCE:g} is allowed; "
+            "nothing was written, export it with other versions of torch and onnxscript"
+        )
+
+
+def difference(found: np.ndarray, expected: np.ndarray) -> float:
+    """Largest difference between answers, divided by the answer's size where that is above 1."""
+    if found.shape != expected.shape:
+        return float("nan")
+    return float(np.max(np.abs(found - expected) / np.maximum(np.abs(expected), 1)))
+
+
+def _trial_inputs(size: int) -> Iterator[Float[Tensor, "batch 3 size size"]]:
+    generator = torch.Generator().manual_seed(0)
+    for batch in (1, 7):
+        shape = batch, 3, size, size
+        yield from (torch.zeros(shape), torch.ones(shape), torch.rand(shape, generator=generator))
+
+
+def require_file_of(path: Path, trained: TrainedModel) -> None:
+    """Check that an ONNX file holds a network, and not another one.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, is none that `export_onnx` wrote, or was made of other weights.
+    """
+    require_packages("onnx", extra="onnx", purpose="an ONNX file")
+    import onnx  # noqa: PLC0415 (an extra)
+    from google.protobuf.message import DecodeError  # noqa: PLC0415 (comes with it)
+
+    try:
+        # the weights stand in the file itself
+        properties = {item.key: item.value for item in onnx.load(path, load_external_data=False).metadata_props}
+        weights = json.loads(properties[MANIFEST])["weights_sha256"]
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; make it with `sliplens export RUN -o {path} --onnx`") from None
+    except (DecodeError, KeyError, TypeError, ValueError):
+        raise InputError(f"{path} is not an ONNX file of sliplens; make it with `sliplens export --onnx`") from None
+    if weights != trained.manifest.weights_sha256:
+        raise InputError(f"{path} holds another network than the run; export the run again")

@@ -1,0 +1,468 @@
+"""Audit of an imported trial: one page that shows what its labels rest on."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from textwrap import wrap
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import UInt8
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from sliplens.images import absolute_difference
+from sliplens.plots.contact_sheet import (
+    NAMED_STATES,
+    STATE_COLOURS,
+    STATE_TINTS,
+    TIMES,
+    brighten,
+    brightening,
+    choose_margins,
+    plot_margin,
+)
+from sliplens.plots.layout import place_axes, place_text, require_picture_path, save_page
+from sliplens.plots.style import BLACK, BLUE, GREEN, GREY, PURPLE, SKY, VERMILLION, decimals, drawing_style, signed
+from sliplens.recordings import ContactState, Recording
+
+_MINUS = "\N{MINUS SIGN}"
+_LOOSE = 10.0  # percentage points: beyond, margins 20 points apart are hard to tell apart
+_SEEN_SIGMAS = 5.0  # an image that moves less at the onset does not speak for a slip
+
+
+class Fact(NamedTuple):
+    """A paragraph beside the charts."""
+
+    head: str
+    words: list[str]
+    doubtful: bool = False
+    """Whether a label may be wrong for it."""
+    indent: str = ""
+
+
+def audit_facts(recording: Recording, labelling: Mapping[str, Any]) -> list[Fact]:
+    """Tell what the labels rest on: what was declared, found and assumed, and what of it is doubtful."""
+    if labelling["friction"] is None:
+        return _tell_given(recording, labelling)
+    axes, notes = labelling["axes"], [*labelling["axes"]["notes"], *labelling["notes"]]
+    found = {name: _found(axes[f"{name}_found"]) for name in ("normal", "sign", "tare")}
+    pressing = f"normal force is {'+' if axes['sign'] > 0 else _MINUS}{axes['normal']}"
+    still = f"untouched until {decimals(axes['still_until_s'], 2)} s"
+    reference, limit = labelling["reference"], labelling["force_range_n"]
+    energy, drift = (decimals(reference[name], 2) for name in ("contact_energy", "drift"))
+    means = f"means over {_milli(labelling['window_s'])} ms; gaps over {_milli(labelling['gap_s'])} ms count as missing"
+    return [
+        _tell_frames(recording),
+        Fact(
+            "Axes",
+            [f"{pressing} (axis {found['normal']}, sign {found['sign']})"],
+            any("axis" in note for note in axes["notes"]),
+        ),
+        Fact(
+            f"Tare {found['tare']}",
+            [
+                f"x, y, z: {_three(axes['tare_n'], signed)} N",
+                f"± {_three(axes['tare_sigma_n'])} N",
+                f"noise of a sample {_three(axes['noise_n'])} N",
+                still,
+            ],
+            axes["tare_found"] == "assumed",
+        ),
+        _tell_friction(labelling["friction"], labelling["slip_s"]),
+        _tell_lag(recording, labelling["lag"], applied=labelling["lag_applied"]),
+        Fact(
+            "Forces",
+            [
+                f"contact from {decimals(labelling['contact_threshold_n'], 3)} N",
+                means,
+                "range of the sensor not told" if limit is None else f"range of the sensor ± {limit:g} N",
+            ],
+        ),
+        Fact(
+            "Reference",
+            [str(reference["method"])]
+            if reference["index"] is None
+            else [
+                f"frame {reference['index']}, {reference['method']}",
+                f"contact energy {energy}, drift {drift} grey levels",
+            ],
+        ),
+        *([Fact("Notes", [f"• {note}" for note in notes], indent="   ")] if notes else []),
+    ]
+
+
+def _tell_given(recording: Recording, labelling: Mapping[str, Any]) -> list[Fact]:
+    """Tell of labels that came with the frames, and were not found from forces."""
+    reference, clip = labelling["reference"], labelling.get("clip") or {}
+    which = "recorded apart from the frames" if reference["index"] is None else f"frame {reference['index']}"
+    labelled = bool(recording.labelled.any())
+    words = ["They came with the recording; nothing was found from forces."] if labelled else ["No frame has one."]
+    known = [f"{name.replace('_', ' ')}: {_plainly(value)}" for name, value in clip.items()]
+    notes = [f"• {note}" for note in labelling["notes"]]
+    counts = labelling["frames_by_reason"]
+    lost = [", ".join(f"{count} {reason}" for reason, count in counts.items() if reason != "valid")]
+    return [
+        Fact(f"Frames: {counts.get('valid', 0)} of {sum(counts.values())} valid", lost),
+        Fact("Labels", words, doubtful=not labelled),
+        *([Fact("Known of the whole clip", known)] if known else []),
+        Fact("Reference", [which]),
+        *([Fact("Notes", notes, indent="   ")] if notes else []),
+    ]
+
+
+def _plainly(value: object) -> str:
+    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
+
+
+def _tell_frames(recording: Recording) -> Fact:
+    """Count the frames with a valid label, and the others by what they lack."""
+    states, sigma = np.array([str(state) for state in recording.contact_state]), recording.safety_margin_sigma
+    lacking = {
+        "missing samples": np.isnan(recording.normal_force_n),
+        "no contact": states == ContactState.NO_CONTACT,
+        "after gross slip": states == ContactState.FULL_SLIP,
+        "outside the sensor's range": np.isnan(recording.safety_margin),
+    }
+    kinds = np.select([recording.labelled, *lacking.values()], range(5), default=5)
+    counts = dict(zip(("valid", *lacking, "not valid"), np.bincount(kinds, minlength=6).tolist(), strict=True))
+    words = [", ".join(f"{count} {name}" for name, count in counts.items() if count and name != "valid")]
+    middle = most = 0.0
+    if sigma is not None and np.isfinite(sigma).any():
+        middle, most = 100 * float(np.nanmedian(sigma)), 100 * float(np.nanmax(sigma))
+        words.append(f"Γ known to ± {middle:.1f} % (median), {most:.1f} % at worst")
+    lost = counts["missing samples"] + counts["outside the sensor's range"]
+    return Fact(f"Frames: {counts['valid']} of {len(states)} valid", words, lost > 0 or middle > _LOOSE)
+
+
+def _tell_friction(friction: Mapping[str, Any], slip_s: float | None) -> Fact:
+    low, high, moved = friction["low"], friction["high"], friction["image_sigmas"]
+    exact = low is not None and low == high
+    interval = "taken as exact" if exact else f"68 % interval {decimals(low, 3)} to {decimals(high, 3)}"
+    image = [] if moved is None else [f"image moves {moved:.1f} σ more at the slip"]  # noqa: RUF001 (sigma is meant)
+    slip = "never slips" if slip_s is None else f"slips at {slip_s:.3f} s on the clock of the forces"
+    unseen = friction["found"] == "inferred" and (moved is None or moved < _SEEN_SIGMAS)
+    words = [f"μ {decimals(friction['mu'], 3)}, {interval}", friction["method"], *image, slip]
+    return Fact(f"Friction {_found(friction['found'])}", words, exact or unseen)
+
+
+def _tell_lag(recording: Recording, lag: Mapping[str, Any] | None, *, applied: bool) -> Fact:
+    head = f"Lag {'applied' if applied else 'not applied'}"
+    if lag is None or lag["doubt"]:
+        return Fact(head, [f"cannot be told: {lag['doubt']}" if lag else "not estimated"], doubtful=True)
+    late = f"camera late by {_milli(lag['lag_s'])} ± {_milli(lag['sigma_s'])} ms"
+    # beyond chance, and as much as half a frame: the labels are those of another frame
+    least = max(2 * (lag["sigma_s"] or 0), np.ptp(recording.time_s) / (2 * len(recording)))
+    ignored = not applied and abs(lag["lag_s"] or 0) > least
+    return Fact(head, [late, f"correlation {decimals(lag['correlation'], 2)}"], bool(ignored))
+
+
+def _found(how: str) -> str:
+    return "found" if how == "inferred" else how
+
+
+def _milli(value: float | None) -> str:
+    return decimals(None if value is None else 1000 * value, 1).replace("-", _MINUS)
+
+
+def _three(values: Sequence[float | None], write: Callable[..., str] = decimals) -> str:
+    return ", ".join(decimals(None, 0) if one is None else write(one, 3) for one in values)
+
+
+_HIGHEST = 2.5  # times mu_s: where hardly anything presses, F_t / F_n goes anywhere
+
+
+def plot_contact_forces(recording: Recording, threshold_n: float | None, *, ax: Axes) -> None:
+    """Draw F_n and F_t over time, in newtons, and the least F_n of a contact."""
+    forces = {"$F_n$": (recording.normal_force_n, BLUE, "-"), "$F_t$": (recording.tangential_force_n, VERMILLION, "--")}
+    for name, (force, colour, line) in forces.items():
+        told = name if np.isfinite(force).any() else "_unknown"
+        ax.plot(recording.time_s, force, color=colour, linestyle=line, linewidth=_width(recording), label=told)
+    if threshold_n is not None:
+        told = f"contact from {threshold_n:.3g} N"
+        ax.axhline(threshold_n, color=BLACK, linestyle=":", linewidth=1.3, label=told)
+    ax.set(ylabel="Force (N)", xmargin=0)
+    if not np.isfinite(recording.normal_force_n).any():
+        _say(ax, "no forces were recorded")
+
+
+def plot_force_ratio(recording: Recording, friction: Mapping[str, Any] | None, *, ax: Axes) -> None:
+    """Draw F_t / F_n of the frames in contact, and the static friction with its interval.
+
+    Where friction came with the frames (None), that of each frame is drawn.
+    """
+    touches = np.array([state != ContactState.NO_CONTACT for state in recording.contact_state])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(touches, recording.tangential_force_n / recording.normal_force_n, np.nan)
+    drawn = {"color": BLUE, "linewidth": _width(recording), "marker": _marker(recording)}
+    ax.plot(recording.time_s, ratio, label="$F_t/F_n$ in contact" if np.isfinite(ratio).any() else "_", **drawn)
+    mu, low, high = (friction or {}).get("mu"), (friction or {}).get("low"), (friction or {}).get("high")
+    own = np.where(touches, recording.friction_coefficient, np.nan)
+    if friction is None and np.isfinite(own).any():
+        ax.plot(recording.time_s, own, color=GREEN, linewidth=1.1, label=r"$\mu$ that came with the frames")
+        mu = float(np.nanmax(own))
+    if low is not None and high is not None and low < high:
+        ax.axhspan(low, high, color=GREEN, alpha=0.35, linewidth=0, label="its 68 % interval")
+    if mu is not None and friction is not None:
+        ax.axhline(mu, color=GREEN, linewidth=1.1, label=f"$\\mu_s$ = {mu:.3g}")
+    largest = float(np.max(ratio, where=np.isfinite(ratio), initial=0))
+    known = [value for value in (mu, high) if value is not None]
+    ceiling = max(_HIGHEST * mu, *known) if mu else 2.0
+    ax.set(ylabel="$F_t/F_n$", xmargin=0, ylim=(0, 1.12 * max([min(largest, ceiling), *known]) or 1))
+    if not np.isfinite(ratio).any():
+        _say(ax, "F_t / F_n is not known")
+
+
+def plot_labels(recording: Recording, *, ax: Axes) -> None:
+    """Draw the safety margin with its uncertainty on the colours of the states, and which frames have no label."""
+    plot_margin(recording, ax=ax)
+    time_s, valid, margin = recording.time_s, recording.labelled, 100 * recording.safety_margin
+    # what is no label stays in sight, but apart
+    ax.lines[0].set(color=GREY, linestyle=":", linewidth=1.3)
+    sigma = recording.safety_margin_sigma
+    if sigma is not None:
+        low, high = margin - 100 * sigma, margin + 100 * sigma
+        ax.fill_between(time_s, low, high, where=valid, color=PURPLE, alpha=0.75, linewidth=0, label=r"Γ $\pm\,\sigma$")
+    held = np.where(valid, margin, np.nan)
+    ax.plot(time_s, held, color=BLACK, linewidth=_width(recording), marker=_marker(recording), label="Γ")
+    ax.plot(time_s, np.where(valid, np.nan, -9), color=GREY, linewidth=4, solid_capstyle="butt", label="no valid label")
+    ax.set(xlabel="", ylim=(-14, 107))
+    if not np.isfinite(margin).any():
+        ax.text(0.5, 0.5, "no frame has a label", transform=ax.transAxes, ha="center", va="center", color=GREY)
+
+
+def _say(ax: Axes, words: str) -> None:
+    """Say over an empty chart why it is empty."""
+    ax.set(yticks=[])
+    ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=GREY, parse_math=False)
+
+
+def _width(recording: Recording) -> float:
+    """Thinner where frames are so many that noise would fill the chart."""
+    return 1.5 if len(recording) <= 1000 else 0.7
+
+
+def _marker(recording: Recording) -> str:
+    """Dots where frames are so few that one alone would draw no line."""
+    return "." if len(recording) <= 60 else ""
+
+
+_SHARES = (0, 1, 0.25, 0.5, 0.75)  # of the way from full stick to the slip; its ends first
+_EVEN = 0.05  # frames of like margins are spread over time: for that, a margin may be off by so much
+_ONSET = "slip", r"as the camera sees it (lag $\pm\,\sigma$)"
+# inches; from left to right: what is told, then charts above pictures
+_WIDTH, _HEIGHT, _EDGE, _LEFT, _GAP = 12.0, 9.0, 0.2, 3.75, 0.07
+_SPAN = _WIDTH - _LEFT - _EDGE
+_PICTURE = (_SPAN + _GAP) / (1 + len(_SHARES)) - _GAP
+# from top to bottom
+_TOP, _LEGEND, _TICKS, _LEADER, _HEAD, _FOOT, _PICTURE_HEIGHT = 0.78, 0.25, 0.22, 0.26, 0.52, 0.36, (0.6, 1.36)
+_LINE, _WRAP = 0.145, 43  # height of a line of facts, and its characters
+
+
+ReadFrames = Callable[[Sequence[int]], UInt8[np.ndarray, "frames height width 3"]]
+"""Gives the frames of these numbers, in their order."""
+
+
+def draw_audit(recording: Recording, labelling: Mapping[str, Any], *, read_frames: ReadFrames | None = None) -> Figure:
+    """Draw a page from which to judge whether the labels of an imported trial can be defended.
+
+    Forces, their ratio beside the static friction, and the safety margin with its uncertainty, on the camera's clock;
+    beneath them the reference and five frames from full stick down to the slip, each with its absolute difference; at
+    the left what was declared, found and assumed.
+
+    Parameters
+    ----------
+    recording
+        The trial.
+    labelling
+        What its labels rest on, as `import_trial` keeps it; what is not known is None.
+    read_frames
+        Gives the frames of these numbers, for a trial that was loaded without its pixels; its own if None.
+    """
+    height = float(np.clip(_PICTURE * recording.reference.shape[0] / recording.reference.shape[1], *_PICTURE_HEIGHT))
+    top = _HEIGHT - _FOOT - 2 * height - _GAP
+    with drawing_style():
+        figure = Figure(figsize=(_WIDTH, _HEIGHT))
+        charts = _draw_charts(figure, recording, labelling, bottom=top - _HEAD - _LEADER - _TICKS)
+        index, along = labelling["reference"]["index"], choose_along(recording)
+        read = recording.frames.__getitem__ if read_frames is None else read_frames
+        _draw_pictures(figure, recording, index, along, read, top=top, height=height)
+        for column, at in enumerate([index, *along]):
+            if at is None:  # the reference was recorded apart from the frames
+                continue
+            time_s = recording.time_s[at]
+            middle = (_LEFT + column * (_PICTURE + _GAP) + _PICTURE / 2) / _WIDTH
+            _lead(figure, charts, float(time_s), middle, top=top - _HEAD - _LEADER)
+        _tell(figure, recording, labelling)
+    return figure
+
+
+def write_audit(
+    recording: Recording, labelling: Mapping[str, Any], path: Path, *, read_frames: ReadFrames | None = None
+) -> None:
+    """Save the audit of a trial as .png, .pdf or .svg; it appears when complete.
+
+    Parameters
+    ----------
+    recording, labelling
+        As `draw_audit` takes them.
+    path
+        File to write.
+    read_frames
+        As `draw_audit` takes it.
+
+    Raises
+    ------
+    InputError
+        If the suffix is another one, or the file cannot be written.
+    """
+    require_picture_path(path, example="audit.png")
+    save_page(draw_audit(recording, labelling, read_frames=read_frames), path)
+
+
+def choose_along(recording: Recording) -> list[int]:
+    """Five different frames in the order of time, or all if there are fewer, evenly spaced in their margins.
+
+    They begin at full stick, pressed hardest, and end in full slip; a trial without begins at its first label, or ends
+    at its least margin. Where no frame has a margin, they are evenly spaced in time.
+    """
+    if not np.isfinite(recording.safety_margin).any():
+        return np.unique(np.linspace(0, len(recording) - 1, len(_SHARES)).round().astype(int)).tolist()
+    margins, margin = choose_margins(recording), np.nan_to_num(recording.safety_margin)
+    allowed = recording.labelled.copy()
+    places = np.flatnonzero(allowed) if allowed.any() else np.arange(len(recording))
+    begin = int(places[0]) if margins[0] is None else margins[0]
+    end = int(places[np.argmin(margin[places])]) if margins[-1] is None else margins[-1]
+    allowed[[begin, end]] = True
+    free, way = np.ones(len(recording), dtype=bool), end - begin
+    for share in _SHARES[: len(recording)]:
+        wanted = margin[begin] + share * (margin[end] - margin[begin])
+        late = np.abs(np.arange(len(recording)) - (begin + share * way)) / max(abs(way), 1)
+        cost = np.abs(margin - wanted) + _EVEN * late + np.where(allowed, 0, 1)
+        free[np.argmin(np.where(free, cost, np.inf))] = False
+    return [int(at) for at in np.flatnonzero(~free)]
+
+
+def _draw_charts(figure: Figure, recording: Recording, labelling: Mapping[str, Any], *, bottom: float) -> list[Axes]:
+    height = (bottom - _TOP) / 3 - _LEGEND
+    tops = [_TOP + row * (height + _LEGEND) + _LEGEND for row in range(3)]
+    charts = [place_axes(figure, _LEFT, top, _SPAN, height) for top in tops]
+    plot_contact_forces(recording, labelling["contact_threshold_n"], ax=charts[0])
+    plot_force_ratio(recording, labelling["friction"], ax=charts[1])
+    plot_labels(recording, ax=charts[2])
+    lag = labelling["lag"]
+    shift = (lag["lag_s"] or 0.0) if lag and labelling["lag_applied"] else 0.0
+    shades = [(str(state), STATE_COLOURS[state], STATE_TINTS[state]) for state in NAMED_STATES]
+    tints = [Patch(color=colour, alpha=tint, linewidth=0, label=name) for name, colour, tint in shades]
+    for ax in charts:
+        if labelling["slip_s"] is not None:
+            slip_s = labelling["slip_s"] + shift
+            ax.axvline(slip_s, color=BLACK, linestyle="-.", linewidth=1.3, label=f"{_ONSET[0]} at {slip_s:.2f} s")
+            if lag is not None and not lag["doubt"] and None not in (lag["lag_s"], lag["sigma_s"]):
+                seen = labelling["slip_s"] + lag["lag_s"] + np.array([-1, 1]) * lag["sigma_s"]
+                ax.axvspan(*seen, color=SKY, alpha=0.6, linewidth=0, label=_ONSET[1], zorder=0)
+        place = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.1, "borderpad": 0}
+        handles, names = ax.get_legend_handles_labels()
+        if ax is not charts[1]:  # what stands in all of them is told once
+            handles = [one for one, name in zip(handles, names, strict=True) if not name.startswith(_ONSET)]
+        handles += tints if ax is charts[2] else []
+        ax.legend(
+            handles=handles, ncols=9, columnspacing=1.1, handlelength=1.9, handletextpad=0.5, fontsize=8.5, **place
+        )
+        ax.tick_params(labelbottom=ax is charts[-1], labelsize=8.5)
+        ax.xaxis.set_major_formatter("{x:g} s")
+        ax.yaxis.set_label_coords(-0.058, 0.5)
+        ax.sharex(charts[0])
+    return charts
+
+
+def _lead(figure: Figure, charts: list[Axes], time_s: float, middle: float, *, top: float) -> None:
+    """Mark on the charts when a frame was taken, and lead from there to its picture."""
+    for ax in charts:
+        ax.axvline(time_s, color=BLACK, linewidth=0.7, alpha=0.45, zorder=1, label="_frame")
+    low, high = charts[-1].get_xlim()
+    from_x = (_LEFT + _SPAN * (time_s - low) / (high - low)) / _WIDTH
+    ends = [1 - top / _HEIGHT, 1 - (top + _LEADER - 0.04) / _HEIGHT]
+    figure.add_artist(Line2D([from_x, middle], ends, color=BLACK, linewidth=0.7, alpha=0.45))
+
+
+def _draw_pictures(
+    figure: Figure,
+    recording: Recording,
+    index: int | None,
+    along: list[int],
+    read_frames: ReadFrames,
+    *,
+    top: float,
+    height: float,
+) -> None:
+    reference, second = recording.reference, top + height + _GAP
+    free = [at for at, state in enumerate(recording.contact_state) if state == ContactState.NO_CONTACT]
+    # the reference less itself would tell nothing, an untouched frame long before or after it tells how it drifts
+    far = max(free, key=lambda at: abs(at - (index or 0)), default=index)
+    shown = read_frames(along if far is None else [*along, far])
+    frames = [reference, *shown[: len(along)]]
+    untouched = reference if far is None else shown[-1]
+    differences = absolute_difference(np.stack([untouched, *frames[1:]]), reference)
+    factor = brightening([differences])
+    for text, middle in (("camera", top + height / 2), (f"difference\n{TIMES} {factor:g}", second + height / 2)):
+        turned = {"rotation": 90, "ha": "right", "va": "center", "multialignment": "center"}
+        place_text(figure, _LEFT - 0.06, middle, text, fontsize=8.5, color=GREY, **turned)
+    for column, (at, frame, difference) in enumerate(zip([index, *along], frames, differences, strict=True)):
+        x = _LEFT + column * (_PICTURE + _GAP)
+        state = ContactState.NO_CONTACT if at is None else recording.contact_state[at]
+        for y, picture in ((top, frame), (second, brighten(difference, factor))):
+            ax = place_axes(figure, x, y, _PICTURE, height)
+            ax.imshow(picture)
+            ax.set(xticks=[], yticks=[])
+            ax.spines[:].set(visible=True, color=STATE_COLOURS[state], linewidth=2)
+        told = _margin(recording, at) if at is not None and column else "reference"
+        apart = "" if at is None or recording.labelled[at] or not column else ", not valid"
+        lines = (
+            (told, 0.37, "bold"),
+            ("recorded apart" if at is None else f"{recording.time_s[at]:.2f} s", 0.21, "normal"),
+            (state + apart, 0.06, "normal"),
+        )
+        for text, up, weight in lines:
+            place_text(figure, x + _PICTURE / 2, top - up, text, ha="center", va="bottom", fontsize=8, weight=weight)
+    words = f"Differences are $|T_n - T_0|$, brightened {TIMES} {factor:g}"
+    if free and far is not None:
+        untouched = f"that of the untouched frame at {recording.time_s[far]:.2f} s"
+        words += f"; beneath the reference {untouched}: it should be dark"
+    place_text(figure, _LEFT, _HEIGHT - _FOOT + 0.08, words, fontsize=8, color=GREY)
+
+
+def _margin(recording: Recording, at: int) -> str:
+    margin, sigma = float(recording.safety_margin[at]), recording.safety_margin_sigma
+    if not np.isfinite(margin):
+        return "no Γ"
+    band = "" if sigma is None or not np.isfinite(sigma[at]) else f" ± {100 * sigma[at]:.1f}"
+    return f"Γ {100 * margin:.0f}{band} %"
+
+
+def _tell(figure: Figure, recording: Recording, labelling: Mapping[str, Any]) -> None:
+    # whoever names a trial may write a dollar sign, which begins no formula here
+    plain = {"parse_math": False}
+    place_text(figure, _EDGE, 0.17, _cut(recording.trial, 75), fontsize=14, fontweight="bold", **plain)
+    about = f"{_cut(recording.sensor, 30)}, day {recording.day}, {_cut(recording.condition, 20)}"
+    sources = [_cut(str(labelling[name]), 50) for name in ("source", "forces") if labelling[name]]
+    place_text(figure, _EDGE, 0.47, "   ·   ".join([about, *sources]), fontsize=9, color=GREY, **plain)
+    top = _TOP + 0.05
+    facts = audit_facts(recording, labelling)
+    if any(fact.doubtful for fact in facts):
+        place_text(figure, _EDGE, _HEIGHT - _FOOT + 0.08, "▲ may put the labels in doubt", fontsize=8, color=VERMILLION)
+    for fact in facts:
+        lines = [line for words in fact.words for line in wrap(words, _WRAP, subsequent_indent=fact.indent)]
+        room = max(1, int((_HEIGHT - _FOOT - top) / _LINE - 1.15))
+        lines = lines if len(lines) <= room else [*lines[: room - 1], "…"]
+        colour, mark = (VERMILLION, "▲ ") if fact.doubtful else (BLACK, "")
+        place_text(figure, _EDGE, top, mark + fact.head, fontsize=9, fontweight="bold", color=colour)
+        for row, line in enumerate(lines):
+            place_text(figure, _EDGE, top + (row + 1.15) * _LINE, line, fontsize=8, **plain)
+        top += (len(lines) + 1.8) * _LINE
+
+
+def _cut(words: str, most: int) -> str:
+    """Leave out the middle of what is too long: of a path, or of numbered trials, the end tells most."""
+    return words if len(words) <= most else f"{words[: most // 3]}…{words[most // 3 + 1 - most :]}"

@@ -1,0 +1,416 @@
+"""The learning curve of one training, as a picture."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+
+from sliplens.plots.layout import place_axes, place_text, require_picture_path, save_page
+from sliplens.plots.style import (
+    BLACK,
+    BLUE,
+    CONTROL,
+    GREEN,
+    GREY,
+    INPUT_COLOURS,
+    METHOD_COLOURS,
+    METHOD_LINES,
+    ORANGE,
+    PURPLE,
+    VERMILLION,
+    conditions_in_order,
+    drawing_style,
+    inputs_in_order,
+    method_name,
+    methods_in_order,
+    short_input_name,
+)
+from sliplens.results.files import read_learning_curve
+from sliplens.results.records import BinScore, DeletionCurve, Predictions, Training
+
+MARGIN_LABEL = "Safety margin Γ (%)"
+
+
+def plot_bins(bins: Mapping[str, tuple[BinScore, ...]], *, ax: Axes) -> Axes:
+    """Draw the MSE in each bin of the safety margin as bars, one colour an input (thesis, Fig. 7).
+
+    Parameters
+    ----------
+    bins
+        Bin scores by input; a bin without frames stays empty.
+    """
+    names = inputs_in_order(bins)
+    width = 0.8 / max(1, len(names))
+    for index, name in enumerate(names):
+        shown = [(place, score.mse) for place, score in enumerate(bins[name]) if score.mse is not None]
+        ax.bar(
+            [place + (index - (len(names) - 1) / 2) * width for place, _ in shown],
+            [mse for _, mse in shown],
+            width=width,
+            color=INPUT_COLOURS.get(name, PURPLE),
+            label=short_input_name(name),
+        )
+    edges = next(iter(bins.values()), ())
+    ax.set_xticks(
+        np.arange(len(edges) + 1) - 0.5,
+        [f"{100 * edge:.0f}" for edge in [*(row.low for row in edges), 1.0]][: len(edges) + 1],
+    )
+    ax.grid(visible=False, axis="x")
+    ax.set(xlabel=MARGIN_LABEL, ylabel="MSE (Γ as a fraction, squared)", xlim=(-0.6, len(edges) - 0.4))
+    _legend_above(ax)
+    return ax
+
+
+def plot_predictions(predictions: Predictions, *, colour: str, ax: Axes) -> Axes:
+    """Draw the answer against the label of every frame, in percent, with the line of perfect answers."""
+    ax.plot([0, 100], [0, 100], color=BLACK, linewidth=1, linestyle="--", label="perfect", zorder=3)
+    ax.scatter(
+        100 * predictions.safety_margin,
+        100 * predictions.prediction,
+        s=9,
+        color=colour,
+        alpha=0.45,
+        linewidths=0,
+        rasterized=True,  # thousands of dots as vectors would swell the page
+        label="one frame",
+    )
+    low, high = _limits(predictions.prediction)
+    ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103), ylim=(low, high))
+    ax.legend(loc="best")
+    return ax
+
+
+def plot_learning_curves(trainings: Mapping[str, Training], *, ax: Axes) -> Axes:
+    """Draw the error on the training and validation frames by epoch, one colour an input."""
+    for name in inputs_in_order(trainings):
+        training, colour = trainings[name], INPUT_COLOURS.get(name, PURPLE)
+        label = short_input_name(name)
+        ax.plot(training.epoch, training.train_mse, color=colour, linestyle=":", label=f"{label}, training")
+        ax.plot(training.epoch, training.validation_mse, color=colour, label=f"{label}, validation")
+    ax.set(xlabel="Epoch (passes over the training frames)", ylabel="MSE (Γ as a fraction, squared)", yscale="log")
+    ax.legend()
+    return ax
+
+
+def plot_faithfulness(curves: Mapping[str, DeletionCurve], *, pixels: int, ax: Axes) -> Axes:
+    """Draw the mean deletion score D while pixels go, most salient first (thesis, Fig. 9).
+
+    The band holds the middle half of the frames.
+
+    Parameters
+    ----------
+    curves
+        Deletion curves by method, the random control among them.
+    pixels
+        Pixels of an image, for the share removed.
+    """
+    for name in methods_in_order(curves):
+        curve, colour = curves[name], METHOD_COLOURS.get(name, PURPLE)
+        share = 100 * curve.pixels_removed / pixels
+        low, high = np.quantile(curve.scores, [0.25, 0.75], axis=0)
+        ax.fill_between(share, low, high, color=colour, alpha=0.12, linewidth=0)
+        ax.plot(
+            share,
+            curve.scores.mean(axis=0),
+            color=colour,
+            linestyle=METHOD_LINES.get(name, "-"),
+            linewidth=2.2 if name != CONTROL else 2.4,
+            label=method_name(name),
+        )
+    ax.set(xlabel="Pixels removed (%)", ylabel="Deletion score D (no unit)", xlim=(0, 100), ylim=(0, 1.03))
+    ax.legend()
+    return ax
+
+
+def plot_margin_over_time(trials: Mapping[str, Predictions], *, ax: Axes) -> Axes:
+    """Draw the label and each network's answer through one trial.
+
+    Parameters
+    ----------
+    trials
+        Frames of the same trial by input.
+    """
+    names = inputs_in_order(trials)
+    label = trials[names[0]]
+    order = np.argsort(label.time_s)
+    ax.plot(label.time_s[order], 100 * label.safety_margin[order], color=BLACK, linewidth=2.4, label="true")
+    for name in names:
+        trial = trials[name]
+        order = np.argsort(trial.time_s)
+        ax.plot(
+            trial.time_s[order],
+            100 * trial.prediction[order],
+            color=INPUT_COLOURS.get(name, PURPLE),
+            marker="o",
+            markersize=3,
+            linewidth=1.2,
+            label=short_input_name(name),
+        )
+    ax.axhline(0, color=GREY, linewidth=0.8)
+    low, high = _limits(np.concatenate([trial.prediction for trial in trials.values()]))
+    ax.set(xlabel="Time (s)", ylabel=MARGIN_LABEL, ylim=(low, high))
+    _legend_above(ax)
+    return ax
+
+
+def _legend_above(ax: Axes) -> None:
+    # right of the title, where it can hide no data
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=3, borderaxespad=0.2, columnspacing=1.2)
+
+
+def _limits(prediction: np.ndarray) -> tuple[float, float]:
+    # answers are not clipped to 0-100 %: show all of them
+    return min(-5.0, 100 * float(prediction.min()) - 3), max(105.0, 100 * float(prediction.max()) + 3)
+
+
+_COLOURS = {"dry": ORANGE, "wet": BLUE}
+_WIDTH, _HEIGHT, _LEFT, _TOP, _GAP, _CHART = 12.0, 7.5, 0.75, 1.25, 0.95, (3.05, 2.25)
+_MOST_DOTS = 4000
+_READER = 0.36  # inches a reader of the margin
+_LOWEST_R2 = -0.3  # further down it does not matter how far; the number says it
+
+
+def draw_evaluation(predictions: pa.Table, told: Mapping[str, Any], path: Path, *, title: str) -> None:
+    """Save a page of six charts as .png, .pdf or .svg, or of eight where there are baselines.
+
+    Answers against labels; mean squared error in ten bins of the margin (thesis, Fig. 7); bias of each trial; how often
+    intervals hold; uncertainty by condition; the trial of median error over time. Below, R2 and mean absolute error of
+    the network beside those of model-based estimators, where `told` has them.
+
+    Parameters
+    ----------
+    predictions, told
+        `predictions.parquet` and `result.json` of `sliplens evaluate`.
+    path
+        File to write.
+    title
+        Head of the page.
+
+    Raises
+    ------
+    InputError
+        If the suffix is another one, or the file cannot be written.
+    """
+    require_picture_path(path, example="evaluation.png")
+    columns = {name: predictions.column(name).to_numpy() for name in predictions.column_names}
+    conditions = conditions_in_order(told["conditions"])
+    with drawing_style():
+        estimators = told["baselines"]["estimators"] if "baselines" in told else {}
+        figure = Figure(figsize=(_WIDTH, _HEIGHT + (0.9 + _READER * (len(estimators) + 1) if estimators else 0)))
+        charts = []
+        for index in range(6):
+            row, column = divmod(index, 3)
+            left = _LEFT + column * (_CHART[0] + _GAP)
+            top = _TOP + row * (_CHART[1] + 1.05)
+            charts.append(place_axes(figure, left, top, *_CHART))
+        _plot_answers(columns, conditions, ax=charts[0])
+        _plot_bins(told["conditions"], conditions, ax=charts[1])
+        _plot_trials(columns, conditions, ax=charts[2])
+        _plot_coverage(told["reliability"], conditions, ax=charts[3])
+        _plot_uncertainty(columns, conditions, told["wet_auroc"], ax=charts[4])
+        _plot_typical(columns, told["trials"], ax=charts[5])
+        if estimators:
+            _plot_readers(figure, {"network": told, **estimators}, conditions, top=_HEIGHT + 0.25)
+        place_text(figure, _LEFT - 0.5, 0.2, title, fontsize=13, fontweight="bold", parse_math=False)
+        place_text(figure, _LEFT - 0.5, 0.52, _summary(told, conditions), fontsize=9, color=GREY)
+    save_page(figure, path)
+
+
+def _plot_answers(columns: Mapping[str, np.ndarray], conditions: list[str], *, ax: Axes) -> None:
+    for name in conditions:
+        rows = np.flatnonzero(columns["condition"] == name)
+        rows = rows[:: max(1, len(rows) // _MOST_DOTS)]
+        label, answer = (100 * columns[key][rows] for key in ("safety_margin", "prediction"))
+        ax.scatter(
+            label, answer, s=5, alpha=0.35, linewidths=0, rasterized=True, color=_COLOURS.get(name, GREEN), label=name
+        )
+    ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="perfect")
+    ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103), title="Answers")
+    ax.legend(markerscale=2.5, fontsize=8, loc="upper left")
+
+
+def _plot_bins(scores: Mapping[str, Any], conditions: list[str], *, ax: Axes) -> None:
+    width = 0.8 / max(1, len(conditions))
+    for index, name in enumerate(conditions):
+        bins = scores[name]["bins"]
+        at = np.arange(len(bins)) + (index - (len(conditions) - 1) / 2) * width
+        heights = [np.nan if one["mse"] is None else one["mse"] for one in bins]
+        ax.bar(at, heights, width=width, color=_COLOURS.get(name, GREEN), label=name)
+    ax.set(xlabel="True Γ, lower edge of the bin (%)", ylabel="MSE (Γ as a fraction, squared)", title="Error by margin")
+    ax.set_xticks(range(10), [str(10 * one) for one in range(10)])
+    ax.legend(fontsize=8)
+
+
+def _plot_trials(columns: Mapping[str, np.ndarray], conditions: list[str], *, ax: Axes) -> None:
+    for place, name in enumerate(conditions):
+        biases = []
+        inside = columns["condition"] == name
+        for trial in np.unique(columns["trial"][inside]):
+            rows = inside & (columns["trial"] == trial)
+            biases.append(100 * float(np.mean(columns["prediction"][rows] - columns["safety_margin"][rows])))
+        spread = np.linspace(-0.25, 0.25, len(biases)) if len(biases) > 1 else np.zeros(1)
+        ax.scatter(np.sort(biases), place + spread, s=14, color=_COLOURS.get(name, GREEN), linewidths=0)
+    ax.axvline(0, color=BLACK, linewidth=1, linestyle="--")
+    ax.set(
+        xlabel="Mean of predicted less true Γ (points)", title="Bias of each trial", ylim=(len(conditions) - 0.5, -0.5)
+    )
+    ax.set_yticks(range(len(conditions)), conditions)
+
+
+def _plot_coverage(reliability: Mapping[str, Any], conditions: list[str], *, ax: Axes) -> None:
+    known = {name: reliability[name]["coverage"] for name in conditions if reliability[name]["coverage"]}
+    for name, shares in known.items():
+        levels = sorted(shares, key=float)
+        drawn = {"color": _COLOURS.get(name, GREEN), "marker": "o", "markersize": 4}
+        ax.plot(
+            [100 * float(level) for level in levels], [100 * shares[level] for level in levels], label=name, **drawn
+        )
+    ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="as promised")
+    ax.set(xlabel="Promised (% of the frames)", ylabel="Held (%)", xlim=(40, 100), ylim=(0, 102), title="Intervals")
+    if not known:
+        _say(ax, "this network was never calibrated")
+    ax.legend(fontsize=8, loc="upper left")
+
+
+def _plot_uncertainty(
+    columns: Mapping[str, np.ndarray], conditions: list[str], auroc: float | None, *, ax: Axes
+) -> None:
+    title = "Uncertainty" if auroc is None else f"Wet told from dry: AUROC {auroc:.2f}"
+    ax.set(xlabel="Standard deviation of the answer (points of Γ)", ylabel="Share of the frames (%)", title=title)
+    if "sigma" not in columns:
+        _say(ax, "one number, and no distribution")
+        return
+    sigma = 100 * columns["sigma"]
+    edges = np.linspace(0, max(1.0, float(np.quantile(sigma, 0.995))), 30).tolist()
+    for name in conditions:
+        shown = sigma[columns["condition"] == name]
+        weights = np.full(len(shown), 100 / len(shown))
+        ax.hist(shown, bins=edges, weights=weights, color=_COLOURS.get(name, GREEN), alpha=0.6, label=name)
+    ax.legend(fontsize=8)
+
+
+def _plot_typical(columns: Mapping[str, np.ndarray], trials: Mapping[str, Any], *, ax: Axes) -> None:
+    ranked = sorted(trials, key=lambda name: trials[name]["mse"])
+    trial = ranked[(len(ranked) - 1) // 2]
+    rows = np.flatnonzero(columns["trial"] == trial)
+    rows = rows[np.argsort(columns["time_s"][rows], kind="stable")]
+    time = columns["time_s"][rows]
+    if "low_90" in columns:
+        low, high = 100 * columns["low_90"][rows], 100 * columns["high_90"][rows]
+        ax.fill_between(time, low, high, color=VERMILLION, alpha=0.2, linewidth=0, label="90 % interval")
+    ax.plot(time, 100 * columns["prediction"][rows], color=VERMILLION, label="predicted")
+    ax.plot(time, 100 * columns["safety_margin"][rows], color=BLACK, linestyle="--", label="true")
+    ax.set(xlabel="Time (s)", ylabel="Γ (%)")
+    shown = trial if len(trial) <= 18 else f"…{trial[-17:]}"
+    ax.set_title(f"Median error: {shown}", parse_math=False)
+    ax.legend(fontsize=8)
+
+
+def _plot_readers(
+    figure: Figure, readers: Mapping[str, Mapping[str, Any]], conditions: list[str], *, top: float
+) -> None:
+    """Bars of R2 and of the mean absolute error, a row a reader of the margin."""
+    left, gap = 2.35, 0.5
+    size = (_WIDTH - left - gap - 0.5) / 2, _READER * len(readers)
+    first, second = (place_axes(figure, left + at * (size[0] + gap), top, *size) for at in range(2))
+    thick = 0.8 / max(1, len(conditions))
+    for index, name in enumerate(conditions):
+        scores = [one["conditions"][name] for one in readers.values()]
+        at = np.arange(len(readers)) + (index - (len(conditions) - 1) / 2) * thick
+        r2 = np.array([np.nan if one["r2"] is None else one["r2"] for one in scores])
+        mae = np.array([100 * one["mae"] for one in scores])
+        for ax, values, digits in ((first, r2, 2), (second, mae, 1)):
+            ax.barh(at, np.maximum(values, _LOWEST_R2), height=thick, color=_COLOURS.get(name, GREEN), label=name)
+            for place, value in zip(at, values, strict=True):
+                if np.isfinite(value):
+                    # -0.00 would look like less than nothing
+                    ax.text(max(value, 0), place, f" {round(value, digits) + 0.0:.{digits}f}", va="center", fontsize=7)
+    first.axvline(0, color=BLACK, linewidth=1)
+    first.set(xlabel="R²", title="Network, and estimators from the markers alone")
+    first.set_xlim(max(first.get_xlim()[0], _LOWEST_R2), 1.08)
+    second.set(xlabel="Mean absolute error (points of Γ)")
+    for ax, names in ((first, list(readers)), (second, [""] * len(readers))):
+        ax.set_yticks(range(len(readers)), names)
+        ax.set_ylim(len(readers) - 0.4, -0.6)
+        ax.grid(visible=False, axis="y")
+    second.legend(fontsize=8, loc="lower right")
+
+
+def _summary(told: Mapping[str, Any], conditions: list[str]) -> str:
+    parts = []
+    for name in conditions:
+        scores, lead = told["conditions"][name], told["lead_times"][name]
+        r2 = "none" if scores["r2"] is None else f"{scores['r2']:.3f}"
+        words = f"{name}: {scores['frames']:,} frames, MSE {scores['mse']:.4f}, R² {r2}"
+        words += f", MAE {100 * scores['mae']:.1f} points"
+        if lead["median_ms"] is not None:
+            words += f", warns {lead['median_ms']:.0f} ms before the slip (the true Γ: {lead['ideal_ms']:.0f} ms)"
+        parts.append(f"{words}, {lead['false_per_minute']:.1f} false alarms a minute")
+    return "\n".join(parts)
+
+
+def _say(ax: Axes, words: str) -> None:
+    ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=GREY)
+
+
+_FEW = 40
+"""Epochs up to which each has a dot: one epoch alone makes no line."""
+
+
+def draw_learning_curve(metrics: Path, path: Path, *, input_name: str, title: str) -> None:
+    """Save the errors of a `metrics.csv` by epoch, on a logarithmic scale, with the epoch whose weights were kept.
+
+    Parameters
+    ----------
+    metrics
+        As `fit` writes it.
+    path
+        File to write: .png, .pdf or .svg.
+    input_name
+        What the network sees; it sets the colour, as in the report.
+    title
+        Head of the page.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read or written.
+    """
+    curve = read_learning_curve(metrics, command="sliplens train")
+    epoch, train, validation = (curve[name] for name in ("epoch", "train_mse", "validation_mse"))
+    best = int(np.argmin(validation))
+    with drawing_style():
+        figure = Figure(figsize=(7.0, 4.4))
+        ax = place_axes(figure, 0.95, 0.75, 5.8, 3.05)
+        _plot(ax, epoch, train, validation, best=best, colour=INPUT_COLOURS.get(input_name, BLUE))
+        place_text(figure, 0.25, 0.15, title, fontsize=12, fontweight="bold", parse_math=False)
+        kept = f"kept: epoch {epoch[best]:.4g}, validation MSE {validation[best]:.4g}"
+        kept += f", root mean square error {100 * np.sqrt(validation[best]):.1f} points of Γ"
+        place_text(figure, 0.25, 0.42, kept, fontsize=9, color=GREY)
+        save_page(figure, path)
+
+
+def _plot(ax: Axes, epoch: np.ndarray, train: np.ndarray, validation: np.ndarray, *, best: int, colour: str) -> None:
+    marker = "o" if len(epoch) <= _FEW else ""
+    style = {"color": colour, "marker": marker, "markersize": 3}
+    ax.plot(epoch, train, linestyle=":", label="training, augmented", **style)
+    ax.plot(epoch, validation, label="validation", **style)
+    ax.plot(
+        epoch[best], validation[best], marker="o", markersize=10, markerfacecolor="none", markeredgewidth=1.6,
+        linestyle="", color=VERMILLION, label="kept",
+    )  # fmt: skip
+    ax.set(xlabel="Epoch (passes over the training frames)", ylabel="MSE (Γ as a fraction, squared)", yscale="log")
+    ax.set_xlim(0, 1.03 * max(1.0, float(epoch[-1])))
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    # room above and below, so that a curve that hardly falls looks like one
+    errors = np.concatenate([train, validation])
+    ax.set_ylim(0.7 * float(errors.min()), 1.4 * float(errors.max()))
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ax.yaxis.set_minor_locator(NullLocator())
+    ax.legend()

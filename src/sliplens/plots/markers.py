@@ -1,0 +1,238 @@
+"""Markers on pictures: arrows on the frame, the field between them, and both beside differences and saliency."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patheffects import Normal, Stroke
+
+from sliplens.errors import InputError
+from sliplens.images import absolute_difference
+from sliplens.markers import DisplacementField, Tracks, compute_field
+from sliplens.plots.contact_sheet import NAMED_STATES, TIMES, brighten, brightening
+from sliplens.plots.saliency import plot_colour_bar, plot_overlay, stretch_saliency
+from sliplens.plots.style import BLACK, GREY, drawing_style, percent
+from sliplens.recordings import ContactState, Recording
+
+# light is far: read alike under every common colour blindness
+FIELD_COLOURS = "cividis"
+_SURE = 0.2  # confidence below which the field is not shown
+ARROWS = 5.0
+"""Length of arrows over the displacement."""
+_STILL_PX = 0.3  # below which a direction is noise
+_PANEL_IN = 2.2
+_FIELD_LABEL = "Displacement (px)"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkedFrame:
+    """A frame with its field and the saliency of a network's answer on it."""
+
+    title: str
+    frame: UInt8[np.ndarray, "height width 3"]
+    field: DisplacementField
+    saliency: Float[np.ndarray, "_ _"]
+    """In [0, 1]."""
+
+
+def plot_arrows(
+    frame: UInt8[np.ndarray, "height width 3"],
+    rest_px: Float[np.ndarray, "markers 2"],
+    displacement_px: Float[np.ndarray, "markers 2"],
+    *,
+    ax: Axes,
+    magnified: float = ARROWS,
+) -> Axes:
+    """Draw a frame with an arrow from each marker's place at rest along its displacement.
+
+    Parameters
+    ----------
+    frame
+        T_n, RGB.
+    rest_px
+        x, y of the markers in T_0.
+    displacement_px
+        x, y of their displacements; markers where it is NaN have no arrow.
+    ax
+        To draw on.
+    magnified
+        Length of an arrow over the displacement.
+    """
+    known = np.all(np.isfinite(displacement_px), axis=1) & np.all(np.isfinite(rest_px), axis=1)
+    place, way = rest_px[known], displacement_px[known]
+    ax.imshow(frame)
+    ax.quiver(
+        *place.T, *way.T, angles="xy", scale_units="xy", scale=1 / magnified, color="white", width=0.008,
+        headlength=3, headaxislength=2.7, edgecolor=BLACK, linewidth=0.6, minlength=0.5,
+    )  # fmt: skip
+    height, width = frame.shape[:2]
+    ax.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="x (px)", ylabel="y (px)")
+    ax.grid(visible=False)
+    return ax
+
+
+def plot_field(
+    field: DisplacementField, *, size: tuple[int, int], ax: Axes, longest_px: float | None = None
+) -> ScalarMappable:
+    """Draw the length of the displacement in colour and its direction as streamlines; what is a guess stays grey.
+
+    Parameters
+    ----------
+    field
+        What to draw.
+    size
+        Height and width of the frame, in pixels.
+    ax
+        To draw on.
+    longest_px
+        Displacement that gets the lightest colour; the field's own longest if None.
+
+    Returns
+    -------
+    matplotlib.cm.ScalarMappable
+        For a colour bar, in pixels.
+    """
+    sure = field.confidence > _SURE
+    length = np.linalg.norm(field.displacement_px, axis=-1)
+    top = longest_px or max(float(np.nanmax(np.where(sure, length, 0))), _STILL_PX)
+    (left, right), (top_edge, bottom) = _ends(field.x_px), _ends(field.y_px)
+    extent = (left, right, bottom, top_edge)
+    ax.set_facecolor("#D1D5DB")
+    norm = Normalize(0, top)
+    ax.imshow(np.where(sure, length, np.nan), cmap=FIELD_COLOURS, norm=norm, extent=extent, interpolation="nearest")
+    moves = sure & (length > _STILL_PX)
+    if moves.sum() > 3:
+        x, y = (np.where(moves, field.displacement_px[..., axis], np.nan) for axis in (0, 1))
+        lines = ax.streamplot(field.x_px, field.y_px, x, y, color="white", density=0.8, linewidth=1.0, arrowsize=0.9)
+        lines.lines.set_path_effects([Stroke(linewidth=2.0, foreground=BLACK, alpha=0.5), Normal()])
+    ax.set(xlim=(-0.5, size[1] - 0.5), ylim=(size[0] - 0.5, -0.5), aspect="equal", xlabel="x (px)", ylabel="y (px)")
+    ax.grid(visible=False)
+    return ScalarMappable(norm, FIELD_COLOURS)
+
+
+def choose_states(recording: Recording) -> dict[ContactState, int]:
+    """Pick a frame for each contact state: the last without slip, and the middle of those in which it slips."""
+    chosen = {}
+    for state in NAMED_STATES:
+        places = [at for at, own in enumerate(recording.contact_state) if own == state]
+        # a trial that lets go ends as it began: what came before the slip is meant
+        if state is ContactState.NO_CONTACT:
+            places = places[: next((at for at, place in enumerate(places) if place != at), len(places))]
+        if places:
+            slips = state in {ContactState.INCIPIENT_SLIP, ContactState.FULL_SLIP}
+            chosen[state] = places[len(places) // 2] if slips else places[-1]
+    return chosen
+
+
+def draw_contact_states(recording: Recording, tracks: Tracks) -> Figure:
+    """Draw raw frame with arrows, field, and difference image across the contact states (thesis, Fig. 4).
+
+    Parameters
+    ----------
+    recording
+        A trial with contact states.
+    tracks
+        Its markers, from the recording's own reference.
+
+    Raises
+    ------
+    InputError
+        If the tracks are of another trial, or no state is known.
+
+    References
+    ----------
+    Polak, *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning*, Fig. 4.
+    """
+    if len(tracks) != len(recording):
+        raise InputError(f"{len(tracks)} frames were tracked but the trial has {len(recording)}; track it anew")
+    chosen = choose_states(recording)
+    if not chosen:
+        raise InputError(f"no frame of trial {recording.trial} has a known contact state; label it first")
+    size = (recording.reference.shape[0], recording.reference.shape[1])
+    fields = {state: compute_field(tracks, at, size=size) for state, at in chosen.items()}
+    lengths = [np.linalg.norm(one.displacement_px, axis=-1)[one.confidence > _SURE].max() for one in fields.values()]
+    differences = {
+        state: absolute_difference(recording.frames[at], recording.reference) for state, at in chosen.items()
+    }
+    factor = brightening([one[None] for one in differences.values()])
+    with drawing_style():
+        figure = Figure(figsize=(_PANEL_IN * len(chosen) + 1.4, 3 * _PANEL_IN + 0.7), layout="constrained")
+        axes = figure.subplots(3, len(chosen), squeeze=False)
+        mappable = None
+        for column, (state, at) in zip(axes.T, chosen.items(), strict=True):
+            plot_arrows(recording.frames[at], tracks.rest_px, tracks.displacement_px[at], ax=column[0])
+            mappable = plot_field(fields[state], size=size, ax=column[1], longest_px=max(*lengths, _STILL_PX))
+            column[2].imshow(brighten(differences[state], factor))
+            margin = float(recording.safety_margin[at])
+            told = "" if np.isnan(margin) else f", Γ {percent(margin)}"
+            column[0].set_title(f"{str(state).capitalize()}{told}")
+        _share_axes(axes, (f"Camera, arrows {TIMES} {ARROWS:g}", "Field", f"Difference {TIMES} {factor:g}"))
+        assert mappable is not None  # there is a state
+        figure.colorbar(mappable, ax=axes[1], label=_FIELD_LABEL, shrink=0.9)
+    return figure
+
+
+def draw_fields_beside_saliency(frames: Sequence[MarkedFrame]) -> Figure:
+    """Draw each frame, its field and the saliency on it side by side, a row a frame (thesis, Fig. 12).
+
+    Raises
+    ------
+    InputError
+        If there is no frame.
+    SaliencyError
+        If a map has another size than its frame, or is not finite.
+
+    References
+    ----------
+    Polak, *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning*, Fig. 12.
+    """
+    if not frames:
+        raise InputError("there is no frame to draw; name one or more")
+    fields = [one.field for one in frames]
+    longest = max(float(np.linalg.norm(one.displacement_px, axis=-1)[one.confidence > _SURE].max()) for one in fields)
+    with drawing_style():
+        figure = Figure(figsize=(3 * _PANEL_IN + 1.4, _PANEL_IN * len(frames) + 1.3), layout="constrained")
+        heights = [*[1.0] * len(frames), 0.07]
+        grid = figure.add_gridspec(len(frames) + 1, 3, height_ratios=heights)
+        axes = np.array([[figure.add_subplot(grid[row, column]) for column in range(3)] for row in range(len(frames))])
+        mappable = None
+        for one, row in zip(frames, axes, strict=True):
+            size = (one.frame.shape[0], one.frame.shape[1])
+            row[0].imshow(one.frame)
+            mappable = plot_field(one.field, size=size, ax=row[1], longest_px=longest)
+            plot_overlay(one.frame, stretch_saliency(one.saliency), ax=row[2])
+            row[2].set_axis_on()
+        _share_axes(axes, tuple(one.title for one in frames))
+        for place, title in zip(axes[0], ("Camera", "Displacement field", "Saliency"), strict=True):
+            place.set_title(title)
+        bars = [figure.add_subplot(grid[-1, column]) for column in (1, 2)]
+        assert mappable is not None  # there is a frame
+        figure.colorbar(mappable, cax=bars[0], orientation="horizontal", label=_FIELD_LABEL)
+        plot_colour_bar(ax=bars[1])
+        bars[1].set_xlabel("Saliency (share of the brightest)")
+    return figure
+
+
+def _ends(places: Float[np.ndarray, " places"]) -> tuple[float, float]:
+    """Outer edges of the cells of an even grid."""
+    half = (places[1] - places[0]) / 2
+    return float(places[0] - half), float(places[-1] + half)
+
+
+def _share_axes(axes: np.ndarray, names: Sequence[str]) -> None:
+    """Name the pixel axes at the left and at the bottom alone, and the rows."""
+    for row, name in zip(axes, names, strict=True):
+        for place in row:
+            place.grid(visible=False)
+            place.set(xlabel="", ylabel="")
+            place.tick_params(labelleft=False, labelbottom=False)
+        row[0].tick_params(labelleft=True)
+        row[0].set_ylabel(f"{name}\ny (px)", color=GREY)
+    for place in axes[-1]:
+        place.tick_params(labelbottom=True)
+        place.set_xlabel("x (px)")

@@ -1,0 +1,252 @@
+"""Panels of saliency: the network's input above what each method made of it, from full stick to full slip."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from sliplens.arrays import require_saliency
+from sliplens.plots.layout import Picture, png_picture
+from sliplens.plots.style import in_order, input_name, method_name, methods_in_order, percent, source_name
+from sliplens.results.records import Explained, ExplainedFrame
+
+# perceptually uniform, rises in lightness, and read alike under every common colour blindness
+COLORMAP = "inferno"
+_DIM = 0.55  # of the picture's lightness: leaves the bright end of the colours to the saliency
+_OPAQUE_FROM = 0.4  # saliency from which the picture no longer shines through
+FULL_COLOUR_PERCENTILE = 99.5
+"""Percentile of a map that gets the brightest colour: a few outlying pixels would leave the rest of the map black."""
+
+
+def overlay_saliency(
+    picture: UInt8[np.ndarray, "height width 3"], saliency: Float[np.ndarray, "rows columns"]
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Picture in dimmed grey with the saliency in colour on top.
+
+    The picture loses its own colours, so that every colour seen is saliency; where the saliency is low the picture
+    shows through.
+
+    Parameters
+    ----------
+    picture
+        What the network saw, as RGB.
+    saliency
+        Importance of each pixel in [0, 1], of the picture's height and width.
+
+    Raises
+    ------
+    SaliencyError
+        If the map has another size than the picture, or is not finite.
+    """
+    value = np.clip(require_saliency(saliency, picture.shape[:2]), 0, 1)
+    return np.round(255 * _blend(_DIM * _lightness(picture), value)).astype(np.uint8)
+
+
+def stretch_saliency(saliency: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
+    """Stretch a map for viewing, so that its 99.5th percentile and all above are 1; a zero map stays zero."""
+    top = np.percentile(saliency, FULL_COLOUR_PERCENTILE) or saliency.max()
+    return np.clip(saliency / top, 0, 1) if top > 0 else saliency
+
+
+def plot_overlay(
+    picture: UInt8[np.ndarray, "height width 3"], saliency: Float[np.ndarray, "rows columns"], *, ax: Axes
+) -> Axes:
+    """Draw a picture with its saliency; both fill the same extent, since they are one image."""
+    ax.imshow(overlay_saliency(picture, saliency))
+    ax.set_axis_off()
+    return ax
+
+
+def plot_colour_bar(*, ax: Axes) -> Axes:
+    """Draw the colours of `overlay_saliency` from least to most important, over a mid-grey picture."""
+    value = np.linspace(0, 1, 256)[None]
+    ax.imshow(_blend(np.full_like(value, _DIM / 2), value), extent=(0, 1, 0, 1), aspect="auto")
+    ax.set(xlabel="Saliency (share of its own picture's 99.5th percentile)", yticks=[], xticks=[0, 0.25, 0.5, 0.75, 1])
+    ax.grid(visible=False)
+    return ax
+
+
+def _lightness(picture: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
+    return picture @ np.array([0.299, 0.587, 0.114]) / 255  # luma weights of ITU-R BT.601
+
+
+def _blend(
+    grey: Float[np.ndarray, "height width"], saliency: Float[np.ndarray, "height width"]
+) -> Float[np.ndarray, "height width 3"]:
+    alpha = np.clip(saliency / _OPAQUE_FROM, 0, 1)[..., None]
+    return (1 - alpha) * grey[..., None] + alpha * colormaps[COLORMAP](saliency)[..., :3]
+
+
+_CELL_IN = 1.6
+
+
+def overlay_jet(
+    picture: UInt8[np.ndarray, "height width 3"], saliency: Float[np.ndarray, "height width"]
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Picture under half of the saliency in Jet, divided by the brightest value, as the thesis's figures have it.
+
+    Jet has bright bands where nothing changes and is not read alike by everyone; use it to compare with those figures.
+
+    Parameters
+    ----------
+    picture
+        What the network saw, as RGB.
+    saliency
+        Importance of each pixel in [0, 1].
+
+    References
+    ----------
+    `show_cam_on_image` of the public pytorch-grad-cam, which the thesis's code calls.
+    """
+    mixed = 0.5 * colormaps["jet"](np.clip(saliency, 0, 1))[..., :3] + 0.5 * picture / 255
+    return np.round(255 * mixed / max(mixed.max(), 1e-12)).astype(np.uint8)
+
+
+def draw_panel(
+    rows: Mapping[str, Sequence[UInt8[np.ndarray, "height width 3"] | None]], *, titles: Sequence[str]
+) -> Figure:
+    """Draw a table of pictures.
+
+    Parameters
+    ----------
+    rows
+        Pictures by the name of their row; None leaves a cell empty.
+    titles
+        Of the columns.
+    """
+    figure = Figure(figsize=(_CELL_IN * len(titles) + 0.4, _CELL_IN * len(rows) + 0.5), dpi=120, layout="constrained")
+    axes = figure.subplots(len(rows), len(titles), squeeze=False)
+    for line, (name, pictures) in zip(axes, rows.items(), strict=True):
+        line[0].set_ylabel(name, fontsize=8)
+        for ax, picture in zip(line, pictures, strict=True):
+            ax.set(xticks=[], yticks=[])
+            ax.spines[:].set_visible(False)
+            if picture is not None:
+                ax.imshow(picture, interpolation="nearest")
+    for ax, title in zip(axes[0], titles, strict=True):
+        ax.set_title(title, fontsize=8)
+    return figure
+
+
+NOMINAL_MARGINS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
+_TOLERANCE = 0.1  # half the distance between two columns
+
+
+@dataclass(frozen=True, kw_only=True)
+class PanelColumn:
+    """Head of a column: what it stands for, the frame's label and the network's answer."""
+
+    head: str
+    label: str
+    prediction: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class PanelRow:
+    """A row of pictures, one a column; None where no frame has that margin."""
+
+    name: str
+    cells: tuple[Picture | None, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Panel:
+    """A table of pictures with its caption."""
+
+    layout: ClassVar[str] = "panel"
+
+    columns: tuple[PanelColumn, ...]
+    rows: tuple[PanelRow, ...]
+    caption: str
+
+
+def build_panel(explained: Explained) -> Panel:
+    """Lay out frames by safety margin (thesis, Figs. 8, 11 and 12).
+
+    Where there are few frames, all of them; otherwise those nearest to 100, 80, 60, 40, 20 and 0 %, of the condition
+    with the most frames; without labels, the first ones.
+    """
+    condition, chosen = choose_frames(explained.frames)
+    columns = tuple(_column(nominal, explained.frames, index) for nominal, index in chosen)
+    rows = [PanelRow(name="Input", cells=tuple(_input_picture(explained, index) for _, index in chosen))]
+    rows += [
+        PanelRow(
+            name=method_name(method), cells=tuple(_overlay_picture(explained, method, index) for _, index in chosen)
+        )
+        for method in methods_in_order(explained.methods)
+    ]
+    absent = [percent(nominal) for nominal, index in chosen if index is None and nominal is not None]
+    gap = f" No frame within 10 percentage points of {', '.join(absent)}." if absent else ""
+    ids = ", ".join(explained.frames[index].id for _, index in chosen if index is not None)
+    return Panel(
+        columns=columns,
+        rows=tuple(rows),
+        caption=f"{input_name(explained.input)}, {source_name(explained.source)}, {condition}: what the network saw, "
+        "and what each method holds to speak for the answer, rather than for that of the untouched sensor. Colours are "
+        f"relative to each picture's own saliency, so brightness does not compare between pictures.{gap}"
+        f"{_tell_blank(explained, chosen)} Frames: {ids}.",
+    )
+
+
+def choose_frames(frames: tuple[ExplainedFrame, ...]) -> tuple[str, list[tuple[float | None, int | None]]]:
+    """Pick the condition, and a frame's index for each nominal margin (None where none is near).
+
+    The nearest label wins and ties go to the first frame: the network's answer plays no part.
+    """
+    conditions = [frame.condition for frame in frames]
+    condition = max(in_order(set(conditions), ("dry", "wet")), key=conditions.count)
+    rows = [index for index, frame in enumerate(frames) if frame.condition == condition]
+    labels = {index: margin for index in rows if (margin := frames[index].safety_margin) is not None}
+    if not labels:
+        return condition, [(None, index) for index in rows[: len(NOMINAL_MARGINS)]]
+    if len(labels) == len(rows) <= len(NOMINAL_MARGINS):
+        return condition, [(labels[index], index) for index in sorted(rows, key=lambda index: -labels[index])]
+    chosen = []
+    for nominal in NOMINAL_MARGINS:
+        nearest = min(labels, key=lambda index: abs(labels[index] - nominal))
+        near = abs(labels[nearest] - nominal) < _TOLERANCE
+        chosen.append((nominal, nearest if near else None))
+    return condition, chosen
+
+
+def _column(nominal: float | None, frames: tuple[ExplainedFrame, ...], index: int | None) -> PanelColumn:
+    frame = None if index is None else frames[index]
+    head = "Γ not known" if nominal is None else f"Γ {percent(nominal)}"
+    told = frame is not None and head == f"Γ {percent(frame.safety_margin)}"
+    return PanelColumn(
+        head=head,
+        # a label that the head gives already is not given twice
+        label="no frame" if frame is None else "" if told else f"true {percent(frame.safety_margin)}",
+        prediction="" if frame is None else f"read {percent(frame.prediction)}",
+    )
+
+
+def _input_picture(explained: Explained, index: int | None) -> Picture | None:
+    if index is None:
+        return None
+    return png_picture(explained.pictures[index], alt=f"Input of the network, frame {_told(explained.frames[index])}")
+
+
+def _overlay_picture(explained: Explained, method: str, index: int | None) -> Picture | None:
+    if index is None:
+        return None
+    pixels = overlay_saliency(explained.pictures[index], stretch_saliency(explained.saliency[method][index]))
+    return png_picture(pixels, alt=f"{method_name(method)} over frame {_told(explained.frames[index])}")
+
+
+def _tell_blank(explained: Explained, chosen: list[tuple[float | None, int | None]]) -> str:
+    rows = [index for _, index in chosen if index is not None]
+    blank = sum(not explained.saliency[method][index].any() for method in explained.methods for index in rows)
+    if not blank:
+        return ""
+    pictures = "1 picture has" if blank == 1 else f"{blank} pictures have"
+    return f" {pictures} no colour: there the method finds nothing that speaks for the answer."
+
+
+def _told(frame: ExplainedFrame) -> str:
+    return f"{frame.id}, true Γ {percent(frame.safety_margin)}, read {percent(frame.prediction)}"

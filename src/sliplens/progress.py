@@ -1,0 +1,63 @@
+"""Progress of long work, told to whoever called it.
+
+Whatever takes long takes `on_progress`, called with how many are done and how many there are. Work of several stages
+also names them where the callback can show that (`Stages`), as the command line's can.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Protocol, TypeAlias, runtime_checkable
+
+OnProgress: TypeAlias = Callable[[int, int], None]
+"""Takes how many are done, and how many there are."""
+
+
+@runtime_checkable
+class Stages(Protocol):
+    """A callback for progress that also shows stages, what they wrote, and what a reader should know."""
+
+    def __call__(self, done: int, total: int, /) -> None:
+        """Show how many are done, and how many there are."""
+        ...
+
+    def stage(self, title: str, /) -> AbstractContextManager[OnProgress]:
+        """Show a stage while it is open; gives the callback for its own progress."""
+        ...
+
+    def wrote(self, path: Path, what: str, /, *, kept: bool = False) -> None:
+        """Show what was written where, or that it was there already."""
+        ...
+
+    def note(self, message: str, /) -> None:
+        """Show a sentence."""
+        ...
+
+
+@contextmanager
+def stage(on_progress: OnProgress | None, title: str) -> Iterator[OnProgress]:
+    """Begin a stage of long work; gives the callback for its progress, which may be called whatever was given."""
+    if isinstance(on_progress, Stages):
+        with on_progress.stage(title) as count:
+            yield count
+    else:
+        yield on_progress or _ignore
+
+
+def wrote(on_progress: OnProgress | None, path: Path, what: str, *, kept: bool = False) -> None:
+    """Tell what was written where, or that it was there already, to a callback that shows stages."""
+    if isinstance(on_progress, Stages):
+        on_progress.wrote(path, what, kept=kept)
+
+
+def note(on_progress: OnProgress | None, message: str) -> None:
+    """Tell a sentence to a callback that shows stages."""
+    if isinstance(on_progress, Stages):
+        on_progress.note(message)
+
+
+def _ignore(done: int, total: int) -> None:
+    """Show nothing."""
+
+
+__all__ = ["OnProgress", "Stages", "note", "stage", "wrote"]

@@ -1,0 +1,123 @@
+"""Does a data set hold what it says: hashes, laws of the labels, splits."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sliplens.errors import SliplensError
+from sliplens.files import hash_file
+from sliplens.recordings.capture import forces_path
+from sliplens.recordings.dataset import Dataset, TrialInfo, trial_path
+from sliplens.recordings.store import load_recording, read_header
+from sliplens.recordings.trial import SIGNALS, ContactState, Recording
+
+_ROUNDING = 1e-6
+"""Margins are stored in double precision; labels made in single precision may differ by this much from their forces."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """Something that is wrong in a data set."""
+
+    where: str
+    """The trial, or the file of the data set."""
+    what: str
+    """What is wrong, and at which frame."""
+
+
+def check_dataset(folder: Path, *, on_trial: Callable[[int, int], None] | None = None) -> tuple[Finding, ...]:
+    """Read every trial of a data set and list what is wrong with it.
+
+    Checked are, for each trial: that its file is there, has the hash of the table and is what the table says; that
+    every image can be read; that times rise, forces are finite, labels lie in [0, 1] and are missing only without
+    contact, margin and forces agree, and contact states follow the margin. For the set: that no trial is listed twice,
+    which would put its frames into two splits, and that no file is left over.
+
+    Parameters
+    ----------
+    folder
+        The data set.
+    on_trial
+        Called with the trials done and the trials in all, after each.
+
+    Returns
+    -------
+    tuple of Finding
+        Empty when all is well.
+
+    Raises
+    ------
+    SliplensError
+        If the folder is no data set at all.
+    """
+    data = Dataset.open(folder)
+    findings = []
+    for trial, count in Counter(info.trial for info in data.trials).items():
+        if count > 1:
+            splits = sorted({info.split for info in data.trials if info.trial == trial})
+            findings.append(Finding(where=trial, what=f"is listed {count} times, in split {' and '.join(splits)}"))
+    listed = {trial_path(folder, info.trial) for info in data.trials}
+    listed |= {forces_path(folder, info.trial) for info in data.trials if info.forces_sha256}
+    findings += [
+        Finding(where=str(path.relative_to(folder)), what="is not in the table of the data set")
+        for path in sorted([*(folder / "trials").glob("*"), *(folder / "forces").glob("*")])
+        if path not in listed
+    ]
+    for done, info in enumerate(data.trials, start=1):
+        findings += [Finding(where=info.trial, what=what) for what in _check_trial(folder, info)]
+        if on_trial is not None:
+            on_trial(done, len(data.trials))
+    return tuple(findings)
+
+
+def _check_trial(folder: Path, info: TrialInfo) -> Iterator[str]:
+    path = trial_path(folder, info.trial)
+    if not path.is_file():
+        yield "has no file"
+        return
+    if hash_file(path) != info.sha256:
+        yield "has a file that is not the one the table was made for (its hash differs)"
+    samples = forces_path(folder, info.trial)
+    if info.forces_sha256 and (not samples.is_file() or hash_file(samples) != info.forces_sha256):
+        yield "has samples of forces that are missing or changed since the table was made"
+    try:
+        stored, recording = asdict(read_header(path)), load_recording(path)
+    except SliplensError as error:
+        yield f"cannot be read: {error}"
+        return
+    for name, value in asdict(info).items():
+        if name in stored and value != stored[name]:
+            yield f"has {name} {stored[name]}, the table says {value}"
+    yield from _check_laws(recording)
+
+
+def _check_laws(recording: Recording) -> Iterator[str]:
+    yield from _first(~np.isfinite(recording.time_s), "the time is not a number")
+    # a force sensor's noise is negative at times, and its samples may be missing, where there is no label;
+    # of a trial whose margins alone are known, none is there
+    measured = bool(np.isfinite(recording.normal_force_n).any())
+    for name in SIGNALS[1:4]:
+        missing = measured & recording.labelled & ~np.isfinite(getattr(recording, name))
+        yield from _first(missing, f"{name} is not a number")
+    negative = recording.labelled & (recording.normal_force_n < 0)
+    yield from _first(negative, "the normal force is negative; flip its sign on import")
+    margin, normal = recording.safety_margin, recording.normal_force_n
+    labelled = np.isfinite(margin)
+    yield from _first(np.isfinite(recording.stick_ratio) != labelled, "only one of margin and stick ratio has a label")
+    capacity = recording.friction_coefficient * normal
+    pressing = labelled & (capacity > 0)
+    expected = np.clip(1 - recording.tangential_force_n / np.where(pressing, capacity, 1), 0, 1)
+    off = pressing & (np.abs(margin - expected) > _ROUNDING)
+    yield from _first(off, "the safety margin is not 1 - F_t / (mu F_n)")
+    states = np.array([str(state) for state in recording.contact_state])
+    yield from _first((states == ContactState.NO_CONTACT) & labelled, "a frame without contact has a safety margin")
+    yield from _first((states == ContactState.FULL_SLIP) & labelled & (margin > 0), "full slip has a margin above 0")
+
+
+def _first(wrong: np.ndarray, what: str) -> Iterator[str]:
+    if wrong.any():
+        count = f" ({int(wrong.sum())} frames)" if wrong.sum() > 1 else ""
+        yield f"frame {int(np.argmax(wrong))}: {what}{count}"

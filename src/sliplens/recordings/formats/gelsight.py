@@ -1,0 +1,166 @@
+"""The published GelSight Mini clips of grasps that slip or hold, with their pitfalls handled."""
+
+import csv
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from sliplens.errors import RecordingError
+from sliplens.recordings.capture import Capture, Told, labels_of_margins
+from sliplens.recordings.formats.stored import count_stale, least_contact, small_copies
+from sliplens.recordings.formats.video import read_video
+
+LABELS_FILE = "labels.csv"
+FRAME_RATE_HZ = 8.0
+"""Roughly: the files say 25, their author that 10 to 13 s of video are 37 s of motion."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GelSightClip:
+    """A clip of one finger, and what its data set says of the whole grasp."""
+
+    capture: Capture
+    """Without the stale frames; times are nominal."""
+    slipped: bool
+    """One label a clip: whether the object slipped at some time, not when."""
+    grasp: str
+    """Same for both fingers: keep them in one split."""
+    grasped: str
+    """The object."""
+    stale_frames: int
+    """Left out at the start."""
+    reference_index: int
+    """Frame of the capture with the least relief: a candidate for the reference, to be looked at before it is used."""
+
+
+def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: float = FRAME_RATE_HZ) -> GelSightClip:
+    """Open a clip of the data set behind *Incipient Slip Detection* (A. Parag), as laid out in its `labels.csv`.
+
+    Parameters
+    ----------
+    path
+        `slip/GRASP/camera_N.avi` or `noslip/GRASP/camera_N.avi`.
+    labels
+        Table of the data set; `labels.csv` two folders above the clip's own if None.
+    frame_rate
+        Frames per second that the times assume.
+
+    Raises
+    ------
+    RecordingError
+        If the table is missing or does not list the clip, or the clip cannot be read or has another number of frames.
+    """
+    table = path.absolute().parent.parent.parent / LABELS_FILE if labels is None else labels
+    rows = _read_labels(table)
+    # the names of clips repeat in every folder: the last three parts tell them apart
+    key = "/".join(path.absolute().parts[-3:])
+    if key not in rows:
+        raise RecordingError(f"{table} does not list {key}; name a clip of the data set it belongs to")
+    row = rows[key]
+    whole = read_video(path)
+    if len(whole.frame_time_s) != int(row["n_frames"]):
+        raise RecordingError(
+            f"{path} has {len(whole.frame_time_s)} frames but {table.name} says {row['n_frames']}; copy the clip again"
+        )
+    copies = small_copies(whole.read_frames())
+    stale = count_stale(copies)
+    slipped = row["slip_label"].strip() == "1"
+    capture = read_video(path, frame_rate=frame_rate, skip_frames=stale, name=f"{path.parent.name}-{path.stem}")
+    reference = least_contact(copies[stale:])
+    label = "slips" if slipped else "does not slip"
+    notes = (
+        f"{path.name}: times are nominal; the true frame rate is unknown, roughly {FRAME_RATE_HZ:g} frames/s, and not "
+        "the 25 of the file.",
+        f"{path.name}: one label for the whole clip ({label}); it is not known when slip begins.",
+        f"{path.name}: no reference frame was recorded; frame {reference} of those kept shows the least contact, "
+        "look at it before it is used.",
+    )
+    return GelSightClip(
+        capture=replace(capture, notes=capture.notes + notes),
+        slipped=slipped,
+        grasp=path.parent.name,
+        grasped=row["object"],
+        stale_frames=stale,
+        reference_index=reference,
+    )
+
+
+def read_gelsight(path: Path, *, frame_rate: float | None = None) -> list[Capture]:
+    """Read clips as captures without a label of any frame; what is known of the whole clip is kept beside.
+
+    Parameters
+    ----------
+    path
+        The data set's folder, for all clips that are there; the folder of a grasp; or a clip.
+    frame_rate
+        Frames per second that the times assume; roughly known if None.
+
+    Raises
+    ------
+    RecordingError
+        As `read_gelsight_clip`, or if a folder holds no clip.
+    """
+    if path.is_file():
+        clips = [path]
+    elif (path / LABELS_FILE).is_file():
+        clips = list_gelsight_clips(path)
+    else:
+        clips = sorted(path.glob("*.avi"))
+    if not clips:
+        raise RecordingError(f"{path} holds no clip; name a clip, the folder of a grasp, or that of {LABELS_FILE}")
+    rate = FRAME_RATE_HZ if frame_rate is None else frame_rate
+    return [_labelled(read_gelsight_clip(clip, frame_rate=rate)) for clip in clips]
+
+
+def is_gelsight(path: Path) -> bool:
+    """Whether a path is a clip of the data set, the folder of a grasp, or the data set; told by its `labels.csv`."""
+    tables = [folder / LABELS_FILE for folder in (path, *path.absolute().parents[1:3])]
+    try:
+        return any(table.is_file() and {"file", "slip_label"} <= _columns(table) for table in tables)
+    except (OSError, UnicodeDecodeError, csv.Error):
+        return False
+
+
+def _labelled(clip: GelSightClip) -> Capture:
+    capture = clip.capture
+    known = {"slips": clip.slipped, "grasp": clip.grasp, "stale_frames": clip.stale_frames}
+    return replace(
+        capture,
+        labels=labels_of_margins(np.full(len(capture.frame_time_s), np.nan), clip=known),
+        reference_index=clip.reference_index,
+        told=Told(sensor="gelsight-mini", object=clip.grasped),
+    )
+
+
+def _columns(table: Path) -> set[str]:
+    with table.open(newline="", encoding="utf-8-sig") as stream:
+        return set(next(csv.reader(stream), []))
+
+
+def list_gelsight_clips(folder: Path) -> list[Path]:
+    """Clips that the data set's `labels.csv` lists and that are there.
+
+    Raises
+    ------
+    RecordingError
+        If the table is missing or no clip is there.
+    """
+    found = [folder / name for name in _read_labels(folder / LABELS_FILE) if (folder / name).is_file()]
+    if not found:
+        raise RecordingError(f"{folder} holds none of the clips that its {LABELS_FILE} lists; copy them beside it")
+    return found
+
+
+def _read_labels(path: Path) -> dict[str, dict[str, str]]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            rows = list(csv.DictReader(stream))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise RecordingError(
+            f"{path}, the labels of the clips, cannot be read ({error}); copy it beside them"
+        ) from None
+    needed = {"file", "slip_label", "object", "n_frames"}
+    if not rows or needed - set(rows[0]):
+        raise RecordingError(f"{path} is no table of GelSight clips; it needs columns {', '.join(sorted(needed))}")
+    return {row["file"]: row for row in rows}

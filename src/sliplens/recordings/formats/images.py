@@ -1,0 +1,192 @@
+"""A folder of images as one trial."""
+
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from sliplens.errors import ImageError, RecordingError
+from sliplens.images.files import list_images, read_image
+from sliplens.recordings.capture import Capture
+from sliplens.recordings.formats.tables import (
+    TIME_UNITS,
+    evenly_spaced,
+    place_on_clock,
+    read_force_table,
+    require_unit,
+    trial_name,
+)
+from sliplens.recordings.formats.video import read_frame_times
+
+
+def frame_size(path: Path) -> tuple[int, int]:
+    """Height and width of an image, in pixels, read from its header.
+
+    Raises
+    ------
+    ImageError
+        If it is missing or no image, claims an absurd size, or holds several images.
+    """
+    try:
+        with warnings.catch_warnings(), Image.open(path) as image:
+            # Pillow warns of a size that would fill the memory, and goes on
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            pages = getattr(image, "n_frames", 1)
+            if pages > 1:
+                raise ImageError(f"{path} holds {pages} images; save one image a file")
+            return image.height, image.width
+    except FileNotFoundError:
+        raise ImageError(f"{path} does not exist; check the path") from None
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise ImageError(f"{path} cannot be read as an image ({error}); copy or export it again") from None
+
+
+def read_frame(path: Path, *, size: tuple[int, int]) -> UInt8[np.ndarray, "height width 3"]:
+    """Read an image as a frame.
+
+    Raises
+    ------
+    ImageError
+        If it is missing, truncated or no image, is neither 8-bit RGB nor 8-bit grey, or has another size.
+    """
+    try:
+        with Image.open(path) as image:
+            if image.mode != "L" or image.size != size[::-1]:
+                return read_image(path, size=size)  # says what is wrong, too
+            grey = np.array(image)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise ImageError(f"{path} cannot be read as an image ({error}); copy or export it again") from None
+    return np.repeat(grey[:, :, None], 3, axis=2)
+
+
+def common_size(paths: tuple[Path, ...]) -> tuple[int, int]:
+    """Height and width that all images share.
+
+    Raises
+    ------
+    ImageError
+        If one cannot be read.
+    RecordingError
+        If one has another size than the first.
+    """
+    first = frame_size(paths[0])
+    for path in paths[1:]:
+        size = frame_size(path)
+        if size != first:
+            raise RecordingError(
+                f"{path} is {size[1]} x {size[0]} pixels but {paths[0].name} is {first[1]} x {first[0]}; "
+                "record all frames of a trial with the same camera settings"
+            )
+    return first
+
+
+_LOSSY = frozenset({".jpg", ".jpeg"})
+
+
+def read_image_folder(
+    folder: Path,
+    *,
+    forces: Path | None = None,
+    times: Path | None = None,
+    frame_rate: float | None = None,
+    name_unit: str | None = None,
+    start_s: float | None = None,
+    name: str | None = None,
+    time_column: str | None = None,
+    force_columns: Sequence[str] | None = None,
+    time_unit: str | None = None,
+    force_unit: str | None = None,
+) -> Capture:
+    """Open a folder of images, and a table of forces recorded beside it.
+
+    Images are TIFF, PNG, JPEG or BMP, 8-bit RGB or grey, in natural order (2 before 10). Where they were taken in time
+    must be said in one of three ways: by `times`, `frame_rate` or `name_unit`.
+
+    Parameters
+    ----------
+    folder
+        One trial.
+    forces
+        Table of forces; `read_force_table` tells of it and of `time_column`, `force_columns`, `time_unit` and
+        `force_unit`.
+    times
+        Table with the name and the time of every image; frames are then ordered by time.
+    frame_rate
+        Frames per second.
+    name_unit
+        Unit (s, ms, us, ns) of the last number in every file's name, which is then its time.
+    start_s
+        When the first frame was taken, on the clock of the forces; None where both count from the same zero.
+    name
+        Of the trial; that of the folder if None.
+
+    Raises
+    ------
+    InputError
+        If the folder is missing or holds no image.
+    ImageError
+        If an image is damaged, is neither 8-bit RGB nor grey, or holds several images.
+    RecordingError
+        If sizes disagree, times are not given in exactly one way, or one is missing or twice there.
+    """
+    given = [option for option in (times, frame_rate, name_unit) if option is not None]
+    if len(given) != 1:
+        raise RecordingError(
+            f"the images of {folder} have {'no times' if not given else 'more than one source of times'}; "
+            "give exactly one of times, frame_rate and name_unit"
+        )
+    paths = tuple(list_images(folder))
+    notes = []
+    if times is not None:
+        table = read_frame_times(times, paths)
+        paths, time = table.paths, table.time_s
+        notes.extend(table.notes)
+    elif frame_rate is not None:
+        time = evenly_spaced(len(paths), frame_rate=frame_rate)
+        notes.append(f"{folder.name}: frames were declared to be taken {frame_rate:g} times a second.")
+    else:
+        unit = require_unit(str(name_unit), quantity="time")
+        time = _numbers_in_names(paths) * TIME_UNITS[unit]
+        notes.append(f"{folder.name}: the last number in a file's name was declared to be its time in {unit}.")
+    lossy = sum(path.suffix.lower() in _LOSSY for path in paths)
+    if lossy:
+        notes.append(
+            f"{folder.name}: {lossy} of {len(paths)} frames are JPEG, which moves markers a little; "
+            "record PNG or TIFF where you can."
+        )
+    size = common_size(paths)
+    table = None
+    if forces is not None:
+        table = read_force_table(
+            forces, time_column=time_column, force_columns=force_columns, time_unit=time_unit, force_unit=force_unit
+        )
+        notes.extend(table.notes)
+    measured = table.forces if table else None
+    clock = place_on_clock(time, forces=measured, start_s=start_s, source=folder.name)
+
+    def read_frames() -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+        return (read_frame(path, size=size) for path in paths)
+
+    return Capture(
+        name=trial_name(folder.resolve().name if name is None else name),
+        source=str(folder),
+        frame_time_s=clock.time_s,
+        frame_size=size,
+        read_frames=read_frames,
+        forces=measured,
+        notes=(*notes, *clock.notes),
+    )
+
+
+def _numbers_in_names(paths: Sequence[Path]) -> Float[np.ndarray, " frames"]:
+    numbers = []
+    for path in paths:
+        found = re.findall(r"\d+(?:\.\d+)?", path.stem)
+        if not found:
+            raise RecordingError(f"{path} has no number in its name; give its time in a table (times) instead")
+        numbers.append(float(found[-1]))
+    return np.array(numbers)

@@ -1,0 +1,779 @@
+"""LeRobot v3 data sets of a tactile camera and a force sensor."""
+
+import io
+import json
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from math import floor, isfinite, prod
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from av.container import InputContainer
+from av.error import FFmpegError
+from jaxtyping import Bool, Float, Int64, UInt8
+from PIL import Image
+
+from sliplens.errors import RecordingError
+from sliplens.recordings.capture import Capture, Forces, GivenLabels, load_forces
+from sliplens.recordings.formats.mcap import TrialText
+from sliplens.recordings.formats.tables import trial_name
+from sliplens.recordings.store import DAMAGED_PARQUET, one_line
+from sliplens.recordings.trial import ContactState, require_unit_interval
+
+_VERSION = re.compile(r"v3\.\d+")
+_FIELD = re.compile(r"\{(video_key|chunk_index|file_index)(?::0?([1-9])d)?\}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """Where an episode lies."""
+
+    index: int
+    length: int
+    """Frames."""
+    data_file: Path
+    video_file: Path | None
+    """None where frames lie in the data file."""
+    video_start_s: float
+    """Stamp, in the video, of the first frame."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """What `meta/info.json` says."""
+
+    folder: Path
+    fps: float
+    features: dict[str, dict[str, Any]]
+    data_path: str
+    video_path: str | None
+
+    def width(self, key: str) -> int:
+        """Numbers that a feature has in each frame."""
+        return prod(self.features[key]["shape"])
+
+
+def read_layout(folder: Path) -> Layout:
+    """Read `meta/info.json`.
+
+    Raises
+    ------
+    RecordingError
+        If it is missing, damaged, or of another version of the format.
+    """
+    path = folder / "meta" / "info.json"
+    try:
+        info = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise RecordingError(f"{path} does not exist; name the folder of a LeRobot data set") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise RecordingError(f"{path} is not valid JSON ({error}); copy it again") from None
+    version = info.get("codebase_version") if isinstance(info, dict) else None
+    if version is None:
+        raise RecordingError(f"{path} has no codebase_version; name the folder of a LeRobot data set")
+    if not _VERSION.fullmatch(str(version)):
+        raise RecordingError(
+            f"{folder} is a LeRobot data set of version {version}, v3.0 is needed; convert it with "
+            "`python -m lerobot.scripts.convert_dataset_v21_to_v30`"
+        )
+    features, fps = info.get("features"), info.get("fps")
+    if not isinstance(fps, int | float) or not isfinite(fps) or fps <= 0:
+        raise RecordingError(f"{path} has fps {fps}; write a positive number of frames a second there")
+    if not isinstance(features, dict) or not all(_is_feature(feature) for feature in features.values()):
+        raise RecordingError(f"{path} lacks features with dtype and shape; copy it again")
+    return Layout(
+        folder=folder,
+        fps=float(fps),
+        features=features,
+        data_path=str(info.get("data_path")),
+        video_path=None if info.get("video_path") is None else str(info["video_path"]),
+    )
+
+
+def read_episodes(layout: Layout, *, camera_key: str, only: int | None = None) -> list[Episode]:
+    """Episodes of a data set and where their frames from a camera lie, in their order.
+
+    Parameters
+    ----------
+    layout
+        What the data set says of itself.
+    camera_key
+        Feature with the images.
+    only
+        Index of the only episode that is wanted; all if None.
+
+    Raises
+    ------
+    RecordingError
+        If `meta/episodes` is missing or damaged, holds no episode or one twice, or not that which is wanted, or paths
+        lead out of the folder.
+    """
+    in_video = layout.features[camera_key]["dtype"] == "video"
+    columns = ["episode_index", "length", "data/chunk_index", "data/file_index"]
+    video = [f"videos/{camera_key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
+    folder = layout.folder / "meta" / "episodes"
+    rows = []
+    for path in sorted(folder.glob("*/*.parquet")):
+        table = read_columns(path, columns + video * in_video)
+        for name in columns + video[:2] * in_video:
+            if not pa.types.is_integer(table.schema.field(name).type):
+                raise RecordingError(f"{path} has no whole numbers in {name}; copy the data set again")
+        rows += table.to_pylist()
+    if not rows:
+        raise RecordingError(f"{folder} lists no episode; record one, or copy it again")
+    episodes = []
+    for row in sorted(rows, key=lambda row: row["episode_index"]):
+        if episodes and episodes[-1].index == row["episode_index"]:
+            raise RecordingError(f"{folder} lists episode {row['episode_index']} twice; copy the data set again")
+        data = {"chunk_index": row["data/chunk_index"], "file_index": row["data/file_index"]}
+        chunk, file, start = (row[name] for name in video) if in_video else (0, 0, 0.0)
+        where = {"video_key": camera_key, "chunk_index": chunk, "file_index": file}
+        episodes.append(
+            Episode(
+                index=row["episode_index"],
+                length=row["length"],
+                data_file=_expand(layout, layout.data_path, data),
+                video_file=_expand(layout, layout.video_path or "", where) if in_video else None,
+                video_start_s=float(start),
+            )
+        )
+    found = [one for one in episodes if only is None or one.index == only]
+    if not found:
+        raise RecordingError(
+            f"{layout.folder} has no episode {only}; it has {len(episodes)}, from {episodes[0].index} to "
+            f"{episodes[-1].index}"
+        )
+    return found
+
+
+def read_columns(path: Path, columns: list[str]) -> pa.Table:
+    """Columns of a Parquet file, with no value missing.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing or damaged, lacks a column, or a value is missing.
+    """
+    try:
+        names = pq.read_schema(path).names
+        missing = [name for name in columns if name not in names]
+        if missing:
+            raise RecordingError(
+                f"{path} lacks {', '.join(missing)}; it is no file of a LeRobot v3 data set, or damaged"
+            )
+        table = pq.read_table(path, columns=columns)
+    except FileNotFoundError:
+        raise RecordingError(f"{path} does not exist; copy the data set again") from None
+    except DAMAGED_PARQUET as error:
+        raise RecordingError(f"{path} is not a readable Parquet file ({one_line(error)}); copy it again") from None
+    for name in columns:
+        if table.column(name).null_count:
+            raise RecordingError(f"{path} has rows without {name}; finish writing the data set, or copy it again")
+    return table
+
+
+def _is_feature(feature: Any) -> bool:
+    if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str):
+        return False
+    shape = feature.get("shape")
+    return isinstance(shape, list) and all(isinstance(size, int) for size in shape)
+
+
+def _expand(layout: Layout, template: str, values: dict[str, Any]) -> Path:
+    """Fill in a template of `info.json`; it comes from outside, so `str.format` would trust it with too much."""
+    path = _FIELD.sub(lambda field: f"{values.get(field[1], '{}')}".rjust(int(field[2] or 0), "0"), template)
+    parts = {*PurePosixPath(path).parts, *PureWindowsPath(path).parts}
+    outside = PurePosixPath(path).is_absolute() or PureWindowsPath(path).anchor or ".." in parts
+    if not path or outside or re.search(r"[{}\0]", path):
+        raise RecordingError(
+            f"{layout.folder / 'meta' / 'info.json'} names files by {template!r}, which leads out of the data set or "
+            "cannot be filled in; copy the data set from one you trust"
+        )
+    return layout.folder / path
+
+
+class EpisodeRows:
+    """Rows of episodes one after another; those of one file share what was read of it.
+
+    Parameters
+    ----------
+    layout
+        What the data set says of itself.
+    columns
+        Features to read.
+    """
+
+    def __init__(self, layout: Layout, columns: list[str]) -> None:
+        self.layout, self.columns = layout, columns
+        self.table: tuple[Path, pa.Table] | None = None
+
+    def of(self, episode: Episode) -> pa.Table:
+        """Rows of an episode, in their order.
+
+        Raises
+        ------
+        RecordingError
+            If the file is missing or damaged, lacks a column or a value, or has not as many rows as it should.
+        """
+        path = episode.data_file
+        if self.table is None or self.table[0] != path:
+            self.table = path, read_columns(path, ["episode_index", *self.columns])
+        table = self.table[1]
+        own: Bool[np.ndarray, " rows"] = table.column("episode_index").to_numpy() == episode.index
+        rows = table.filter(pa.array(own))
+        if rows.num_rows != episode.length or not rows.num_rows:
+            raise RecordingError(
+                f"{path} has {rows.num_rows} frames of episode {episode.index}, its metadata say {episode.length}; "
+                "leave the episode out, or copy the data set again"
+            )
+        return rows
+
+    def vectors(self, rows: pa.Table, key: str, episode: Episode) -> Float[np.ndarray, "frames numbers"]:
+        """A feature of several floating-point numbers a frame."""
+        width = self.layout.width(key)
+        column = rows.column(key).combine_chunks()
+        numbers = column.flatten() if hasattr(column, "flatten") else column
+        if len(numbers) != len(rows) * width or numbers.null_count or not pa.types.is_floating(numbers.type):
+            raise RecordingError(
+                f"{key} of {episode.data_file} does not hold {width} numbers a frame, as meta/info.json says; "
+                "copy the data set again"
+            )
+        return numbers.to_numpy().astype(np.float64).reshape(-1, width)
+
+    def numbers(self, rows: pa.Table, key: str, episode: Episode) -> Float[np.ndarray, " frames"]:
+        """A feature of one number a frame, as exact as it is stored."""
+        return self._one(rows, key, episode, pa.types.is_floating, "numbers").astype(np.float64)
+
+    def truths(self, rows: pa.Table, key: str, episode: Episode) -> Bool[np.ndarray, " frames"]:
+        """A feature that is true or false."""
+        return self._one(rows, key, episode, pa.types.is_boolean, "true and false").astype(bool)
+
+    def words(self, rows: pa.Table, key: str, episode: Episode) -> tuple[str, ...]:
+        """A feature whose whole numbers count through words that `meta/info.json` lists."""
+        codes: Int64[np.ndarray, " frames"] = self._one(rows, key, episode, pa.types.is_integer, "whole numbers")
+        info = self.layout.features[key].get("info")
+        words = info.get("values") if isinstance(info, dict) else None
+        if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
+            raise RecordingError(
+                f"meta/info.json of {self.layout.folder} does not list the values of {key}; copy the data set again"
+            )
+        if codes.min() < 0 or codes.max() >= len(words):
+            raise RecordingError(
+                f"{key} of {episode.data_file} leads beyond the {len(words)} values that meta/info.json lists; "
+                "copy the data set again"
+            )
+        return tuple(words[code] for code in codes)
+
+    def _one(self, rows: pa.Table, key: str, episode: Episode, fits: Callable[..., bool], what: str) -> np.ndarray:
+        column = rows.column(key)
+        if not fits(column.type):
+            raise RecordingError(f"{key} of {episode.data_file} does not hold {what}; copy the data set again")
+        return column.to_numpy()
+
+
+# what FFmpeg would guess from the content may be a play list that leads to other files and hosts
+_CONTAINERS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska", ".webm": "webm"}
+_MOST_PIXELS = 100_000_000
+"""Of a frame: a larger one is a damaged header."""
+_DAMAGED_IMAGE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning)
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoInfo:
+    """What a video says of its frames, without any being decoded."""
+
+    frame_size: tuple[int, int]
+    codec: str
+    lossy: bool
+
+
+def read_video_info(path: Path) -> VideoInfo:
+    """Read the header of a video.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing, no video, or its frames are absurdly large.
+    """
+    with _open_video(path) as container:
+        coder = container.streams.video[0].codec_context
+        if coder is None:
+            raise RecordingError(f"{path} is coded in a way that FFmpeg cannot read; write it as AV1 or H.264")
+        size = coder.height, coder.width
+        if min(size) <= 0 or size[0] * size[1] > _MOST_PIXELS:
+            raise RecordingError(f"{path} claims frames of {size[0]} x {size[1]} pixels; copy it again")
+        return VideoInfo(frame_size=size, codec=coder.codec.canonical_name, lossy=coder.codec.lossy)
+
+
+def video_frames(
+    path: Path, wanted_s: Float[np.ndarray, " frames"], *, tolerance_s: float, frame_size: tuple[int, int]
+) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    """Decode the frames nearest to some stamps of a video.
+
+    Parameters
+    ----------
+    path
+        Video of many episodes.
+    wanted_s
+        Presentation stamps, rising.
+    tolerance_s
+        How far from it a frame may lie.
+    frame_size
+        Height and width that each must have.
+
+    Raises
+    ------
+    RecordingError
+        If there is no frame near a stamp, its size changes, or the video is damaged.
+    """
+    with _open_video(path) as container:
+        shown = _decode_from(container, float(wanted_s[0]) - tolerance_s)
+        current, following = next(shown, None), next(shown, None)
+        for wanted in wanted_s:
+            while current and following and abs(following[0] - wanted) < abs(current[0] - wanted):
+                current, following = following, next(shown, None)
+            if current is None or abs(current[0] - wanted) > tolerance_s:
+                raise RecordingError(
+                    f"{path} has no frame at {wanted:.3f} s; it is cut off, or was not written with this data set"
+                )
+            frame = current[1]
+            if (frame.height, frame.width) != frame_size:
+                raise RecordingError(
+                    f"{path} has frames of {frame.height} x {frame.width} pixels at {wanted:.3f} s, its header says "
+                    f"{frame_size[0]} x {frame_size[1]}; leave the episode out"
+                )
+            yield frame.to_ndarray(format="rgb24")
+
+
+def image_frames(
+    episode: Episode, key: str
+) -> tuple[tuple[int, int], Callable[[], Iterator[UInt8[np.ndarray, "height width 3"]]]]:
+    """Find the height and width of the frames of an episode that lie in a Parquet file, and how they are read.
+
+    Parameters
+    ----------
+    episode
+        Where they lie.
+    key
+        Column of the images.
+
+    Raises
+    ------
+    RecordingError
+        If an image is missing, damaged, neither RGB nor grey, or of another size than the first; of those that follow,
+        when they are read.
+    """
+    read = partial(_stored_images, episode.data_file, key, episode.index)
+    first = next(read(frame_size=None), None)
+    if first is None:
+        raise RecordingError(f"{episode.data_file} has no frame of episode {episode.index}; copy the data set again")
+    height, width, _ = first.shape
+    return (height, width), partial(read, frame_size=(height, width))
+
+
+def _stored_images(
+    path: Path, key: str, episode: int, *, frame_size: tuple[int, int] | None
+) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    index = 0
+    try:
+        file = pq.ParquetFile(path)
+        groups = _row_groups(file, episode)
+        for batch in file.iter_batches(batch_size=16, row_groups=groups, columns=["episode_index", key]):
+            own = batch.column("episode_index").to_numpy() == episode
+            for cell in batch.filter(pa.array(own)).column(key).to_pylist():
+                where = f"frame {index} of {key}, episode {episode} of {path},"
+                data = cell.get("bytes") if isinstance(cell, dict) else None
+                if not isinstance(data, bytes) or not data:
+                    raise RecordingError(f"{where} is not in the file; embed the images, or copy the data set again")
+                pixels = decode_image(data, where=where)
+                if frame_size is not None and pixels.shape[:2] != frame_size:
+                    raise RecordingError(
+                        f"{where} is {pixels.shape[0]} x {pixels.shape[1]} pixels, the first is "
+                        f"{frame_size[0]} x {frame_size[1]}; leave the episode out"
+                    )
+                yield pixels
+                index += 1
+    except DAMAGED_PARQUET as error:
+        raise RecordingError(f"{path} is not a readable Parquet file ({one_line(error)}); copy it again") from None
+
+
+def _row_groups(file: pq.ParquetFile, episode: int) -> list[int]:
+    """Row groups that may hold rows of an episode: without this, each episode would cost all that share its file."""
+    # columns with parts, such as images, count as several here
+    column = [file.schema.column(index).path for index in range(len(file.schema))].index("episode_index")
+    found = []
+    for group in range(file.num_row_groups):
+        told = file.metadata.row_group(group).column(column).statistics
+        if told is not None and told.has_min_max and told.physical_type == "INT64":
+            if told.min <= episode <= told.max:
+                found.append(group)
+        else:
+            found.append(group)
+    return found
+
+
+def decode_image(data: bytes, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    """Pixels of a PNG or JPEG; a grey one gets three equal channels.
+
+    Raises
+    ------
+    RecordingError
+        If it is damaged, or neither RGB nor grey; the message begins with `where`.
+    """
+    try:
+        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
+            if image.mode not in {"RGB", "L"}:
+                raise RecordingError(f"{where} has pixels of mode {image.mode}; record it as 8-bit RGB or grey")
+            pixels = np.array(image)
+    except _DAMAGED_IMAGE as error:
+        raise RecordingError(f"{where} cannot be read as PNG or JPEG ({error}); copy the data set again") from None
+    return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
+
+
+def _decode_from(container: InputContainer, start_s: float) -> Iterator[tuple[float, av.VideoFrame]]:
+    """Frames with their stamps, from a key frame at or before `start_s`."""
+    stream = container.streams.video[0]
+    stream.thread_type = "AUTO"
+    if stream.time_base is not None:
+        container.seek(max(floor(start_s / stream.time_base), 0), stream=stream)
+    for frame in container.decode(stream):
+        if frame.time is not None and not frame.is_corrupt:
+            yield frame.time, frame
+
+
+@contextmanager
+def _open_video(path: Path) -> Iterator[InputContainer]:
+    if not path.is_file():
+        raise RecordingError(f"{path} does not exist; copy the data set again, with its videos")
+    form = _CONTAINERS.get(path.suffix.lower())
+    if form is None:
+        raise RecordingError(f"{path} is no video that can be read; write {', '.join(_CONTAINERS)}")
+    try:
+        # an absolute path cannot be taken for an address
+        with av.open(str(path.absolute()), format=form, options={"protocol_whitelist": "file"}) as container:
+            if not container.streams.video:
+                raise RecordingError(f"{path} has no video stream; copy it again")
+            yield container
+    except (FFmpegError, OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise RecordingError(f"{path} cannot be decoded as a video ({reason}); copy it again") from None
+
+
+CAMERA, TIME, FORCE = "observation.images.tactile", "observation.time_s", "observation.force"
+FORCE_AXES = ("tangential_n", "across_n", "normal_n")
+NUMBERS = {
+    name: f"observation.{name}"
+    for name in ("friction_coefficient", "safety_margin", "safety_margin_sigma", "stick_ratio")
+}
+"""Features of one number, by the labels they hold."""
+VALID, STATE, REASON = "observation.valid", "observation.contact_state", "observation.invalid_reason"
+_COLUMNS = [TIME, FORCE, *NUMBERS.values(), VALID, STATE, REASON]
+_STATES = {str(state): state for state in ContactState}
+
+
+def trials_path(folder: Path) -> Path:
+    """File with a line of JSON an episode."""
+    return folder / "meta" / "sliplens" / "trials.jsonl"
+
+
+def reference_path(folder: Path, episode: int) -> Path:
+    """Reference frame of an episode."""
+    return folder / "meta" / "sliplens" / f"reference-{episode:06d}.png"
+
+
+def samples_path(folder: Path, episode: int) -> Path:
+    """Samples of the force sensor of an episode."""
+    return folder / "meta" / "sliplens" / f"forces-{episode:06d}.parquet"
+
+
+def read_kept(layout: Layout) -> tuple[TrialText, ...] | None:
+    """Read what is kept of the trials, one an episode; None where nothing is.
+
+    Raises
+    ------
+    RecordingError
+        If it is damaged, or names a trial twice.
+    """
+    path = trials_path(layout.folder)
+    try:
+        lines = path.read_text(encoding="utf-8").rstrip("\n").split("\n")
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{path} cannot be read ({error}); copy the data set again") from None
+    trials = tuple(TrialText.parse(line, where=f"line {number + 1} of {path}") for number, line in enumerate(lines))
+    if len({trial.trial for trial in trials}) < len(trials):
+        raise RecordingError(f"{path} names a trial twice; copy the data set again")
+    missing = [key for key in (CAMERA, *_COLUMNS) if key not in layout.features]
+    if missing:
+        raise RecordingError(
+            f"meta/info.json of {layout.folder} lacks {', '.join(missing)}; copy the data set again, or remove {path} "
+            "to read it without labels"
+        )
+    return trials
+
+
+def kept_captures(layout: Layout, trials: tuple[TrialText, ...], *, episode: int | None) -> list[Capture]:
+    """Trials of a data set as they were exported.
+
+    Parameters
+    ----------
+    layout
+        What the data set says of itself.
+    trials
+        What is kept of them.
+    episode
+        Index of the only episode that is wanted; all if None.
+
+    Raises
+    ------
+    RecordingError
+        If the episodes are others than those exported, or one is damaged.
+    """
+    episodes = read_episodes(layout, camera_key=CAMERA)
+    exported = [(index, trial.frames) for index, trial in enumerate(trials)]
+    if [(one.index, one.length) for one in episodes] != exported:
+        path = trials_path(layout.folder)
+        raise RecordingError(
+            f"the episodes of {layout.folder} are no longer those that {path} tells of; export the trials again, or "
+            "remove that file to read the data set without labels"
+        )
+    rows = EpisodeRows(layout, _COLUMNS)
+    wanted = read_episodes(layout, camera_key=CAMERA, only=episode)
+    return [_capture(layout, rows, one, trials[one.index]) for one in wanted]
+
+
+def _capture(layout: Layout, rows: EpisodeRows, episode: Episode, trial: TrialText) -> Capture:
+    table = rows.of(episode)
+    size, read_frames = image_frames(episode, CAMERA)
+    source = f"{trial.trial}, episode {episode.index} of {layout.folder}"
+    time = rows.numbers(table, TIME, episode)
+    if not np.isfinite(time).all():
+        raise RecordingError(f"{TIME} of {source} is not a number everywhere; copy the data set again")
+    path = reference_path(layout.folder, episode.index)
+    try:
+        png = path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read ({error.strerror}); copy the data set again") from None
+    return Capture(
+        name=trial.trial,
+        source=source,
+        frame_time_s=time,
+        frame_size=size,
+        read_frames=read_frames,
+        forces=_forces(samples_path(layout.folder, episode.index), trial) if trial.force_samples else None,
+        labels=_labels(rows, table, episode, trial, source),
+        reference=decode_image(png, where=f"{path}"),
+        told=trial.told,
+    )
+
+
+def _labels(rows: EpisodeRows, table: pa.Table, episode: Episode, trial: TrialText, source: str) -> GivenLabels:
+    force = rows.vectors(table, FORCE, episode)
+    if force.shape[1] != len(FORCE_AXES):
+        raise RecordingError(f"{FORCE} of {source} has {force.shape[1]} numbers, not 3; copy the data set again")
+    numbers = {name: rows.numbers(table, key, episode) for name, key in NUMBERS.items()}
+    for name in ("safety_margin", "stick_ratio"):
+        require_unit_interval(numbers[name], name=name, trial=source)
+    states = rows.words(table, STATE, episode)
+    unknown = set(states) - set(_STATES)
+    if unknown:
+        raise RecordingError(
+            f"{source} has the contact state {min(unknown)[:40]!r}, none of {', '.join(_STATES)}; "
+            "copy the data set again"
+        )
+    optional = {
+        "safety_margin_sigma": numbers.pop("safety_margin_sigma"),
+        "valid": rows.truths(table, VALID, episode),
+        "reason": rows.words(table, REASON, episode),
+    }
+    return GivenLabels(
+        **numbers,
+        tangential_force_n=force[:, 0].copy(),
+        normal_force_n=force[:, 2].copy(),
+        contact_state=tuple(_STATES[state] for state in states),
+        **{name: values for name, values in optional.items() if name in trial.optional},
+        labelling=trial.labelling,
+    )
+
+
+def _forces(path: Path, trial: TrialText) -> Forces:
+    forces = load_forces(path)
+    if len(forces.time_s) != trial.force_samples:
+        raise RecordingError(
+            f"{path} has {len(forces.time_s)} samples of {trial.trial}, {trial.force_samples} were exported; "
+            "copy the data set again"
+        )
+    return forces
+
+
+_TACTILE = re.compile(r"tactile|touch|gel|digit|tactip|fingertip|skin", re.IGNORECASE)
+_FORCE = re.compile(r"force|wrench|(?<![a-z])f_?t(?![a-z])", re.IGNORECASE)
+_TORQUE = re.compile(r"torque|moment|(?<![a-z])[tm]_?[xyz](?![a-z])", re.IGNORECASE)
+
+
+def read_lerobot(
+    folder: Path, *, camera_key: str | None = None, force_key: str | None = None, episode: int | None = None
+) -> list[Capture]:
+    """Read a data set, one trial an episode.
+
+    Frames and forces are rows of one table: each force was taken with its frame, and both have its time, in seconds
+    from the start of the episode. Frames of a video are those shown within half a frame of their row's time.
+
+    Trials that `write_lerobot` exported come back as they were, with their labels; where a feature is named, like those
+    of any data set.
+
+    Parameters
+    ----------
+    folder
+        Folder with `meta/info.json` of version 3.
+    camera_key
+        Feature with the images; by default the only camera, or the only one named like a tactile sensor.
+    force_key
+        Feature of 3 or 6 numbers, the first three the force (x, y, z); by default the only one named like a force.
+    episode
+        Index of an episode; all by default.
+
+    Returns
+    -------
+    list of Capture
+        In the order of the episodes.
+
+    Raises
+    ------
+    RecordingError
+        If the folder is no such data set, it is damaged, or a feature or episode is missing or one of several.
+    """
+    layout = read_layout(folder)
+    if camera_key is None and force_key is None and (kept := read_kept(layout)) is not None:
+        return kept_captures(layout, kept, episode=episode)
+    camera, notes = _choose_camera(layout, camera_key)
+    force = _choose_force(layout, force_key)
+    if force is None:
+        notes.append("There are no forces: no feature of 3 or 6 numbers is named like one.")
+    read = _Reader(layout, camera=camera, force=force, notes=tuple(notes))
+    return [read.capture(one) for one in read_episodes(layout, camera_key=camera, only=episode)]
+
+
+class _Reader:
+    """Reads episodes one after another; those of one file share what was read of it."""
+
+    def __init__(self, layout: Layout, *, camera: str, force: str | None, notes: tuple[str, ...]) -> None:
+        self.layout, self.camera, self.force, self.notes = layout, camera, force, notes
+        self.rows = EpisodeRows(layout, ["timestamp", *([force] if force else [])])
+        self.videos: dict[Path, VideoInfo] = {}
+
+    def capture(self, episode: Episode) -> Capture:
+        rows = self.rows.of(episode)
+        time = rows.column("timestamp").to_numpy().astype(np.float64)
+        source = f"episode {episode.index} of {self.layout.folder}"
+        forces = None
+        if self.force is not None:
+            force = self.rows.vectors(rows, self.force, episode)[:, :3].copy()
+            forces = Forces(time_s=time, force_n=force, source=f"{self.force} of {source}")
+        size, read_frames, notes = self._frames(episode, time)
+        return Capture(
+            name=trial_name(f"{self.layout.folder.resolve().name}-{episode.index:06d}"),
+            source=f"{self.camera} of {source}",
+            frame_time_s=time,
+            frame_size=size,
+            read_frames=read_frames,
+            forces=forces,
+            notes=(*self.notes, *notes),
+        )
+
+    def _frames(
+        self, episode: Episode, time: Float[np.ndarray, " frames"]
+    ) -> tuple[tuple[int, int], Callable[[], Iterator[UInt8[np.ndarray, "height width 3"]]], list[str]]:
+        if episode.video_file is None:
+            return *image_frames(episode, self.camera), []
+        video = self.videos.get(episode.video_file)
+        if video is None:
+            video = self.videos[episode.video_file] = read_video_info(episode.video_file)
+        notes = []
+        if video.lossy:
+            notes.append(f"Frames are coded with loss ({video.codec}), which moves markers a little.")
+        read = partial(
+            video_frames,
+            episode.video_file,
+            episode.video_start_s + time,
+            tolerance_s=0.5 / self.layout.fps,
+            frame_size=video.frame_size,
+        )
+        return video.frame_size, read, notes
+
+
+def _choose_camera(layout: Layout, named: str | None) -> tuple[str, list[str]]:
+    cameras = [
+        key
+        for key, feature in layout.features.items()
+        if feature["dtype"] in {"video", "image"} and not _is_depth(feature)
+    ]
+    if named is not None:
+        if named not in cameras:
+            raise RecordingError(f"{layout.folder} has no camera {named}; it has {_listed(cameras)}")
+        return named, []
+    tactile = [key for key in cameras if _TACTILE.search(key)]
+    if len(tactile) == 1:
+        return tactile[0], []
+    if len(cameras) == 1:
+        return cameras[0], [f"{cameras[0]} was taken for the tactile camera, for there is no other."]
+    if not cameras:
+        raise RecordingError(f"{layout.folder} has no camera; record one, as video or images")
+    raise RecordingError(
+        f"{layout.folder} has cameras {_listed(cameras)}, of which {_listed(tactile)} could be tactile; "
+        "name the camera_key"
+    )
+
+
+def _choose_force(layout: Layout, named: str | None) -> str | None:
+    fitting = [
+        key
+        for key, feature in layout.features.items()
+        if feature["dtype"].startswith("float") and feature["shape"] in ([3], [6])
+    ]
+    if named is not None:
+        if named not in layout.features:
+            raise RecordingError(f"{layout.folder} has no feature {named}; 3 or 6 numbers have {_listed(fitting)}")
+        if named not in fitting:
+            feature = layout.features[named]
+            raise RecordingError(
+                f"{named} of {layout.folder} is {feature['dtype']} of shape {feature['shape']}; a force has 3 or 6 "
+                "floating-point numbers"
+            )
+        found = [named]
+    else:
+        # what was commanded is not what was felt
+        found = [key for key in fitting if _FORCE.search(key) and not key.startswith("action")]
+        if len(found) > 1:
+            raise RecordingError(f"{layout.folder} has forces {_listed(found)}; name the force_key")
+    if not found:
+        return None
+    first = _names(layout.features[found[0]].get("names"))[:3]
+    if any(_TORQUE.search(name) for name in first):
+        raise RecordingError(f"{found[0]} of {layout.folder} begins with {', '.join(first)}; forces must come first")
+    return found[0]
+
+
+def _names(names: object) -> list[str]:
+    """Names of the numbers of a feature, in the two shapes there are: a list, or lists by group."""
+    groups = names.values() if isinstance(names, dict) else [names]
+    return [str(name) for group in groups if isinstance(group, list) for name in group]
+
+
+def _is_depth(feature: dict) -> bool:
+    details = [feature.get(name) for name in ("info", "video_info")]
+    return any(
+        found.get("is_depth_map") or found.get("video.is_depth_map") for found in details if isinstance(found, dict)
+    )
+
+
+def _listed(keys: list[str]) -> str:
+    return ", ".join(keys) or "none"

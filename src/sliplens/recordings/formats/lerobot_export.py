@@ -1,0 +1,526 @@
+"""LeRobot v3 data sets of tactile frames, forces and labels."""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import Int64, Shaped, UInt8
+
+from sliplens.errors import InputError, RecordingError
+from sliplens.files import require_folder, write_json
+from sliplens.images.files import encode_png, write_png
+from sliplens.recordings.capture import Capture, GivenLabels, save_forces
+from sliplens.recordings.dataset import Dataset, TrialInfo
+from sliplens.recordings.formats.lerobot import (
+    CAMERA,
+    FORCE,
+    FORCE_AXES,
+    NUMBERS,
+    REASON,
+    STATE,
+    TIME,
+    VALID,
+    reference_path,
+    samples_path,
+    trials_path,
+)
+from sliplens.recordings.formats.mcap import OPTIONAL, TrialText
+from sliplens.recordings.formats.stored import read_stored_trial
+from sliplens.recordings.formats.tables import trial_name
+from sliplens.recordings.trial import ContactState
+
+_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+
+Stats = dict[str, Any]
+"""min, max, mean, std, count and quantiles, as JSON holds them."""
+
+
+class PixelCount:
+    """How often each channel has each of the 256 levels, from which all statistics of pixels follow."""
+
+    def __init__(self) -> None:
+        self.levels: Int64[np.ndarray, "3 256"] = np.zeros((3, 256), dtype=np.int64)
+        self.frames = 0
+
+    def add(self, frame: UInt8[np.ndarray, "height width 3"]) -> None:
+        """Count the pixels of a frame."""
+        self.levels += [np.bincount(frame[..., channel].ravel(), minlength=256) for channel in range(3)]
+        self.frames += 1
+
+    def join(self, other: "PixelCount") -> None:
+        """Count what another has counted."""
+        self.levels += other.levels
+        self.frames += other.frames
+
+    def stats(self) -> Stats:
+        """Statistics of each channel, in [0, 1]; a quantile is the lowest level that so many pixels do not exceed."""
+        level = np.arange(256) / 255
+        share = self.levels / self.levels.sum(axis=1, keepdims=True)
+        mean = share @ level
+        present = [level[counts > 0] for counts in self.levels]
+        below = self.levels.cumsum(axis=1)
+        found = {
+            "min": [levels.min() for levels in present],
+            "max": [levels.max() for levels in present],
+            "mean": mean,
+            "std": np.sqrt((share * (level - mean[:, None]) ** 2).sum(axis=1)),
+            **{
+                name: [level[np.searchsorted(counts, quantile * counts[-1])] for counts in below]
+                for name, quantile in _QUANTILES.items()
+            },
+        }
+        return {
+            **{name: np.reshape(values, (3, 1, 1)).tolist() for name, values in found.items()},
+            "count": [self.frames],
+        }
+
+
+def number_stats(values: Shaped[np.ndarray, "frames numbers"]) -> Stats:
+    """Statistics of a feature over the frames of which all its numbers are known; zeros, counted 0, where none is.
+
+    Parameters
+    ----------
+    values
+        NaN where a number is not known.
+    """
+    known = values[np.isfinite(values).all(axis=1)]
+    counted = known if len(known) else np.zeros_like(values[:1])
+    exact = counted.astype(np.float64)
+    found = {
+        "min": counted.min(axis=0),
+        "max": counted.max(axis=0),
+        "mean": exact.mean(axis=0),
+        "std": exact.std(axis=0),
+        **dict(zip(_QUANTILES, np.quantile(exact, list(_QUANTILES.values()), axis=0), strict=True)),
+    }
+    return {**{name: value.tolist() for name, value in found.items()}, "count": [len(known)]}
+
+
+Features = dict[str, dict[str, Any]]
+
+CHUNK_FILES = 1000
+FILE_MB = 100
+"""Of a data file: the limits that LeRobot sets itself."""
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+
+_IMAGE = pa.struct({"bytes": pa.binary(), "path": pa.string()})
+_TYPES = {"image": _IMAGE, "float64": pa.float64(), "float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeEntry:
+    """A row of `meta/episodes`."""
+
+    first: int
+    """Number of the first frame in the whole data set."""
+    length: int
+    task: str
+    chunk: int
+    """Folder of the data file, and number of the file in it."""
+    file: int
+    stats: dict[str, Stats]
+
+
+class DataFiles:
+    """Writes frames; an episode is in one file, and what would make it too large goes into the next, as with LeRobot.
+
+    Parameters
+    ----------
+    folder
+        Of the data set.
+    features
+        As `meta/info.json` lists them.
+    file_mb
+        Size at which a file is full.
+    """
+
+    def __init__(self, folder: Path, features: Features, *, file_mb: float = FILE_MB) -> None:
+        self.folder, self.limit = folder, file_mb * 2**20
+        self.schema = _data_schema(features)
+        self.number, self.frames = -1, 0
+        self.writer: pq.ParquetWriter | None = None
+        self.paths: list[Path] = []
+
+    def __enter__(self) -> "DataFiles":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close()
+
+    def begin(self, frames: int) -> tuple[int, int]:
+        """Choose the file of an episode: chunk and number in it."""
+        size = self.paths[-1].stat().st_size if self.writer is not None else 0
+        if self.writer is None or size + size / max(self.frames, 1) * frames >= self.limit:
+            self._close()
+            self.number, self.frames = self.number + 1, 0
+            chunk, file = divmod(self.number, CHUNK_FILES)
+            path = self.folder / DATA_PATH.format(chunk_index=chunk, file_index=file)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self.paths.append(path)
+            self.writer = pq.ParquetWriter(path, self.schema, compression="snappy", use_dictionary=False)
+        return divmod(self.number, CHUNK_FILES)
+
+    def write(self, columns: Mapping[str, Any], *, images: str, pngs: Sequence[bytes], first: int) -> None:
+        """Write frames of an episode as a row group.
+
+        Parameters
+        ----------
+        columns
+            All features but the images; an array of vectors has a row a frame.
+        images, pngs
+            Feature of the images, and these.
+        first
+            Number of the first of them in the episode.
+        """
+        assert self.writer is not None
+        paths = [f"frame-{first + index:06d}.png" for index in range(len(pngs))]
+        arrays = {images: pa.StructArray.from_arrays([pa.array(pngs, pa.binary()), pa.array(paths)], ["bytes", "path"])}
+        for name, values in columns.items():
+            flat = pa.array(np.ascontiguousarray(values).ravel())
+            width = values.shape[1] if values.ndim == 2 else 1
+            arrays[name] = pa.FixedSizeListArray.from_arrays(flat, width) if values.ndim == 2 else flat
+        table = pa.Table.from_arrays([arrays[name] for name in self.schema.names], schema=self.schema)
+        self.writer.write_table(table)
+        self.frames += len(pngs)
+
+    def column(self, name: str) -> Shaped[np.ndarray, "frames numbers"]:
+        """Read back a feature of all episodes; the files must be closed."""
+        found = []
+        for path in self.paths:
+            column = pq.read_table(path, columns=[name]).column(name).combine_chunks()
+            flat = column.flatten() if pa.types.is_fixed_size_list(column.type) else column
+            found.append(flat.to_numpy(zero_copy_only=False).reshape(len(column), -1))
+        return np.concatenate(found)
+
+    def _close(self) -> None:
+        if self.writer is not None:
+            self.writer.close()
+            self.writer = None
+
+
+def write_tasks(folder: Path, tasks: Sequence[str]) -> None:
+    """Write `meta/tasks.parquet`: a data frame of pandas, whose index are the words of the tasks."""
+    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
+    columns = [
+        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
+        for name, kind, numpy in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+    ]
+    index = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.2.0"}
+    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(index)}), folder / "meta" / "tasks.parquet")
+
+
+def write_episodes(folder: Path, episodes: Sequence[EpisodeEntry]) -> None:
+    """Write `meta/episodes`: where each episode lies, and its statistics."""
+    columns: dict[str, Any] = {
+        "episode_index": range(len(episodes)),
+        "tasks": [[one.task] for one in episodes],
+        "length": [one.length for one in episodes],
+        "data/chunk_index": [one.chunk for one in episodes],
+        "data/file_index": [one.file for one in episodes],
+        "dataset_from_index": [one.first for one in episodes],
+        "dataset_to_index": [one.first + one.length for one in episodes],
+    }
+    for feature, stats in episodes[0].stats.items():
+        for name in stats:
+            columns[f"stats/{feature}/{name}"] = [one.stats[feature][name] for one in episodes]
+    columns |= {f"meta/episodes/{name}": [0] * len(episodes) for name in ("chunk_index", "file_index")}
+    path = folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.table(columns), path)
+
+
+def _data_schema(features: Features) -> pa.Schema:
+    """Columns of a data file, with what the `datasets` library reads of them, so that it, too, shows images."""
+    fields, told = [], {}
+    for name, feature in features.items():
+        kind, width = feature["dtype"], feature["shape"][0]
+        value = {"dtype": kind, "_type": "Value"}
+        if kind == "image":
+            fields.append(pa.field(name, _IMAGE))
+            told[name] = {"_type": "Image"}
+        elif width > 1:
+            fields.append(pa.field(name, pa.list_(_TYPES[kind], width)))
+            told[name] = {"feature": value, "length": width, "_type": "List"}
+        else:
+            fields.append(pa.field(name, _TYPES[kind]))
+            told[name] = value
+    return pa.schema(fields, {"huggingface": json.dumps({"info": {"features": told}})})
+
+
+_STATES = [str(state) for state in ContactState]
+
+
+def frame_features(height: int, width: int) -> Features:
+    """Features of the frames, as `meta/info.json` lists them; the words of the reasons are added when all are known."""
+    found: Features = {
+        CAMERA: {"dtype": "image", "shape": [height, width, 3], "names": ["height", "width", "channels"]},
+        TIME: {"dtype": "float64", "shape": [1], "names": ["time_s"]},
+        FORCE: {"dtype": "float64", "shape": [3], "names": list(FORCE_AXES)},
+        **{key: {"dtype": "float64", "shape": [1], "names": [name]} for name, key in NUMBERS.items()},
+        VALID: {"dtype": "bool", "shape": [1], "names": ["valid"]},
+        STATE: {"dtype": "int64", "shape": [1], "names": ["contact_state"], "info": {"values": _STATES}},
+        REASON: {"dtype": "int64", "shape": [1], "names": ["invalid_reason"]},
+        "timestamp": {"dtype": "float32", "shape": [1], "names": None},
+    }
+    counts = ("frame_index", "episode_index", "index", "task_index")
+    return found | {name: {"dtype": "int64", "shape": [1], "names": None} for name in counts}
+
+
+def frame_columns(capture: Capture, *, fps: int | float, reasons: dict[str, int]) -> dict[str, np.ndarray]:
+    """Features of the frames of a trial, but for its images and its place.
+
+    Parameters
+    ----------
+    capture
+        The trial, with labels.
+    fps
+        Frames in a second of `timestamp`.
+    reasons
+        Numbers of the reasons why labels are not valid; those not met before are added.
+    """
+    labels, count = capture.labels, len(capture.frame_time_s)
+    assert labels is not None
+    force = np.stack([labels.tangential_force_n, np.zeros(count), labels.normal_force_n], axis=1)
+    return {
+        TIME: capture.frame_time_s,
+        FORCE: force,
+        **{key: _given(labels, name) for name, key in NUMBERS.items()},
+        VALID: _given(labels, "valid"),
+        STATE: np.array([_STATES.index(state) for state in labels.contact_state], dtype=np.int64),
+        REASON: np.array([reasons.setdefault(reason, len(reasons)) for reason in _given(labels, "reason")], np.int64),
+        "timestamp": (np.arange(count) / fps).astype(np.float32),
+    }
+
+
+def _given(labels: GivenLabels, name: str) -> Any:
+    """Labels of a name; those that a trial lacks follow from what it has, or are not known."""
+    values = getattr(labels, name)
+    if values is not None:
+        return values
+    known = np.isfinite(labels.safety_margin)
+    return {"safety_margin_sigma": np.full(len(labels), np.nan), "valid": known, "reason": [""] * len(labels)}[name]
+
+
+def frame_places(frames: int, *, first: int, episode: int, task: int) -> dict[str, np.ndarray]:
+    """Features that place the frames of an episode in the data set.
+
+    Parameters
+    ----------
+    frames
+        Of the episode.
+    first
+        Number of its first frame in the whole data set.
+    episode, task
+        Their numbers.
+    """
+    numbers = np.arange(frames, dtype=np.int64)
+    return {
+        "frame_index": numbers,
+        "episode_index": np.full_like(numbers, episode),
+        "index": first + numbers,
+        "task_index": np.full_like(numbers, task),
+    }
+
+
+_BATCH = 16
+"""Frames that are encoded side by side and written together."""
+_RATE_WHERE_NONE = 30
+"""Where every trial is one frame."""
+
+
+def write_lerobot(
+    data: Dataset,
+    folder: Path,
+    *,
+    trials: Sequence[TrialInfo] | None = None,
+    on_frames: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write trials as a LeRobot v3.0 data set, one episode a trial, without loss: `read_lerobot` gives them back.
+
+    Frames are PNG in Parquet, never a lossy video, which moves markers. `observation.force` is (F_t, 0, F_n) in
+    newtons: how strongly, not whither, the object is pulled. Contact states and reasons are numbers, whose words
+    `meta/info.json` lists. What is not known is NaN; statistics leave it out.
+
+    LeRobot knows one frame rate and counts time in frames of it: `fps` is the median rate, a whole number where that is
+    within 1 %, and `timestamp` is `frame_index / fps`. The true times stand in `observation.time_s`. Trials of a split
+    follow each other, for a split is a range of episodes. What LeRobot has no place for lies in `meta/sliplens`:
+    reference frames, samples of the force sensor, sensor, day, condition, object, and what the labels rest on. Of a
+    simulated trial the ground truth beyond its labels stays behind.
+
+    Parameters
+    ----------
+    data
+        The data set.
+    folder
+        Folder to write to; `data` and `meta` of an earlier attempt that came to no end are replaced.
+    trials
+        Rows of its table; all by default.
+    on_frames
+        Called with the frames written and the frames in all.
+
+    Raises
+    ------
+    InputError
+        If the folder is missing, or holds a data set.
+    RecordingError
+        If there is no trial, one is damaged or not named like a file, or sizes of frames or frame rates differ.
+
+    References
+    ----------
+    https://huggingface.co/docs/lerobot/lerobot-dataset-v3
+    """
+    chosen = _in_splits(data.trials if trials is None else trials)
+    height, width = _require_one_kind(chosen)
+    _make_room(folder)
+    fps = _frame_rate(data, chosen)
+    features, reasons = frame_features(height, width), {"": 0}
+    tasks: dict[str, int] = {}
+    episodes: list[EpisodeEntry] = []
+    pixels, first, total = PixelCount(), 0, sum(info.frames for info in chosen)
+    with DataFiles(folder, features) as files:
+        for episode, info in enumerate(chosen):
+            capture = read_stored_trial(data, info)
+            count = len(capture.frame_time_s)
+            _keep(folder, episode, capture)
+            task = f"touch {info.object or 'an object'} ({info.condition})"
+            columns = frame_columns(capture, fps=fps, reasons=reasons) | frame_places(
+                count, first=first, episode=episode, task=tasks.setdefault(task, len(tasks))
+            )
+            chunk, file = files.begin(count)
+            shown = PixelCount()
+            for done in _write_frames(files, capture, columns, shown):
+                if on_frames is not None:
+                    on_frames(first + done, total)
+            stats = {
+                CAMERA: shown.stats(),
+                **{name: number_stats(values.reshape(count, -1)) for name, values in columns.items()},
+            }
+            episodes.append(EpisodeEntry(first=first, length=count, task=task, chunk=chunk, file=file, stats=stats))
+            pixels.join(shown)
+            first += count
+    stats = {name: pixels.stats() if name == CAMERA else number_stats(files.column(name)) for name in features}
+    _fill_unknown(episodes, stats)
+    write_tasks(folder, list(tasks))
+    write_episodes(folder, episodes)
+    write_json(folder / "meta" / "stats.json", stats)
+    features[REASON]["info"] = {"values": list(reasons)}
+    # the last file: it makes the folder a data set
+    write_json(
+        folder / "meta" / "info.json",
+        {
+            "codebase_version": "v3.0",
+            "robot_type": None,
+            "total_episodes": len(episodes),
+            "total_frames": first,
+            "total_tasks": len(tasks),
+            "chunks_size": CHUNK_FILES,
+            "data_files_size_in_mb": FILE_MB,
+            "video_files_size_in_mb": 200,
+            "fps": fps,
+            "splits": _ranges([info.split for info in chosen]),
+            "data_path": DATA_PATH,
+            "video_path": None,
+            "features": features,
+        },
+    )
+
+
+def _in_splits(trials: Sequence[TrialInfo]) -> list[TrialInfo]:
+    splits = list(dict.fromkeys(info.split for info in trials))
+    return sorted(trials, key=lambda info: splits.index(info.split))
+
+
+def _ranges(splits: Sequence[str]) -> dict[str, str]:
+    return {split: f"{splits.index(split)}:{splits.index(split) + splits.count(split)}" for split in splits}
+
+
+def _require_one_kind(trials: Sequence[TrialInfo]) -> tuple[int, int]:
+    if not trials:
+        raise RecordingError("there is no trial to export; name at least one")
+    first = trials[0]
+    for info in trials:
+        if trial_name(info.trial) != info.trial:
+            raise RecordingError(f"trial {info.trial!r} has no name for a file; rename it")
+        if (info.height, info.width) != (first.height, first.width):
+            raise RecordingError(
+                f"trial {info.trial} has frames of {info.height} x {info.width} pixels, trial {first.trial} of "
+                f"{first.height} x {first.width}, and a LeRobot data set has one size; export them apart"
+            )
+    return first.height, first.width
+
+
+def _make_room(folder: Path) -> None:
+    require_folder(folder, what="the folder to write to")
+    if (folder / "meta" / "info.json").exists():
+        raise InputError(f"{folder} holds a LeRobot data set; name a new folder")
+    for name in ("data", "meta"):
+        if (folder / name).is_dir():
+            shutil.rmtree(folder / name)
+    trials_path(folder).parent.mkdir(parents=True)
+
+
+def _frame_rate(data: Dataset, trials: Sequence[TrialInfo]) -> int | float:
+    steps = {info.trial: np.diff(read_stored_trial(data, info).frame_time_s) for info in trials}
+    if not any(map(len, steps.values())):
+        return _RATE_WHERE_NONE
+    rate = 1 / float(np.median(np.concatenate(list(steps.values()))))
+    for trial, own in steps.items():
+        if len(own) and abs(np.median(own) * rate - 1) > 0.1:
+            raise RecordingError(
+                f"trial {trial} has {1 / np.median(own):.4g} frames/s, most have {rate:.4g}, and a LeRobot data set "
+                "has one rate; export them apart"
+            )
+    return round(rate) if abs(round(rate) / rate - 1) < 0.01 else rate
+
+
+def _write_frames(
+    files: DataFiles, capture: Capture, columns: dict[str, np.ndarray], shown: PixelCount
+) -> Iterator[int]:
+    """Write the frames of a trial in batches, those of a batch encoded side by side; how many there are, each time."""
+    done, frames = 0, capture.read_frames()
+    with ThreadPoolExecutor() as pool:
+        while batch := list(islice(frames, _BATCH)):
+            pngs = pool.map(encode_png, batch)
+            for frame in batch:
+                shown.add(frame)
+            some = {name: values[done : done + len(batch)] for name, values in columns.items()}
+            files.write(some, images=CAMERA, pngs=list(pngs), first=done)
+            done += len(batch)
+            yield done
+
+
+def _keep(folder: Path, episode: int, capture: Capture) -> None:
+    """Write what LeRobot has no place for."""
+    labels, forces = capture.labels, capture.forces
+    assert labels is not None
+    assert capture.reference is not None
+    write_png(reference_path(folder, episode), capture.reference)
+    if forces is not None:
+        save_forces(forces, samples_path(folder, episode))
+    text = TrialText(
+        trial=capture.name,
+        told=capture.told,
+        frames=len(labels),
+        force_samples=len(forces.time_s) if forces else 0,
+        force_source=forces.source if forces else "",
+        optional=tuple(name for name in OPTIONAL if getattr(labels, name) is not None),
+        labelling=labels.labelling,
+    )
+    with trials_path(folder).open("a", encoding="utf-8", newline="\n") as lines:
+        lines.write(text.dump() + "\n")
+
+
+def _fill_unknown(episodes: Sequence[EpisodeEntry], whole: dict[str, Stats]) -> None:
+    """Give episodes in which a feature is never known the statistics of all, at a count of 0."""
+    for one in episodes:
+        for name, stats in one.stats.items():
+            if stats["count"] == [0]:
+                stats.update({**whole[name], "count": [0]})

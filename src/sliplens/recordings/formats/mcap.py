@@ -1,0 +1,378 @@
+"""Trials as MCAP files of ROS 2 messages, which Foxglove, Rerun and ROS play with images, forces and labels."""
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, fields
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt8
+
+from sliplens._version import __version__
+from sliplens.errors import InputError, RecordingError
+from sliplens.files import require_folder
+from sliplens.images.files import encode_png
+from sliplens.recordings.capture import GIVEN_SIGNALS, Capture, Forces, GivenLabels, Told
+from sliplens.recordings.dataset import Dataset, TrialInfo
+from sliplens.recordings.formats.stored import read_stored_trial
+from sliplens.recordings.formats.tables import trial_name
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+
+FORMAT, VERSION = "sliplens trial", 1
+"""What the text of a trial calls itself."""
+
+TRIAL, REFERENCE, IMAGE = "/tactile/trial", "/tactile/reference", "/tactile/image"
+LABELS, MARGIN = "/tactile/labels", "/tactile/safety_margin"
+WRENCH, WRENCH_TIMES = "/tactile/wrench", "/tactile/wrench_times"
+TOPICS = {
+    TRIAL: "std_msgs/msg/String",
+    REFERENCE: "sensor_msgs/msg/CompressedImage",
+    IMAGE: "sensor_msgs/msg/CompressedImage",
+    LABELS: "sliplens_msgs/msg/SafetyMargin",
+    MARGIN: "std_msgs/msg/Float64",
+    WRENCH: "geometry_msgs/msg/WrenchStamped",
+    WRENCH_TIMES: "sliplens_msgs/msg/SampleTimes",
+}
+"""Types of the messages; wrenches and their times are there where forces are known."""
+
+NUMBERS = ("time_s", *GIVEN_SIGNALS, "safety_margin_sigma")
+"""The numbers of a frame, named as in its message."""
+OPTIONAL = ("safety_margin_sigma", "valid", "reason")
+"""What labels may lack, though the message of each frame has room for it."""
+
+_DEFINITIONS = {
+    "sliplens_msgs/msg/SafetyMargin": """
+std_msgs/Header header
+float64 time_s
+float64 normal_force_n
+float64 tangential_force_n
+float64 friction_coefficient
+float64 safety_margin
+float64 safety_margin_sigma
+float64 stick_ratio
+bool valid
+string contact_state
+string invalid_reason
+""",
+    "sliplens_msgs/msg/SampleTimes": """
+std_msgs/Header header
+float64[] time_s
+""",
+}
+_LONGEST = 2**24
+"""Characters of a text that is parsed; those of a trial are some thousands."""
+_TOLD = {"sensor": str, "day": int, "condition": str, "object": str, "split": str, "simulated": bool}
+
+
+def trial_types() -> "Typestore":
+    """Messages of ROS 2 and ours: from these definitions, never from a file's, for `rosbags` turns them into code."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415 (an extra)
+
+    types = get_typestore(Stores.LATEST)
+    for kind, definition in _DEFINITIONS.items():
+        types.register(get_types_from_msg(definition, kind))
+    return types
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialText:
+    """What a trial is, and how many messages of each kind belong to it."""
+
+    trial: str
+    told: Told
+    frames: int
+    force_samples: int
+    """0 where no force is known."""
+    force_source: str
+    """Topic, file or column names, for people."""
+    optional: tuple[str, ...]
+    """Those of `OPTIONAL` that the labels have."""
+    labelling: dict[str, Any] | None
+    """What the labels rest on."""
+
+    def dump(self, **more: Any) -> str:
+        """Text of `/tactile/trial`; `more` is for people and not read back."""
+        return json.dumps(
+            {"format": FORMAT, "version": VERSION, **asdict(self), **more}, allow_nan=False, ensure_ascii=False
+        )
+
+    @classmethod
+    def parse(cls, text: str, *, where: str) -> "TrialText":
+        """Read what `dump` wrote, believing nothing.
+
+        Parameters
+        ----------
+        text
+            JSON.
+        where
+            Beginning of the error message.
+
+        Raises
+        ------
+        RecordingError
+            If the text is damaged or of another version.
+        """
+        if len(text) > _LONGEST:
+            raise RecordingError(f"{where} has {len(text)} characters, no description does; export the trial again")
+        try:
+            table = json.loads(text)
+            # what JSON of another hand can hold and ours cannot: infinite numbers, halves of characters
+            json.dumps(table, allow_nan=False, ensure_ascii=False).encode()
+        except (ValueError, RecursionError) as error:
+            raise RecordingError(f"{where} is no JSON ({error}); export the trial again") from None
+        if not isinstance(table, dict) or table.get("format") != FORMAT:
+            raise RecordingError(f"{where} does not describe a {FORMAT}; export the trial again")
+        if table.get("version") != VERSION:
+            raise RecordingError(
+                f"{where} is of version {str(table.get('version'))[:20]}, this sliplens reads {VERSION}; update it"
+            )
+        wrong = [name for name, fits in _FITS.items() if name not in table or not fits(table[name])]
+        if wrong:
+            raise RecordingError(f"{where} has no proper {', '.join(wrong)}; export the trial again")
+        values = {field.name: table[field.name] for field in fields(cls)}
+        return cls(**{**values, "told": Told(**values["told"]), "optional": tuple(values["optional"])})
+
+
+def _fits_told(value: object) -> bool:
+    if not isinstance(value, dict) or set(value) != set(_TOLD):
+        return False
+    return all(type(value[name]) is kind or (value[name] is None and kind is not bool) for name, kind in _TOLD.items())
+
+
+def _fits_count(value: object) -> bool:
+    return type(value) is int and value >= 0
+
+
+_FITS = {
+    # it becomes the name of a file
+    "trial": lambda value: isinstance(value, str) and trial_name(value) == value,
+    "told": _fits_told,
+    "frames": lambda value: _fits_count(value) and value > 0,
+    "force_samples": _fits_count,
+    "force_source": lambda value: isinstance(value, str),
+    "optional": lambda value: isinstance(value, list) and all(name in OPTIONAL for name in value),
+    "labelling": lambda value: value is None or isinstance(value, dict),
+}
+"""What each entry must be."""
+
+
+_FRAME_ID = "tactile"
+_LAST_S = 2**31
+"""A stamp of ROS counts seconds in 32 bits."""
+_BATCH = 16
+"""Frames that are encoded side by side."""
+_BLOCK = 1000
+"""Times of wrenches in a message."""
+
+
+def write_mcap(
+    data: Dataset,
+    folder: Path,
+    *,
+    trials: Sequence[TrialInfo] | None = None,
+    on_frames: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write trials as `TRIAL.mcap`, without loss: `read_rosbag` gives each back as it is in the data set.
+
+    Messages are those of ROS 2 and two of ours; each file holds their definitions, so that it needs no ROS to be seen.
+    Frames are PNG: on simulated frames those are 22 % smaller than raw images under the Zstandard of MCAP. Wrenches are
+    the samples of the force sensor where the data set keeps them, else the forces of the frames, (tangential, 0,
+    normal); their torques, which nobody kept, are 0. Of a simulated trial the ground truth beyond its labels stays
+    behind.
+
+    Stamps are the times of the trial to the nanosecond. ROS takes a stamp of 0 for none and cannot write one before:
+    where a trial begins before 1 s, stamps are later by the whole seconds that let it begin within [1 s, 2 s), which
+    `stamp_offset_s` of `/tactile/trial` tells. Exact times stand in `/tactile/labels` and `/tactile/wrench_times`.
+
+    Parameters
+    ----------
+    data
+        The data set.
+    folder
+        An empty folder.
+    trials
+        Rows of its table; all by default.
+    on_frames
+        Called with the frames written and the frames in all.
+
+    Raises
+    ------
+    InputError
+        If `mcap` or `rosbags` is not installed, or the folder is missing or not empty.
+    RecordingError
+        If a trial is damaged, its name is not that of a file, or its times do not fit into stamps.
+    """
+    require_folder(folder, what="the folder to write to")
+    if any(folder.iterdir()):
+        raise InputError(f"{folder} is not empty; name a new folder")
+    chosen = data.trials if trials is None else tuple(trials)
+    written, total = 0, sum(info.frames for info in chosen)
+    for info in chosen:
+        with _Bag(folder / f"{_require_name(info.trial)}.mcap") as bag:
+            for _ in _write_trial(bag, read_stored_trial(data, info)):
+                written += 1
+                if on_frames is not None:
+                    on_frames(written, total)
+
+
+class _Bag:
+    """An MCAP file that takes messages by topic and field; it appears when complete."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            from mcap.writer import Writer  # noqa: PLC0415 (an extra)
+
+            self.types = trial_types()
+        except ImportError:
+            raise InputError(
+                "an MCAP file needs mcap and rosbags, which are not installed; install them with "
+                '`pip install "sliplens[ros]"`'
+            ) from None
+        self.path, self.part = path, path.with_name(path.name + ".part")
+        self.stream = self.part.open("wb")
+        # chunks under Zstandard, with indexes and checksums
+        self.writer = Writer(self.stream)
+        self.writer.start(profile="ros2", library=f"sliplens {__version__}")
+        self.schemas: dict[str, int] = {}
+        self.channels: dict[str, int] = {}
+
+    def __enter__(self) -> "_Bag":
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is None:
+            self.writer.finish()
+        self.stream.close()
+        if kind is None:
+            self.part.replace(self.path)
+        else:
+            self.part.unlink()
+
+    def make(self, kind: str, **fields: Any) -> Any:
+        """A message, or part of one."""
+        return self.types.types[kind](**fields)
+
+    def header(self, stamp_ns: int) -> Any:
+        stamp = self.make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=_FRAME_ID)
+
+    def write(self, topic: str, stamp_ns: int, **fields: Any) -> None:
+        """Write a message; it was recorded when it was stamped."""
+        kind = TOPICS[topic]
+        if topic not in self.channels:
+            self.channels[topic] = self.writer.register_channel(topic, "cdr", self._schema(kind))
+        data = self.types.serialize_cdr(self.make(kind, **fields), kind)
+        self.writer.add_message(self.channels[topic], log_time=stamp_ns, data=bytes(data), publish_time=stamp_ns)
+
+    def _schema(self, kind: str) -> int:
+        if kind not in self.schemas:
+            definition, _ = self.types.generate_msgdef(kind, ros_version=2)
+            self.schemas[kind] = self.writer.register_schema(kind, "ros2msg", definition.encode())
+        return self.schemas[kind]
+
+
+def _write_trial(bag: _Bag, capture: Capture) -> Iterator[None]:
+    """Write all of a trial in the order of time; stops after every frame."""
+    labels, forces = capture.labels, capture.forces
+    assert labels is not None
+    assert capture.reference is not None
+    offset_s = _stamp_offset_s(capture)
+    frame_ns = _stamps_ns(capture.frame_time_s, offset_s)
+    force_ns = _stamps_ns(forces.time_s, offset_s) if forces else np.zeros(0, dtype=np.int64)
+    start_ns = min(series[0].item() for series in (frame_ns, force_ns) if len(series))
+    about = TrialText(
+        trial=capture.name,
+        told=capture.told,
+        frames=len(frame_ns),
+        force_samples=len(force_ns),
+        force_source=forces.source if forces else "",
+        optional=tuple(name for name in OPTIONAL if getattr(labels, name) is not None),
+        labelling=labels.labelling,
+    )
+    bag.write(TRIAL, start_ns, data=about.dump(stamp_offset_s=offset_s, sliplens_version=__version__))
+    bag.write(REFERENCE, start_ns, **_image(bag, encode_png(capture.reference), start_ns))
+    sampled = 0
+    for index, png in enumerate(_encoded(capture.read_frames())):
+        stamp_ns = frame_ns[index].item()
+        if forces is not None:
+            until = int(np.searchsorted(force_ns, stamp_ns, side="right"))
+            _write_forces(bag, forces, force_ns, sampled, until)
+            sampled = until
+        bag.write(IMAGE, stamp_ns, **_image(bag, png, stamp_ns))
+        time_s = capture.frame_time_s[index].item()
+        bag.write(LABELS, stamp_ns, header=bag.header(stamp_ns), time_s=time_s, **_label(labels, index))
+        bag.write(MARGIN, stamp_ns, data=labels.safety_margin[index].item())
+        yield
+    if forces is not None:
+        _write_forces(bag, forces, force_ns, sampled, len(force_ns))
+
+
+def _write_forces(bag: _Bag, forces: Forces, stamps_ns: Int64[np.ndarray, " samples"], start: int, stop: int) -> None:
+    for index in range(start, stop):
+        stamp_ns = stamps_ns[index].item()
+        if index % _BLOCK == 0:
+            times = forces.time_s[index : index + _BLOCK]
+            bag.write(WRENCH_TIMES, stamp_ns, header=bag.header(stamp_ns), time_s=times)
+        force, torque = (
+            bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+            for x, y, z in (forces.force_n[index].tolist(), (0.0, 0.0, 0.0))
+        )
+        wrench = bag.make("geometry_msgs/msg/Wrench", force=force, torque=torque)
+        bag.write(WRENCH, stamp_ns, header=bag.header(stamp_ns), wrench=wrench)
+
+
+def _image(bag: _Bag, png: bytes, stamp_ns: int) -> dict[str, Any]:
+    return {"header": bag.header(stamp_ns), "format": "png", "data": np.frombuffer(png, dtype=np.uint8)}
+
+
+def _label(labels: GivenLabels, index: int) -> dict[str, Any]:
+    """Fields of a label; what the trial does not have follows from what it has, or is not known."""
+    sigma, valid, reason = labels.safety_margin_sigma, labels.valid, labels.reason
+    return {
+        **{name: getattr(labels, name)[index].item() for name in GIVEN_SIGNALS},
+        "safety_margin_sigma": math.nan if sigma is None else sigma[index].item(),
+        "valid": math.isfinite(labels.safety_margin[index]) if valid is None else bool(valid[index]),
+        "contact_state": str(labels.contact_state[index]),
+        "invalid_reason": "" if reason is None else reason[index],
+    }
+
+
+def _encoded(frames: Iterator[UInt8[np.ndarray, "height width 3"]]) -> Iterator[bytes]:
+    """PNG of each frame, a few of them made side by side."""
+    with ThreadPoolExecutor() as pool:
+        while batch := list(islice(frames, _BATCH)):
+            yield from pool.map(encode_png, batch)
+
+
+def _stamp_offset_s(capture: Capture) -> int:
+    """Whole seconds by which stamps are later than the times of the trial."""
+    series = [capture.frame_time_s, *([capture.forces.time_s] if capture.forces else [])]
+    first, last = min(times[0].item() for times in series), max(times[-1].item() for times in series)
+    offset_s = 0 if first >= 1 else 1 - math.floor(first)
+    if first < -_LAST_S or last + offset_s >= _LAST_S:
+        raise RecordingError(
+            f"trial {capture.name} goes from {first:.6g} s to {last:.6g} s, and stamps of ROS end at {_LAST_S} s; "
+            "import it with times in seconds"
+        )
+    return offset_s
+
+
+def _stamps_ns(time_s: Float[np.ndarray, " samples"], offset_s: int) -> Int64[np.ndarray, " samples"]:
+    """Nearest nanoseconds; whole seconds apart, for of a time since 1970 the product would be rounded to 256 ns."""
+    whole = np.floor(time_s)
+    return (whole.astype(np.int64) + offset_s) * 10**9 + np.rint((time_s - whole) * 1e9).astype(np.int64)
+
+
+def _require_name(trial: str) -> str:
+    if trial_name(trial) != trial:
+        raise RecordingError(
+            f"trial {trial[:40]!r} cannot name a file; name it with letters, digits, dots, dashes and underscores"
+        )
+    return trial

@@ -1,0 +1,712 @@
+"""ROS 2 bags (MCAP or sqlite3) of a tactile camera and a force-torque sensor."""
+
+import io
+import os
+import sys
+from array import array
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec, module_from_spec
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt8
+from PIL import Image
+
+from sliplens.errors import InputError, RecordingError, SliplensError
+from sliplens.recordings.capture import GIVEN_SIGNALS, Capture, Forces, GivenLabels
+from sliplens.recordings.formats.mcap import (
+    FORMAT,
+    IMAGE,
+    LABELS,
+    NUMBERS,
+    REFERENCE,
+    TOPICS,
+    TRIAL,
+    WRENCH,
+    WRENCH_TIMES,
+    TrialText,
+    trial_types,
+)
+from sliplens.recordings.formats.tables import trial_name
+from sliplens.recordings.trial import ContactState, require_unit_interval
+
+if TYPE_CHECKING:
+    from rosbags.rosbag2 import Reader
+
+
+RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+
+_CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
+_FORMATS = ("JPEG", "PNG")
+_DAMAGED = (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning)
+
+
+def image_size(message: Any, *, where: str) -> tuple[int, int]:
+    """Height and width of an image, in pixels, without decoding it.
+
+    Parameters
+    ----------
+    message
+        A `sensor_msgs/Image` or `CompressedImage`.
+    where
+        Beginning of the error message.
+
+    Raises
+    ------
+    RecordingError
+        If the encoding is another one, or the message claims more pixels than it holds.
+    """
+    if message.__msgtype__ == COMPRESSED:
+        with _open_compressed(message, where=where) as image:
+            return image.height, image.width
+    channels = _CHANNELS.get(message.encoding)
+    if channels is None:
+        raise RecordingError(
+            f"{where} has encoding {message.encoding[:40]!r}; record it as {', '.join(_CHANNELS)}, JPEG or PNG"
+        )
+    if min(message.height, message.width) == 0 or message.step < message.width * channels:
+        raise RecordingError(
+            f"{where} claims {message.height} x {message.width} pixels in rows of {message.step} bytes, which cannot "
+            f"be in {message.encoding}; record it again"
+        )
+    # Python's integers do not overflow, and nothing has the claimed size until it is known to be there
+    if message.height * message.step > len(message.data):
+        raise RecordingError(
+            f"{where} claims {message.height} rows of {message.step} bytes but holds {len(message.data)} bytes; "
+            "record it again"
+        )
+    return message.height, message.width
+
+
+def image_pixels(message: Any, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    """Pixels of an image as RGB; grey is repeated in all three channels.
+
+    Parameters
+    ----------
+    message
+        A `sensor_msgs/Image` or `CompressedImage`.
+    where
+        Beginning of the error message.
+
+    Raises
+    ------
+    RecordingError
+        If the image is damaged or has another encoding.
+    """
+    if message.__msgtype__ == COMPRESSED:
+        return _decompress(message, where=where)
+    height, width = image_size(message, where=where)
+    channels = _CHANNELS[message.encoding]
+    # rows may be padded: step counts the padding too
+    rows = message.data[: height * message.step].reshape(height, message.step)[:, : width * channels]
+    pixels = rows.reshape(height, width, channels)
+    if message.encoding == "mono8":
+        return np.repeat(pixels, 3, axis=2)
+    return np.array(pixels[..., ::-1] if message.encoding == "bgr8" else pixels, order="C")
+
+
+def _open_compressed(message: Any, *, where: str) -> Image.Image:
+    """Image with its header read; Pillow refuses one that would expand beyond its limit (a decompression bomb)."""
+    try:
+        # the bytes say what they are; `format` is free text, and drivers differ in it
+        image = Image.open(io.BytesIO(message.data), formats=_FORMATS)
+    except _DAMAGED as error:
+        raise RecordingError(
+            f"{where}, of format {message.format[:40]!r}, cannot be read as {' or '.join(_FORMATS)} ({error}); "
+            "record it again, or as one of these"
+        ) from None
+    if image.mode not in {"RGB", "L"}:
+        raise RecordingError(f"{where} has pixels of mode {image.mode}; record it as 8-bit RGB or grey")
+    return image
+
+
+def _decompress(message: Any, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    with _open_compressed(message, where=where) as image:
+        try:
+            pixels = np.array(image)
+        except _DAMAGED as error:
+            raise RecordingError(f"{where} is damaged ({error}); cut the bag before it") from None
+    return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
+
+
+MOST_BYTES = 256 * 2**20
+"""In memory at a time: of a chunk, of all chunks that cover one moment, or of a message. Chunks are of some 1 MB."""
+MOST_TIMES = 100
+"""A file that is compressed as a whole expands on disk, so far that its size may be multiplied."""
+
+
+class ExpandsTooFarError(Exception):
+    """Says what expands too far, for a sentence that begins with the bag."""
+
+
+@cache
+def bounded_reader() -> "type[Reader]":
+    """`rosbags.rosbag2.Reader`, but it raises `ExpandsTooFarError` before memory or disk are filled.
+
+    Raises
+    ------
+    ImportError
+        If `rosbags` is not installed.
+    """
+    mcap, reader = _own_copy("rosbags.rosbag2.storage_mcap"), _own_copy("rosbags.rosbag2.reader")
+    sqlite = import_module("rosbags.rosbag2.storage_sqlite3")
+    zstd, lz4 = mcap.zstd, import_module("lz4.frame")
+
+    class Mcap(mcap.McapReader):
+        def _open(self) -> None:
+            super()._open()
+            _require_room(self.chunks)
+
+    class Sqlite(sqlite.Sqlite3Reader):
+        def _open(self) -> None:
+            # a tiny database may compute a message of any size
+            self.dbconn.limit(sqlite.apsw.SQLITE_LIMIT_LENGTH, MOST_BYTES)
+            super()._open()
+
+    # each gets the bytes and the size that is claimed for them, which rosbags compares with what comes out
+    mcap.DECOMPRESSORS = {
+        "": lambda data, _: data,
+        "lz4": lambda data, size: _expand_chunk(data, lz4.LZ4FrameDecompressor, size, frames=1),
+        "zstd": lambda data, size: _expand_chunk(data, zstd.ZstdDecompressor, size),
+    }
+    reader.zstd = SimpleNamespace(
+        decompress=lambda data: _expand(
+            data, zstd.ZstdDecompressor, most=MOST_BYTES, refusal=_beyond("a message", MOST_BYTES)
+        ),
+        open=lambda file, mode: _BoundedFile(
+            zstd.open(file, mode), most=max(MOST_BYTES, MOST_TIMES * os.fstat(file.fileno()).st_size)
+        ),
+    )
+    reader.DirectoryReader.STORAGE_PLUGINS = {"mcap": Mcap, "sqlite3": Sqlite}
+    reader.Reader.STORAGE_PLUGINS = {"dir": reader.DirectoryReader, ".mcap": Mcap, ".db3": Sqlite}
+    return reader.Reader
+
+
+def _own_copy(name: str) -> Any:
+    spec = find_spec(name)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{name} is not there")
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _expand_chunk(data: bytes, decompressor: Any, size: int, *, frames: int | None = None) -> bytes:
+    if size > MOST_BYTES:
+        raise _beyond("a chunk", MOST_BYTES)
+    lie = ExpandsTooFarError(f"a chunk expands to more than the {size:,} bytes that it claims")
+    return _expand(data, decompressor, most=size, refusal=lie, frames=frames)
+
+
+def _require_room(chunks: Iterable[Any]) -> None:
+    """Refuse chunks that cover one moment and are too large together: rosbags expands all of these at once."""
+    # at the same moment what begins counts before what ends
+    begins = [(chunk.message_start_time, 0, chunk.uncompressed_size) for chunk in chunks]
+    ends = [(max(chunk.message_start_time, chunk.message_end_time), 1, -chunk.uncompressed_size) for chunk in chunks]
+    held = 0
+    for _, _, size in sorted(begins + ends):
+        held += size
+        if held > MOST_BYTES:
+            raise _beyond("a chunk, or chunks of the same moment together,", MOST_BYTES)
+
+
+def _expand(
+    data: bytes, decompressor: Any, *, most: int, refusal: ExpandsTooFarError, frames: int | None = None
+) -> bytes:
+    """Expand frames that follow each other, all or so many, to no more bytes than that."""
+    parts, room, done = [], most + 1, 0
+    while data and done != frames:
+        frame = decompressor()
+        given = data
+        while not frame.eof and (given or not frame.needs_input):
+            parts.append(frame.decompress(given, max_length=room))
+            room -= len(parts[-1])
+            given = b""
+            if room <= 0:
+                raise refusal
+        if not frame.eof:
+            raise EOFError("compressed bytes end early")
+        data, done = frame.unused_data or b"", done + 1
+    return b"".join(parts)
+
+
+class _BoundedFile:
+    """A file that is expanded while it is read."""
+
+    def __init__(self, file: Any, *, most: int) -> None:
+        self._file, self._room, self._most = file, most, most
+
+    def __enter__(self) -> "_BoundedFile":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def read(self, size: int = -1) -> bytes:
+        part = self._file.read(min(size, self._room + 1) if size >= 0 else self._room + 1)
+        self._room -= len(part)
+        if self._room < 0:
+            raise _beyond("a file", self._most)
+        return part
+
+
+def _beyond(what: str, most: int) -> ExpandsTooFarError:
+    return ExpandsTooFarError(f"{what} expands to more than {most / 2**20:,.0f} MiB")
+
+
+_STORAGE = (".mcap", ".db3")
+
+
+def bag_topics(path: Path) -> dict[str, str]:
+    """Topics of a bag and the types of their messages.
+
+    Raises
+    ------
+    InputError
+        If `rosbags` is not installed.
+    RecordingError
+        If the path is no bag, it is damaged, or expands too far.
+    """
+    with open_bag(path) as bag:
+        return {connection.topic: connection.msgtype for connection in bag.connections}
+
+
+def bag_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+    """Topic, time of arrival in nanoseconds and content of each message, in the order of recording.
+
+    Definitions that the bag brings along are not used, for `rosbags` turns them into code; those of the messages read
+    here are the same in all of ROS 2. Message data are views of the bytes read: a large header claims nothing. What is
+    compressed is expanded a chunk, message or file at a time, within the limits of `ros_expansion`.
+
+    Parameters
+    ----------
+    path
+        Folder with `metadata.yaml`, or an .mcap or .db3 file.
+    topics
+        The topics to read.
+
+    Raises
+    ------
+    InputError
+        If `rosbags` is not installed.
+    RecordingError
+        If the path is no bag, it is damaged, or expands too far.
+    """
+    with open_bag(path) as bag:
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 (an extra)
+
+        types = get_typestore(Stores.LATEST)
+        wanted = [connection for connection in bag.connections if connection.topic in topics]
+        if not wanted:  # to rosbags none means all
+            return
+        for connection, time_ns, data in bag.messages(wanted):
+            yield connection.topic, time_ns, types.deserialize_cdr(memoryview(data), connection.msgtype)
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator["Reader"]:
+    """Open a bag to read it, as `bag_topics` and `bag_messages` do; they tell of its errors."""
+    try:
+        import rosbags.rosbag2  # noqa: F401, PLC0415 (an extra)
+    except ImportError:
+        raise InputError(
+            'a ROS 2 bag needs rosbags, which is not installed; install it with `pip install "sliplens[ros]"`'
+        ) from None
+    _require_bag(path)
+    for file in path.glob("*.db3") if path.is_dir() else [path]:
+        _require_whole_pages(file)
+    try:
+        with bounded_reader()(path) as bag:
+            yield bag
+    except SliplensError:
+        raise
+    except ExpandsTooFarError as error:
+        raise RecordingError(
+            f"{path}: {error}, as damaged and hostile files do; expand it beforehand, or record it in smaller pieces"
+        ) from None
+    # a damaged byte may lead rosbags, sqlite or YAML into any error there is, from KeyError to MemoryError
+    except Exception as error:
+        said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise RecordingError(
+            f"{path} is not a readable ROS 2 bag ({said}); copy it again, or mend it with `mcap recover`"
+        ) from None
+
+
+def _require_bag(path: Path) -> None:
+    if not path.exists():
+        raise RecordingError(f"{path} does not exist; check the path")
+    if path.is_dir():
+        if (path / "metadata.yaml").is_file():
+            return
+        inside = sorted(file.name for file in path.iterdir() if file.suffix in _STORAGE)
+        cure = f"name {inside[0]} itself" if len(inside) == 1 else "name the folder of one bag"
+        raise RecordingError(f"{path} has no metadata.yaml; write it with `ros2 bag reindex`, or {cure}")
+    if path.suffix == ".bag":
+        raise RecordingError(f"{path} is a ROS 1 bag; convert it with `rosbags-convert --src BAG --dst FOLDER`")
+    if path.suffix not in _STORAGE:
+        raise RecordingError(f"{path} is no ROS 2 bag; name its folder, or its {' or '.join(_STORAGE)} file")
+
+
+def _require_whole_pages(file: Path) -> None:
+    """Refuse a database that is cut off within a page, for sqlite would read zeros there."""
+    with file.open("rb") as stream:
+        head = stream.read(18)
+    # https://www.sqlite.org/fileformat.html: 16 bytes of magic, then the page size, where 1 stands for 65536
+    page = int.from_bytes(head[16:18], "big")
+    if head.startswith(b"SQLite format 3\0") and file.stat().st_size % (65536 if page == 1 else page or 1):
+        raise RecordingError(f"{file} is cut off; copy it again")
+
+
+_STATES = {str(state): state for state in ContactState}
+
+
+def read_trial_bag(path: Path, topics: dict[str, str]) -> Capture | None:
+    """Read a bag that `write_mcap` wrote; None where it is another one.
+
+    Frames, times, labels, reference frame and forces are those of the data set it came from, bit by bit.
+
+    Parameters
+    ----------
+    path
+        Folder with `metadata.yaml`, or an .mcap or .db3 file.
+    topics
+        Topics of the bag and the types of their messages.
+
+    Raises
+    ------
+    RecordingError
+        If it is one of ours, but damaged, cut, or changed.
+    """
+    if topics.get(TRIAL) != TOPICS[TRIAL]:
+        return None
+    text = next((message.data for _, message in _messages(path, {TRIAL})), "")
+    # either is enough: the other may be what is damaged
+    if FORMAT not in text and topics.get(LABELS) != TOPICS[LABELS]:
+        return None
+    about = TrialText.parse(text, where=f"{TRIAL} of {path}")
+    needed = {REFERENCE, IMAGE, LABELS} | ({WRENCH, WRENCH_TIMES} if about.force_samples else set())
+    missing = [topic for topic in sorted(needed) if topics.get(topic) != TOPICS[topic]]
+    if missing:
+        raise RecordingError(
+            f"{path} lacks {', '.join(f'{topic} ({TOPICS[topic]})' for topic in missing)}; export the trial again"
+        )
+    found = _scan_labels(path, needed)
+    _require_whole(found, about, path)
+    assert found.size is not None
+    labels = _labels(found, about)
+    for name in ("safety_margin", "stick_ratio"):
+        require_unit_interval(getattr(labels, name), name=name, trial=f"{about.trial} of {path}")
+    return Capture(
+        name=about.trial,
+        source=f"{about.trial} of {path}",
+        frame_time_s=found.column("time_s"),
+        frame_size=found.size,
+        read_frames=lambda: _read_labelled_frames(path),
+        forces=None
+        if not about.force_samples
+        else Forces(
+            time_s=np.array(found.force_time_s, dtype=np.float64),
+            force_n=np.array(found.force_n, dtype=np.float64).reshape(-1, 3),
+            source=about.force_source,
+        ),
+        labels=labels,
+        reference=found.reference,
+        told=about.told,
+    )
+
+
+@dataclass(kw_only=True)
+class _LabelScan:
+    """What a bag holds besides pixels."""
+
+    size: tuple[int, int] | None = None
+    reference: UInt8[np.ndarray, "height width 3"] | None = None
+    references: int = 0
+    image_ns: array = field(default_factory=lambda: array("q"))
+    label_ns: array = field(default_factory=lambda: array("q"))
+    numbers: array = field(default_factory=lambda: array("d"))
+    valid: list[bool] = field(default_factory=list)
+    states: list[ContactState] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
+    force_n: array = field(default_factory=lambda: array("d"))
+    force_time_s: array = field(default_factory=lambda: array("d"))
+
+    def column(self, name: str) -> Float[np.ndarray, " frames"]:
+        """One of `NUMBERS`."""
+        return np.array(self.numbers, dtype=np.float64).reshape(-1, len(NUMBERS))[:, NUMBERS.index(name)].copy()
+
+
+def _scan_labels(path: Path, topics: Collection[str]) -> _LabelScan:
+    found = _LabelScan()
+    for topic, message in _messages(path, topics):
+        if topic == IMAGE:
+            where = _where_label(len(found.image_ns), path)
+            found.image_ns.append(_stamp_ns(message))
+            size = image_size(message, where=where)
+            if found.size not in {None, size}:
+                raise RecordingError(f"{where} has another size than those before it; export the trial again")
+            found.size = size
+        elif topic == LABELS:
+            _add_label(found, message, where=f"label {len(found.label_ns)} of {LABELS} in {path}")
+        elif topic == WRENCH:
+            force = message.wrench.force
+            found.force_n.extend((force.x, force.y, force.z))
+        elif topic == WRENCH_TIMES:
+            found.force_time_s.extend(message.time_s.tolist())
+        else:
+            found.references += 1
+            found.reference = image_pixels(message, where=f"{REFERENCE} of {path}")
+    return found
+
+
+def _add_label(found: _LabelScan, message: Any, *, where: str) -> None:
+    if message.contact_state not in _STATES:
+        raise RecordingError(
+            f"{where} has the contact state {message.contact_state[:40]!r}, none of {', '.join(_STATES)}; "
+            "export the trial again"
+        )
+    found.label_ns.append(_stamp_ns(message))
+    found.numbers.extend(getattr(message, name) for name in NUMBERS)
+    found.states.append(_STATES[message.contact_state])
+    found.valid.append(bool(message.valid))
+    found.reasons.append(sys.intern(message.invalid_reason))  # few, and often
+
+
+def _require_whole(found: _LabelScan, about: TrialText, path: Path) -> None:
+    """Check that all that was promised is there, and that labels belong to their frames."""
+    counts = {
+        "reference frames": (found.references, 1),
+        "frames": (len(found.image_ns), about.frames),
+        "labels": (len(found.label_ns), about.frames),
+        "wrenches": (len(found.force_n) // 3, about.force_samples),
+        "times of wrenches": (len(found.force_time_s), about.force_samples),
+    }
+    for name, (count, promised) in counts.items():
+        if count != promised:
+            raise RecordingError(f"{path} has {count} {name}, {TRIAL} promises {promised}; export the trial again")
+    if found.image_ns != found.label_ns:
+        at = next(i for i, (one, other) in enumerate(zip(found.image_ns, found.label_ns, strict=True)) if one != other)
+        raise RecordingError(f"label {at} of {path} has another stamp than its frame; export the trial again")
+    if not np.isfinite(found.column("time_s")).all():
+        raise RecordingError(f"{LABELS} of {path} has a time that is not a number; export the trial again")
+
+
+def _labels(found: _LabelScan, about: TrialText) -> GivenLabels:
+    optional = {
+        "safety_margin_sigma": found.column("safety_margin_sigma"),
+        "valid": np.array(found.valid, dtype=bool),
+        "reason": tuple(found.reasons),
+    }
+    return GivenLabels(
+        **{name: found.column(name) for name in GIVEN_SIGNALS},
+        contact_state=tuple(found.states),
+        **{name: values for name, values in optional.items() if name in about.optional},
+        labelling=about.labelling,
+    )
+
+
+def _read_labelled_frames(path: Path) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    for index, (_, message) in enumerate(_messages(path, {IMAGE})):
+        yield image_pixels(message, where=_where_label(index, path))
+
+
+def _messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, Any]]:
+    """Topic and content of each message of some of our topics, in the order of recording."""
+    with open_bag(path) as bag:
+        types = trial_types()
+        # a second channel of the same topic could hold anything
+        wanted = [one for one in bag.connections if one.topic in topics and one.msgtype == TOPICS[one.topic]]
+        if not wanted:  # to rosbags none means all
+            return
+        for connection, _, data in bag.messages(wanted):
+            yield connection.topic, types.deserialize_cdr(memoryview(data), connection.msgtype)
+
+
+def _stamp_ns(message: Any) -> int:
+    stamp = message.header.stamp
+    return stamp.sec * 1_000_000_000 + stamp.nanosec
+
+
+def _where_label(index: int, path: Path) -> str:
+    return f"frame {index} of {IMAGE} in {path}"
+
+
+_IMAGES = (RAW, COMPRESSED)
+_WRENCHES = ("geometry_msgs/msg/WrenchStamped",)
+
+
+def read_rosbag(path: Path, *, image_topic: str | None = None, wrench_topic: str | None = None) -> Capture:
+    """Read a bag as one trial.
+
+    Images are `sensor_msgs/Image` (rgb8, bgr8, mono8) or `CompressedImage` (JPEG, PNG), forces the x, y, z of
+    `geometry_msgs/WrenchStamped`; torques are left out. A first pass reads stamps and sizes; pixels are decoded when
+    frames are read. Frames and forces share one clock, that of the message headers; where a header has no stamp, or
+    the two topics have clocks that never meet, both take the times at which the bag received them, and `notes` say so.
+    Times are seconds since the first frame or force: since the epoch, double precision would round them to 0.2 us.
+
+    A trial that `write_mcap` exported comes back as it was, with its labels; where a topic is named, like any bag.
+
+    Parameters
+    ----------
+    path
+        Folder with `metadata.yaml`, or an .mcap or .db3 file.
+    image_topic
+        By default the only topic that holds images.
+    wrench_topic
+        By default the only topic that holds wrenches; there are no forces where there is none.
+
+    Raises
+    ------
+    InputError
+        If `rosbags` is not installed.
+    RecordingError
+        If the path is no bag, it is damaged, a topic is missing or could be one of several, an image has another
+        encoding or its size changes, or times do not rise.
+    """
+    topics = bag_topics(path)
+    if image_topic is None and wrench_topic is None and (trial := read_trial_bag(path, topics)) is not None:
+        return trial
+    images = _choose(topics, image_topic, types=_IMAGES, what="images", path=path)
+    wrenches = _choose(topics, wrench_topic, types=_WRENCHES, what="wrenches", path=path)
+    if images is None:
+        raise RecordingError(
+            f"{path} has no topic with images ({' or '.join(_IMAGES)}); record the camera too "
+            f"(it has {_listed(topics)})"
+        )
+    found = _scan(path, images=images, wrenches=wrenches)
+    notes = []
+    if wrenches is None:
+        notes.append(f"There are no forces: the bag has no topic of {_WRENCHES[0]}.")
+    elif wrench_topic is None and not found.wrenches.bag_ns:
+        notes.append(f"There are no forces: {wrenches} has no message.")
+        wrenches = None
+    if found.size is None:
+        raise RecordingError(f"{images} of {path} has no frame; leave it out or record it again")
+    clock, why = _choose_clock(found)
+    notes += why
+    frame_ns, wrench_ns = found.frames.times(clock), found.wrenches.times(clock)
+    zero = min(series[0] for series in (frame_ns, wrench_ns) if len(series))
+    return Capture(
+        name=trial_name(path.stem if path.is_file() else path.resolve().name),
+        source=f"{images} of {path}",
+        frame_time_s=_seconds(frame_ns - zero),
+        frame_size=found.size,
+        read_frames=lambda: _read_frames(path, images),
+        forces=None
+        if wrenches is None
+        else Forces(
+            time_s=_seconds(wrench_ns - zero),
+            force_n=np.array(found.force_n, dtype=np.float64).reshape(-1, 3),
+            source=f"{wrenches} of {path}",
+        ),
+        notes=tuple(notes),
+    )
+
+
+@dataclass(kw_only=True)
+class _Stamps:
+    """Times of the messages of a topic in nanoseconds, 16 bytes each: an hour at 1 kHz is 58 MB."""
+
+    topic: str
+    header_ns: array = field(default_factory=lambda: array("q"))
+    bag_ns: array = field(default_factory=lambda: array("q"))
+
+    def append(self, message: Any, bag_ns: int) -> None:
+        stamp = message.header.stamp
+        self.header_ns.append(stamp.sec * 1_000_000_000 + stamp.nanosec)
+        self.bag_ns.append(bag_ns)
+
+    def times(self, clock: str) -> Int64[np.ndarray, " messages"]:
+        return np.array(self.header_ns if clock == "header" else self.bag_ns, dtype=np.int64)
+
+
+@dataclass(kw_only=True)
+class _Scan:
+    """What the first pass found."""
+
+    frames: _Stamps
+    wrenches: _Stamps
+    force_n: array = field(default_factory=lambda: array("d"))
+    size: tuple[int, int] | None = None
+
+
+def _scan(path: Path, *, images: str, wrenches: str | None) -> _Scan:
+    """Read stamps, sizes and forces, but no pixel."""
+    found = _Scan(frames=_Stamps(topic=images), wrenches=_Stamps(topic=wrenches or "no topic"))
+    for topic, bag_ns, message in bag_messages(path, {images, wrenches} - {None}):
+        if topic == wrenches:
+            found.wrenches.append(message, bag_ns)
+            force = message.wrench.force
+            found.force_n.extend((force.x, force.y, force.z))
+            continue
+        index = len(found.frames.bag_ns)
+        size = image_size(message, where=_where(index, images, path))
+        if found.size is not None and size != found.size:
+            raise RecordingError(
+                f"{_where(index, images, path)} is {size[0]} x {size[1]} pixels, those before it are "
+                f"{found.size[0]} x {found.size[1]}; cut the bag there"
+            )
+        found.size = size
+        found.frames.append(message, bag_ns)
+    return found
+
+
+def _read_frames(path: Path, images: str) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    for index, (_, _, message) in enumerate(bag_messages(path, {images})):
+        yield image_pixels(message, where=_where(index, images, path))
+
+
+def _choose(topics: dict[str, str], named: str | None, *, types: tuple[str, ...], what: str, path: Path) -> str | None:
+    """Topic that was named, or the only one of these types."""
+    fitting = {topic: kind for topic, kind in topics.items() if kind in types}
+    if named is not None:
+        if named not in topics:
+            raise RecordingError(f"{path} has no topic {named}; it has {_listed(topics)}")
+        if named not in fitting:
+            raise RecordingError(
+                f"{named} of {path} holds {topics[named]}, no {what}; name one of {' or '.join(types)}"
+            )
+        return named
+    if len(fitting) > 1:
+        raise RecordingError(f"{path} has {len(fitting)} topics with {what}, {_listed(fitting)}; name one of them")
+    return next(iter(fitting), None)
+
+
+def _choose_clock(found: _Scan) -> tuple[str, list[str]]:
+    """Clock that both topics have, "header" or "bag", and a note where it is not the header's."""
+    for stamps in (found.frames, found.wrenches):
+        missing = stamps.header_ns.count(0)
+        if missing:
+            return "bag", [
+                f"{missing} of {len(stamps.header_ns)} messages of {stamps.topic} have no header stamp: "
+                "times are those at which the bag received the messages."
+            ]
+    if found.wrenches.bag_ns and not _meet("header", found) and _meet("bag", found):
+        return "bag", [
+            f"The header stamps of {found.frames.topic} and {found.wrenches.topic} are of different clocks: "
+            "times are those at which the bag received the messages."
+        ]
+    return "header", []
+
+
+def _meet(clock: str, found: _Scan) -> bool:
+    frames, wrenches = found.frames.times(clock), found.wrenches.times(clock)
+    return bool(frames[0] <= wrenches[-1] and wrenches[0] <= frames[-1])
+
+
+def _seconds(time_ns: Int64[np.ndarray, " messages"]) -> Float[np.ndarray, " messages"]:
+    return time_ns / 1e9
+
+
+def _listed(topics: dict[str, str]) -> str:
+    return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())) or "no topic"
+
+
+def _where(index: int, topic: str, path: Path) -> str:
+    return f"frame {index} of {topic} in {path}"

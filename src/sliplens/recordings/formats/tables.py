@@ -1,0 +1,599 @@
+"""Forces from a table in a text file (CSV), with what had to be guessed told in sentences."""
+
+import codecs
+import csv
+import re
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from math import isfinite
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from sliplens.errors import RecordingError
+from sliplens.recordings.capture import Forces
+
+_SEPARATORS = ("\t", ";", ",")  # a comma may be a decimal one where another separator is there
+_COMMENTS = ("#", "%")
+_PROBED_BYTES = 65536
+_CONTROLS = frozenset(range(32)) - frozenset(b"\t\n\r\f\x1a\x1b")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TextTable:
+    """A table of a text file, its rows read one at a time."""
+
+    path: Path
+    encoding: str
+    separator: str
+    header: tuple[str, ...]
+    first_line: int
+    """Line of the file after the header, counted from 1."""
+
+    def require(self, name: str, *, option: str) -> str:
+        """Return the name of a column as the file writes it.
+
+        Raises
+        ------
+        RecordingError
+            If there is no such column, or more than one.
+        """
+        same = [there for there in self.header if there == name] or [
+            there for there in self.header if there.strip().lower() == name.strip().lower()
+        ]
+        if not same:
+            raise RecordingError(
+                f"{self.path} has no column {name!r}, it has {', '.join(map(repr, self.header))}; "
+                f"name one of them with {option}"
+            )
+        if len(same) > 1:
+            raise RecordingError(f"{self.path} has {len(same)} columns {name!r}; rename one of them")
+        return same[0]
+
+    def rows(self) -> Iterator[tuple[int, list[str]]]:
+        """Read the rows: the number of the line, and a text a column.
+
+        Raises
+        ------
+        RecordingError
+            If a row has more or fewer columns than the header.
+        """
+        for line, text in _lines(self.path, self.encoding):
+            if line < self.first_line or _is_comment(text):
+                continue
+            fields = _split(text, self.separator, where=f"{self.path}, line {line}")
+            if len(fields) == len(self.header) + 1 and not fields[-1]:
+                fields.pop()  # some loggers end every row, but not the header, with a separator
+            if len(fields) != len(self.header):
+                cure = "mend or drop the line"
+                if self.separator == "," and len(fields) > len(self.header):
+                    cure = "where decimals are commas, separate the columns by semicolons"
+                raise RecordingError(
+                    f"{self.path}, line {line} has {len(fields)} columns but the header {len(self.header)}; {cure}"
+                )
+            yield line, fields
+
+
+def open_table(path: Path) -> TextTable:
+    """Find the separator and the header of a table; a byte order mark, comments and empty lines are passed over.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing or empty, is no text, or has no header.
+    """
+    encoding = _encoding(path)
+    comment = ""
+    for line, text in _lines(path, encoding):
+        if _is_comment(text):
+            comment = text
+            continue
+        separator = next((mark for mark in _SEPARATORS if mark in text), None)
+        if separator is None:
+            raise RecordingError(
+                f"{path} has a single column {text.strip()[:40]!r}; separate the columns by commas, semicolons or tabs"
+            )
+        header, first_line = _split(text, separator, where=f"{path}, line {line}"), line + 1
+        if all(map(_is_number, header)):
+            # NumPy writes the header as a comment
+            header, first_line = _split(comment.lstrip("#% "), separator, where=f"{path}, line {line}"), line
+            if len(header) != text.count(separator) + 1:
+                raise RecordingError(
+                    f"{path} begins with numbers, not with the names of its columns; "
+                    "add a first line such as time_s,fx,fy,fz"
+                )
+        return TextTable(path=path, encoding=encoding, separator=separator, header=tuple(header), first_line=first_line)
+    raise RecordingError(f"{path} is empty; name a table with a header and a row a sample")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Numbers:
+    """Columns of numbers."""
+
+    values: Float[np.ndarray, "rows columns"]
+    lines: tuple[int, ...]
+    """Line of the file, for each row."""
+    decimal_comma: bool
+
+
+def read_numbers(table: TextTable, names: Sequence[str]) -> Numbers:
+    """Read columns of a table as finite numbers.
+
+    Raises
+    ------
+    RecordingError
+        If there is no row, or a field is empty, no number or not finite; the message gives its line.
+    """
+    places = [table.header.index(name) for name in names]
+    values, lines = array("d"), array("q")
+    commas = points = False
+    for line, fields in table.rows():
+        lines.append(line)
+        for place in places:
+            text = fields[place]
+            points |= "." in text
+            if "," in text:
+                commas = True
+                text = text.replace(",", ".")
+            values.append(
+                to_number(text, shown=fields[place], where=f"{table.path}, line {line}, {_name(table, place)}")
+            )
+    if not lines:
+        raise RecordingError(f"{table.path} has a header but no row; record the force sensor too")
+    if commas and points:
+        raise RecordingError(f"{table.path} mixes decimal commas and points; write all numbers in one way")
+    return Numbers(
+        values=np.frombuffer(values, dtype=np.float64).reshape(-1, len(places)),
+        lines=tuple(lines),
+        decimal_comma=commas,
+    )
+
+
+def to_number(text: str, *, shown: str, where: str) -> float:
+    """Read a finite number.
+
+    Raises
+    ------
+    RecordingError
+        If it is none; the message begins with `where`.
+    """
+    if not text:
+        raise RecordingError(f"{where} is empty; mend or drop the line")
+    try:
+        value = float(text)
+    except ValueError:
+        raise RecordingError(
+            f"{where} is {shown[:40]!r}, not a number; mend the line, or name another column"
+        ) from None
+    if not isfinite(value):
+        raise RecordingError(f"{where} is {shown!r}, not a finite number; mend or drop the line")
+    return value
+
+
+def require_rising(time: Float[np.ndarray, " rows"], lines: Sequence[int], *, path: Path, column: str) -> None:
+    """Check that times rise from row to row.
+
+    Raises
+    ------
+    RecordingError
+        Naming the line of the first that does not.
+    """
+    for row, (before, after) in enumerate(pairwise(time.tolist())):
+        if not after > before:
+            what = "repeats" if after == before else "falls"
+            raise RecordingError(
+                f"{path}, line {lines[row + 1]}: {column!r} {what} ({before:.9g}, then {after:.9g}); "
+                "sort the rows or mend their stamps"
+            )
+
+
+def _name(table: TextTable, place: int) -> str:
+    return repr(table.header[place])
+
+
+def _encoding(path: Path) -> str:
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(_PROBED_BYTES)
+    except FileNotFoundError:
+        raise RecordingError(f"{path} does not exist; check the path") from None
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read ({error.strerror}); name a text file") from None
+    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"  # "Unicode text" of Excel
+    if not _CONTROLS.isdisjoint(start):
+        raise RecordingError(f"{path} is not a text file; export the table as CSV")
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(start)
+    except UnicodeDecodeError:
+        return "cp1252"  # the micro sign of an older logger on Windows
+    return "utf-8-sig"
+
+
+def _lines(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
+    """Read the lines that are not empty, with their numbers."""
+    try:
+        with path.open(encoding=encoding) as stream:
+            for number, text in enumerate(stream, start=1):
+                if text.strip():
+                    yield number, text.rstrip("\r\n")
+    except UnicodeError:
+        raise RecordingError(f"{path} is not a text file; export the table as CSV") from None
+
+
+def _split(text: str, separator: str, *, where: str) -> list[str]:
+    try:
+        fields = next(csv.reader([text], delimiter=separator, skipinitialspace=separator != "\t"))
+    except csv.Error as error:
+        raise RecordingError(f"{where} cannot be split into columns ({error}); export the table again") from None
+    return [field.strip() for field in fields]
+
+
+def _is_comment(text: str) -> bool:
+    return text.lstrip().startswith(_COMMENTS)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Seconds in a unit of time."""
+FORCE_UNITS = {"N": 1.0, "mN": 1e-3, "kN": 1e3, "gf": 9.80665e-3, "kgf": 9.80665, "lbf": 4.4482216152605}
+"""Newtons in a unit of force."""
+
+_TIME_SPELLINGS = {
+    "s": ("s", "sec", "secs", "second", "seconds"),
+    "ms": ("ms", "msec", "msecs", "millis", "millisecond", "milliseconds"),
+    "us": ("us", "usec", "usecs", "micros", "microsecond", "microseconds", "\u00b5s", "\u03bcs"),  # micro sign, mu
+    "ns": ("ns", "nsec", "nsecs", "nanos", "nanosecond", "nanoseconds"),
+}
+_FORCE_SPELLINGS = {
+    "N": ("n", "newton", "newtons"),
+    "mN": ("mn", "millinewton", "millinewtons"),
+    "kN": ("kn", "kilonewton", "kilonewtons"),
+    "gf": ("gf", "g", "gram", "grams", "gramforce"),
+    "kgf": ("kgf", "kg", "kp", "kilogram", "kilograms"),
+    "lbf": ("lbf", "lb", "lbs"),
+}
+_SPELLINGS = {"time": _TIME_SPELLINGS, "force": _FORCE_SPELLINGS}
+_TIME_WORDS = frozenset({"time", "times", "t", "stamp", "timestamp", "timestamps", "ts", "elapsed", "clock"})
+_AXES = {
+    "x": (("fx",), ("f", "x"), ("force", "x"), ("forcex",)),
+    "y": (("fy",), ("f", "y"), ("force", "y"), ("forcey",)),
+    "z": (("fz",), ("f", "z"), ("force", "z"), ("forcez",)),
+    "normal": (("fn",), ("f", "n"), ("normal",), ("normal", "force"), ("force", "normal"), ("normalforce",)),
+    "tangential": (
+        *(("ft",), ("f", "t"), ("tangential",), ("tangential", "force"), ("force", "tangential"), ("tangentialforce",)),
+        *(("shear",), ("shear", "force"), ("force", "shear")),
+    ),
+}
+
+
+def unit_of(name: str, *, quantity: str, path: str) -> str | None:
+    """Unit that a column's name gives, in brackets or as its last word; None where it gives none.
+
+    Raises
+    ------
+    RecordingError
+        If the brackets hold a unit that is not known: a voltage must not pass for a force.
+    """
+    spellings = _SPELLINGS[quantity]
+    bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]", name)
+    if bracket:
+        unit = _spelled(bracket[1].lower(), spellings)
+        if unit is None:
+            raise RecordingError(
+                f"{path}: {name!r} is in {bracket[1]!r}, which is no known unit of {quantity} "
+                f"({', '.join(spellings)}); declare the right one with {quantity}_unit"
+            )
+        return unit
+    words = _words(name)
+    # "f_n" is a normal force, "fx_n" one along x in newtons
+    if quantity == "force" and (len(words) < 2 or _axis(words) is not None):
+        return None
+    return _spelled(words[-1], spellings) if words else None
+
+
+def require_unit(unit: str, *, quantity: str) -> str:
+    """Return a declared unit as it is written here.
+
+    Raises
+    ------
+    RecordingError
+        If it is not known.
+    """
+    known = _spelled(unit.lower(), _SPELLINGS[quantity])
+    if known is None:
+        raise RecordingError(f"{unit!r} is no unit of {quantity}; use one of {', '.join(_SPELLINGS[quantity])}")
+    return known
+
+
+def guess_time_column(table: TextTable) -> str:
+    """Column whose name says that it holds times.
+
+    Raises
+    ------
+    RecordingError
+        If there is none, or more than one.
+    """
+    units = {spelling for names in _TIME_SPELLINGS.values() for spelling in names}
+    found = []
+    for name in table.header:
+        words = _words(re.sub(r"[\[(].*", "", name))
+        named = bool(_TIME_WORDS & set(words)) and _axis(words) is None  # "f_t" is a tangential force
+        if named or (len(words) == 1 and words[0] in units):
+            found.append(name)
+    return _only(found, table=table, what="the time", option="time_column")
+
+
+def guess_force_columns(table: TextTable) -> tuple[str, ...]:
+    """Columns that hold the force along x, y and z, or the normal and the tangential force.
+
+    Raises
+    ------
+    RecordingError
+        If neither set is there, or a force twice.
+    """
+    found: dict[str, list[str]] = {axis: [] for axis in _AXES}
+    for name in table.header:
+        words = _words(re.sub(r"[\[(].*", "", name))
+        axis = _axis(words) or _axis(words[:-1])
+        if axis is not None:
+            found[axis].append(name)
+    for axes in (("x", "y", "z"), ("normal", "tangential")):
+        if all(found[axis] for axis in axes):
+            return tuple(
+                _only(found[axis], table=table, what=f"the force ({axis})", option="force_columns") for axis in axes
+            )
+    raise RecordingError(
+        f"{table.path} has no columns that look like forces (fx, fy, fz or fn, ft) among "
+        f"{', '.join(map(repr, table.header))}; name them with force_columns"
+    )
+
+
+def guess_time_unit(time: Float[np.ndarray, " samples"]) -> str:
+    """Unit of times from their size: by the date where they count from 1970, else by the usual step.
+
+    A force sensor is read from 2 to 10 000 times a second, a camera likewise: a step of 0.01 is in seconds, one of 1 or
+    10 in milliseconds.
+    """
+    size = float(np.abs(time[-1]))
+    for unit, since_1970 in (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 1e8)):
+        if size >= since_1970 and (unit != "s" or _step(time) < 0.5):
+            return unit
+    step = _step(time)
+    for unit, most in (("s", 0.5), ("ms", 500.0), ("us", 5e5)):
+        if step <= most:
+            return unit
+    return "ns"
+
+
+def _step(time: Float[np.ndarray, " samples"]) -> float:
+    return float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+
+
+def _words(name: str) -> Sequence[str]:
+    return [word for word in re.split(r"[^0-9a-z\u00b5\u03bc]+", name.lower()) if word]
+
+
+def _axis(words: Sequence[str]) -> str | None:
+    """Axis that the last words of a name give: "wrench.force.x" is the force along x."""
+    for axis, spellings in _AXES.items():
+        if any(tuple(words[-len(spelling) :]) == spelling for spelling in spellings):
+            return axis
+    return None
+
+
+def _spelled(text: str, spellings: dict[str, tuple[str, ...]]) -> str | None:
+    return next((unit for unit, names in spellings.items() if text in names), None)
+
+
+def _only(found: Sequence[str], *, table: TextTable, what: str, option: str) -> str:
+    if not found:
+        raise RecordingError(
+            f"{table.path} has no column that looks like {what} among {', '.join(map(repr, table.header))}; "
+            f"name it with {option}"
+        )
+    if len(found) > 1:
+        raise RecordingError(
+            f"{table.path}: {what} could be any of {', '.join(map(repr, found))}; name the right one with {option}"
+        )
+    return found[0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameClock:
+    """Times of frames on the clock of the forces."""
+
+    time_s: Float[np.ndarray, " frames"]
+    notes: tuple[str, ...]
+
+
+def place_on_clock(
+    time_s: Float[np.ndarray, " frames"], *, forces: Forces | None, start_s: float | None, source: str
+) -> FrameClock:
+    """Put frames on the clock of forces that were recorded into another file.
+
+    Parameters
+    ----------
+    time_s
+        Times of the frames, as their file gives them.
+    forces
+        None where only images were recorded.
+    start_s
+        When the first frame was taken, on the clock of the forces; None where both count from the same zero.
+    source
+        Of the frames, for people.
+
+    Raises
+    ------
+    RecordingError
+        If frames and forces have no moment in common.
+    """
+    notes: tuple[str, ...] = ()
+    if start_s is not None:
+        if not isfinite(start_s):
+            raise RecordingError(f"the first frame cannot start at {start_s} s; give the time of the force clock")
+        time_s = time_s - time_s[0] + start_s
+        notes = (f"{source}: the first frame was declared to be taken at {start_s:.6g} s of the force clock.",)
+    elif forces is not None:
+        notes = (f"{source}: the times of its frames and of the forces were taken to count from the same zero.",)
+    if forces is not None and (time_s[-1] < forces.time_s[0] or time_s[0] > forces.time_s[-1]):
+        raise RecordingError(
+            f"the frames of {source} ({time_s[0]:.6g} to {time_s[-1]:.6g} s) and the forces of {forces.source} "
+            f"({forces.time_s[0]:.6g} to {forces.time_s[-1]:.6g} s) have no moment in common; "
+            "declare with start_s when the first frame was taken, on the clock of the forces"
+        )
+    return FrameClock(time_s=time_s, notes=notes)
+
+
+def evenly_spaced(count: int, *, frame_rate: float) -> Float[np.ndarray, " frames"]:
+    """Times of frames taken at a declared rate, in seconds from the first.
+
+    Raises
+    ------
+    RecordingError
+        If the rate is not a positive number.
+    """
+    if not (isfinite(frame_rate) and frame_rate > 0):
+        raise RecordingError(f"a frame rate of {frame_rate} frames/s cannot be; declare a positive one")
+    return np.arange(count) / frame_rate
+
+
+def trial_name(text: str) -> str:
+    """Name of a trial: letters, digits, dots, dashes and underscores."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", text).strip("-.") or "trial"
+
+
+MOST_FORCE_N = 1e4
+"""No fingertip survives more; a larger number is in another unit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForceTable:
+    """Forces of a table, and how its columns were read."""
+
+    forces: Forces
+    notes: tuple[str, ...]
+    """What was declared or guessed, a sentence each, to be shown to the user."""
+
+
+def read_force_table(
+    path: Path,
+    *,
+    time_column: str | None = None,
+    force_columns: Sequence[str] | None = None,
+    time_unit: str | None = None,
+    force_unit: str | None = None,
+) -> ForceTable:
+    """Read times and forces from a text table with a header.
+
+    Columns are separated by commas, semicolons or tabs, decimals by points or (where columns are not separated by
+    commas) commas; lines that begin with # or % are comments. What is not declared is guessed from the names of the
+    columns (`time_s`, `t [ms]`, `stamp`; `fx`, `force_x [mN]`, `wrench.force.x`; `fn` and `ft`), the unit of the time
+    also from its steps.
+
+    Parameters
+    ----------
+    path
+        The table.
+    time_column
+        Name of the column with the times.
+    force_columns
+        Names of three columns, forces along x, y and z; or of two, the normal and the tangential force, which become
+        z and x.
+    time_unit
+        s, ms, us or ns.
+    force_unit
+        N, mN, kN, gf, kgf or lbf.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing, empty or no text, lacks a column, holds what is no finite number, times do not rise,
+        or a force is too large to be one.
+    """
+    table = open_table(path)
+    time_name = guess_time_column(table) if time_column is None else table.require(time_column, option="time_column")
+    names = _force_names(table, force_columns)
+    numbers = read_numbers(table, [time_name, *names])
+    time = numbers.values[:, 0]
+    require_rising(time, numbers.lines, path=path, column=time_name)
+    unit, how = _time_unit(table, time_name, time_unit, time)
+    scales, units = _force_scales(table, names, force_unit)
+    forces = numbers.values[:, 1:] * scales
+    large = np.abs(forces).max(axis=1) > MOST_FORCE_N
+    if large.any():
+        at = int(np.argmax(large))
+        raise RecordingError(
+            f"{path}, line {numbers.lines[at]}: {np.abs(forces[at]).max():.4g} N is no force of a fingertip; "
+            "declare the right force_unit"
+        )
+    declared = "declared" if time_column is not None else "by its name"
+    notes = [
+        f"{path.name}: times are those of column {time_name!r} ({declared}), in {unit} ({how}).",
+        f"{path.name}: forces are those of {_listed(names, force_columns is not None)}, in {units}.",
+    ]
+    if numbers.decimal_comma:
+        notes.append(f"{path.name}: commas were read as decimal points.")
+    return ForceTable(
+        forces=Forces(time_s=time * TIME_UNITS[unit], force_n=_to_axes(forces), source=str(path)), notes=tuple(notes)
+    )
+
+
+def _force_names(table: TextTable, declared: Sequence[str] | None) -> tuple[str, ...]:
+    if declared is None:
+        return guess_force_columns(table)
+    if len(declared) not in {2, 3}:
+        raise RecordingError(
+            f"{len(declared)} force columns were named; name three (x, y, z) or two (normal, tangential)"
+        )
+    names = tuple(table.require(name, option="force_columns") for name in declared)
+    if len(set(names)) < len(names):
+        raise RecordingError(f"the force columns {', '.join(names)} repeat; name each once")
+    return names
+
+
+def _to_axes(forces: Float[np.ndarray, "samples columns"]) -> Float[np.ndarray, "samples 3"]:
+    if forces.shape[1] == 3:
+        return np.ascontiguousarray(forces)
+    # normal and tangential: z points into the gel, the tangential force has no direction and is laid along x
+    return np.stack([forces[:, 1], np.zeros(len(forces)), forces[:, 0]], axis=1)
+
+
+def _time_unit(
+    table: TextTable, name: str, declared: str | None, time: Float[np.ndarray, " samples"]
+) -> tuple[str, str]:
+    if declared is not None:
+        return require_unit(declared, quantity="time"), "declared"
+    unit = unit_of(name, quantity="time", path=str(table.path))
+    if unit is not None:
+        return unit, "by its name"
+    unit = guess_time_unit(time)
+    span = (time[-1] - time[0]) * TIME_UNITS[unit]
+    return unit, f"guessed: {len(time)} samples in {span:.4g} s"
+
+
+def _force_scales(
+    table: TextTable, names: Sequence[str], declared: str | None
+) -> tuple[Float[np.ndarray, " columns"], str]:
+    if declared is not None:
+        unit = require_unit(declared, quantity="force")
+        return np.full(len(names), FORCE_UNITS[unit]), f"{unit} (declared)"
+    named = [unit_of(name, quantity="force", path=str(table.path)) for name in names]
+    units = [unit or "N" for unit in named]
+    how = "assumed, for the names give no unit" if None in named else "by their names"
+    return np.array([FORCE_UNITS[unit] for unit in units]), f"{', '.join(dict.fromkeys(units))} ({how})"
+
+
+def _listed(names: Sequence[str], declared: bool) -> str:
+    axes = "x, y, z" if len(names) == 3 else "normal (laid along z), tangential (laid along x)"
+    return f"{', '.join(map(repr, names))} as {axes} ({'declared' if declared else 'by their names'})"

@@ -1,0 +1,314 @@
+"""The lists of the thesis: paths of frames, paths of their reference frames, and their safety margins."""
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path, PureWindowsPath
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from sliplens.errors import RecordingError
+from sliplens.images.files import natural_key
+from sliplens.recordings.capture import Capture, labels_of_margins
+from sliplens.recordings.formats.images import common_size, read_frame
+from sliplens.recordings.formats.tables import evenly_spaced, trial_name
+from sliplens.recordings.trial import require_unit_interval
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """A line of a list."""
+
+    line: int
+    """Counted from 1, in the file."""
+    text: str
+
+
+def read_lines(path: Path) -> list[Line]:
+    """Read the lines of a list that are neither empty nor comments.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing, empty or no text.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise RecordingError(f"{path} does not exist; the lists of a set must lie in one folder") from None
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read ({error.strerror}); name a text file") from None
+    except UnicodeDecodeError:
+        text = "\0"
+    if "\0" in text:
+        raise RecordingError(f"{path} is not a text file; name a list with one entry a line")
+    lines = [Line(line=number, text=line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
+    lines = [line for line in lines if line.text and not line.text.startswith("#")]
+    if not lines:
+        raise RecordingError(f"{path} is empty; list one entry a line")
+    return lines
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListedFiles:
+    """Finds the files of lists by the paths they had elsewhere."""
+
+    folder: Path
+    """Of the lists: relative paths start here."""
+    root: Path
+    """Relative paths may not lead out of it; files that moved are looked for under it."""
+    _found: dict[Path, str] = field(default_factory=dict)
+
+    def find(self, listed: str, *, where: str) -> Path:
+        """Find a file: where its path says, else under the root by the last parts of its path, the most first.
+
+        Raises
+        ------
+        RecordingError
+            If it is not there, a relative path leads out of the root, or another listed path led to the same file; the
+            message begins with `where`.
+        """
+        path = self._search(listed, where=where)
+        before = self._found.setdefault(path, listed)
+        if before != listed:
+            raise RecordingError(
+                f"{where}: {listed!r} and {before!r} both lead to {path}; give as root a folder in which they differ"
+            )
+        return path
+
+    def _search(self, listed: str, *, where: str) -> Path:
+        foreign = PureWindowsPath(listed.strip("\"'"))  # reads slashes and backslashes
+        own = Path(listed.strip("\"'"))
+        if own.is_absolute() and _is_file(own):
+            return own
+        parts = foreign.parts
+        if foreign.anchor:
+            parts = parts[1:]
+        else:
+            inside = Path(os.path.normpath(self.folder.absolute().joinpath(*parts)))
+            if inside.is_relative_to(os.path.normpath(self.root.absolute())):
+                if _is_file(inside):
+                    return inside
+            elif ".." in parts:
+                raise RecordingError(f"{where}: {listed!r} leads out of {self.root}; give the folder of all as root")
+        parts = tuple(part for part in parts if part != "..")
+        for dropped in range(len(parts)):
+            moved = self.root.joinpath(*parts[dropped:])
+            if _is_file(moved):
+                return moved
+        raise RecordingError(
+            f"{where}: {listed[:200]!r} is not there, nor under {self.root}; give the folder of the images as root"
+        )
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a line that is too long for a name
+        return False
+
+
+FRAMES, REFERENCES, MARGINS = "_images_L.txt", "_images_Lref.txt", "_gamma.csv"
+"""How the names of the three lists end."""
+_FRAME_RATE_HZ = 30.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThesisTrial:
+    """Frames that share a reference frame, in natural order; without times and forces, which the lists do not give."""
+
+    name: str
+    source: str
+    frame_paths: tuple[Path, ...]
+    reference_path: Path
+    frame_size: tuple[int, int]
+    """Height and width, in pixels."""
+    safety_margin: Float[np.ndarray, " frames"]
+    """As a fraction; NaN where the list has none."""
+    notes: tuple[str, ...] = ()
+    """What the reader had to assume, a sentence each, to be shown to the user."""
+
+    def __len__(self) -> int:
+        """Count the frames."""
+        return len(self.frame_paths)
+
+    def read_reference(self) -> UInt8[np.ndarray, "height width 3"]:
+        """Read the reference frame T_0."""
+        return read_frame(self.reference_path, size=self.frame_size)
+
+    def read_frames(self) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+        """Read the frames T_n, one at a time."""
+        return (read_frame(path, size=self.frame_size) for path in self.frame_paths)
+
+
+def read_thesis_lists(
+    path: Path, *, root: Path | None = None, margin_unit: str | None = None
+) -> tuple[ThesisTrial, ...]:
+    """Read the lists of a set: `SET_images_L.txt`, `SET_images_Lref.txt` and `SET_gamma.csv`, in one folder.
+
+    The thesis's programs (`get_data` in github.com/MaxPolak97/polycam-regression) read a path a line, and a margin a
+    line as a fraction, without a header. The lists themselves are not public, so more is accepted: a header, several
+    columns (that called gamma, else the last), percent, backslashes, empty lines and comments. Their paths are those
+    of the computer that recorded them; a path that does not exist here is looked for under `root` by its last parts,
+    the most first.
+
+    Parameters
+    ----------
+    path
+        The list of frames, or the folder that holds just one.
+    root
+        Folder under which the images lie now; that of the list if None. Relative paths start here and may not lead
+        out of it.
+    margin_unit
+        "fraction" or "percent"; from the largest margin if None.
+
+    Returns
+    -------
+    tuple of ThesisTrial
+        A trial for each reference frame, in the order of the list.
+
+    Raises
+    ------
+    RecordingError
+        If a list is missing or empty, their lengths differ, a file is not found, sizes disagree, or a margin is none.
+    """
+    frames_list = _frames_list(path)
+    stem = frames_list.name.removesuffix(FRAMES)
+    lists = [frames_list, *(frames_list.with_name(stem + ending) for ending in (REFERENCES, MARGINS))]
+    frames, references = (read_lines(file) for file in lists[:2])
+    margins, notes = _read_margins(lists[2], unit=margin_unit)
+    if not len(frames) == len(references) == len(margins):
+        raise RecordingError(
+            f"{frames_list} has {len(frames)} frames, {lists[1].name} {len(references)} references and {lists[2].name} "
+            f"{len(margins)} margins; give one of each a line"
+        )
+    files = ListedFiles(folder=frames_list.parent, root=frames_list.parent if root is None else root)
+    rows: dict[Path, list[tuple[Path, float]]] = {}
+    for frame, reference, margin in zip(frames, references, margins.tolist(), strict=True):
+        untouched = files.find(reference.text, where=f"{lists[1]}, line {reference.line}")
+        found = files.find(frame.text, where=f"{frames_list}, line {frame.line}")
+        rows.setdefault(untouched, []).append((found, margin))
+    names = _trial_names(stem, len(rows))
+    return tuple(
+        _trial(name, reference, rows[reference], source=str(frames_list), notes=notes)
+        for name, reference in zip(names, rows, strict=True)
+    )
+
+
+def read_thesis(
+    path: Path, *, image_root: Path | None = None, margin_unit: str | None = None, frame_rate: float | None = None
+) -> list[Capture]:
+    """Read the lists of a set as captures, one for each reference frame, with the margins of the list as their labels.
+
+    Parameters
+    ----------
+    path, image_root, margin_unit
+        As `read_thesis_lists` takes them.
+    frame_rate
+        Frames per second, which the lists do not give; those of a usual camera if None.
+
+    Raises
+    ------
+    RecordingError
+        As `read_thesis_lists`.
+    """
+    rate = _FRAME_RATE_HZ if frame_rate is None else frame_rate
+    how = "assumed" if frame_rate is None else "declared"
+    times = f"The lists give no times: {rate:g} frames/s were {how}; how fast the margin falls rests on it."
+    return [
+        Capture(
+            name=trial.name,
+            source=f"{trial.name} of {trial.source}",
+            frame_time_s=evenly_spaced(len(trial), frame_rate=rate),
+            frame_size=trial.frame_size,
+            read_frames=trial.read_frames,
+            forces=None,
+            notes=(*trial.notes, times),
+            labels=labels_of_margins(trial.safety_margin),
+            reference=trial.read_reference(),
+        )
+        for trial in read_thesis_lists(path, root=image_root, margin_unit=margin_unit)
+    ]
+
+
+def is_thesis_list(path: Path) -> bool:
+    """Whether a path is named like a list of the thesis, or a folder that holds one."""
+    return path.name.endswith(FRAMES) or (path.is_dir() and next(path.glob(f"*{FRAMES}"), None) is not None)
+
+
+def _frames_list(path: Path) -> Path:
+    if path.is_dir():
+        found = sorted(path.glob(f"*{FRAMES}"))
+        if len(found) != 1:
+            names = ", ".join(file.name for file in found) or "none"
+            raise RecordingError(f"{path} must hold one list *{FRAMES}, it holds {names}; name the list itself")
+        return found[0]
+    if not path.name.endswith(FRAMES):
+        raise RecordingError(f"{path} is not a list of the thesis; name the file that ends in {FRAMES}")
+    return path
+
+
+def _trial_names(stem: str, count: int) -> list[str]:
+    base = trial_name(stem or "thesis")
+    return [base] if count == 1 else [f"{base}-{number:0{len(str(count))}d}" for number in range(1, count + 1)]
+
+
+def _trial(
+    name: str, reference: Path, rows: list[tuple[Path, float]], *, source: str, notes: tuple[str, ...]
+) -> ThesisTrial:
+    ordered = sorted(rows, key=lambda row: natural_key(str(row[0])))
+    if ordered != rows:
+        notes = (*notes, f"{name}: frames were put into the natural order of their names.")
+    paths = tuple(path for path, _ in ordered)
+    if len(set(paths)) < len(paths):
+        twice = next(path for path in paths if paths.count(path) > 1)
+        raise RecordingError(f"{source} lists {twice} twice with one reference; list every frame once")
+    return ThesisTrial(
+        name=name,
+        source=source,
+        frame_paths=paths,
+        reference_path=reference,
+        frame_size=common_size((reference, *paths)),
+        safety_margin=np.array([margin for _, margin in ordered]),
+        notes=notes,
+    )
+
+
+def _read_margins(path: Path, *, unit: str | None) -> tuple[Float[np.ndarray, " frames"], tuple[str, ...]]:
+    if unit not in {None, "fraction", "percent"}:
+        raise RecordingError(f"{unit!r} is no unit of a safety margin; use fraction or percent")
+    lines = read_lines(path)
+    rows = [re.split(r"[;,\t]", line.text) for line in lines]
+    column = -1
+    if not all(map(_is_margin, rows[0])):  # a header
+        heads = [head.strip().strip('"').lower() for head in rows[0]]
+        column = next((at for at, head in enumerate(heads) if "gamma" in head), -1)
+        lines, rows = lines[1:], rows[1:]
+    if not rows:
+        raise RecordingError(f"{path} has a header but no margin; give one a line")
+    values, percent = [], unit == "percent"
+    for line, row in zip(lines, rows, strict=True):
+        text = row[column].strip().strip('"')
+        if not _is_margin(text):
+            raise RecordingError(f"{path}, line {line.line} is {line.text[:40]!r}, not a safety margin; mend the line")
+        percent |= text.endswith("%")
+        values.append(float(text.removesuffix("%") or "nan"))
+    margins = np.array(values)
+    if np.isnan(margins).all():
+        raise RecordingError(f"{path} holds no safety margin; give one a line")
+    how = "declared" if unit is not None else "by their size"
+    if unit is None:
+        percent |= bool(np.nanmax(margins) > 2)  # no margin of a fraction comes near it, percents all do
+    margins = margins / 100 if percent else margins
+    require_unit_interval(margins, name="safety_margin", trial=path.name)
+    return margins, (f"{path.name}: safety margins were read as {'percent' if percent else 'fractions'} ({how}).",)
+
+
+def _is_margin(text: str) -> bool:
+    try:
+        float(text.strip().strip('"').removesuffix("%") or "nan")
+    except ValueError:
+        return False
+    return True

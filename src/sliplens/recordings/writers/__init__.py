@@ -1,1 +1,0 @@
-"""Writers: data sets for other programs, one file a format."""

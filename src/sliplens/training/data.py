@@ -1,0 +1,329 @@
+"""Which frames make a batch, in one process or shared among several."""
+
+import math
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, UInt8
+from torch import Tensor
+from torch.nn import functional
+from torch.utils.data import DataLoader, Sampler
+from torch.utils.data import Dataset as TorchDataset
+from torchvision.transforms.v2 import functional as transforms
+
+from sliplens.errors import InputError, RecordingError
+from sliplens.models.encodings import Encoding
+from sliplens.recordings import Dataset, TrialInfo
+from sliplens.recordings.dataset import count_labelled, trial_path
+
+
+@dataclass(frozen=True, kw_only=True)
+class Augmentation:
+    """Slight rotations and shifts, colour, Gaussian noise and Gaussian blur, drawn for each image.
+
+    Parameters
+    ----------
+    rotation_deg
+        Rotations are uniform within plus and minus this: the pull is never exactly along gravity.
+    shift
+        Shifts along x and y are uniform within plus and minus this share of the image: a camera never sits twice alike,
+        and a network must not know a day by its place.
+    colour
+        Each channel is scaled by 1 plus or minus up to this: white balance.
+    noise_sd
+        Standard deviation of the noise is uniform in [0, noise_sd], in units of the image's maximum.
+    neutral
+        What stands for no change in the input; `colour` scales about it.
+    blur_probability, blur_sd_px
+        Share of batches that are blurred, and the largest standard deviation of the blur in pixels.
+
+    References
+    ----------
+    Polak, section 4 ("random image augmentations": rotation, noise and blur; shift and colour are ours).
+    """
+
+    rotation_deg: float = 5.0
+    shift: float = 0.015
+    colour: float = 0.05
+    noise_sd: float = 0.03
+    blur_probability: float = 0.25
+    blur_sd_px: float = 0.8
+    neutral: float = 0.0
+
+    def __call__(
+        self, images: Float[Tensor, "batch 3 size size"], *, generator: torch.Generator
+    ) -> Float[Tensor, "batch 3 size size"]:
+        """Augment a batch; the same generator state gives the same images."""
+        batch = len(images)
+        device = images.device
+
+        def uniform(*shape: int) -> Tensor:
+            return torch.rand(*shape, generator=generator, device=device)
+
+        angle = (2 * uniform(batch) - 1) * math.radians(self.rotation_deg)
+        # the grid spans 2, from -1 to 1
+        along, down = 2 * self.shift * (2 * uniform(2, batch) - 1)
+        turn = torch.stack([angle.cos(), -angle.sin(), along, angle.sin(), angle.cos(), down], dim=1).view(-1, 2, 3)
+        grid = functional.affine_grid(turn, list(images.shape), align_corners=False)
+        images = functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
+        # a blur of images that lie channels last takes a quarter of the time, and the network wants them so
+        images = images.contiguous(memory_format=torch.channels_last)
+        if float(uniform(1)) < self.blur_probability:
+            images = transforms.gaussian_blur(images, [3, 3], [0.1 + (self.blur_sd_px - 0.1) * float(uniform(1))])
+        scale = 1 + self.colour * (2 * uniform(batch, 3, 1, 1) - 1)
+        # in place: images of a batch are large, and the sampled ones are ours
+        images.sub_(self.neutral).mul_(scale).add_(self.neutral)
+        height, width = images.shape[-2:]
+        noise = torch.randn((batch, height, width, 3), generator=generator, device=device).permute(0, 3, 1, 2)
+        return images.add_(noise.mul_(uniform(batch, 1, 1, 1) * self.noise_sd)).clamp_(0, 1)
+
+
+AUGMENTATIONS = {
+    "none": None,
+    "thesis": Augmentation(shift=0.0, colour=0.0),
+    "default": Augmentation(),
+}
+"""What a recipe may ask for; `thesis` has rotation, noise and blur alone, in amounts of ours, for it gives none."""
+
+
+def get_augmentation(name: str, *, neutral: float = 0.0) -> Augmentation | None:
+    """Look up an augmentation by name, for inputs with a neutral level; None for none.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name; the message lists those there are.
+    """
+    if name not in AUGMENTATIONS:
+        raise InputError(f"there is no augmentation named {name!r}; choose one of {', '.join(AUGMENTATIONS)}")
+    found = AUGMENTATIONS[name]
+    return None if found is None else replace(found, neutral=neutral)
+
+
+UNTOUCHED = -1
+"""Frame number of the reference frame, which is no frame of the trial."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameSet(TorchDataset):
+    """Resized 8-bit inputs with their labels; a batch is indexed at once, not frame by frame.
+
+    Attributes
+    ----------
+    images
+        Compared and resized frames, uint8, as `Encoding.resize` returns them.
+    safety_margin
+        Labels in [0, 1].
+    trial, frame, condition, day, time_s
+        Where each row comes from, for tables by trial, condition and day.
+    """
+
+    encoding: Encoding
+    images: UInt8[Tensor, "frames 3 size size"]
+    safety_margin: Float32[Tensor, " frames"]
+    trial: tuple[str, ...]
+    frame: tuple[int, ...]
+    condition: tuple[str, ...]
+    day: tuple[int, ...]
+    time_s: Float[np.ndarray, " frames"]
+
+    def __len__(self) -> int:
+        """Count the frames."""
+        return len(self.images)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
+        """Return one input and its label."""
+        images, labels = self.__getitems__([index])
+        return images[0], labels[0]
+
+    def __getitems__(self, indices: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Return a batch of inputs and their labels; torch's loader asks for it by this name."""
+        rows = torch.as_tensor(indices)
+        return self.encoding.normalise(self.images[rows]), self.safety_margin[rows]
+
+
+def load_frames(
+    data: Dataset,
+    trials: Sequence[TrialInfo],
+    *,
+    encoding: Encoding,
+    image_size: int,
+    untouched_share: float = 0.0,
+    scratch: Path | None = None,
+    on_trial: Callable[[int, int], None] | None = None,
+) -> FrameSet:
+    """Read trials, encode them, and keep the frames that have a label.
+
+    Frames without contact have no safety margin and are left out, as in the thesis.
+
+    Parameters
+    ----------
+    data, trials
+        The data set and the trials of it to read.
+    encoding, image_size
+        Input of the network, and its height and width in pixels.
+    untouched_share
+        For training: add the untouched sensor itself, with the label 1, this often for each labelled frame and at least
+        once a trial. Without a pull the safety margin is 1 however light the touch, so 1 is its limit; and a network
+        that was shown the untouched sensor gives explanations a reference that means something: "why 20 % rather than
+        100 %?". Never for an evaluation.
+    scratch
+        Folder for what does not fit into memory: frames that would take more than half of what is free go into a file
+        there, which is read as needed and gone when the frames are. Always in memory if None.
+    on_trial
+        Called with the number of trials read and the number of all.
+
+    Raises
+    ------
+    RecordingError
+        If no frame has a label, or the trials' frames differ in size.
+    """
+    sizes = {(info.height, info.width) for info in trials}
+    if len(sizes) > 1:
+        raise RecordingError(f"{data.folder} mixes frames of {sorted(sizes)} pixels; use one sensor at a time")
+    copies_of = partial(_untouched_copies, share=untouched_share)
+    counts = [count_labelled(trial_path(data.folder, info.trial)) for info in trials]
+    if not sum(counts):
+        raise RecordingError(f"{data.folder}: no frame of the {len(trials)} trials has a label; label them first")
+    total = sum(count + copies_of(count) for count in counts)
+    images = _allocate((total, 3, image_size, image_size), scratch)
+    labels, times, rows = [], [], []
+    for done, recording in enumerate(data.load_all(trials, truth=False), start=1):
+        labelled = np.flatnonzero(recording.labelled)
+        compared = encoding.compare(recording.frames[labelled], recording.reference)
+        images[len(rows) : len(rows) + len(labelled)] = encoding.resize(compared, image_size=image_size)
+        labels.append(recording.safety_margin[labelled])
+        times.append(recording.time_s[labelled])
+        rows += [(recording.trial, int(frame), recording.condition, recording.day) for frame in labelled]
+        if copies := copies_of(len(labelled)):
+            compared = encoding.compare(recording.reference[None], recording.reference)
+            images[len(rows) : len(rows) + copies] = encoding.resize(compared, image_size=image_size)
+            labels.append(np.ones(copies))
+            times.append(np.full(copies, recording.time_s[0]))
+            rows += [(recording.trial, UNTOUCHED, recording.condition, recording.day)] * copies
+        if on_trial is not None:
+            on_trial(done, len(trials))
+    trial, frame, condition, day = zip(*rows, strict=True)
+    return FrameSet(
+        encoding=encoding,
+        images=images,
+        safety_margin=torch.from_numpy(np.concatenate(labels)).float(),
+        trial=trial,
+        frame=frame,
+        condition=condition,
+        day=day,
+        time_s=np.concatenate(times),
+    )
+
+
+def _untouched_copies(labelled: int, *, share: float) -> int:
+    return max(1, round(share * labelled)) if share > 0 else 0
+
+
+def _allocate(shape: tuple[int, int, int, int], scratch: Path | None) -> UInt8[Tensor, "frames 3 size size"]:
+    """Room for images: in memory, or in a file without a name, which is gone when nothing uses it any more."""
+    size = int(np.prod(shape))
+    if scratch is None or size <= _free_memory() / 2:
+        return torch.empty(shape, dtype=torch.uint8)
+    with tempfile.TemporaryFile(dir=scratch) as file:
+        file.truncate(size)
+        return torch.from_numpy(np.memmap(file, dtype=np.uint8, mode="r+", shape=shape))
+
+
+def _free_memory() -> int:
+    """Bytes that are free now; what is not known counts as plenty."""
+    try:
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return 1 << 62
+
+
+class EpochShuffle(Sampler[int]):
+    """A random order for each epoch that depends on the seed and the epoch alone, so that resuming repeats it.
+
+    Of one order that all processes draw alike, each takes every `processes`-th frame, so that together the n-th batches
+    of all processes are the n-th batch of one.
+
+    Parameters
+    ----------
+    count
+        Frames there are; those that do not divide among the processes are left out of this epoch.
+    seed
+        Of the orders.
+    rank, processes
+        Number of this process, from 0, and how many there are.
+    """
+
+    def __init__(self, count: int, *, seed: int, rank: int = 0, processes: int = 1) -> None:
+        self.count = count
+        self.seed = seed
+        self.rank = rank
+        self.processes = processes
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Lightning calls this before each epoch."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        """Count the frames of this process."""
+        return self.count // self.processes
+
+    def __iter__(self) -> Iterator[int]:
+        """Yield every index once, over all processes."""
+        return iter(self.order(self.epoch)[self.rank :: self.processes][: len(self)])
+
+    def order(self, epoch: int) -> list[int]:
+        """Every index once, in the order of an epoch."""
+        return np.random.default_rng((self.seed, epoch)).permutation(self.count).tolist()
+
+
+class EvenShares(Sampler[list[int]]):
+    """Batches of every frame once, over all processes, and as many in each: they must take each step together.
+
+    Parameters
+    ----------
+    count
+        Frames there are, at least one for each process.
+    batch_size
+        Most frames of a batch.
+    rank, processes
+        Number of this process, from 0, and how many there are.
+    """
+
+    def __init__(self, count: int, *, batch_size: int, rank: int = 0, processes: int = 1) -> None:
+        largest_share = -(-count // processes)
+        rows = np.arange(count)[rank::processes]
+        # shares differ by one frame at most, so that none of these is empty
+        self.batches = [part.tolist() for part in np.array_split(rows, -(-largest_share // batch_size))]
+
+    def __len__(self) -> int:
+        """Count the batches, the same in every process."""
+        return len(self.batches)
+
+    def __iter__(self) -> Iterator[list[int]]:
+        """Yield the batches of this process."""
+        return iter(self.batches)
+
+
+def make_loaders(
+    train: FrameSet, validation: FrameSet, *, seed: int, batch_size: int, rank: int, processes: int
+) -> tuple[DataLoader, DataLoader]:
+    """Loaders of this process; `batch_size` is its share of the batch."""
+    common: dict[str, Any] = {"collate_fn": _as_is}
+    shuffle = EpochShuffle(len(train), seed=seed, rank=rank, processes=processes)
+    shares = EvenShares(len(validation), batch_size=batch_size, rank=rank, processes=processes)
+    # a last small batch would make batch normalisation noisy
+    shuffled = DataLoader(train, sampler=shuffle, batch_size=batch_size, drop_last=True, **common)
+    return shuffled, DataLoader(validation, batch_sampler=shares, **common)
+
+
+def _as_is(batch: Any) -> Any:
+    return batch  # FrameSet.__getitems__ has made the batch already

@@ -1,0 +1,220 @@
+import pytest
+import torch
+from captum import attr
+from torch import nn
+from torchcam.methods import GradCAM, LayerCAM
+
+from sliplens.errors import InputError, ModelError
+from sliplens.explainers import GradCam, HiResCam, LayerCam, capture
+from sliplens.explainers.cam import grad_cam_map, layer_cam_map
+
+
+def captured(model: nn.Module, images, layer: str):
+    with capture(model, [layer], differentiable=True) as outputs:
+        prediction = model(images).flatten()
+    (gradients,) = torch.autograd.grad(prediction.sum(), outputs[layer])
+    return outputs[layer].detach(), gradients, prediction.detach()
+
+
+@pytest.mark.parametrize(
+    ("name", "layer"), [("shufflenet", "conv5"), ("resnet", "layer4"), ("vgg", "features"), ("gap", "second")]
+)
+def test_a_pooled_linear_head_is_the_sum_of_the_map_and_its_bias(name, layer, network, images):
+    model = network(name)
+    activations, gradients, prediction = captured(model, images, layer)
+    bias = (model.classifier if name == "vgg" else model.fc).bias
+    total = grad_cam_map(activations, gradients).sum(dim=(1, 2)) + bias
+    tolerance = 1e-4 * torch.maximum(prediction.abs(), torch.tensor(1.0))
+    assert bool(((total - prediction).abs() <= tolerance).all())
+
+
+@pytest.mark.parametrize("size", [64, 50])  # 50 px is no multiple of the map's 2 cells' stride
+def test_upsampling_keeps_that_sum(size, network, images):
+    model = network("shufflenet")
+    explanation = GradCam(contrast=False)(model, images[..., :size, :size])
+    total = explanation.relevance.sum(dim=(1, 2)) + model.fc.bias.detach().float()
+    torch.testing.assert_close(total, explanation.prediction, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "layer"),
+    [
+        ("shufflenet", "conv5"),
+        ("shufflenet", "stage3"),
+        ("mobilenet", "features"),
+        ("resnet", "layer3"),
+        ("vgg", "features.10"),
+    ],
+)
+def test_equals_torch_cam_after_the_same_relu(name, layer, network, images):
+    model = network(name)
+    activations, gradients, _ = captured(model, images, layer)
+    with GradCAM(model, target_layer=layer) as extractor:
+        oracle = extractor(0, model(images.clone().requires_grad_()), normalized=False)[0]
+    torch.testing.assert_close(torch.relu(grad_cam_map(activations, gradients)), oracle, atol=1e-6, rtol=0)
+
+
+def test_equals_torch_cam_on_the_image(network, images):
+    model = network("shufflenet")
+    explanation = GradCam(layer="stage3", contrast=False)(model, images)
+    with GradCAM(model, target_layer="stage3") as extractor:
+        oracle = extractor(0, model(images.clone().requires_grad_()), normalized=False)[0]
+    # torch-cam has applied its ReLU to the cells, so compare where the cells have one sign only
+    activations, gradients, _ = captured(model, images, "stage3")
+    cells = grad_cam_map(activations, gradients)
+    torch.testing.assert_close(torch.relu(cells), oracle, atol=1e-6, rtol=0)
+    upsampled = nn.functional.interpolate(cells[None], size=(64, 64), mode="bilinear", align_corners=False)[0]
+    torch.testing.assert_close(explanation.relevance, (upsampled / 16**2).float(), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(("name", "layer"), [("shufflenet", "stage3"), ("resnet", "layer3"), ("vgg", "features.10")])
+def test_equals_captum_with_its_sign(name, layer, network, images):
+    model = network(name)
+    activations, gradients, _ = captured(model, images, layer)
+    oracle = torch.as_tensor(
+        attr.LayerGradCam(lambda x: model(x).flatten(), model.get_submodule(layer)).attribute(images)
+    )
+    torch.testing.assert_close(grad_cam_map(activations, gradients), oracle[:, 0].detach(), atol=1e-9, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "layer"), [("shufflenet", "stage3"), ("mobilenet", "features.3"), ("resnet", "layer2")]
+)
+def test_layer_cam_equals_torch_cam(name, layer, network, images):
+    model = network(name)
+    activations, gradients, _ = captured(model, images, layer)
+    with LayerCAM(model, target_layer=layer) as extractor:
+        oracle = extractor(0, model(images.clone().requires_grad_()), normalized=False)[0]
+    torch.testing.assert_close(torch.relu(layer_cam_map(activations, gradients)), oracle, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "layer"), [("shufflenet", "conv5"), ("resnet", "layer4"), ("vgg", None), ("gap", None)]
+)
+def test_hires_cam_is_grad_cam_before_a_pooled_linear_head(name, layer, network, images, reference):
+    model = network(name)
+    hires = HiResCam(layer=layer)(model, images, reference=reference)
+    plain = GradCam(layer=layer)(model, images, reference=reference)
+    if name == "vgg":
+        # the maximum of 2 x 2 cells hands its gradient to one of them
+        assert not torch.allclose(hires.relevance, plain.relevance, atol=1e-6)
+    else:
+        torch.testing.assert_close(hires.relevance, plain.relevance, atol=1e-7, rtol=1e-5)
+
+
+def test_hires_and_layer_cam_weigh_each_cell_by_its_own_gradient(network, images, reference):
+    model = network("shufflenet")
+    activations, gradients, prediction = captured(model, images, "stage3")
+    references, _, empty = captured(model, reference.expand_as(images), "stage3")
+    sign = torch.sign(prediction - empty)
+    hires, layered = torch.zeros(2, len(images), 4, 4, dtype=torch.float64)
+    for image, channel, row, column in torch.cartesian_prod(*map(torch.arange, activations.shape)).tolist():
+        slope = gradients[image, channel, row, column]
+        added = activations[image, channel, row, column] - references[image, channel, row, column]
+        hires[image, row, column] += slope * added
+        layered[image, row, column] += max(sign[image] * slope, 0) * sign[image] * added
+    for explain, cells in ((HiResCam(layer="stage3"), hires), (LayerCam(layer="stage3"), layered)):
+        upsampled = nn.functional.interpolate(cells[None], size=(64, 64), mode="bilinear", align_corners=False)[0]
+        relevance = explain(model, images, reference=reference).relevance
+        torch.testing.assert_close(relevance, (upsampled / 16**2).float(), atol=1e-7, rtol=1e-5)
+
+
+def test_images_and_references_share_a_pass(network, images):
+    class Count(nn.Module):
+        def __init__(self, inner: nn.Module) -> None:
+            super().__init__()
+            self.inner, self.batches = inner, []
+
+        def forward(self, images):
+            self.batches.append(len(images))
+            return self.inner(images)
+
+    counted = Count(network("small shufflenet"))
+    GradCam()(counted, images)
+    assert counted.batches == [1, 3 + 1]  # the search for layers; the images and the reference that all share
+    counted.batches.clear()
+    GradCam(batch_size=2)(counted, images)
+    GradCam(batch_size=2)(counted, images, reference=images)
+    assert counted.batches == [2 + 1, 1, 2 + 2, 1 + 1]
+
+
+def test_a_network_that_was_changed_is_searched_anew(network, images):
+    model = network("small shufflenet")
+    GradCam()(model, images[:1])
+    model.conv5 = nn.Sequential()  # hands its input on
+    model.fc = nn.Linear(16, 1).double()
+    assert "through layer stage4" in GradCam()(model, images[:1]).target
+    assert "through layer stage2" in GradCam(layer="stage2")(model, images[:1]).target
+
+
+def test_last_layer_is_the_default(network, images):
+    model = network("shufflenet")
+    by_name = GradCam(layer="conv5")(model, images).relevance
+    # two runs may differ in the last bit
+    torch.testing.assert_close(GradCam()(model, images).relevance, by_name, atol=1e-9, rtol=1e-6)
+
+
+def test_the_published_map_does_not_depend_on_the_reference(network, images, reference):
+    model = network("shufflenet")
+    published = GradCam(contrast=False)
+    one, other = published(model, images), published(model, images, reference=reference)
+    torch.testing.assert_close(one.relevance, other.relevance, atol=1e-9, rtol=1e-6)
+    assert not torch.equal(one.reference_prediction, other.reference_prediction)
+    assert one.completeness_gap is None
+
+
+@pytest.mark.parametrize(("name", "size"), [("shufflenet", 64), ("shufflenet", 50), ("gap", 64)])
+def test_the_contrast_adds_up_to_the_difference_for_a_pooled_linear_head(name, size, network, images, reference):
+    explanation = GradCam()(network(name), images[..., :size, :size], reference=reference[..., :size, :size])
+    total = explanation.relevance.sum(dim=(1, 2))
+    # a float32 sum over the pixels of the image
+    torch.testing.assert_close(total, explanation.change, atol=1e-4, rtol=1e-4)
+    assert explanation.completeness_gap is not None
+    assert float(explanation.completeness_gap.max()) <= 1e-5
+
+
+def test_the_contrast_is_the_published_map_less_that_of_the_references_activations(network, images, reference):
+    model = network("shufflenet")
+    activations, gradients, _ = captured(model, images, "stage3")
+    references, _, _ = captured(model, reference.expand_as(images), "stage3")
+    cells = grad_cam_map(activations, gradients) - grad_cam_map(references, gradients)
+    upsampled = nn.functional.interpolate(cells[None], size=(64, 64), mode="bilinear", align_corners=False)[0]
+    relevance = GradCam(layer="stage3")(model, images, reference=reference).relevance
+    torch.testing.assert_close(relevance, (upsampled / 16**2).float(), atol=1e-6, rtol=0)
+
+
+def test_an_image_that_is_its_own_reference_has_an_empty_map(network, images):
+    # two runs of a float64 network may differ in the last bit
+    assert float(GradCam()(network("shufflenet"), images, reference=images).relevance.abs().max()) < 1e-12
+
+
+def test_moves_with_the_image_by_the_networks_stride(network):
+    def with_patch(at: int):
+        images = torch.zeros(1, 3, 512, 512)  # large, so that the padding of the border is out of sight
+        patch = torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(5))
+        images[..., at : at + 64, at : at + 64] = patch
+        return images
+
+    model = network("shufflenet").float()
+    one = GradCam()(model, with_patch(224)).relevance[0, 192:320, 192:320]
+    other = GradCam()(model, with_patch(256)).relevance[0, 224:352, 224:352]
+    assert float(torch.corrcoef(torch.stack([one.flatten(), other.flatten()]))[0, 1]) >= 0.99
+
+
+def test_refuses_a_layer_that_the_output_ignores(images):
+    class Ignorant(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.maps = nn.Conv2d(3, 4, 1)
+
+        def forward(self, images):
+            self.maps(images)
+            return images.mean(dim=(1, 2, 3))
+
+    with pytest.raises(ModelError, match="the output does not depend on layer 'maps'; choose a layer on the path"):
+        GradCam()(Ignorant(), images.float())
+
+
+def test_rejects_a_batch_size_of_zero():
+    with pytest.raises(InputError, match="GradCam's batch_size is 0; give at least 1"):
+        GradCam(batch_size=0)

@@ -1,0 +1,362 @@
+"""Laws that every explainer obeys."""
+
+import copy
+
+import pytest
+import torch
+from torch import nn
+
+from sliplens.errors import ImageError, ModelError
+from sliplens.explainers import (
+    EXPLAINERS,
+    ExpectedGradients,
+    Explanation,
+    GradCam,
+    HiResCam,
+    IntegratedGradients,
+    LayerCam,
+    Occlusion,
+    PolyCam,
+    SmoothGrad,
+)
+
+# LRP has laws of its own, in test_lrp.py
+NAMES = [name for name in EXPLAINERS if name != "lrp"]
+every_explainer = pytest.mark.parametrize("name", NAMES)
+# an untrained network is so rough that integrated gradients would go to their most steps in every test
+SHORT = IntegratedGradients(steps=4, max_steps=8)
+QUICK = EXPLAINERS | {
+    "integrated-gradients": SHORT,
+    "expected-gradients": ExpectedGradients(integrated=SHORT),
+    "smooth-grad": SmoothGrad(samples=3),
+    # the images here show none
+    "occlusion-marker": Occlusion(markers_px=torch.tensor([[3.0, 3.0], [5.0, 60.0], [30.0, 31.0], [47.0, 12.0]])),
+}
+CAMS = ["grad-cam", "hires-cam", "layer-cam", "poly-cam"]
+# what adds up to f(x) - f(reference), for some networks at least
+COMPLETE = ["grad-cam", "hires-cam", "poly-cam", "integrated-gradients", "expected-gradients"]
+
+HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+
+
+class Affine(nn.Module):
+    """scale x f + shift of a network."""
+
+    def __init__(self, network: nn.Module, *, scale: float, shift: float) -> None:
+        super().__init__()
+        self.network, self.scale, self.shift = network, scale, shift
+
+    def forward(self, images):
+        return self.scale * self.network(images) + self.shift
+
+
+def state_of(model: nn.Module):
+    """Everything that a call must leave alone."""
+    return {
+        "tensors": {name: value.clone() for name, value in model.state_dict().items()},
+        "training": {name: module.training for name, module in model.named_modules()},
+        "trainable": {name: parameter.requires_grad for name, parameter in model.named_parameters()},
+        "gradients": {name: copy.deepcopy(parameter.grad) for name, parameter in model.named_parameters()},
+        "hooks": {name: [list(getattr(module, kind)) for kind in HOOKS] for name, module in model.named_modules()},
+    }
+
+
+def in_use(model):
+    """Put a network into the middle of a training: mixed flags, gradients, and a hook of the user's."""
+    model.train()
+    model.stage2.eval()
+    model.conv1[0].weight.requires_grad_(False)
+    model.fc.weight.grad = torch.ones_like(model.fc.weight)
+    model.stage3.register_forward_hook(lambda *_: None)
+    return model
+
+
+def assert_same(one, other):
+    for key in ("training", "trainable", "hooks"):
+        assert one[key] == other[key]
+    for key in ("tensors", "gradients"):
+        assert one[key].keys() == other[key].keys()
+        for name, value in one[key].items():
+            expected = other[key][name]
+            same = expected is None if value is None else torch.equal(value, expected)
+            assert same, name
+
+
+@every_explainer
+def test_model_is_given_back_as_it_was(name, network, images):
+    model = in_use(network("small shufflenet"))
+    before = state_of(model)
+    QUICK[name](model, images[:1])
+    assert_same(state_of(model), before)
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [(name, call) for name in NAMES for call in (1, 2)]  # predicting, or looking for layers, or explaining
+    + [(name, 3) for name in NAMES if name not in CAMS[:3]]
+    + [("poly-cam", 4), ("poly-cam", 5), ("occlusion", 4), ("occlusion-marker", 4)],
+)
+def test_model_is_given_back_as_it_was_after_an_exception(name, call, network, images):
+    model = in_use(network("small shufflenet"))
+    calls = []
+
+    def fail(*_):
+        calls.append(1)
+        if len(calls) == call:
+            raise RuntimeError("out of memory")
+
+    model.get_submodule("stage4").register_forward_hook(fail)
+    before = state_of(model)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        QUICK[name](model, images[:1])
+    assert_same(state_of(model), before)
+
+
+@every_explainer
+def test_model_is_given_back_as_it_was_when_interrupted(name, network, images):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    model = in_use(network("small shufflenet"))
+    before = state_of(model)
+    with pytest.raises(KeyboardInterrupt):
+        QUICK[name](model, images[:2], on_progress=interrupt)
+    assert_same(state_of(model), before)
+
+
+@every_explainer
+def test_images_are_left_alone_and_the_result_has_no_graph(name, network, images, reference):
+    x, b = images.clone(), reference.clone()
+    explanation = QUICK[name](network("small shufflenet"), x, reference=b)
+    assert torch.equal(x, images)
+    assert torch.equal(b, reference)
+    assert not x.requires_grad
+    assert not explanation.relevance.requires_grad
+    assert not explanation.prediction.requires_grad
+    assert explanation.relevance.dtype == torch.float32
+
+
+@every_explainer
+def test_a_batch_gives_what_its_images_alone_give(name, network, images):
+    model = network("small shufflenet").float()
+    references = images.flip(0).float()
+    together = QUICK[name](model, images.float(), reference=references)
+    alone = [QUICK[name](model, images[i, None].float(), reference=references[i, None]) for i in range(len(images))]
+    torch.testing.assert_close(together.relevance, torch.cat([one.relevance for one in alone]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(together.saliency, torch.cat([one.saliency for one in alone]), atol=1e-3, rtol=0)
+
+
+@every_explainer
+@pytest.mark.parametrize("scale", [0.3, -3.0])
+def test_affine_law(name, scale, network, images, reference):
+    model = network("small shufflenet")
+    plain = QUICK[name](model, images, reference=reference)
+    scaled = QUICK[name](Affine(model, scale=scale, shift=0.4), images, reference=reference)
+    expected = scale * plain.relevance
+    torch.testing.assert_close(scaled.relevance, expected, atol=1e-5 * float(expected.abs().max()), rtol=0)
+    # the evidence for the change is the same, whichever way the output points; Grad-CAM's sign is the output's own
+    torch.testing.assert_close(scaled.saliency, plain.saliency, atol=1e-4, rtol=0)
+
+
+@every_explainer
+def test_map_moves_with_the_image(name, network):
+    def with_patch(at: int):
+        images = torch.zeros(1, 3, 96, 96, dtype=torch.float64)
+        generator = torch.Generator().manual_seed(5)
+        images[..., at : at + 24, at : at + 24] = torch.rand(3, 24, 24, generator=generator, dtype=torch.float64)
+        return images
+
+    model = network("gap")
+    # noise does not move with the image; markers do
+    places = torch.tensor([[30.0, 30.0], [40.0, 28.0], [33.0, 41.0]])
+    moving = {
+        "smooth-grad": lambda _: SmoothGrad(samples=1, noise=0.0),
+        "occlusion-marker": lambda at: Occlusion(markers_px=places + at - 24, radius_px=6.0),
+    }
+    explain = moving.get(name, lambda _: QUICK[name])
+    one = explain(24)(model, with_patch(24)).relevance[0, 16:56, 16:56]
+    other = explain(40)(model, with_patch(40)).relevance[0, 32:72, 32:72]
+    correlation = torch.corrcoef(torch.stack([one.flatten(), other.flatten()]))[0, 1]
+    assert float(correlation) >= 0.99
+
+
+@every_explainer
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_works_where_the_caller_has_gradients_off(name, mode, network, images):
+    model = network("small shufflenet")
+    expected = QUICK[name](model, images[:1]).relevance
+    with mode():
+        inside = QUICK[name](model, images[:1].clone()).relevance
+    torch.testing.assert_close(inside, expected)
+
+
+@every_explainer
+def test_outputs_with_and_without_an_axis_of_one_agree(name, network, images):
+    class Flat(nn.Module):
+        def __init__(self, network: nn.Module) -> None:
+            super().__init__()
+            self.network = network
+
+        def forward(self, images):
+            return self.network(images)[:, 0]
+
+    model = network("small shufflenet")
+    torch.testing.assert_close(QUICK[name](Flat(model), images[:1]).relevance, QUICK[name](model, images[:1]).relevance)
+
+
+@every_explainer
+def test_reference_defaults_to_zeros_and_may_be_shared(name, network, images):
+    model = network("small shufflenet")
+    default = QUICK[name](model, images[:2])
+    shared = QUICK[name](model, images[:2], reference=torch.zeros_like(images[0]))
+    each = QUICK[name](model, images[:2], reference=torch.zeros_like(images[:2]))
+    for other in (shared, each):
+        torch.testing.assert_close(other.relevance, default.relevance)
+        torch.testing.assert_close(other.reference_prediction, default.reference_prediction)
+
+
+@every_explainer
+def test_record_says_what_was_explained(name, network, images, reference):
+    model = network("small shufflenet")
+    explanation = QUICK[name](model, images, reference=reference)
+    assert explanation.method == name
+    assert "f(x)" in explanation.target or "f at x" in explanation.target
+    with torch.no_grad():
+        torch.testing.assert_close(explanation.prediction, model(images)[:, 0].float())
+        torch.testing.assert_close(explanation.reference_prediction, model(reference[None])[:, 0].float().expand(3))
+    assert explanation.seconds > 0
+    assert (explanation.completeness_gap is not None) == (name in COMPLETE)
+
+
+@every_explainer
+def test_half_precision_of_the_caller_changes_nothing(name, network, images):
+    model = network("small shufflenet").float()
+    expected = QUICK[name](model, images[:1].float())
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        inside = QUICK[name](model, images[:1].float())
+    torch.testing.assert_close(inside.relevance, expected.relevance, atol=1e-7, rtol=1e-4)
+
+
+@every_explainer
+def test_a_reference_without_a_margin_is_told(name, network, images):
+    model = Affine(network("small shufflenet"), scale=1.0, shift=0.0)
+    assert not any("no safety margin" in text for text in QUICK[name](model, images[:1], reference=images[1]).warnings)
+    model.shift = 5.0
+    warnings = QUICK[name](model, images[:1], reference=images[1]).warnings
+    assert any("is no safety margin, so the reference lies far from the data" in text for text in warnings)
+
+
+@every_explainer
+def test_image_equal_to_its_reference_has_nothing_to_explain(name, network, images):
+    explanation = QUICK[name](network("small shufflenet"), images[:1], reference=images[:1])
+    assert not explanation.saliency.any()
+    assert "so there is next to nothing to explain" in explanation.warnings[0]
+
+
+def explanation_of(relevance, *, prediction: float, reference: float) -> Explanation:
+    return Explanation(
+        relevance=torch.tensor([relevance]),
+        method="by hand",
+        target="f(x) - f(reference)",
+        prediction=torch.tensor([prediction]),
+        reference_prediction=torch.tensor([reference]),
+        seconds=0.0,
+    )
+
+
+@pytest.mark.parametrize(
+    ("prediction", "reference", "expected"),
+    [
+        (0.9, 0.2, [[0.5, 1.0, 0.0]]),  # the margin rose: what raises it
+        (0.2, 0.9, [[0.0, 0.0, 1.0]]),  # the margin fell: what lowers it
+        (0.5, 0.5, [[0.0, 0.0, 0.0]]),  # no change, no evidence for it
+    ],
+)
+def test_saliency_shows_the_evidence_for_the_change(prediction, reference, expected):
+    explanation = explanation_of([[0.2, 0.4, -0.1]], prediction=prediction, reference=reference)
+    torch.testing.assert_close(explanation.saliency, torch.tensor([expected]))
+
+
+def test_saliency_without_supporting_evidence_stays_zero():
+    assert not explanation_of([[-0.2, -0.1]], prediction=0.9, reference=0.1).saliency.any()
+
+
+def filled(value: float, *, shape=(2, 3, 8, 8)):
+    return torch.full(shape, value)
+
+
+BAD_IMAGES = [
+    (filled(0.5, shape=(3, 8, 8)), r"shape \(3, 8, 8\), which is not \(batch, 3, height, width\); add a batch axis"),
+    (filled(0.5, shape=(0, 3, 8, 8)), "there is no image to explain, the batch is empty; pass at least one image"),
+    (filled(0.5, shape=(2, 1, 8, 8)), "images have 1 channels instead of 3; pass RGB images"),
+    (filled(0.5, shape=(2, 3, 0, 8)), "images of 0 x 8 pixels are empty; pass images with at least one pixel"),
+    (filled(0.5).to(torch.uint8), "image values are torch.uint8 instead of float; divide 8-bit images by 255"),
+    (filled(torch.nan), "image 0 holds NaN or infinity in 192 of 192 values; read the frame again"),
+    (filled(37.0), r"image 0 has values from 37 to 37, outside \[0, 1\]; scale it as"),
+]
+
+
+@every_explainer
+@pytest.mark.parametrize(("images", "message"), BAD_IMAGES)
+def test_rejects_images(name, images, message, network):
+    with pytest.raises(ImageError, match=message):
+        QUICK[name](network("gap").float(), images)
+
+
+BAD_REFERENCES = [
+    (filled(0.5, shape=(3, 8, 9)), r"the reference has shape \(3, 8, 9\) but the images have \(2, 3, 8, 8\); pass one"),
+    (filled(0.5, shape=(3, 3, 8, 8)), r"the reference has shape \(3, 3, 8, 8\) but the images have \(2, 3, 8, 8\)"),
+    (filled(-0.5, shape=(3, 8, 8)), r"reference 0 has values from -0.5 to -0.5, outside \[0, 1\]"),
+    (filled(torch.inf), "reference 0 holds NaN or infinity in 192 of 192 values"),
+]
+
+
+@every_explainer
+@pytest.mark.parametrize(("reference", "message"), BAD_REFERENCES)
+def test_rejects_references(name, reference, message, network):
+    with pytest.raises(ImageError, match=message):
+        QUICK[name](network("gap").float(), filled(0.5), reference=reference)
+
+
+class Returns(nn.Module):
+    def __init__(self, make) -> None:
+        super().__init__()
+        self.make = make
+
+    def forward(self, images):
+        return self.make(images)
+
+
+BAD_MODELS = [
+    (lambda x: x.mean(dim=(2, 3)), r"output has shape \(2, 3\) for 2 image\(s\), not one number an image; end it"),
+    (lambda x: x.mean(), r"output has shape \(\) for 2 image\(s\), not one number an image"),
+    (lambda x: {"margin": x}, "the model returns dict instead of a tensor; wrap it so that"),
+    (lambda x: x.mean(dim=(1, 2, 3)) * torch.nan, "the model predicts nan for image 0; train or load it again"),
+    (lambda x: 1 / x.mean(dim=(1, 2, 3)), "the model predicts inf for reference 0; train or load it again"),
+]
+
+
+@every_explainer
+@pytest.mark.parametrize(("make", "message"), BAD_MODELS)
+def test_rejects_models(name, make, message):
+    with pytest.raises(ModelError, match=message):
+        QUICK[name](Returns(make), filled(0.5))
+
+
+@pytest.mark.parametrize("name", CAMS)
+def test_cams_need_a_layer_with_a_map(name):
+    with pytest.raises(ModelError, match="Returns has no layer with a spatial map for images of 8 x 8 pixels"):
+        QUICK[name](Returns(lambda x: x.mean(dim=(1, 2, 3))), filled(0.5))
+
+
+@pytest.mark.parametrize(
+    "explainer", [GradCam(layer="conv9"), HiResCam(layer="conv9"), LayerCam(layer="conv9"), PolyCam(layers=("conv9",))]
+)
+def test_cams_name_the_layers_there_are(explainer, network, images):
+    with pytest.raises(ModelError, match="has no layer 'conv9'; choose among conv1, stage2, stage3, stage4, conv5"):
+        explainer(network("small shufflenet"), images[:1])
+
+
+def test_integrated_gradients_need_no_layer():
+    explanation = IntegratedGradients()(Returns(lambda x: x.mean(dim=(1, 2, 3))), filled(0.5))
+    torch.testing.assert_close(explanation.relevance, torch.full((2, 8, 8), 0.5 / 64))

@@ -1,0 +1,122 @@
+import pytest
+import torch
+from torch import nn
+
+from sliplens.errors import InputError
+from sliplens.explainers import IntegratedGradients
+
+
+class Linear(nn.Module):
+    def __init__(self, weights) -> None:
+        super().__init__()
+        self.weights = nn.Parameter(weights)
+
+    def forward(self, images):
+        return (images * self.weights).sum(dim=(1, 2, 3))
+
+
+class Count(nn.Module):
+    """Counts the images that go through a network."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+        self.batches: list[int] = []
+
+    def forward(self, images):
+        self.batches.append(len(images))
+        return self.network(images)
+
+
+def test_is_exact_on_a_linear_model(images, reference):
+    generator = torch.Generator().manual_seed(4)
+    weights = torch.randn(3, 64, 64, generator=generator, dtype=torch.float64) / 64**2
+    explanation = IntegratedGradients()(Linear(weights), images, reference=reference)
+    expected = (weights * (images - reference)).sum(dim=1).float()
+    torch.testing.assert_close(explanation.relevance, expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(explanation.relevance, expected, atol=0, rtol=1e-5)
+
+
+def test_steps_grow_until_the_sum_is_complete(network, images, reference):
+    model = network("gap")
+    fixed = IntegratedGradients(steps=2, max_steps=2)(model, images, reference=reference)
+    adaptive = IntegratedGradients(steps=2)(model, images, reference=reference)
+    assert fixed.completeness_gap is not None
+    assert adaptive.completeness_gap is not None
+    assert bool((fixed.completeness_gap > 0.01 * fixed.change.abs()).any())
+    assert bool((adaptive.completeness_gap <= 0.01 * adaptive.change.abs()).all())
+    assert any("unexplained, more than 1%" in sentence for sentence in fixed.warnings)
+    assert not any("unexplained" in sentence for sentence in adaptive.warnings)
+
+
+def test_each_image_takes_the_steps_that_it_needs(network, images):
+    model = network("gap")
+    references = torch.stack([images[0] * 0.999, torch.zeros_like(images[0])])  # a short way, and a long one
+    counted = Count(model)
+    IntegratedGradients(steps=1, tolerance=1e-3)(counted, images[:1], reference=references[0])
+    short = sum(counted.batches)
+    counted.batches.clear()
+    IntegratedGradients(steps=1, tolerance=1e-3)(counted, images[:1], reference=references[1])
+    assert short < sum(counted.batches)
+
+
+def test_the_steps_go_where_the_network_changes():
+    class Steep(nn.Module):
+        """Rises from 0 to 1 within a twentieth of the way."""
+
+        def forward(self, images):
+            return torch.sigmoid(400 * (images.mean(dim=(1, 2, 3)) - 0.21))
+
+    images = torch.ones(1, 3, 4, 4, dtype=torch.float64)
+    spread = IntegratedGradients(steps=64, max_steps=64)(Steep(), images)
+    counted = Count(Steep())
+    refined = IntegratedGradients(steps=16)(counted, images)
+    assert spread.completeness_gap is not None
+    assert refined.completeness_gap is not None
+    assert float(spread.completeness_gap) > 0.01
+    assert float(refined.completeness_gap) <= 0.01
+    assert sum(counted.batches) < 2 * 64
+    # a function of the mean alone: each pixel has the same share, within the tolerance
+    torch.testing.assert_close(refined.relevance, torch.full((1, 4, 4), 1 / 16), atol=0, rtol=0.01)
+
+
+def test_stops_at_the_most_steps_and_says_so():
+    class Jump(nn.Module):
+        """A step that no gradient sees."""
+
+        def forward(self, images):
+            return (images.mean(dim=(1, 2, 3)) > 0.5).double() + 0 * images.sum(dim=(1, 2, 3))
+
+    counted = Count(Jump())
+    explanation = IntegratedGradients(steps=4, max_steps=13)(counted, torch.ones(1, 3, 4, 4, dtype=torch.float64))
+    assert explanation.completeness_gap is not None
+    assert explanation.completeness_gap.tolist() == [1]
+    assert any("leaves 1 of f(x) - f(reference) = 1 unexplained" in sentence for sentence in explanation.warnings)
+    # the predictions and one piece of four; then its halves, and the predictions at its start and middle
+    assert sum(counted.batches) == 2 + 4 + 2 * 4 + 2
+
+
+def test_one_pass_is_bounded(network, images):
+    counted = Count(network("gap"))
+    IntegratedGradients(steps=50, max_steps=50, batch_size=8)(counted, images)
+    assert max(counted.batches) <= 8
+
+
+def test_progress_counts_images(network, images):
+    seen = []
+    IntegratedGradients()(network("gap"), images, on_progress=lambda *step: seen.append(step))
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"steps": 0}, "steps = 0 and max_steps = 1024; give 1 <= steps <= max_steps"),
+        ({"steps": 64, "max_steps": 32}, "steps = 64 and max_steps = 32; give 1 <= steps <= max_steps"),
+        ({"batch_size": 0}, "batch_size is 0; give at least 1"),
+        ({"tolerance": 0.0}, "tolerance is 0.0; give a share above 0"),
+    ],
+)
+def test_rejects_options(options, message):
+    with pytest.raises(InputError, match=message):
+        IntegratedGradients(**options)

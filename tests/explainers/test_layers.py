@@ -1,0 +1,143 @@
+import pytest
+import torch
+from torch import nn
+from torchvision import models
+
+from sliplens.errors import ModelError
+from sliplens.explainers import capture, find_layers
+from sliplens.models import build_model
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        (
+            "shufflenet_v2_x1_0",
+            [("conv1", 24, 112), ("stage2", 116, 28), ("stage3", 232, 14), ("stage4", 464, 7), ("conv5", 1024, 7)],
+        ),
+        (
+            "resnet18",
+            [("relu", 64, 112), ("layer1", 64, 56), ("layer2", 128, 28), ("layer3", 256, 14), ("layer4", 512, 7)],
+        ),
+        (
+            "mobilenet_v3_small",
+            [
+                ("features.0", 16, 112),
+                ("features.1", 16, 56),
+                ("features.3", 24, 28),
+                ("features.6", 40, 14),
+                ("features.8", 48, 14),
+                ("features.11", 96, 7),
+                ("features", 576, 7),
+            ],
+        ),
+        (
+            "vgg11",  # the last map before each pooling
+            [
+                ("features.1", 64, 224),
+                ("features.4", 128, 112),
+                ("features.9", 256, 56),
+                ("features.14", 512, 28),
+                ("features.19", 512, 14),
+            ],
+        ),
+    ],
+)
+def test_finds_the_last_map_of_each_resolution_and_width(name, expected):
+    with torch.device("meta"):  # shapes without arithmetic
+        layers = find_layers(getattr(models, name)(weights=None), torch.zeros(1, 3, 224, 224))
+    assert [(layer.name, layer.channels, layer.height) for layer in layers] == expected
+    assert all(layer.width == layer.height for layer in layers)
+
+
+def test_finds_layers_before_functional_pooling(network, images):
+    assert [layer.name for layer in find_layers(network("gap"), images)] == ["first", "second"]
+
+
+def test_looks_into_wrappers_and_blocks_that_shrink_repeatedly():
+    class Backbone(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.one = nn.Conv2d(3, 4, 3, stride=2, padding=1)
+            self.two = nn.Conv2d(4, 4, 3, stride=2, padding=1)
+
+        def forward(self, images):
+            return self.two(self.one(images))
+
+    class Wrapper(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.net = nn.Sequential(Backbone(), nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(4, 1))
+
+        def forward(self, images):
+            return self.net(images)
+
+    layers = find_layers(Wrapper(), torch.zeros(1, 3, 32, 32))
+    assert [layer.name for layer in layers] == ["net.0.one", "net.0.two"]
+
+
+def test_maps_of_one_pixel_are_left_out(network, images):
+    layers = find_layers(network("shufflenet"), images[..., :32, :32])
+    assert [layer.name for layer in layers] == ["conv1", "stage2", "stage3"]
+
+
+def test_named_layers_come_in_the_order_in_which_they_run(network, images):
+    layers = find_layers(network("shufflenet"), images, names=["conv5", "stage2.1.branch2.0", "conv1"])
+    assert [layer.name for layer in layers] == ["conv1", "stage2.1.branch2.0", "conv5"]
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (
+            ["stage9"],
+            "ShuffleNetV2 has no layer 'stage9'; choose among conv1, stage2, stage3, stage4, conv5 "
+            r"or another name of model.named_modules\(\)",
+        ),
+        (["fc"], "layer 'fc' gives no spatial map; choose among conv1, stage2, stage3, stage4, conv5"),
+        ([], "the list of layers is empty; name at least one, or pass None to have them found"),
+    ],
+)
+def test_rejects_names(names, message, network, images):
+    with pytest.raises(ModelError, match=message):
+        find_layers(network("shufflenet"), images, names=names)
+
+
+def test_a_network_without_maps_is_refused():
+    model = nn.Sequential(nn.Flatten(), nn.Linear(3 * 64, 1))
+    with pytest.raises(ModelError, match="Sequential has no layer with a spatial map for images of 8 x 8 pixels"):
+        find_layers(model, torch.zeros(1, 3, 8, 8))
+
+
+def test_search_leaves_a_training_network_as_it_was(network, images):
+    model = network("shufflenet").train()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    find_layers(model, images)
+    assert all(module.training for module in model.modules())
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+
+
+def test_capture_keeps_what_an_in_place_activation_would_overwrite():
+    convolution = nn.Conv2d(3, 4, 3)
+    nn.init.constant_(convolution.weight, -1.0)
+    model = nn.Sequential(convolution, nn.ReLU(inplace=True))
+    with capture(model, ["0"]) as outputs:
+        result = model(torch.ones(1, 3, 5, 5))
+    assert bool((outputs["0"] < 0).all())
+    assert bool((result == 0).all())
+
+
+def test_capture_takes_its_hooks_off_after_an_exception():
+    model = nn.Sequential(nn.Conv2d(3, 4, 3))
+    with pytest.raises(KeyboardInterrupt), capture(model, ["0"]):
+        raise KeyboardInterrupt
+    assert not model[0]._forward_hooks
+
+
+def test_a_head_that_answers_with_a_distribution_hides_no_layer():
+    images = torch.zeros(1, 3, 64, 64)
+    plain, wrapped = (find_layers(build_model(head=head).eval(), images) for head in ("point", "histogram"))
+    assert [f"backbone.{one.name}" for one in plain] == [one.name for one in wrapped]
+    assert [(one.channels, one.height, one.width) for one in plain] == [
+        (one.channels, one.height, one.width) for one in wrapped
+    ]

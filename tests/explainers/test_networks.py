@@ -1,0 +1,58 @@
+"""The laws that depend on a network's parts, over four of TorchVision's."""
+
+import copy
+
+import pytest
+import torch
+
+from sliplens.explainers import EXPLAINERS, ExpectedGradients, IntegratedGradients, Occlusion, PolyCam, SmoothGrad
+
+every_network = pytest.mark.parametrize("name", ["shufflenet", "resnet", "mobilenet", "vgg"])
+SHORT = IntegratedGradients(steps=8, max_steps=40)
+# as in test_explainers.py, and one small layer for Poly-CAM
+CHEAP = {
+    **{name: explain for name, explain in EXPLAINERS.items() if name != "lrp"},
+    "integrated-gradients": SHORT,
+    "expected-gradients": ExpectedGradients(integrated=SHORT),
+    "smooth-grad": SmoothGrad(samples=2),
+    "occlusion": Occlusion(tile_px=32),
+    "occlusion-marker": Occlusion(markers_px=torch.tensor([[10.0, 12.0], [40.0, 20.0], [25.0, 50.0]])),
+}
+FIRST = {"shufflenet": "conv1", "resnet": "relu", "mobilenet": "features.0", "vgg": "features.1"}
+
+
+@every_network
+def test_integrated_gradients_are_complete_or_say_so(name, network, images):
+    explanation = SHORT(network(name).float(), images[:2].float())
+    assert explanation.completeness_gap is not None
+    for index in range(2):
+        incomplete = bool(explanation.completeness_gap[index] > 0.01 * explanation.change[index].abs())
+        told = any(f"image {index}: the map leaves" in text for text in explanation.warnings)
+        assert told == incomplete
+
+
+@every_network
+def test_a_network_is_left_as_it_was_and_in_place_layers_do_no_harm(name, network, images):
+    model = network(name).float().train()
+    before = copy.deepcopy(model.state_dict())
+    relevance = {}
+    for method, explain in CHEAP.items():
+        chosen = PolyCam(budget=0.3, layers=(FIRST[name],)) if method == "poly-cam" else explain
+        relevance[method] = chosen(model, images[:1].float()).relevance
+        assert all(module.training for module in model.modules())
+        assert all(parameter.requires_grad and parameter.grad is None for parameter in model.parameters())
+        assert not any(module._forward_hooks or module._forward_pre_hooks for module in model.modules())
+    for key, value in model.state_dict().items():
+        assert torch.equal(value, before[key])
+    for method, one in relevance.items():
+        assert bool(one.isfinite().all()), method
+        assert bool(one.any()), method
+
+
+@every_network
+def test_a_batch_gives_what_its_images_alone_give(name, network, images):
+    model = network(name).float()
+    for method in ("grad-cam", "layer-cam", "occlusion"):
+        together = CHEAP[method](model, images.float()).relevance
+        alone = torch.cat([CHEAP[method](model, images[index, None].float()).relevance for index in range(3)])
+        torch.testing.assert_close(together, alone, atol=1e-5, rtol=0)

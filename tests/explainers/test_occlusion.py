@@ -1,0 +1,88 @@
+import pytest
+import torch
+from torch import nn
+
+from sliplens.errors import InputError
+from sliplens.explainers import IntegratedGradients, Occlusion
+from sliplens.explainers.occlusion import marker_regions, tile_regions
+
+
+class Linear(nn.Module):
+    def __init__(self, weights) -> None:
+        super().__init__()
+        self.weights = nn.Parameter(weights)
+
+    def forward(self, images):
+        return (images * self.weights).sum(dim=(1, 2, 3))
+
+
+@pytest.fixture
+def linear():
+    return Linear(torch.randn(3, 12, 12, generator=torch.Generator().manual_seed(4), dtype=torch.float64) / 144)
+
+
+@pytest.fixture
+def small(images):
+    return images[..., ::5, ::5][..., :12, :12].contiguous()
+
+
+def test_a_pixel_of_a_linear_model_loses_what_it_adds(linear, small):
+    occluded = Occlusion(tile_px=1)(linear, small, reference=small[0])
+    expected = (linear.weights * (small - small[0])).sum(dim=1).detach().float()
+    torch.testing.assert_close(occluded.relevance, expected, atol=1e-6, rtol=1e-5)
+    integrated = IntegratedGradients()(linear, small, reference=small[0])
+    torch.testing.assert_close(occluded.relevance, integrated.relevance, atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("tile_px", [5, 7, 100])  # none divides 12
+def test_tiles_are_replaced_one_by_one(tile_px, network, small):
+    model = network("gap")
+    occluded = Occlusion(tile_px=tile_px, batch_size=2)(model, small[:1], reference=small[1])
+    expected = torch.zeros(12, 12)
+    with torch.no_grad():
+        for row in range(0, 12, tile_px):
+            for column in range(0, 12, tile_px):
+                tile = (slice(row, row + tile_px), slice(column, column + tile_px))
+                changed = small[:1].clone()
+                changed[0, :, *tile] = small[1, :, *tile]
+                expected[tile] = float(model(small[:1]) - model(changed)) / expected[tile].numel()
+    torch.testing.assert_close(occluded.relevance[0], expected, atol=1e-8, rtol=1e-5)
+
+
+def test_tiles_cover_the_image_without_overlap():
+    regions = tile_regions((5, 7), tile_px=3)
+    assert regions.tolist() == [[0, 0, 0, 1, 1, 1, 2]] * 3 + [[3, 3, 3, 4, 4, 4, 5]] * 2
+
+
+def test_a_pixel_belongs_to_the_nearest_marker_within_reach():
+    # x runs to the right: the second marker lies three columns from the first, in the same row
+    regions = marker_regions((3, 6), torch.tensor([[1.0, 1.0], [4.0, 1.0]]), radius_px=1.2)
+    assert regions.tolist() == [[2, 0, 2, 2, 1, 2], [0, 0, 0, 1, 1, 1], [2, 0, 2, 2, 1, 2]]
+    # without a radius: half of the distance of 3 between neighbours
+    assert torch.equal(
+        marker_regions((3, 6), torch.tensor([[1.0, 1.0], [4.0, 1.0]])),
+        marker_regions((3, 6), torch.tensor([[1.0, 1.0], [4.0, 1.0]]), radius_px=1.5),
+    )
+
+
+def test_markers_of_a_linear_model_add_up(linear, small):
+    markers = torch.tensor([[2.0, 2.0], [9.0, 3.0], [5.0, 9.0]])
+    occluded = Occlusion(markers_px=markers, radius_px=2.0)(linear, small)
+    torch.testing.assert_close(occluded.relevance.sum(dim=(1, 2)), occluded.change, atol=1e-6, rtol=1e-5)
+    for region in marker_regions((12, 12), markers, radius_px=2.0).unique():
+        inside = marker_regions((12, 12), markers, radius_px=2.0) == region
+        assert float(occluded.relevance[0][inside].std()) < 1e-7
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tile_px": 0}, "occlusion's tile_px is 0; give at least 1 pixel"),
+        ({"batch_size": 0}, "occlusion's batch_size is 0; give at least 1"),
+        ({"markers_px": torch.zeros(1, 2)}, "occlusion has 1 marker.* and no radius_px; a single one's reach"),
+        ({"radius_px": 0.0}, "occlusion's radius_px is 0.0; give a radius above 0 pixels"),
+    ],
+)
+def test_rejects_options(options, message):
+    with pytest.raises(InputError, match=message):
+        Occlusion(**options)

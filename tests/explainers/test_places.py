@@ -1,0 +1,45 @@
+"""Where the markers of a frame lie: in truth, and found."""
+
+import numpy as np
+import pytest
+import torch
+
+from sliplens.errors import InputError
+from sliplens.explainers import find_markers
+from sliplens.explainers.occlusion import markers_in_recording
+from sliplens.recordings import Recording
+from sliplens.simulation import PRESETS, plan_trials, simulate_trial
+
+ROW = 3  # pressed a little
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return simulate_trial(plan_trials(PRESETS["small"])[0])
+
+
+def test_the_truth_is_brought_to_the_size_of_the_networks_image(recording):
+    assert recording.truth is not None
+    expected = recording.truth.marker_px[ROW]
+    np.testing.assert_allclose(markers_in_recording(recording, ROW, image_size=224), expected, atol=1e-9)
+    # half the size: pixels 0 and 1 become pixel 0, whose centre lies between theirs
+    half = markers_in_recording(recording, ROW, image_size=112)
+    np.testing.assert_allclose(half, (expected - 0.5) / 2, atol=1e-6)
+
+
+def test_markers_found_in_a_frame_are_those_of_the_truth(recording):
+    pytest.importorskip("cv2", reason="OpenCV, of the extra markers, is not installed")
+    assert recording.truth is not None
+    frame, untouched = (
+        torch.from_numpy(one).permute(2, 0, 1).float() / 255 for one in (recording.frames[ROW], recording.reference)
+    )
+    found = find_markers(frame, untouched).numpy()
+    inside = ((recording.truth.marker_px[ROW] > 8) & (recording.truth.marker_px[ROW] < 215)).all(axis=1)
+    apart = np.linalg.norm(recording.truth.marker_px[ROW][inside, None] - found[None], axis=-1).min(axis=1)
+    # a marker's radius is 6.5 px: a pixel apart is the same marker; shading hides some
+    assert np.mean(apart < 1) > 0.9
+
+
+def test_difference_images_show_no_markers():
+    with pytest.raises(InputError, match="markers do not show in difference images; give their places"):
+        find_markers(torch.rand(3, 16, 16), torch.zeros(3, 16, 16))

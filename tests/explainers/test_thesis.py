@@ -1,0 +1,102 @@
+"""Poly-CAM as the public code ran it, against a re-derivation of that code one mask at a time."""
+
+import numpy as np
+import pytest
+import torch
+from torchvision import models
+
+from sliplens.errors import InputError, ModelError
+from sliplens.explainers import PolyCam, capture
+from sliplens.explainers.poly_cam_thesis import find_published_layers
+
+PUBLISHED = [
+    "conv1",
+    "maxpool",
+    "stage2.0.branch1",
+    "stage2.0.branch2.2",
+    "stage2",
+    "stage3.0.branch1",
+    "stage3.0.branch2.2",
+    "stage3",
+    "stage4.0.branch1",
+    "stage4.0.branch2.2",
+]
+
+
+def test_finds_the_ten_layers_of_the_public_code():
+    # at 64 px the maps of TorchVision's ShuffleNetV2 shrink where they shrink at 224 px
+    model = models.shufflenet_v2_x1_0(weights=None)
+    layers = find_published_layers(model, torch.zeros(1, 3, 64, 64))
+    assert [layer.name for layer in layers] == PUBLISHED
+    assert sum(layer.channels for layer in layers) == 1208
+
+
+def test_a_network_that_keeps_its_size_has_no_such_layer():
+    model = torch.nn.Sequential(torch.nn.Conv2d(3, 2, 3, padding=1), torch.nn.Flatten(), torch.nn.Linear(2 * 64, 1))
+    with pytest.raises(ModelError, match=r"has no layer where the size of the map changes, .*; name layers"):
+        PolyCam(score="thesis")(model, torch.full((1, 3, 8, 8), 0.5))
+
+
+def interpolate(cells, size):
+    return torch.nn.functional.interpolate(cells[None, None], size, mode="bilinear")[0, 0]
+
+
+def normalise(cells):
+    low, high = np.percentile(cells.numpy(), [0.1, 99.9])
+    return ((cells - low) / max(high, 1e-12)).clamp(0, 1)
+
+
+@torch.no_grad()
+def by_hand(model, image, *, layers):
+    """Maps of all levels, from the coarsest on, as the public code lists them."""
+
+    def score(pixels):
+        return torch.sigmoid(100 * model(pixels[None]).squeeze())
+
+    size = tuple(image.shape[1:])
+    with capture(model, layers) as outputs:
+        base = score(image)
+    kept = dict(outputs)
+    maps, carried = [], None
+    for name in reversed(layers):
+        cells = torch.zeros_like(kept[name][0, 0])
+        for activation in kept[name][0]:
+            mask = interpolate(normalise(activation), size)
+            cells += torch.relu(score(image * mask) + base - score(image * (1 - mask))) * activation
+        cells = torch.relu(cells)
+        if carried is not None:
+            smooth = interpolate(interpolate(cells, carried.shape), cells.shape)
+            cells = torch.relu(cells / smooth.clamp_min(1e-12) * interpolate(carried, cells.shape))
+        maps.append(interpolate(normalise(cells), size))
+        carried = cells
+    return maps
+
+
+@pytest.mark.parametrize(("level", "place"), [(0, 1), (1, 0)])  # fine to coarse here, coarse to fine there
+def test_equals_the_public_code(level, place, network, images):
+    model, layers = network("gap"), ("first", "second")
+    with torch.no_grad():
+        # the answers near zero, where the sigmoid of a percentage still tells channels apart
+        model.fc.bias.sub_(model(images[:1])[0])
+        model.fc.weight.mul_(0.05)
+        expected = by_hand(model, images[0], layers=layers)[place]
+    explanation = PolyCam(score="thesis", layers=layers, level=level)(model, images[:1], reference=images[1])
+    assert float(expected.max()) > 0
+    torch.testing.assert_close(explanation.saliency[0], (expected / expected.max()).float(), atol=1e-5, rtol=0)
+
+
+def test_its_weights_are_all_one_where_the_sigmoid_is_saturated(network, images):
+    model = network("small shufflenet").float()
+    with torch.no_grad():
+        model.fc.bias.add_(5)  # 17 % is far below every masked image's answer
+    explanation = PolyCam(score="thesis", levels=True)(model, images[:1].float())
+    for level in explanation.levels:
+        assert bool((level.weights == 1).all())
+    assert sum("has the weight 1, so the masked passes chose nothing" in text for text in explanation.warnings) == len(
+        explanation.levels
+    )
+
+
+def test_a_level_that_is_not_there_is_told(network, images):
+    with pytest.raises(InputError, match="Poly-CAM has no level 5 for 2 layers; count from 0, the finest"):
+        PolyCam(score="thesis", layers=("conv1", "stage2"), level=5)(network("small shufflenet"), images[:1])

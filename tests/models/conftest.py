@@ -1,0 +1,82 @@
+"""Networks that are not trained, but whose batch normalisation has seen images."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from sliplens.models import Manifest, TrainedModel, build_model, load_checkpoint, save_checkpoint
+from sliplens.models.backbones import HistogramRegressor
+from sliplens.models.onnx import export_onnx
+
+FRAME_SIZE, IMAGE_SIZE = 48, 32
+CALIBRATION = {"temperature": 1.0, "offsets": {"0.68": 0.02, "0.9": 0.05}, "frames": 100, "mse": 0.01}
+
+
+def some_images(count: int, *, seed: int) -> Tensor:
+    """Coloured clouds: unlike noise, each gives a network another answer."""
+    colours = torch.rand(count, 3, 4, 4, generator=torch.Generator().manual_seed(seed)) ** 2
+    return functional.interpolate(colours, size=(IMAGE_SIZE, IMAGE_SIZE), mode="bilinear")
+
+
+@torch.no_grad()
+def awaken(network: nn.Module) -> None:
+    """Give a network at its beginning statistics and answers that vary, else a mistake would hardly be seen."""
+    for one in network.modules():
+        if isinstance(one, nn.BatchNorm2d):
+            one.momentum = None  # the true statistics; a few steps towards them would let the signal die
+    for seed in range(3):
+        network.train()(some_images(16, seed=seed))
+    last = [one for one in network.eval().modules() if isinstance(one, nn.Linear)][-1]
+    spread = network(some_images(64, seed=3)).std(dim=0, keepdim=True).T
+    last.weight.mul_(1 / spread)
+    last.bias.mul_(1 / spread[:, 0])
+
+
+def save_run(folder: Path, *, head: str, kind: str = "difference") -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(5)
+        model = build_model(head=head)
+    awaken(model.backbone if isinstance(model, HistogramRegressor) else model)
+    manifest = Manifest(
+        backbone="shufflenet_v2_x1_0",
+        input=kind,
+        image_size=IMAGE_SIZE,
+        frame_size=(FRAME_SIZE, FRAME_SIZE),
+        sensor="test-sensor",
+        data_hash="none",
+        head=head,
+        calibration=CALIBRATION if head == "histogram" else None,
+    )
+    save_checkpoint(folder, model.eval(), manifest)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A run for each head."""
+    return {head: save_run(tmp_path_factory.mktemp(head), head=head) for head in ("point", "histogram")}
+
+
+@pytest.fixture(scope="session")
+def networks(runs: dict[str, Path]) -> dict[str, TrainedModel]:
+    return {head: load_checkpoint(folder) for head, folder in runs.items()}
+
+
+@pytest.fixture(scope="session")
+def images() -> Tensor:
+    """Five images, to which the networks give five answers."""
+    return some_images(5, seed=9)
+
+
+@pytest.fixture(scope="session")
+def onnx_files(networks: dict[str, TrainedModel], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Each network as it is exported, once."""
+    pytest.importorskip("onnxscript")
+    folder = tmp_path_factory.mktemp("onnx")
+    for head, trained in networks.items():
+        export_onnx(trained, folder / f"{head}.onnx")
+    return {head: folder / f"{head}.onnx" for head in networks}

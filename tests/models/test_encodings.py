@@ -1,0 +1,71 @@
+import numpy as np
+import pytest
+import torch
+
+from sliplens.errors import ImageError, InputError
+from sliplens.models.encodings import ENCODINGS, get_encoding
+
+
+@pytest.fixture
+def frames(rng: np.random.Generator) -> np.ndarray:
+    return rng.integers(0, 200, (3, 16, 16, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("name", [name for name, encoding in ENCODINGS.items() if encoding.own_maximum])
+def test_an_image_divided_by_its_own_maximum_spans_up_to_one(name: str, frames: np.ndarray):
+    encoded = ENCODINGS[name].encode(frames, np.zeros_like(frames[0]), image_size=8)
+    assert encoded.shape == (3, 3, 8, 8)
+    torch.testing.assert_close(encoded.amax(dim=(1, 2, 3)), torch.ones(3))
+    assert encoded.min() >= 0
+
+
+def test_the_untouched_sensor_is_black_as_a_difference_and_itself_as_a_raw_frame(frames: np.ndarray):
+    assert not ENCODINGS["difference"].empty(frames[0], image_size=16).any()
+    expected = torch.from_numpy(frames[0]).permute(2, 0, 1) / frames[0].max()
+    torch.testing.assert_close(ENCODINGS["raw"].empty(frames[0], image_size=16), expected)
+
+
+def test_a_difference_forgets_its_amplitude(frames: np.ndarray):
+    black = np.zeros_like(frames[0])
+    halves = frames // 2 * 2  # even, so that half of it is exact
+    difference = ENCODINGS["difference"]
+    full, half = (difference.encode(images, black, image_size=16) for images in (halves, halves // 2))
+    torch.testing.assert_close(full, half)
+
+
+def test_halving_the_size_averages_neighbours_in_the_middle(frames: np.ndarray):
+    # a tent of half-width 2 on a ratio of 2: weights 1/8, 3/8, 3/8, 1/8 in each direction
+    resized = ENCODINGS["raw"].resize(frames, image_size=8)[0, 1, 3, 4].item()
+    weights = np.array([1, 3, 3, 1]) / 8
+    patch = frames[0, 5:9, 7:11, 1].astype(float)
+    assert abs(resized - weights @ patch @ weights) <= 0.5 + 1e-4  # rounded to whole levels
+
+
+def test_frames_of_another_size_than_the_reference_are_refused(frames: np.ndarray):
+    for encoding in ENCODINGS.values():
+        with pytest.raises(ImageError, match="against a reference of 8 x 16"):
+            encoding.encode(frames, frames[0, :8], image_size=8)
+
+
+def test_an_unknown_input_lists_those_there_are():
+    with pytest.raises(InputError, match="no input named 'depth'; choose one of difference, raw"):
+        get_encoding("depth")
+
+
+def test_a_signed_difference_tells_up_from_down_and_leaves_equal_pixels_alone(rng: np.random.Generator):
+    reference = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
+    frame = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
+    encoding = ENCODINGS["signed"]
+    untouched = encoding.empty(reference, image_size=8)
+    torch.testing.assert_close(untouched, torch.full_like(untouched, encoding.neutral))
+    told = encoding.encode(frame[None], reference, image_size=8)[0].permute(1, 2, 0).numpy()
+    true = (frame.astype(float) - reference) / 2 / 255 + 128 / 255
+    # each of the two images is halved and rounded down: at most half a step apart
+    np.testing.assert_allclose(told, true, atol=0.5 / 255 + 1e-6)
+
+
+def test_an_amplitude_is_kept():
+    reference = np.zeros((8, 8, 3), dtype=np.uint8)
+    frames = np.stack([np.full((8, 8, 3), level, dtype=np.uint8) for level in (10, 20, 200)])
+    told = ENCODINGS["amplitude"].encode(frames, reference, image_size=8)
+    torch.testing.assert_close(told.amax(dim=(1, 2, 3)), torch.tensor([10.0, 20.0, 200.0]) / 255)

@@ -1,0 +1,174 @@
+"""ONNX files: what they answer and tell, and that they appear right or not at all."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from sliplens import __version__
+from sliplens.errors import InputError, ModelError
+from sliplens.extras import import_onnxruntime
+from sliplens.files import to_jsonable
+from sliplens.models import Manifest, TrainedModel
+from sliplens.models import onnx as onnx_file
+from sliplens.models.onnx import difference, export_onnx, require_file_of
+
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxscript")
+runtime = import_onnxruntime()
+
+HEADS = ("point", "histogram")
+
+
+class Brightness(nn.Module):
+    """The least network there is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = nn.Parameter(torch.tensor(1.0))
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.scale * images.mean(dim=(1, 2, 3))[:, None]
+
+
+@pytest.fixture
+def least() -> TrainedModel:
+    manifest = Manifest(
+        backbone="brightness", input="raw", image_size=8, frame_size=(8, 8), sensor="none", data_hash="none"
+    )
+    return TrainedModel(model=Brightness().eval(), manifest=manifest)
+
+
+def run(path: Path, images: Tensor) -> list[np.ndarray]:
+    session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    return session.run(None, {"image": images.numpy()})
+
+
+@pytest.mark.parametrize("head", HEADS)
+@pytest.mark.parametrize("batch", [1, 2, 5])
+def test_the_file_answers_as_the_network(
+    head: str, batch: int, onnx_files: dict[str, Path], networks: dict[str, TrainedModel], images: Tensor
+):
+    # other images and batches than the export itself looks at
+    images = images[:batch]
+    expected = networks[head].estimate(images)
+    margin, *probabilities = run(onnx_files[head], images)
+    # float32 sums in another order, through some 60 layers
+    np.testing.assert_allclose(margin, expected.margin, atol=1e-4)
+    assert margin.shape == (batch,)
+    if head == "histogram":
+        assert expected.probabilities is not None
+        np.testing.assert_allclose(probabilities[0], expected.probabilities, atol=1e-4)
+    else:
+        assert not probabilities
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_the_file_is_valid_and_tells_how_to_feed_it(
+    head: str, onnx_files: dict[str, Path], networks: dict[str, TrainedModel]
+):
+    model = onnx.load(onnx_files[head])
+    onnx.checker.check_model(model, full_check=True)
+    assert [(one.domain, one.version) for one in model.opset_import] == [("", 18)]
+    assert (model.producer_name, model.producer_version) == ("sliplens", __version__)
+    shapes = {
+        value.name: [dim.dim_param or dim.dim_value for dim in value.type.tensor_type.shape.dim]
+        for value in (*model.graph.input, *model.graph.output)
+    }
+    assert shapes == {
+        "image": ["batch", 3, 32, 32],
+        "margin": ["batch"],
+        **({"probabilities": ["batch", 60]} if head == "histogram" else {}),
+    }
+    told = {item.key: json.loads(item.value) for item in model.metadata_props}
+    assert told["sliplens.manifest"] == to_jsonable(asdict(networks[head].manifest))
+    assert told["sliplens.input"]["encoding"] == "difference"
+    assert told["sliplens.input"]["image_size"] == 32
+    edges = told["sliplens.output"]["bin_edges"]
+    if head == "histogram":
+        # 60 bins from -0.1 to 1.1; kept as float32
+        np.testing.assert_allclose(edges, np.linspace(-0.1, 1.1, 61), atol=1e-6)
+    else:
+        assert edges is None
+
+
+def test_the_file_names_no_folder_of_whoever_made_it(onnx_files: dict[str, Path]):
+    for path in onnx_files.values():
+        data = path.read_bytes()
+        for name in (str(Path.home()), str(Path.cwd()), "site-packages", "answers.py"):
+            assert name.encode() not in data
+
+
+def test_an_export_is_quiet_and_leaves_only_the_file(
+    least: TrainedModel, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
+    export_onnx(least, tmp_path / "a.onnx")
+    captured = capfd.readouterr()
+    assert captured.out + captured.err == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["a.onnx"]
+    # closed form: the mean of an image that is 0.25 everywhere
+    np.testing.assert_allclose(run(tmp_path / "a.onnx", torch.full((3, 3, 8, 8), 0.25))[0], [0.25] * 3, rtol=1e-6)
+
+
+def test_a_network_that_answers_otherwise_is_refused(
+    least: TrainedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    path = tmp_path / "a.onnx"
+    path.write_text("the last good one")
+    run_network = onnx_file.run_network
+    monkeypatch.setattr(
+        onnx_file, "run_network", lambda network, inputs: tuple(one + 1e-3 for one in run_network(network, inputs))
+    )
+    with pytest.raises(ModelError, match=r"answers 0\.001 off the trained one, 0\.0001 is allowed"):
+        export_onnx(least, path)
+    assert path.read_text() == "the last good one"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_network_that_answers_nothing_is_refused(least: TrainedModel, tmp_path: Path):
+    with torch.no_grad():
+        least.model.get_parameter("scale").fill_(float("nan"))
+    with pytest.raises(ModelError, match="answers nan off"):
+        export_onnx(least, tmp_path / "a.onnx")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_network_that_torch_cannot_export_is_refused(least: TrainedModel, tmp_path: Path):
+    class Branches(Brightness):
+        def forward(self, images: Tensor) -> Tensor:
+            return super().forward(images) if images.sum() > 0 else super().forward(-images)
+
+    strange = TrainedModel(model=Branches().eval(), manifest=least.manifest)
+    with pytest.raises(ModelError, match=r"cannot export a brightness \(.+\); train another backbone$"):
+        export_onnx(strange, tmp_path / "a.onnx")
+    assert not list(tmp_path.iterdir())
+
+
+def test_differences_are_relative_only_above_one():
+    assert difference(np.array([0.5]), np.array([0.25])) == 0.25
+    assert difference(np.array([9.0]), np.array([10.0])) == pytest.approx(0.1)
+    assert np.isnan(difference(np.zeros(2), np.zeros(3)))
+
+
+def test_without_the_extra_the_cure_is_told(least: TrainedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("sliplens.extras.find_spec", lambda name: None if name == "onnxscript" else name)
+    with pytest.raises(InputError, match=r"needs onnxscript, which is not .* `pip install \"sliplens\[onnx\]\"`"):
+        export_onnx(least, tmp_path / "a.onnx")
+
+
+def test_only_the_file_of_a_network_is_taken_for_it(
+    onnx_files: dict[str, Path], networks: dict[str, TrainedModel], tmp_path: Path
+):
+    require_file_of(onnx_files["point"], networks["point"])
+    with pytest.raises(InputError, match="holds another network than the run"):
+        require_file_of(onnx_files["point"], networks["histogram"])
+    with pytest.raises(InputError, match="does not exist; make it with"):
+        require_file_of(tmp_path / "a.onnx", networks["point"])
+    for junk in (b"junk", onnx.helper.make_model(onnx.helper.make_graph([], "empty", [], [])).SerializeToString()):
+        (tmp_path / "a.onnx").write_bytes(junk)
+        with pytest.raises(InputError, match="is not an ONNX file of sliplens"):
+            require_file_of(tmp_path / "a.onnx", networks["point"])

@@ -1,0 +1,283 @@
+"""Predictions: those of the network, one frame at a time, from every kind of source."""
+
+import weakref
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from sliplens.errors import ImageError, InputError, RecordingError
+from sliplens.images import absolute_difference, write_png
+from sliplens.models import TrainedModel, load_checkpoint
+from sliplens.models.engines import make_engine
+from sliplens.models.predict import write_predictions
+from sliplens.models.sources import FrameSource, FrameTrial, SourceOptions, open_source
+from sliplens.recordings import Dataset, Recording
+from sliplens.recordings.formats import ReadOptions
+from sliplens.recordings.formats.lerobot_export import write_lerobot
+
+TRIAL = "test-wet-7"
+
+
+@pytest.fixture
+def trained(networks: dict[str, TrainedModel]) -> TrainedModel:
+    return networks["histogram"]
+
+
+@pytest.fixture
+def wet(small_dataset: Dataset) -> Recording:
+    return small_dataset.load(small_dataset.select(split="test", condition="wet")[0])
+
+
+def predict(
+    source: Path, trained: TrainedModel, path: Path, *, batch_size: int = 5, **options: object
+) -> dict[str, list]:
+    opened = open_source(source, trained, SourceOptions(**options))  # pyright: ignore[reportArgumentType]
+    write_predictions(make_engine("eager", trained), opened, path, metadata={"who": "a test"}, batch_size=batch_size)
+    return pq.read_table(path).to_pydict()
+
+
+def one_by_one(trained: TrainedModel, frames: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """The slow way: each frame by itself."""
+    return np.array([trained.estimate(trained.encode(frame[None], reference)).margin[0] for frame in frames])
+
+
+def write_frames(folder: Path, frames: np.ndarray) -> Path:
+    folder.mkdir()
+    for index, frame in enumerate(frames):
+        write_png(folder / f"frame{index}.png", frame)  # frame10 after frame9, not after frame1
+    return folder
+
+
+def write_video(path: Path, frames: np.ndarray) -> Path:
+    """Lossless."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=25, options={"level": "3"})
+        stream.height, stream.width = frames.shape[1:3]
+        stream.pix_fmt = "bgr0"
+        stream.time_base = Fraction(1, 25)
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+    return path
+
+
+def test_a_data_set_is_predicted_frame_by_frame(
+    trained: TrainedModel, small_dataset: Dataset, wet: Recording, tmp_path: Path
+):
+    rows = predict(small_dataset.folder, trained, tmp_path / "a.parquet", split="test")
+    assert list(rows) == [
+        "trial",
+        "frame",
+        "time_s",
+        "safety_margin",
+        "prediction",
+        "sigma",
+        "low_90",
+        "high_90",
+    ]
+    assert rows["trial"] == ["test-dry-6"] * 12 + [TRIAL] * 12
+    assert rows["frame"] == [*range(12), *range(12)]
+    assert rows["time_s"][12:] == wet.time_s.tolist()
+    # the first frame has no contact, and so no label
+    assert rows["safety_margin"][12] is None
+    assert rows["safety_margin"][13:] == wet.safety_margin[1:].tolist()
+    # float32 sums of a batch in another order than of one frame
+    np.testing.assert_allclose(rows["prediction"][12:], one_by_one(trained, wet.frames, wet.reference), atol=1e-5)
+
+
+def test_how_sure_the_network_is_comes_from_its_distribution(
+    trained: TrainedModel, small_dataset: Dataset, wet: Recording, tmp_path: Path
+):
+    rows = predict(small_dataset.folder, trained, tmp_path / "a.parquet", split="test")
+    estimate = trained.estimate(trained.encode(wet.frames, wet.reference))
+    interval = estimate.interval(0.9)
+    assert interval is not None
+    assert estimate.sigma is not None
+    for name, values in zip(("sigma", "low_90", "high_90"), (estimate.sigma, *interval), strict=True):
+        np.testing.assert_allclose(rows[name][12:], values, atol=1e-5)  # as above
+    assert np.all(np.array(rows["low_90"]) <= rows["high_90"])
+
+
+def test_a_network_with_one_number_tells_nothing_of_it(
+    networks: dict[str, TrainedModel], small_dataset: Dataset, tmp_path: Path
+):
+    rows = predict(small_dataset.folder, networks["point"], tmp_path / "a.parquet", split="test")
+    assert {*rows["sigma"], *rows["low_90"], *rows["high_90"]} == {None}
+    assert None not in rows["prediction"]
+
+
+@pytest.mark.parametrize("batch_size", [1, 7, 64])
+def test_predictions_do_not_depend_on_the_batch(
+    batch_size: int, trained: TrainedModel, small_dataset: Dataset, tmp_path: Path
+):
+    first = predict(small_dataset.folder, trained, tmp_path / "a.parquet", batch_size=5)
+    second = predict(small_dataset.folder, trained, tmp_path / "b.parquet", batch_size=batch_size)
+    np.testing.assert_allclose(first["prediction"], second["prediction"], atol=1e-5)  # as above
+    assert first["frame"] == second["frame"]
+
+
+def test_all_trials_are_predicted_unless_a_split_is_named(
+    trained: TrainedModel, small_dataset: Dataset, tmp_path: Path
+):
+    rows = predict(small_dataset.folder, trained, tmp_path / "a.parquet")
+    assert list(dict.fromkeys(rows["trial"])) == [info.trial for info in small_dataset.trials]
+
+
+def test_a_folder_of_frames_and_its_differences_are_the_same(trained: TrainedModel, wet: Recording, tmp_path: Path):
+    frames = write_frames(tmp_path / "frames", wet.frames)
+    compared = write_frames(tmp_path / "compared", absolute_difference(wet.frames, wet.reference))
+    write_png(tmp_path / "untouched.png", wet.reference)
+    first = predict(frames, trained, tmp_path / "a.parquet", reference=tmp_path / "untouched.png")
+    second = predict(compared, trained, tmp_path / "b.parquet")
+    assert first["prediction"] == second["prediction"]
+    assert first["file"] == [f"frame{index}.png" for index in range(12)]
+    assert set(first["time_s"]) == {None}
+    assert "safety_margin" not in first
+    np.testing.assert_allclose(first["prediction"], one_by_one(trained, wet.frames, wet.reference), atol=1e-5)
+
+
+def test_images_have_times_where_their_rate_is_told(trained: TrainedModel, wet: Recording, tmp_path: Path):
+    frames = write_frames(tmp_path / "frames", wet.frames)
+    rows = predict(frames, trained, tmp_path / "a.parquet", reference_frame=0, read=ReadOptions(frame_rate=8.0))
+    assert rows["time_s"] == [index / 8 for index in range(12)]
+
+
+def test_a_video_is_compared_with_a_frame_of_it_or_an_image(trained: TrainedModel, wet: Recording, tmp_path: Path):
+    video = write_video(tmp_path / "touch.mkv", wet.frames)
+    write_png(tmp_path / "third.png", wet.frames[3])
+    first = predict(video, trained, tmp_path / "a.parquet", reference_frame=3)
+    second = predict(video, trained, tmp_path / "b.parquet", reference=tmp_path / "third.png")
+    assert first["prediction"] == second["prediction"]
+    assert set(first["trial"]) == {"touch"}
+    # Matroska keeps milliseconds
+    np.testing.assert_allclose(first["time_s"], np.arange(12) / 25, atol=6e-4)
+    np.testing.assert_allclose(first["prediction"], one_by_one(trained, wet.frames, wet.frames[3]), atol=1e-5)
+
+
+def test_raw_frames_need_no_reference(raw_run: Path, wet: Recording, tmp_path: Path):
+    trained = load_checkpoint(raw_run)
+    frames = write_frames(tmp_path / "frames", wet.frames)
+    rows = predict(frames, trained, tmp_path / "a.parquet")
+    again = predict(write_video(tmp_path / "touch.mkv", wet.frames), trained, tmp_path / "b.parquet")
+    np.testing.assert_allclose(rows["prediction"], one_by_one(trained, wet.frames, wet.reference), atol=1e-5)
+    assert rows["prediction"] == again["prediction"]
+
+
+def test_what_the_images_were_taken_for_is_noted(trained: TrainedModel, wet: Recording, tmp_path: Path):
+    frames = write_frames(tmp_path / "frames", wet.frames)
+    assert "taken for difference images" in open_source(frames, trained, SourceOptions()).notes[0]
+    assert not open_source(frames, trained, SourceOptions(reference_frame=0)).notes
+
+
+def refused(source: Path, trained: TrainedModel, kind: type[Exception], message: str, **options: object) -> None:
+    with pytest.raises(kind, match=message):
+        open_source(source, trained, SourceOptions(**options))  # pyright: ignore[reportArgumentType]
+
+
+def test_what_is_missing_or_too_much_is_told(
+    trained: TrainedModel, small_dataset: Dataset, wet: Recording, tmp_path: Path
+):
+    video, image = write_video(tmp_path / "touch.mkv", wet.frames), tmp_path / "untouched.png"
+    write_png(image, wet.reference)
+    refused(video, trained, InputError, "with --reference IMAGE, or a frame of it with --reference-frame N")
+    refused(video, trained, InputError, "named twice", reference=image, reference_frame=0)
+    refused(video, trained, InputError, "no splits; leave out --split", split="test", reference=image)
+    refused(video, trained, ImageError, "gone.png does not exist", reference=tmp_path / "gone.png")
+    refused(video, trained, InputError, "no frame 12; name one from 0 to 11", reference_frame=12)
+    refused(tmp_path / "nothing", trained, InputError, "nothing does not exist")
+    refused(small_dataset.folder, trained, InputError, "bring their reference frames", reference=image)
+    refused(small_dataset.folder, trained, InputError, "does not take frame_rate", read=ReadOptions(frame_rate=30.0))
+    refused(small_dataset.folder, trained, RecordingError, "no trial with split exam", split="exam")
+    frames = write_frames(tmp_path / "frames", wet.frames)
+    refused(frames, trained, InputError, "no frame 12; name one from 0 to 11", reference_frame=12)
+    refused(frames, trained, InputError, "does not take image_topic", read=ReadOptions(image_topic="/image"))
+
+
+def test_frames_of_another_size_are_refused(trained: TrainedModel, wet: Recording, tmp_path: Path):
+    cut = np.ascontiguousarray(wet.frames[:, :40])
+    refused(write_video(tmp_path / "touch.mkv", cut), trained, ImageError, "40 x 48 pixels", reference_frame=0)
+    with pytest.raises(ImageError, match="40 x 48 pixels, 48 x 48 are needed"):
+        predict(write_frames(tmp_path / "frames", cut), trained, tmp_path / "a.parquet")
+    assert not (tmp_path / "a.parquet").exists()
+
+
+def test_signed_images_need_a_reference(wet: Recording, tmp_path: Path, networks: dict[str, TrainedModel]):
+    trained = networks["point"]
+    manifest = type(trained.manifest)(**{**vars(trained.manifest), "input": "signed"})
+    signed = TrainedModel(model=trained.model, manifest=manifest)
+    frames = write_frames(tmp_path / "frames", wet.frames)
+    refused(frames, signed, InputError, "a network on signed images compares the frames")
+    rows = predict(frames, signed, tmp_path / "a.parquet", reference_frame=0)
+    # answers of weights that were never trained reach 2.5, so what a batch rounds otherwise grows with them: some fifty
+    # layers of 6e-8 each, whatever the processor's kernels add up first
+    expected = one_by_one(signed, wet.frames, wet.frames[0])
+    np.testing.assert_allclose(rows["prediction"], expected, atol=1e-5, rtol=1e-5)
+
+
+def test_a_source_that_fails_leaves_what_was_there(trained: TrainedModel, wet: Recording, tmp_path: Path):
+    def broken() -> Iterator[np.ndarray]:
+        yield from wet.frames[:6]
+        raise RecordingError("the disk is gone")
+
+    trial = FrameTrial(name="broken", read_frames=broken, reference=wet.reference)
+    source = FrameSource(frames=12, labelled=False, files=False, open_trials=lambda: iter((trial,)))
+    path = tmp_path / "a.parquet"
+    path.write_text("the last good one")
+    with pytest.raises(RecordingError, match="the disk is gone"):
+        write_predictions(make_engine("eager", trained), source, path, metadata={}, batch_size=4)
+    assert path.read_text() == "the last good one"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_only_one_batch_of_frames_is_held(trained: TrainedModel, wet: Recording, tmp_path: Path):
+    alive, most = 0, 0
+
+    def die() -> None:
+        nonlocal alive
+        alive -= 1
+
+    def frames() -> Iterator[np.ndarray]:
+        nonlocal alive, most
+        for index in range(60):
+            frame = wet.frames[index % 12].copy()
+            weakref.finalize(frame, die)
+            alive += 1
+            most = max(most, alive)
+            yield frame
+
+    trial = FrameTrial(name="long", read_frames=frames, reference=wet.reference)
+    source = FrameSource(frames=60, labelled=False, files=False, open_trials=lambda: iter((trial,)))
+    seen = []
+    write_predictions(
+        make_engine("eager", trained),
+        source,
+        tmp_path / "a.parquet",
+        metadata={},
+        batch_size=4,
+        on_frames=lambda done, total: seen.append((done, total)),
+    )
+    # the next frame is read while the last batch still has its name
+    assert most <= 2 * 4 + 1
+    assert seen == [(done, 60) for done in range(4, 61, 4)]
+
+
+def test_the_file_keeps_where_it_comes_from(trained: TrainedModel, small_dataset: Dataset, tmp_path: Path):
+    predict(small_dataset.folder, trained, tmp_path / "a.parquet", split="test")
+    assert pq.read_schema(tmp_path / "a.parquet").metadata[b"who"] == b"a test"
+
+
+def test_a_recording_brings_its_own_reference_and_labels_unless_told_otherwise(
+    trained: TrainedModel, small_dataset: Dataset, wet: Recording, tmp_path: Path
+):
+    (made := tmp_path / "lerobot").mkdir()
+    write_lerobot(small_dataset, made, trials=small_dataset.select(condition="wet"))
+    rows = predict(made, trained, tmp_path / "a.parquet")
+    np.testing.assert_allclose(rows["prediction"], one_by_one(trained, wet.frames, wet.reference), atol=1e-5)
+    assert rows["safety_margin"] == [None, *wet.safety_margin[1:].tolist()]
+    rows = predict(made, trained, tmp_path / "b.parquet", reference_frame=2)
+    np.testing.assert_allclose(rows["prediction"], one_by_one(trained, wet.frames, wet.frames[2]), atol=1e-5)

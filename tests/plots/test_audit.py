@@ -1,0 +1,473 @@
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import replace
+from itertools import combinations, pairwise
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.text import Text
+
+from sliplens.errors import InputError
+from sliplens.plots.audit import choose_along, draw_audit, write_audit
+from sliplens.plots.contact_sheet import STATE_COLOURS
+from sliplens.recordings import ContactState, Recording
+
+NO_CONTACT, CONTACT, INCIPIENT_SLIP, FULL_SLIP, _ = ContactState
+MU = 0.53
+
+
+def make_trial(
+    *, pull: int = 41, lowest: float = 0.0, size: tuple[int, int] = (24, 24), step_s: float = 0.04
+) -> Recording:
+    """Four frames untouched, five of pressing, a pull down to the lowest margin and, if that is 0, three of sliding."""
+    slide = 3 if lowest == 0 else 0
+    margin = np.concatenate([np.full(4, np.nan), np.ones(5), np.linspace(1, lowest, pull), np.zeros(slide)])
+    state = [NO_CONTACT] * 4 + [CONTACT] * 5 + [INCIPIENT_SLIP] * pull + [FULL_SLIP] * slide
+    normal = np.concatenate([np.zeros(4), [0.1, 0.3, 0.6, 0.9, 1.2], np.full(pull + slide, 1.1)])
+    valid = np.array([one in (CONTACT, INCIPIENT_SLIP) for one in state])
+    rng = np.random.default_rng(pull)
+    reference = rng.integers(0, 100, (*size, 3), dtype=np.uint8)
+    frames = np.repeat(reference[None], len(margin), axis=0)
+    for index in range(4, len(margin)):
+        frames[index, index % 8 : index % 8 + 8, 5:15] += 90
+    return Recording(
+        trial="day1-dry-001",
+        sensor="test-sensor",
+        day=1,
+        condition="dry",
+        reference=reference,
+        frames=frames,
+        time_s=np.arange(len(margin)) * step_s,
+        normal_force_n=normal,
+        tangential_force_n=np.nan_to_num(MU * normal * (1 - margin)),
+        friction_coefficient=np.full(len(margin), MU),
+        safety_margin=margin,
+        stick_ratio=margin ** (2 / 3),
+        contact_state=tuple(state),
+        safety_margin_sigma=np.where(valid, 0.031, np.nan),
+        valid=valid,
+    )
+
+
+def make_labelling(**changes: Any) -> dict[str, Any]:
+    """Everything found, nothing doubtful; the trial slips at 1.97 s."""
+    told = {
+        "source": "/data/one.mkv",
+        "forces": "/data/one.csv",
+        "notes": ["one.csv: times are those of column 't'."],
+        "axes": {
+            "normal": "z",
+            "sign": -1,
+            "tare_n": [0.211, -0.322, 1.433],
+            "noise_n": [0.021, 0.022, 0.023],
+            "tare_sigma_n": [0.001, 0.002, 0.003],
+            "still_until_s": 0.12,
+            "normal_found": "inferred",
+            "sign_found": "declared",
+            "tare_found": "inferred",
+            "notes": [],
+        },
+        "friction": {
+            "mu": MU,
+            "low": 0.517,
+            "high": 0.546,
+            "onset_s": 1.97,
+            "found": "inferred",
+            "method": "break of F_t / F_n, seen in the image",
+            "image_sigmas": 12.3,
+        },
+        "slip_s": 1.97,
+        "lag": {"lag_s": 0.015, "sigma_s": 0.009, "correlation": 0.87, "doubt": ""},
+        "lag_applied": False,
+        "contact_threshold_n": 0.061,
+        "window_s": 0.04,
+        "gap_s": 0.008,
+        "force_range_n": 17.5,
+        "reference": {"index": 2, "method": "least contact energy", "contact_energy": 0.42, "drift": 0.37},
+    }
+    return {**deepcopy(told), **changes}
+
+
+def forget(value: Any) -> Any:
+    """The same, every number that may be unknown gone."""
+    if isinstance(value, dict):
+        kept = {"sign", "index", "lag_applied"}
+        return {name: item if name in kept else forget(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [forget(item) for item in value]
+    return None if isinstance(value, float) else value
+
+
+def slice_trial(trial: Recording, kept: slice) -> Recording:
+    names = (
+        "frames time_s normal_force_n tangential_force_n friction_coefficient safety_margin stick_ratio contact_state "
+        "safety_margin_sigma valid"
+    )
+    return replace(trial, **{name: getattr(trial, name)[kept] for name in names.split()})
+
+
+def told(figure: Figure) -> str:
+    """All words, lines that were wrapped put together again."""
+    words = " ".join(found.get_text() for found in figure.findobj(Text))
+    return " ".join(words.replace("\N{NO-BREAK SPACE}", " ").replace("\N{MINUS SIGN}", "-").split())
+
+
+def charts(figure: Figure) -> list[Axes]:
+    return [ax for ax in figure.axes if ax.get_ylabel()]
+
+
+def pictures(figure: Figure) -> tuple[list[Axes], list[Axes]]:
+    """Axes of the camera frames and of the differences, from left to right."""
+    shown = [ax for ax in figure.axes if ax.images]
+    return shown[::2], shown[1::2]
+
+
+def bands(ax: Axes) -> list[PolyCollection]:
+    return [one for one in ax.collections if isinstance(one, PolyCollection)]
+
+
+def onsets(ax: Axes) -> list[float]:
+    return [float(np.asarray(line.get_xdata())[0]) for line in ax.lines if str(line.get_label()).startswith("slip at")]
+
+
+def misplaced(figure: Figure) -> tuple[list[str], list[tuple[str, str]]]:
+    """Words that leave the page, and pairs that lie over each other."""
+    FigureCanvasAgg(figure).draw()
+    # ticks beyond the limits of their axis have a place but are never drawn
+    ticks = [
+        (tick, axis.get_view_interval())
+        for ax in figure.axes
+        for axis in (ax.xaxis, ax.yaxis)
+        for tick in axis.get_major_ticks()
+    ]
+    beyond = {tick.label1 for tick, (low, high) in ticks if not low <= tick.get_loc() <= high}
+    shown = [found for found in figure.findobj(Text) if found.get_visible() and found.get_text().strip()]
+    boxes = [(found.get_text(), found.get_window_extent()) for found in shown if found not in beyond]
+    width, height = figure.bbox.size
+    outside = [text for text, box in boxes if box.x0 < 0 or box.y0 < 0 or box.x1 > width or box.y1 > height]
+    return outside, [(one, other) for (one, a), (other, b) in combinations(boxes, 2) if a.overlaps(b)]
+
+
+def test_words_hold_what_the_labels_rest_on():
+    words = told(draw_audit(make_trial(), make_labelling()))
+
+    for fact in (
+        "day1-dry-001",
+        "test-sensor, day 1, dry",
+        "/data/one.mkv",
+        "/data/one.csv",
+        "46 of 53 valid",
+        "4 no contact",
+        "3 after gross slip",
+        "± 3.1 % (median)",
+        "normal force is -z (axis found, sign declared)",
+        "Tare found",
+        "+0.211, -0.322, +1.433 N",
+        "0.021, 0.022, 0.023 N",
+        "0.12 s",
+        "0.530, 68 % interval 0.517 to 0.546",
+        "seen in the image",
+        "12.3",
+        "slips at 1.970 s",
+        "Lag not applied",
+        "15.0 ± 9.0 ms",
+        "correlation 0.87",
+        "contact from 0.061 N",
+        "40.0 ms",
+        "8.0 ms",
+        "17.5 N",
+        "frame 2, least contact energy",
+        "drift 0.37 grey levels",
+        "one.csv: times are those of column 't'.",
+    ):
+        assert fact in words
+
+
+def test_frames_without_a_valid_label_are_counted_by_what_they_lack():
+    trial = make_trial()
+    normal, margin, valid = trial.normal_force_n.copy(), trial.safety_margin.copy(), trial.labelled.copy()
+    normal[20:22], margin[20:27], valid[20:27] = np.nan, np.nan, False
+
+    words = told(draw_audit(replace(trial, normal_force_n=normal, safety_margin=margin, valid=valid), make_labelling()))
+
+    for fact in (
+        "39 of 53 valid",
+        "2 missing samples",
+        "5 outside the sensor's range",
+        "4 no contact",
+        "3 after gross",
+    ):
+        assert fact in words
+
+
+@pytest.mark.parametrize(
+    ("changes", "head"),
+    [
+        ({}, None),
+        ({"lag": None}, "Lag not applied"),
+        ({"lag": {"lag_s": 0.1, "sigma_s": 0.1, "correlation": 0.2, "doubt": "they correlate too little"}}, "Lag not"),
+        ({"lag": {"lag_s": 0.1, "sigma_s": 0.01, "correlation": 0.9, "doubt": ""}}, "Lag not applied"),
+        (
+            {"friction": {**make_labelling()["friction"], "low": MU, "high": MU, "found": "declared"}},
+            "Friction declared",
+        ),
+        ({"friction": {**make_labelling()["friction"], "image_sigmas": 1.2}}, "Friction found"),
+        ({"axes": {**make_labelling()["axes"], "tare_found": "assumed"}}, "Tare assumed"),
+        ({"axes": {**make_labelling()["axes"], "notes": ["the normal axis is doubtful"]}}, "Axes"),
+    ],
+)
+def test_what_may_put_the_labels_in_doubt_is_marked(changes, head):
+    words = told(draw_audit(make_trial(), make_labelling(**changes)))
+
+    assert ("▲" in words) == (head is not None)
+    assert head is None or f"▲ {head}" in words
+
+
+def test_reason_why_a_lag_cannot_be_told_is_given():
+    lag = {"lag_s": 0.1, "sigma_s": 0.1, "correlation": 0.2, "doubt": "they correlate by 0.20 only"}
+
+    assert "cannot be told: they correlate by 0.20 only" in told(draw_audit(make_trial(), make_labelling(lag=lag)))
+
+
+def test_charts_draw_forces_ratio_and_margin_of_the_frames():
+    trial = make_trial()
+    forces, ratio, margin = charts(draw_audit(trial, make_labelling()))
+
+    lines = {str(line.get_label()): np.asarray(line.get_ydata()) for ax in (forces, ratio, margin) for line in ax.lines}
+    touches = trial.normal_force_n > 0
+    np.testing.assert_array_equal(lines["$F_n$"], trial.normal_force_n)
+    np.testing.assert_array_equal(lines["$F_t$"], trial.tangential_force_n)
+    np.testing.assert_allclose(lines["contact from 0.061 N"], 0.061)
+    np.testing.assert_allclose(lines[r"$\mu_s$ = 0.53"], MU)
+    # by Coulomb, Γ is what the ratio leaves of mu
+    np.testing.assert_allclose(lines["$F_t/F_n$ in contact"][touches], MU * (1 - trial.safety_margin[touches]))
+    assert np.isnan(lines["$F_t/F_n$ in contact"][~touches]).all()
+    np.testing.assert_array_equal(lines["Γ"][trial.labelled], 100 * trial.safety_margin[trial.labelled])
+
+
+def test_frames_without_a_valid_label_are_drawn_apart():
+    trial = make_trial()
+    margin = charts(draw_audit(trial, make_labelling()))[2]
+
+    lines = {str(line.get_label()): np.asarray(line.get_ydata()) for line in margin.lines}
+    assert trial.valid is not None
+    np.testing.assert_array_equal(np.isfinite(lines["Γ"]), trial.valid)
+    np.testing.assert_array_equal(np.isfinite(lines["no valid label"]), ~trial.valid)
+
+
+def test_band_is_one_sigma_either_way():
+    trial = make_trial()
+    (band,) = bands(charts(draw_audit(trial, make_labelling()))[2])
+
+    corners = np.concatenate([path.vertices for path in band.get_paths()])
+    assert corners[:, 1].max() == pytest.approx(103.1)
+    assert corners[:, 1].min() == pytest.approx(-3.1)
+    assert corners[:, 0].min() == trial.time_s[4]
+    assert corners[:, 0].max() == trial.time_s[-4]
+
+
+def test_no_band_without_a_sigma():
+    figure = draw_audit(replace(make_trial(), safety_margin_sigma=None), make_labelling())
+
+    assert not bands(charts(figure)[2])
+    assert "median" not in told(figure)
+
+
+@pytest.mark.parametrize(("applied", "seen"), [(False, 1.97), (True, 1.985)])
+def test_onset_is_marked_on_the_cameras_clock(applied, seen):
+    figure = draw_audit(make_trial(), make_labelling(lag_applied=applied))
+
+    for ax in charts(figure):
+        assert onsets(ax) == [pytest.approx(seen)]
+
+
+def test_trial_that_never_slips_has_no_onset():
+    figure = draw_audit(make_trial(lowest=0.4), make_labelling(slip_s=None))
+
+    assert not [found for ax in charts(figure) for found in onsets(ax)]
+    assert "never slips" in told(figure)
+
+
+@pytest.mark.parametrize(("low", "high", "ends"), [(0.517, 0.546, [0.517, 0.546]), (MU, MU, [])])
+def test_interval_of_friction_is_a_band_unless_it_is_exact(low, high, ends):
+    friction = {**make_labelling()["friction"], "low": low, "high": high}
+    ratio = charts(draw_audit(make_trial(), make_labelling(friction=friction)))[1]
+
+    found = [one for one in ratio.patches if one.get_label() == "its 68 % interval" and isinstance(one, Rectangle)]
+    assert [end for one in found for end in (one.get_y(), one.get_y() + one.get_height())] == pytest.approx(ends)
+
+
+def test_ratio_of_a_light_touch_does_not_squeeze_the_rest():
+    trial = make_trial()
+    normal, tangential = trial.normal_force_n.copy(), trial.tangential_force_n.copy()
+    normal[4], tangential[4] = 1e-4, 0.02
+
+    ratio = charts(draw_audit(replace(trial, normal_force_n=normal, tangential_force_n=tangential), make_labelling()))[
+        1
+    ]
+
+    assert MU < ratio.get_ylim()[1] < 4 * MU
+
+
+@pytest.mark.parametrize("changes", [{}, {"lowest": 0.4}, {"pull": 700}, {"pull": 2}])
+def test_six_pictures_are_the_reference_and_five_frames_in_the_order_of_time(changes):
+    trial = make_trial(**changes)
+    camera, difference = pictures(draw_audit(trial, make_labelling()))
+
+    along = choose_along(trial)
+    assert len(camera) == len(difference) == 6
+    assert len(set(along)) == 5
+    assert along == sorted(along)
+    np.testing.assert_array_equal(camera[0].images[0].get_array(), trial.reference)
+    for ax, index in zip(camera[1:], along, strict=True):
+        np.testing.assert_array_equal(ax.images[0].get_array(), trial.frames[index])
+        assert to_hex(ax.spines["top"].get_edgecolor()).upper() == STATE_COLOURS[trial.contact_state[index]]
+
+
+def test_a_trial_without_its_pixels_has_those_read_that_are_shown():
+    trial = make_trial()
+    bare = replace(trial, frames=np.broadcast_to(trial.reference, trial.frames.shape))
+    asked: list[int] = []
+
+    def read(places: Sequence[int]) -> np.ndarray:
+        asked.extend(places)
+        return trial.frames[list(places)]
+
+    shown, expected = draw_audit(bare, make_labelling(), read_frames=read), draw_audit(trial, make_labelling())
+
+    for row, other in zip(pictures(shown), pictures(expected), strict=True):
+        for ax, whole in zip(row, other, strict=True):
+            np.testing.assert_array_equal(ax.images[0].get_array(), whole.images[0].get_array())
+    # the five frames, and an untouched one to tell the drift
+    assert len(asked) == 6
+
+
+@pytest.mark.parametrize("lowest", [0.0, 0.4, 0.8])
+def test_margins_shown_are_evenly_spaced_down_to_the_slip(lowest):
+    trial = make_trial(lowest=lowest, pull=81)
+
+    along = choose_along(trial)
+
+    margins = trial.safety_margin[along]
+    assert trial.contact_state[along[0]] == CONTACT
+    assert (trial.contact_state[along[-1]] == FULL_SLIP) == (lowest == 0)
+    np.testing.assert_allclose(np.diff(margins), (lowest - 1) / 4, atol=0.06)
+
+
+def test_frames_of_a_trial_that_is_never_pulled_are_spread_over_it():
+    trial = slice_trial(make_trial(pull=60), slice(4, 64))
+    stuck = replace(trial, safety_margin=np.ones(60), contact_state=(CONTACT,) * 60, normal_force_n=np.ones(60))
+    late = replace(stuck, normal_force_n=np.linspace(1, 2, 60))
+
+    for one in (stuck, late):
+        assert len(set(choose_along(one))) == 5
+    assert max(later - sooner for sooner, later in pairwise(choose_along(late))) <= 20
+
+
+def test_difference_beneath_the_reference_is_its_drift():
+    trial = make_trial()
+    frames = trial.frames.copy()
+    frames[0] += 40
+    _, difference = pictures(draw_audit(replace(trial, frames=frames), make_labelling()))
+
+    assert np.all(np.asarray(difference[0].images[0].get_array()) > 0)
+
+
+def test_drift_is_told_of_untouched_frames_only():
+    touched = slice_trial(make_trial(), slice(4, None))
+
+    assert "untouched frame" not in told(draw_audit(touched, make_labelling()))
+    assert "untouched frame at 0.00 s" in told(draw_audit(make_trial(), make_labelling()))
+
+
+def test_marks_stand_where_the_frames_were_taken():
+    trial = make_trial()
+    figure = draw_audit(trial, make_labelling())
+
+    taken = trial.time_s[[2, *choose_along(trial)]]
+    for ax in charts(figure):
+        marks = [np.asarray(line.get_xdata())[0] for line in ax.lines if line.get_label() == "_frame"]
+        np.testing.assert_array_equal(marks, taken)
+
+
+@pytest.mark.parametrize("size", [(24, 32), (90, 16)])
+def test_no_words_lie_over_others_or_leave_the_page(size):
+    trial = replace(
+        make_trial(size=size, step_s=40.0),
+        trial="a_trial_with_a_name_as_$long$ as a sentence that goes on and on and on and does not end where it should",
+        sensor="Some Sensor Mini 2 no 31 of the second batch, glued anew",
+        condition="rubbed with oil and then with water",
+    )
+    told = make_labelling(notes=["a note that tells of a doubt at some length, and of its cure"] * 30, slip_s=1970.1)
+    told["source"] = "/a/very/long/path" * 9
+    told["forces"] = "/another/of/these" * 9
+    told["lag"] = {"lag_s": -0.1, "sigma_s": 0.1, "correlation": 0.2, "doubt": "several lags fit alike " * 4}
+    told["friction"].update(low=MU, high=MU, found="declared", method="given by hand, after three trials by eye")
+    told["axes"].update(tare_n=[-1234.5, 2345.6, -3456.7], tare_found="assumed", notes=["the normal axis is doubtful"])
+
+    outside, pairs = misplaced(draw_audit(trial, told))
+
+    assert not outside
+    assert not pairs
+
+
+def test_numbers_that_are_not_known_are_dashes():
+    trial = replace(make_trial(), valid=None, safety_margin_sigma=None)
+    figure = draw_audit(trial, forget(make_labelling()))
+
+    assert misplaced(figure) == ([], [])
+    assert "68 % interval –" in told(figure)  # noqa: RUF001 (an en dash is meant)
+    assert "drift – grey levels" in told(figure)  # noqa: RUF001 (the same)
+    assert len(pictures(figure)[0]) == 6
+
+
+@pytest.mark.parametrize("kept", [slice(0, 1), slice(0, 4), slice(6, 8)])
+def test_few_frames_are_all_shown(kept):
+    trial = slice_trial(make_trial(), kept)
+    told = make_labelling(reference={**make_labelling()["reference"], "index": 0}, slip_s=None)
+    figure = draw_audit(trial, told)
+    figure.draw_without_rendering()
+
+    assert choose_along(trial) == list(range(len(trial)))
+    assert len(pictures(figure)[0]) == 1 + len(trial)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".PDF", ".svg"])
+def test_file_is_complete_and_alone(tmp_path, suffix):
+    path = tmp_path / "new" / f"audit{suffix}"
+
+    write_audit(make_trial(), make_labelling(), path)
+
+    assert [found.name for found in path.parent.iterdir()] == [path.name]
+    assert path.stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("name", ["audit.jpg", "audit", "audit.png.txt"])
+def test_another_suffix_is_refused_and_nothing_written(tmp_path, name):
+    with pytest.raises(InputError, match=r"does not end in \.png, \.pdf, \.svg; name a picture"):
+        write_audit(make_trial(), make_labelling(), tmp_path / name)
+
+    assert not list(tmp_path.iterdir())
+
+
+def test_unwritable_place_is_told(tmp_path):
+    (tmp_path / "file").write_text("no folder")
+
+    with pytest.raises(InputError, match=r"cannot write .* choose another file"):
+        write_audit(make_trial(), make_labelling(), tmp_path / "file" / "audit.png")
+
+
+def test_drawing_leaves_matplotlib_as_it_was(tmp_path):
+    before = dict(mpl.rcParams)
+
+    write_audit(make_trial(), make_labelling(), tmp_path / "audit.png")
+
+    assert dict(mpl.rcParams) == before

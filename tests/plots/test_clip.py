@@ -1,0 +1,287 @@
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jaxtyping import UInt8
+from matplotlib.colors import to_rgb
+
+from sliplens.errors import InputError
+from sliplens.images import absolute_difference
+from sliplens.plots.clip import clip_frames, natural_rate, paint_outlines, write_clip
+from sliplens.plots.contact_sheet import brighten, brightening
+from sliplens.plots.style import PURPLE, SKY
+from sliplens.recordings import ContactState, GroundTruth, Recording
+
+av = pytest.importorskip("av")
+
+CURSOR = np.round(255 * np.array(to_rgb(PURPLE))).astype(np.int16)
+
+
+def read(path: Path) -> tuple[UInt8[np.ndarray, "frames height width 3"], float, str]:
+    """Frames, duration in seconds and pixel format of a clip."""
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        frames = np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(stream)])
+        return frames, float(stream.duration * stream.time_base), stream.codec_context.pix_fmt
+
+
+def cursor_column(frame: UInt8[np.ndarray, "height width 3"]) -> float:
+    """Middle of the columns in which the cursor's colour runs through much of the picture."""
+    # lossy video blurs the colours of a line three pixels wide; nothing else is purple from top to bottom
+    purple = np.abs(frame.astype(np.int16) - CURSOR).max(axis=-1) < 60
+    return float(np.flatnonzero(purple.sum(axis=0) > 0.3 * len(frame)).mean())
+
+
+@pytest.fixture(scope="module")
+def trial() -> Recording:
+    """Twenty frames in two seconds: a bright square goes to the right over a dark sensor."""
+    count = 20
+    reference = np.full((24, 32, 3), 30, dtype=np.uint8)
+    frames = np.repeat(reference[None], count, axis=0)
+    for index in range(count):
+        frames[index, 8:16, index : index + 8] = (150, 90, 60)
+    margin = np.linspace(1, 0, count)
+    return Recording(
+        trial="day1-wet-001",
+        sensor="test-sensor",
+        day=1,
+        condition="wet",
+        reference=reference,
+        frames=frames,
+        time_s=5 + 0.1 * np.arange(count),
+        normal_force_n=np.ones(count),
+        tangential_force_n=0.5 * (1 - margin),
+        friction_coefficient=np.full(count, 0.5),
+        safety_margin=margin,
+        stick_ratio=margin ** (2 / 3),
+        contact_state=(ContactState.INCIPIENT_SLIP,) * (count - 1) + (ContactState.FULL_SLIP,),
+    )
+
+
+@pytest.fixture(scope="module")
+def written(trial, tmp_path_factory) -> tuple[Path, list[tuple[int, int]]]:
+    """The clip of the trial, and what was told while it was written."""
+    path = tmp_path_factory.mktemp("clip") / "new" / "trial.mp4"
+    told = []
+    write_clip(trial, path, on_frames=lambda done, total: told.append((done, total)))
+    return path, told
+
+
+def test_clip_lasts_as_long_as_its_recording(written):
+    frames, duration, _ = read(written[0])
+
+    # twenty frames, each a tenth of a second; one frame of the clip may be gained or lost
+    assert duration == pytest.approx(2.0, abs=1 / 30 + 1e-3)
+    assert len(frames) == pytest.approx(60, abs=1)
+
+
+def test_clip_plays_in_browsers(written):
+    frames, _, pixel_format = read(written[0])
+    data = written[0].read_bytes()
+
+    assert pixel_format == "yuv420p"
+    assert frames.shape[1] % 2 == frames.shape[2] % 2 == 0
+    assert data.index(b"moov") < data.index(b"mdat")
+
+
+def test_clip_stands_alone_in_its_folder(written):
+    assert list(written[0].parent.iterdir()) == [written[0]]
+
+
+def test_every_frame_is_told(written):
+    _, told = written
+
+    assert told == [(done, 60) for done in range(1, 61)]
+
+
+def test_cursor_goes_evenly_from_left_to_right(written):
+    frames, _, _ = read(written[0])
+
+    # time passes evenly until the last recorded frame at 1.9 s, which is shown for as long as the others
+    columns = np.array([cursor_column(frame) for frame in frames[:57:8]])
+    assert np.all(np.diff(columns) > 0)
+    # rounded to whole pixels, there and in the blur
+    assert np.abs(columns - np.linspace(columns[0], columns[-1], 8)).max() < 2
+    assert cursor_column(frames[59]) >= columns[-1]
+
+
+def test_clip_shows_camera_and_difference_enlarged(trial, written):
+    frames, _, _ = read(written[0])
+    rows, columns = 24 * 20, 32 * 20  # the largest whole factor within 480 x 640 pixels
+    factor = brightening([absolute_difference(trial.frames, trial.reference)])
+
+    for shown, index in ((0, 0), (30, 10), (59, 19)):
+        difference = brighten(absolute_difference(trial.frames[index], trial.reference), factor)
+        for expected, left in ((trial.frames[index], 18), (difference, 36 + columns)):
+            seen = frames[shown, 74 : 74 + rows, left : left + columns]
+            blocks = seen.reshape(24, 20, 32, 20, 3).mean(axis=(1, 3))
+            # H.264 at this quality errs by a few levels where nothing changes, Lanczos rings at edges
+            assert np.abs(blocks - expected).mean() < 4
+
+
+@pytest.mark.parametrize("frames_per_s", [25.0, 30.0, 12.5])
+def test_each_moment_shows_the_nearest_frame(frames_per_s, rng):
+    time_s = 3 + np.cumsum(rng.uniform(0.01, 0.2, 40))
+
+    shown = clip_frames(time_s, frames_per_s)
+
+    moments = time_s[0] + np.arange(len(shown)) / frames_per_s
+    assert shown.tolist() == [int(np.argmin(np.abs(time_s - moment))) for moment in moments]
+    whole = time_s[-1] - time_s[0] + np.median(np.diff(time_s))
+    assert len(shown) / frames_per_s == pytest.approx(whole, abs=1 / frames_per_s)
+
+
+@pytest.mark.parametrize("own", [25.0, 29.97, 30.0])
+def test_smooth_recording_is_shown_frame_by_frame(own):
+    time_s = np.round(np.arange(300) / own, 6)
+
+    assert natural_rate(time_s) == own
+    assert clip_frames(time_s, own).tolist() == list(range(300))
+
+
+@pytest.mark.parametrize("own", [5.0, 24.0, 60.0, 1000.0])
+def test_other_recordings_are_shown_at_30_frames_a_second(own):
+    assert natural_rate(np.arange(10) / own) == 30
+
+
+def test_single_frame_is_a_clip_of_one_frame(trial, tmp_path):
+    signals = ("time_s", "normal_force_n", "tangential_force_n", "friction_coefficient", "safety_margin", "stick_ratio")
+    one = replace(
+        trial,
+        frames=trial.frames[:1],
+        contact_state=trial.contact_state[:1],
+        **{name: getattr(trial, name)[:1] for name in signals},
+    )
+
+    write_clip(one, tmp_path / "one.mp4")
+
+    assert len(read(tmp_path / "one.mp4")[0]) == 1
+
+
+@pytest.mark.parametrize(
+    ("size", "pictures"), [((1081, 101), (541, 51)), ((101, 1921), (34, 641)), ((301, 301), (301, 301))]
+)
+def test_large_frames_are_reduced_by_a_whole_factor(trial, tmp_path, size, pictures):
+    rows, columns = pictures
+    large = replace(
+        trial,
+        reference=np.zeros((*size, 3), dtype=np.uint8),
+        frames=np.full((len(trial), *size, 3), 200, dtype=np.uint8),
+    )
+
+    write_clip(large, tmp_path / "large.mp4", frames_per_s=2.0)
+
+    picture = read(tmp_path / "large.mp4")[0][0]
+    assert picture.shape[0] % 2 == picture.shape[1] % 2 == 0
+    # camera and difference are grey, 200 and 255, between white edges
+    grey = np.abs(picture[74 + rows // 2, :, 0].astype(int) - 200) < 8
+    assert grey[: 18 + columns].sum() == pytest.approx(columns, abs=2)
+
+
+def test_outlines_do_not_hide_each_other_or_leave_their_side():
+    contact = np.zeros((40, 40), dtype=np.uint8)
+    contact[10:30, 10:30] = 2
+    picture = np.full((480, 480, 3), 77, dtype=np.uint8)
+
+    paint_outlines(picture, contact)
+
+    inside = np.zeros((480, 480), dtype=bool)
+    inside[120:360, 120:360] = True  # twelvefold
+    white = (picture == 255).all(axis=-1)
+    blue = (picture == np.round(255 * np.array(to_rgb(SKY)))).all(axis=-1)
+    assert white.any()
+    assert blue.any()
+    assert not (white & inside).any()
+    assert not (blue & ~inside).any()
+    assert (picture[240, 240] == picture[5, 5]).all()
+    assert (picture[5, 5] == 77).all()
+
+
+def test_outlines_are_in_the_clip_where_the_truth_is_known(trial, written, tmp_path):
+    contact = np.zeros(trial.frames.shape[:3], dtype=np.uint8)
+    contact[:, 4:20, 4:28] = 1
+    rest = np.zeros((1, 2), dtype=np.float32)
+    truth = GroundTruth(
+        recipe="none",
+        displacement="half-space",
+        marker_rest_px=rest,
+        marker_px=np.repeat(rest[None], len(trial), axis=0),
+        static_friction=np.ones(len(trial)),
+        contact_radius_m=np.ones(len(trial)),
+        stick_radius_m=np.zeros(len(trial)),
+        contact_map=contact,
+    )
+
+    write_clip(replace(trial, truth=truth), tmp_path / "known.mp4")
+
+    known, unknown = (read(path)[0][0].astype(int) for path in (tmp_path / "known.mp4", written[0]))
+    # two pixels of white above the contact's first row, on a sensor of grey level 30
+    row, column = 74 + 4 * 20 - 1, 18 + 16 * 20
+    assert known[row - 1 : row + 1, column].mean() > 150
+    assert unknown[row - 1 : row + 1, column].mean() < 50
+
+
+@pytest.mark.parametrize("name", ["trial.avi", "trial", "trial.mp4.mkv"])
+def test_another_suffix_is_refused_and_nothing_written(trial, tmp_path, name):
+    with pytest.raises(InputError, match=r"does not end in \.mp4; name a clip"):
+        write_clip(trial, tmp_path / name)
+
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("frames_per_s", [0.0, -25.0, 1e-6, 1e6, float("nan"), float("inf")])
+def test_rate_that_nobody_can_watch_is_refused(trial, tmp_path, frames_per_s):
+    with pytest.raises(InputError, match="cannot be watched; ask for 25 to 30"):
+        write_clip(trial, tmp_path / "trial.mp4", frames_per_s=frames_per_s)
+
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("stop_at", [1, 25, 60])
+def test_interrupted_clip_leaves_no_file(trial, tmp_path, stop_at):
+    def stop(done: int, total: int) -> None:
+        if done == stop_at:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_clip(trial, tmp_path / "trial.mp4", on_frames=stop)
+
+    assert not list(tmp_path.iterdir())
+
+
+def test_interrupted_clip_leaves_the_one_before(trial, tmp_path):
+    def stop(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    (tmp_path / "trial.mp4").write_bytes(b"yesterday's")
+    with pytest.raises(KeyboardInterrupt):
+        write_clip(trial, tmp_path / "trial.mp4", on_frames=stop)
+
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("trial.mp4", b"yesterday's")]
+
+
+def test_unwritable_place_is_told(trial, tmp_path):
+    (tmp_path / "file").write_text("no folder")
+
+    with pytest.raises(InputError, match=r"cannot write .* choose another file"):
+        write_clip(trial, tmp_path / "file" / "trial.mp4")
+
+
+def test_missing_pyav_is_told_with_its_cure(trial, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+
+    with pytest.raises(InputError, match="needs PyAV, which is not installed; install it with `pip install av`"):
+        write_clip(trial, tmp_path / "trial.mp4")
+
+    assert not list(tmp_path.iterdir())
+
+
+def test_importing_the_report_does_not_import_pyav():
+    code = "import sys, sliplens.report, sliplens.plots.clip; print('av' in sys.modules)"
+
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    assert done.stdout.strip() == "False"

@@ -1,0 +1,393 @@
+import re
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from PIL import Image
+
+from sliplens.errors import InputError
+from sliplens.plots.contact_sheet import (
+    brighten,
+    brightening,
+    choose_margins,
+    choose_untouched,
+    draw_contact_sheet,
+    write_contact_sheet,
+)
+from sliplens.plots.saliency import NOMINAL_MARGINS
+from sliplens.recordings import ContactState, GroundTruth, Recording
+
+NO_CONTACT, CONTACT, INCIPIENT_SLIP, FULL_SLIP, _ = ContactState
+
+
+def make_trial(*, pull: int = 41, lowest: float = 0.0, size: tuple[int, int] = (24, 24), bright: int = 90) -> Recording:
+    """Four frames untouched, five of pressing, a pull down to the lowest margin and, if that is 0, three of sliding."""
+    slide = 3 if lowest == 0 else 0
+    margin = np.concatenate([np.full(4, np.nan), np.ones(5), np.linspace(1, lowest, pull), np.zeros(slide)])
+    state = [NO_CONTACT] * 4 + [CONTACT] * 5 + [INCIPIENT_SLIP] * pull + [FULL_SLIP] * slide
+    normal = np.concatenate([np.zeros(4), [0.1, 0.3, 0.6, 0.9, 1.2], np.full(pull + slide, 1.1)])
+    rng = np.random.default_rng(pull)
+    reference = rng.integers(0, 100, (*size, 3), dtype=np.uint8)
+    frames = np.repeat(reference[None], len(margin), axis=0)
+    for index in range(4, len(margin)):
+        frames[index, index % 8 : index % 8 + 8, 5:15] += np.uint8(bright)
+    return Recording(
+        trial="day1-dry-001",
+        sensor="test-sensor",
+        day=1,
+        condition="dry",
+        reference=reference,
+        frames=frames,
+        time_s=np.arange(len(margin)) / 25,
+        normal_force_n=normal,
+        tangential_force_n=np.nan_to_num(0.5 * normal * (1 - margin)),
+        friction_coefficient=np.full(len(margin), 0.5),
+        safety_margin=margin,
+        stick_ratio=margin ** (2 / 3),
+        contact_state=tuple(state),
+    )
+
+
+def with_truth(trial: Recording, *, displacement: str = "half-space") -> Recording:
+    """A contact of rows 6 to 17 and columns 8 to 19, its inner 4 x 4 pixels sticking before full slip."""
+    count = len(trial)
+    contact = np.zeros(trial.frames.shape[:3], dtype=np.uint8)
+    contact[4:, 6:18, 8:20] = 1
+    contact[4:-3, 10:14, 12:16] = 2
+    rest = np.zeros((2, 2), dtype=np.float32)
+    truth = GroundTruth(
+        recipe="none",
+        displacement=displacement,
+        marker_rest_px=rest,
+        marker_px=np.repeat(rest[None], count, axis=0),
+        static_friction=np.ones(count),
+        contact_radius_m=np.ones(count),
+        stick_radius_m=np.zeros(count),
+        contact_map=contact,
+    )
+    return replace(trial, truth=truth)
+
+
+def texts(figure: Figure) -> list[str]:
+    return [found.get_text().replace("\N{NO-BREAK SPACE}", " ") for found in figure.findobj(Text)]
+
+
+def pictures(figure: Figure) -> tuple[list[Axes], list[Axes]]:
+    """Axes of the camera frames and of the differences, from left to right and top to bottom."""
+    shown = [ax for ax in figure.axes if ax.images]
+    return shown[::2], shown[1::2]
+
+
+def factor_told(figure: Figure) -> float:
+    """The one factor that the sheet tells; it must not tell two."""
+    told = {found for text in texts(figure) for found in re.findall(r"\N{MULTIPLICATION SIGN} ([\d.]+)", text)}
+    assert len(told) == 1
+    return float(told.pop().rstrip("."))
+
+
+@pytest.mark.parametrize("pull", [11, 41, 700])
+def test_chosen_frames_are_the_nearest_to_the_margins(pull):
+    trial = make_trial(pull=pull)
+
+    for nominal, index in zip(NOMINAL_MARGINS, choose_margins(trial), strict=True):
+        nearest = np.nanmin(np.abs(trial.safety_margin - nominal))
+        assert index is not None
+        # frames within half a percentage point are told apart by their force alone
+        assert abs(trial.safety_margin[index] - nominal) <= nearest + 0.005
+
+
+def test_full_stick_is_shown_where_the_sensor_is_pressed_hardest():
+    trial = make_trial()
+
+    first = choose_margins(trial)[0]
+
+    assert first is not None
+    assert trial.contact_state[first] == CONTACT
+    assert (
+        trial.normal_force_n[first] == trial.normal_force_n[[state == CONTACT for state in trial.contact_state]].max()
+    )
+
+
+def test_full_slip_is_shown_rather_than_its_onset():
+    trial = make_trial()
+
+    last = choose_margins(trial)[-1]
+
+    assert last is not None
+    assert trial.contact_state[last] == FULL_SLIP
+
+
+def test_frames_of_a_later_stick_are_left_alone():
+    trial = make_trial()
+    # after sliding the contact sticks again at exactly 40 %, and is pressed harder than ever
+    margin, force = trial.safety_margin.copy(), trial.normal_force_n.copy()
+    margin[-1], force[-1] = 0.4, 9.0
+    again = replace(
+        trial, safety_margin=margin, normal_force_n=force, contact_state=(*trial.contact_state[:-1], INCIPIENT_SLIP)
+    )
+
+    assert choose_margins(again)[:-1] == choose_margins(trial)[:-1]
+
+
+@pytest.mark.parametrize(("lowest", "missing"), [(0.52, 3), (0.5, 3), (0.49, 2), (0.12, 1), (0.05, 0)])
+def test_margin_is_missing_where_no_frame_is_within_ten_points(lowest, missing):
+    found = choose_margins(make_trial(lowest=lowest))
+
+    assert [index is None for index in found] == [False] * (6 - missing) + [True] * missing
+
+
+def test_no_frame_stands_in_two_columns():
+    trial = make_trial(lowest=0.5, pull=6)
+
+    found = [index for index in choose_margins(trial) if index is not None]
+
+    assert len(set(found)) == len(found)
+
+
+def test_untouched_frame_has_no_contact():
+    index = choose_untouched(make_trial())
+
+    assert index is not None
+    assert make_trial().contact_state[index] == NO_CONTACT
+
+
+def test_sheet_tells_each_margin_shown_and_each_that_is_missing():
+    figure = draw_contact_sheet([make_trial(lowest=0.52, pull=25)])
+
+    found = texts(figure)
+    assert [text for text in found if re.fullmatch(r"Γ \d+ %", text)] == ["Γ 100 %", "Γ 80 %", "Γ 60 %"]
+    assert [text for text in found if "no frame" in text] == [f"no frame\nnear {left} %" for left in (40, 20, 0)]
+    assert [len(axes) for axes in pictures(figure)] == [4, 4]
+
+
+def test_sheet_tells_who_when_and_what():
+    told = "\n".join(texts(draw_contact_sheet([make_trial()], title="A title")))
+
+    for words in (
+        "A title",
+        "day1-dry-001",
+        "dry, day 1",
+        "test-sensor",
+        "1.10–1.20 N",  # noqa: RUF001 (an en dash is meant)
+        "$\\mu$ 0.50",
+        "53 frames in 2.1 s",
+    ):
+        assert words in told
+
+
+def test_difference_is_the_absolute_one_times_the_factor_told():
+    trials = [make_trial(bright=60), make_trial(bright=20, pull=21)]
+    figure = draw_contact_sheet(trials)
+
+    factor, below = factor_told(figure), pictures(figure)[1]
+    rows = [(trial, index) for trial in trials for index in (choose_untouched(trial), *choose_margins(trial))]
+    assert any("one factor for the whole sheet" in text for text in texts(figure))
+    assert factor > 2
+    for ax, (trial, index) in zip(below, rows, strict=True):
+        signed = trial.frames[index].astype(float) - trial.reference
+        # halves may be rounded either way
+        assert np.abs(np.asarray(ax.images[0].get_array()) - np.minimum(255, factor * np.abs(signed))).max() <= 0.51
+
+
+def test_camera_frame_is_shown_as_it_is():
+    trial = make_trial()
+    above, _ = pictures(draw_contact_sheet([trial]))
+
+    for ax, index in zip(above, (choose_untouched(trial), *choose_margins(trial)), strict=True):
+        np.testing.assert_array_equal(ax.images[0].get_array(), trial.frames[index])
+
+
+def test_reference_stands_in_where_every_frame_touches():
+    trial = make_trial()
+    touched = replace(trial, contact_state=tuple(CONTACT if s == NO_CONTACT else s for s in trial.contact_state))
+    above, below = pictures(draw_contact_sheet([touched]))
+
+    np.testing.assert_array_equal(above[0].images[0].get_array(), trial.reference)
+    assert not np.any(below[0].images[0].get_array())
+
+
+@pytest.mark.parametrize(("level", "factor"), [(51, 5.0), (255, 1.0), (0, 255.0), (250, 1.0)])
+def test_brightening_makes_the_brightest_pixels_white(level, factor):
+    difference = np.full((1, 8, 8, 3), level, dtype=np.uint8)
+
+    assert brightening([difference[:, :4], difference // 2]) == factor
+
+
+def test_brightened_levels_do_not_wrap():
+    np.testing.assert_array_equal(brighten(np.array([0, 100, 128, 255], dtype=np.uint8), 2.0), [0, 200, 255, 255])
+
+
+@pytest.mark.parametrize("size", [(24, 32), (32, 24), (16, 90), (90, 16)])
+def test_pixels_are_square(size):
+    figure = draw_contact_sheet([make_trial(size=size)])
+    figure.draw_without_rendering()
+
+    for ax in [ax for axes in pictures(figure) for ax in axes]:
+        box = ax.get_window_extent()
+        # the figure's edges fall on whole dots
+        assert box.height / box.width == pytest.approx(size[0] / size[1], rel=0.01)
+
+
+def test_marks_stand_where_the_frames_were_taken():
+    trial = make_trial(lowest=0.5, pull=26)
+    charts = [ax for ax in draw_contact_sheet([trial]).axes if ax.get_ylabel()]
+
+    taken = [index for index in (choose_untouched(trial), *choose_margins(trial)) if index is not None]
+    assert [ax.get_ylabel() for ax in charts] == ["Force (N)", "Γ (%)"]
+    for ax in charts:
+        drawn = [np.asarray(line.get_xdata()) for line in ax.lines]
+        marks = [x[0] for x in drawn if len(x) == 2]
+        np.testing.assert_array_equal(marks, trial.time_s[taken])
+
+
+def test_charts_draw_forces_in_newtons_and_the_margin_in_percent():
+    trial = make_trial()
+    forces, margin = [ax for ax in draw_contact_sheet([trial]).axes if ax.get_ylabel()]
+
+    drawn = {line.get_label(): line.get_ydata() for line in forces.lines}
+    np.testing.assert_array_equal(drawn["$F_n$"], trial.normal_force_n)
+    np.testing.assert_array_equal(drawn["$F_t$"], trial.tangential_force_n)
+    np.testing.assert_array_equal(drawn[r"$\mu F_n$"], 0.5 * trial.normal_force_n)
+    np.testing.assert_array_equal(margin.lines[0].get_ydata(), 100 * trial.safety_margin)
+
+
+def test_outlines_run_along_the_edges_of_contact_and_stick_zone():
+    above, _ = pictures(draw_contact_sheet([with_truth(make_trial())]))
+
+    def spans(ax: Axes) -> set[tuple[float, ...]]:
+        corners = [np.concatenate([path.vertices for path in one.get_paths()]) for one in ax.collections]
+        return {(*found.min(axis=0), *found.max(axis=0)) for found in corners}
+
+    # half way between the last pixel inside and the first one outside, as (x, y)
+    contact, stick = (7.5, 5.5, 19.5, 17.5), (11.5, 9.5, 15.5, 13.5)
+    assert [spans(ax) for ax in above] == [set(), *[{contact, stick}] * 5, {contact}]
+
+
+@pytest.mark.parametrize(
+    ("trial", "names"),
+    [
+        (make_trial(), []),
+        (with_truth(make_trial()), ["outline of the contact", "outline of its stick zone"]),
+        (
+            with_truth(make_trial(), displacement="calibrated"),
+            ["outline of the contact", "outline of its stick zone (nominal)"],
+        ),
+    ],
+)
+def test_legend_names_outlines_where_there_are_any(trial, names):
+    (legend,) = draw_contact_sheet([trial]).legends
+
+    found = [text.get_text() for text in legend.get_texts()]
+    assert found == [*names, "frame shown", "no contact", "contact", "incipient slip", "full slip"]
+
+
+def test_no_text_lies_over_another_or_beyond_the_edge():
+    long = replace(
+        make_trial(size=(16, 60)),
+        trial="a_trial_with_a_name_as_$long$ as a sentence that goes on and on and on",
+        sensor="Some Sensor Mini 2 no 31",
+    )
+    slow = make_trial(size=(40, 30))
+    slow = replace(slow, time_s=400 * slow.time_s)
+    figure = draw_contact_sheet(
+        [long, slow, with_truth(make_trial(lowest=0.5, pull=26), displacement="calibrated")], title="All"
+    )
+    FigureCanvasAgg(figure).draw()
+
+    # ticks beyond the limits of their axis have a place but are never drawn
+    ticks = [
+        (tick, axis.get_view_interval())
+        for ax in figure.axes
+        for axis in (ax.xaxis, ax.yaxis)
+        for tick in axis.get_major_ticks()
+    ]
+    beyond = {tick.label1 for tick, (low, high) in ticks if not low <= tick.get_loc() <= high}
+    shown = [found for found in figure.findobj(Text) if found.get_visible() and found.get_text().strip()]
+    shown = [found for found in shown if found not in beyond]
+    boxes = [(found.get_text(), found.get_window_extent()) for found in shown]
+    width, height = figure.bbox.size
+    assert not [text for text, box in boxes if box.x0 < 0 or box.y0 < 0 or box.x1 > width or box.y1 > height]
+    assert not [(one, other) for (one, a), (other, b) in combinations(boxes, 2) if a.overlaps(b)]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".PDF", ".svg"])
+def test_file_is_complete_and_alone(tmp_path, suffix):
+    path = tmp_path / "new" / f"preview{suffix}"
+
+    write_contact_sheet([make_trial()], path)
+
+    assert [found.name for found in path.parent.iterdir()] == [path.name]
+    assert path.stat().st_size > 10_000
+
+
+def test_png_is_readable_and_wide_enough_to_read(tmp_path):
+    path = tmp_path / "preview.png"
+
+    write_contact_sheet([make_trial(), make_trial(pull=21)], path)
+
+    with Image.open(path) as image:
+        image.load()
+        assert image.width >= 1600
+
+
+@pytest.mark.parametrize("name", ["preview.jpg", "preview", "preview.png.txt"])
+def test_another_suffix_is_refused_and_nothing_written(tmp_path, name):
+    with pytest.raises(InputError, match=r"does not end in \.png, \.pdf, \.svg; name a picture"):
+        write_contact_sheet([make_trial()], tmp_path / name)
+
+    assert not list(tmp_path.iterdir())
+
+
+def test_interrupted_sheet_leaves_nothing_half_written(tmp_path, monkeypatch):
+    def stop(figure: Figure, path: Path, **settings: object) -> None:
+        path.write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Figure, "savefig", stop)
+    with pytest.raises(KeyboardInterrupt):
+        write_contact_sheet([make_trial()], tmp_path / "preview.png")
+
+    assert not list(tmp_path.iterdir())
+
+
+def test_unwritable_place_is_told(tmp_path):
+    (tmp_path / "file").write_text("no folder")
+
+    with pytest.raises(InputError, match=r"cannot write .* choose another file"):
+        write_contact_sheet([make_trial()], tmp_path / "file" / "preview.png")
+
+
+def test_no_trial_is_no_sheet():
+    with pytest.raises(InputError, match="needs a trial; name at least one"):
+        draw_contact_sheet([])
+
+
+def test_one_frame_and_no_label_can_be_drawn():
+    trial = make_trial()
+    signals = ("time_s", "normal_force_n", "tangential_force_n", "friction_coefficient", "safety_margin", "stick_ratio")
+    one = replace(
+        trial,
+        frames=trial.frames[:1],
+        contact_state=trial.contact_state[:1],
+        **{name: getattr(trial, name)[:1] for name in signals},
+    )
+
+    figure = draw_contact_sheet([one])
+    figure.draw_without_rendering()
+
+    assert sum("no frame" in text for text in texts(figure)) == len(NOMINAL_MARGINS)
+
+
+def test_drawing_leaves_matplotlib_as_it_was(tmp_path):
+    before = dict(mpl.rcParams)
+
+    write_contact_sheet([make_trial()], tmp_path / "preview.png")
+
+    assert dict(mpl.rcParams) == before

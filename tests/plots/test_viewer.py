@@ -1,0 +1,455 @@
+"""What the Rerun viewer is given of a trial, read back with Rerun's own reader."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from sliplens.errors import InputError, RecordingError
+from sliplens.images.files import decode_png
+from sliplens.plots import viewer as viewer_process
+from sliplens.plots.viewer import open_viewer, write_rrd
+from sliplens.recordings import ContactState, Dataset, Recording
+from sliplens.recordings.capture import Capture, Forces, forces_path
+from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.importing import About, import_trial
+from sliplens.recordings.labels import LabelSettings
+from sliplens.recordings.store import read_labelling, save_recording
+from sliplens.recordings.trial import SIGNALS
+from sliplens.simulation import PRESETS, plan_trials, simulate_trial
+
+rerun = pytest.importorskip("rerun")
+chunk = pytest.importorskip("rerun.chunk")
+
+FRAMES = 20  # more than are sent together, and no multiple of them
+LAG_S = 0.05
+
+
+class Rows(NamedTuple):
+    """What a file says of one component of one entity, in the order of time."""
+
+    time_ns: np.ndarray | None
+    frame: np.ndarray | None
+    values: list[Any]
+
+
+Read = Callable[[str, str], Rows]
+
+
+def read_rrd(path: Path) -> dict[str, list[pa.RecordBatch]]:
+    """Chunks of the one recording of a file, by entity."""
+    reader, found = chunk.RrdReader(path), {}
+    assert [entry.application_id for entry in reader.recordings()] == ["sliplens"]
+    for one in reader.stream():
+        found.setdefault(one.entity_path.removeprefix("/"), []).append(one.to_record_batch())
+    return found
+
+
+def rows(entities: dict[str, list[pa.RecordBatch]], entity: str, component: str) -> Rows:
+    batches = [batch for batch in entities[entity] if component in batch.schema.names]
+    table = pa.concat_tables([pa.Table.from_batches([batch]) for batch in batches], promote_options="permissive")
+    time, frame = (table.column(name).to_numpy() if name in table.column_names else None for name in ("time", "frame"))
+    values = table.column(component).to_pylist()
+    if time is None:
+        return Rows(None, None, values)
+    order = np.argsort(time.astype(np.int64), kind="stable")
+    return Rows(
+        time.astype(np.int64)[order],
+        None if frame is None else frame[order],
+        [values[at] for at in order],
+    )
+
+
+def numbers(entities: dict[str, list[pa.RecordBatch]], entity: str) -> np.ndarray:
+    return np.array(rows(entities, entity, "Scalars:scalars").values, dtype=np.float64).squeeze(-1)
+
+
+def pictures(entities: dict[str, list[pa.RecordBatch]], entity: str) -> np.ndarray:
+    found = rows(entities, entity, "EncodedImage:blob")
+    return np.stack([decode_png(bytes(blob), where=entity) for (blob,) in found.values])
+
+
+def stored(folder: Path, *recordings: Recording) -> Dataset:
+    table = []
+    for recording in recordings:
+        save_recording(recording, trial_path(folder, recording.trial))
+        table.append(trial_info(trial_path(folder, recording.trial), split="train"))
+    write_dataset_table(folder, table)
+    return Dataset.open(folder)
+
+
+@pytest.fixture(scope="module")
+def trial() -> Recording:
+    """A simulated trial with its truth."""
+    return simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=FRAMES))
+
+
+@pytest.fixture(scope="module")
+def written(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("simulated")
+    data = stored(folder / "data", trial)
+    told = []
+    write_rrd(data, data.trials[0], folder / "new" / "a.rrd", on_frames=lambda done, total: told.append((done, total)))
+    assert told == [(8, FRAMES), (16, FRAMES), (FRAMES, FRAMES)]
+    assert [path.name for path in (folder / "new").iterdir()] == ["a.rrd"]
+    return folder / "new" / "a.rrd"
+
+
+@pytest.fixture(scope="module")
+def simulated(written: Path) -> dict[str, list[pa.RecordBatch]]:
+    return read_rrd(written)
+
+
+def test_frames_come_back_pixel_by_pixel(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
+    np.testing.assert_array_equal(pictures(simulated, "camera/frame"), trial.frames)
+    np.testing.assert_array_equal(pictures(simulated, "reference"), trial.reference[None])
+    assert rows(simulated, "reference", "EncodedImage:blob").time_ns is None
+
+
+def test_differences_are_those_of_signed_numbers_times_one_factor(
+    trial: Recording, simulated: dict[str, list[pa.RecordBatch]]
+):
+    difference = np.abs(trial.frames.astype(int) - trial.reference)
+    shown = pictures(simulated, "difference").astype(int)
+    # the factor is found anew from what is bright enough to tell it, and not cut off at white
+    told = (difference > 20) & (shown < 255)
+    factor = np.median(shown[told] / difference[told])
+    assert factor > 1
+    # rounded to whole grey levels; half of one more for the factor found, which is off by 0.5 / 20 of a level at most
+    assert np.abs(shown - np.minimum(factor * difference, 255)).max() <= 0.5 + 0.025 * 255 / factor
+
+
+def test_every_frame_has_its_time_and_its_number(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
+    parts = {
+        "camera/frame": "EncodedImage:blob",
+        "difference": "EncodedImage:blob",
+        "camera/zones": "SegmentationImage:buffer",
+        "camera/markers": "Points2D:positions",
+        "camera/displacements": "Arrows2D:vectors",
+        "margin/gamma": "Scalars:scalars",
+    }
+    for entity, component in parts.items():
+        found = rows(simulated, entity, component)
+        assert found.time_ns is not None
+        # Rerun counts whole nanoseconds
+        np.testing.assert_allclose(found.time_ns / 1e9, trial.time_s, rtol=0, atol=0.6e-9)
+        np.testing.assert_array_equal(found.frame, np.arange(FRAMES))
+
+
+def test_labels_and_forces_are_those_of_the_recording(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
+    assert trial.truth is not None
+    expected = {
+        "force/normal": trial.normal_force_n,
+        "force/tangential": trial.tangential_force_n,
+        "force/limit": trial.friction_coefficient * trial.normal_force_n,
+        "ratio/static_friction": trial.truth.static_friction,
+        "margin/gamma": 100 * trial.safety_margin,
+        "margin/stick_ratio": 100 * trial.stick_ratio,
+    }
+    for entity, values in expected.items():
+        np.testing.assert_array_equal(numbers(simulated, entity), values)
+    assert np.isnan(numbers(simulated, "margin/gamma")).any()  # before the contact there is none
+    # Gamma = 1 - (F_t / F_n) / mu wherever there is one
+    ratio, known = numbers(simulated, "ratio/tangential_to_normal"), np.isfinite(trial.safety_margin)
+    gamma = np.clip(1 - ratio / trial.friction_coefficient, 0, 1)
+    np.testing.assert_allclose(gamma[known], trial.safety_margin[known], atol=1e-9)
+    assert "margin/band/high" not in simulated
+
+
+def test_states_begin_where_they_change(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
+    found = rows(simulated, "state/contact", "StateChange:state")
+    assert found.frame is not None
+    states = [state for (state,) in found.values]
+    last = np.searchsorted(found.frame, np.arange(FRAMES), side="right") - 1
+    assert [states[at] for at in last] == [str(state) for state in trial.contact_state]
+    assert all(one != other for one, other in pairwise(states))
+    assert "state/label" not in simulated
+
+
+def test_truth_lies_over_the_pixels_it_belongs_to(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
+    truth = trial.truth
+    assert truth is not None
+    found = rows(simulated, "camera/zones", "SegmentationImage:buffer").values
+    maps = np.stack([np.array(one, dtype=np.uint8).reshape(trial.reference.shape[:2]) for (one,) in found])
+    np.testing.assert_array_equal(maps, truth.contact_map)
+    # a pixel's centre is a whole number here, and a half more in Rerun
+    markers = np.array(rows(simulated, "camera/markers", "Points2D:positions").values, dtype=np.float32)
+    np.testing.assert_allclose(markers, truth.marker_px + 0.5, atol=1e-4)
+    # arrows go from rest to where the marker is
+    begin, way = (
+        np.array(rows(simulated, "camera/displacements", f"Arrows2D:{name}").values, dtype=np.float32)
+        for name in ("origins", "vectors")
+    )
+    np.testing.assert_allclose(begin, np.broadcast_to(truth.marker_rest_px + 0.5, begin.shape), atol=1e-4)
+    np.testing.assert_allclose(begin + way, markers, atol=1e-4)
+
+
+def test_a_trial_and_its_layout_are_told(trial: Recording, written: Path, simulated: dict[str, list[pa.RecordBatch]]):
+    (text,) = rows(simulated, "about", "TextDocument:text").values[0]
+    assert text.startswith(f"# {trial.trial}\n")
+    assert f"- frames: {FRAMES} of 224" in text
+    assert "Simulated" in text
+    assert rows(simulated, "__properties", "RecordingInfo:name").values[-1] == [trial.trial]
+    reader = chunk.RrdReader(written)
+    (blueprint,) = reader.blueprints()
+    origins = {
+        value
+        for one in reader.stream(store=blueprint)
+        for batch in [one.to_record_batch()]
+        if "ViewBlueprint:space_origin" in batch.schema.names
+        for (value,) in batch.column("ViewBlueprint:space_origin").to_pylist()
+    }
+    shown = {"camera", "difference", "reference", "state", "force", "ratio", "margin", "about"}
+    assert {origin.strip("/") for origin in origins} == shown
+
+
+def test_a_trial_without_truth_keeps_its_gaps(trial: Recording, tmp_path: Path):
+    margin, normal = trial.safety_margin.copy(), trial.normal_force_n.copy()
+    margin[8:11], normal[12] = np.nan, np.nan
+    sigma = np.where(np.isnan(margin), np.nan, 0.04)
+    valid = np.arange(FRAMES) % 5 > 0
+    states = (ContactState.UNKNOWN,) * FRAMES
+    bare = replace(
+        trial,
+        truth=None,
+        safety_margin=margin,
+        normal_force_n=normal,
+        safety_margin_sigma=sigma,
+        valid=valid,
+        contact_state=states,
+    )
+    data = stored(tmp_path / "data", bare)
+    write_rrd(data, data.trials[0], tmp_path / "a.rrd")
+    found = read_rrd(tmp_path / "a.rrd")
+    np.testing.assert_array_equal(numbers(found, "margin/gamma"), 100 * margin)
+    np.testing.assert_array_equal(numbers(found, "force/normal"), normal)
+    high, low = (numbers(found, f"margin/band/{name}") for name in ("high", "low"))
+    np.testing.assert_allclose((high + low) / 2, 100 * margin, rtol=1e-12)
+    np.testing.assert_allclose((high - low) / 2, 100 * sigma, rtol=1e-9)
+    # what friction holds is known, whether it is the static one is not
+    np.testing.assert_array_equal(numbers(found, "ratio/friction"), trial.friction_coefficient)
+    assert not {"ratio/static_friction", "camera/markers", "camera/zones", "sensor/force"} & set(found)
+    label = rows(found, "state/label", "StateChange:state")
+    assert label.frame is not None
+    last = np.searchsorted(label.frame, np.arange(FRAMES), side="right") - 1
+    np.testing.assert_array_equal([label.values[at] == ["valid"] for at in last], valid & np.isfinite(margin))
+    np.testing.assert_array_equal(pictures(found, "camera/frame"), trial.frames)
+
+
+def test_a_trial_where_nothing_is_known_can_be_looked_at(trial: Recording, tmp_path: Path):
+    nothing = np.full(FRAMES, np.nan)
+    bare = replace(
+        trial,
+        truth=None,
+        frames=np.repeat(trial.reference[None], FRAMES, axis=0),
+        contact_state=(ContactState.UNKNOWN,) * FRAMES,
+        **dict.fromkeys(SIGNALS[1:], nothing),
+    )
+    data = stored(tmp_path / "data", bare)
+    write_rrd(data, data.trials[0], tmp_path / "a.rrd")
+    found = read_rrd(tmp_path / "a.rrd")
+    assert np.isnan(numbers(found, "margin/gamma")).all()
+    assert not pictures(found, "difference").any()
+
+
+@pytest.mark.parametrize("applied", [True, False])
+def test_samples_of_the_force_sensor_stand_on_the_clock_of_the_camera(
+    trial: Recording, tmp_path: Path, *, applied: bool
+):
+    """As import keeps them, and late by the camera's lag where the labels were shifted by it."""
+    long = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=120))
+    rng = np.random.default_rng(1)
+    time = np.arange(0, long.time_s[-1] + 0.1, 1 / 500)
+    pull, press = (np.interp(time, long.time_s, one) for one in (long.tangential_force_n, long.normal_force_n))
+    force = np.stack([pull, np.zeros_like(pull), press], axis=-1) + rng.normal(0, 0.02, (len(time), 3))
+    capture = Capture(
+        name="cup_1",
+        source="cup",
+        frame_time_s=long.time_s + LAG_S,
+        frame_size=(224, 224),
+        read_frames=lambda: iter(long.frames),
+        forces=Forces(time_s=time, force_n=force, source="table of forces"),
+    )
+    path = trial_path(tmp_path, "cup_1")
+    import_trial(
+        capture,
+        path,
+        about=About(sensor="mine", day=1, condition="dry", object="paper_cup*"),
+        settings=LabelSettings(apply_lag=applied),
+        rng=rng,
+        forces_path=forces_path(tmp_path, "cup_1"),
+    )
+    write_dataset_table(tmp_path, [trial_info(path, split="test")])
+    data = Dataset.open(tmp_path)
+    write_rrd(data, data.trials[0], tmp_path / "a.rrd")
+    labelling, found = read_labelling(path), read_rrd(tmp_path / "a.rrd")
+    assert labelling is not None
+    late = rows(found, "sensor/force", "Scalars:scalars")
+    assert late.frame is None
+    assert late.time_ns is not None
+    shift = labelling["lag"]["lag_s"] if applied else 0.0
+    np.testing.assert_allclose(late.time_ns / 1e9, time + shift, rtol=0, atol=0.6e-9)
+    np.testing.assert_array_equal(np.array(late.values), force)
+    if applied:  # half a frame at 15 a second
+        assert shift == pytest.approx(LAG_S, abs=1 / 30)
+    np.testing.assert_array_equal(numbers(found, "ratio/static_friction"), labelling["friction"]["mu"])
+    (text,) = rows(found, "about", "TextDocument:text").values[0]
+    # as it was typed, not as Markdown reads it
+    assert r"- object: paper\_cup\*" in text
+    assert "**Friction found**" in text
+    assert "table of forces" in text
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a"])
+def test_another_suffix_is_refused(small_dataset: Dataset, tmp_path: Path, name: str):
+    with pytest.raises(InputError, match=r"does not end in \.rrd; name a file of the Rerun viewer, such as trial\.rrd"):
+        write_rrd(small_dataset, small_dataset.trials[0], tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_trial_leaves_no_file(trial: Recording, tmp_path: Path):
+    data = stored(tmp_path / "data", trial)
+    path = trial_path(data.folder, trial.trial)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(RecordingError, match="is not a readable Parquet file"):
+        write_rrd(data, data.trials[0], tmp_path / "out" / "a.rrd")
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_an_interruption_leaves_no_file(small_dataset: Dataset, tmp_path: Path):
+    def interrupt(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_rrd(small_dataset, small_dataset.trials[0], tmp_path / "a.rrd", on_frames=interrupt)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_made_is_told(small_dataset: Dataset, tmp_path: Path):
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(InputError, match=r"cannot write .*a\.rrd .*; choose another file"):
+        write_rrd(small_dataset, small_dataset.trials[0], tmp_path / "taken" / "a.rrd")
+
+
+def test_without_rerun_its_installation_is_told(
+    monkeypatch: pytest.MonkeyPatch, small_dataset: Dataset, tmp_path: Path
+):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    wanted = r'the Rerun viewer is not installed; install it with pip install "sliplens\[view\]"'
+    with pytest.raises(InputError, match=wanted):
+        write_rrd(small_dataset, small_dataset.trials[0], tmp_path / "a.rrd")
+
+
+def test_rerun_that_is_too_old_is_told(monkeypatch: pytest.MonkeyPatch, small_dataset: Dataset, tmp_path: Path):
+    monkeypatch.delattr(rerun, "StateChange")
+    with pytest.raises(InputError, match=r"too old .*; upgrade it with pip install"):
+        write_rrd(small_dataset, small_dataset.trials[0], tmp_path / "a.rrd")
+
+
+def test_rerun_switched_off_writes_no_empty_file(
+    monkeypatch: pytest.MonkeyPatch, small_dataset: Dataset, tmp_path: Path
+):
+    monkeypatch.setenv("RERUN", "off")
+    with pytest.raises(InputError, match="the environment variable RERUN switches Rerun off; unset it"):
+        write_rrd(small_dataset, small_dataset.trials[0], tmp_path / "a.rrd")
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_imports_rerun_before_it_is_needed():
+    code = "import sys, sliplens.cli, sliplens.cli.view, sliplens.plots.viewer; sys.exit('rerun' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_an_open_viewer_is_given_what_a_file_is(
+    monkeypatch: pytest.MonkeyPatch, trial: Recording, simulated: dict[str, list[pa.RecordBatch]], tmp_path: Path
+):
+    def connect(stream: Any, url: str) -> None:
+        assert url == "rerun+http://127.0.0.1:1/proxy"
+        stream.save(tmp_path / "sent.rrd")
+
+    monkeypatch.setattr(rerun.RecordingStream, "connect_grpc", connect)
+    monkeypatch.setattr("sliplens.plots.viewer.start_viewer", lambda: "rerun+http://127.0.0.1:1/proxy")
+    data = stored(tmp_path / "data", trial)
+    open_viewer(data, data.trials[0])
+    sent = read_rrd(tmp_path / "sent.rrd")
+    assert set(sent) == set(simulated)
+    np.testing.assert_array_equal(pictures(sent, "camera/frame"), trial.frames)
+
+
+def test_no_viewer_opens_for_a_trial_that_is_not_there(
+    monkeypatch: pytest.MonkeyPatch, trial: Recording, tmp_path: Path
+):
+    monkeypatch.setattr("sliplens.plots.viewer.start_viewer", lambda: pytest.fail("a viewer was started"))
+    data = stored(tmp_path / "data", trial)
+    trial_path(data.folder, trial.trial).unlink()
+    with pytest.raises(RecordingError, match="does not exist; make the data set again"):
+        open_viewer(data, data.trials[0])
+
+
+class Begun(NamedTuple):
+    command: list[str]
+    process: subprocess.Popen[bytes]
+
+
+StandIn = Callable[[str], list[Begun]]
+
+STAND_IN = """
+import socket, sys, time
+words = dict(zip(sys.argv[1::2], sys.argv[2::2]))
+server = socket.create_server((words["--bind"], int(words["--port"])))
+time.sleep(60)
+"""
+
+
+@pytest.fixture
+def stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> StandIn:
+    """Start a script in the viewer's place; gives the processes that were started."""
+
+    def put(code: str) -> list[Begun]:
+        script, begun = tmp_path / "viewer.py", []
+        script.write_text(code)
+
+        def popen(command: list[str], **settings: Any) -> subprocess.Popen[bytes]:
+            assert command[1:3] == ["-m", "rerun_cli"]
+            process: subprocess.Popen[bytes] = real([command[0], str(script), *command[3:]], **settings)
+            begun.append(Begun(command, process))
+            return process
+
+        monkeypatch.setattr(viewer_process.subprocess, "Popen", popen)
+        return begun
+
+    real: Any = subprocess.Popen
+    return put
+
+
+def test_the_viewer_listens_to_this_machine_alone(stand_in: StandIn):
+    begun = stand_in(STAND_IN)
+    address = viewer_process.start_viewer()
+    words, process = begun[0]
+    assert process.poll() is None
+    process.kill()
+    process.wait()
+    assert words[words.index("--bind") + 1] == "127.0.0.1"
+    assert address == f"rerun+http://127.0.0.1:{words[words.index('--port') + 1]}/proxy"
+
+
+def test_a_viewer_that_finds_no_screen_is_told_with_its_reason(stand_in: StandIn):
+    # it listens first, and only then looks for a screen
+    stand_in(STAND_IN.replace("time.sleep(60)", "time.sleep(0.3); sys.exit('Error: no DISPLAY is set')"))
+    with pytest.raises(InputError, match=r"did not start \(Error: no DISPLAY is set\); write a file with --output"):
+        viewer_process.start_viewer()
+
+
+def test_a_viewer_that_never_answers_is_ended(monkeypatch: pytest.MonkeyPatch, stand_in: StandIn):
+    monkeypatch.setattr(viewer_process, "_PATIENCE_S", 0.5)
+    begun = stand_in("import time; time.sleep(60)")
+    with pytest.raises(InputError, match=r"did not start \(it said nothing\)"):
+        viewer_process.start_viewer()
+    assert begun[0].process.returncode is not None

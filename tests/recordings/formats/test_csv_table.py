@@ -1,0 +1,198 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sliplens.errors import RecordingError
+from sliplens.recordings.formats.tables import read_force_table
+
+TIME = [0.0, 0.01, 0.02]
+FORCE = [[0.5, -0.25, 2.0], [0.75, -0.5, 4.0], [1.0, -0.75, 6.0]]
+
+
+def write(folder: Path, text: str, *, encoding: str = "utf-8") -> Path:
+    path = folder / "forces.csv"
+    path.write_text(text, encoding=encoding)
+    return path
+
+
+def table(*, header: str = "time_s,fx,fy,fz", separator: str = ",", comma: bool = False, scale: float = 1.0) -> str:
+    rows = [[time, *(scale * value for value in force)] for time, force in zip(TIME, FORCE, strict=True)]
+    lines = [separator.join(f"{value:g}" for value in row) for row in rows]
+    if comma:
+        lines = [line.replace(".", ",") for line in lines]
+    return "\n".join([header.replace(",", separator), *lines]) + "\n"
+
+
+def test_times_and_forces_are_read(tmp_path: Path):
+    forces = read_force_table(write(tmp_path, table())).forces
+    np.testing.assert_allclose(forces.time_s, TIME)
+    np.testing.assert_allclose(forces.force_n, FORCE)
+    assert forces.source == str(tmp_path / "forces.csv")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        table(separator=";"),
+        table(separator="\t"),
+        table(separator=";", comma=True),
+        table(separator="\t", comma=True),
+        "\ufeff" + table(),
+        "# logged by hand\n\n" + table().replace("\n", "\n# a note, with commas, in between\n", 2),
+        "# " + table(),  # as numpy.savetxt writes it
+        table().replace("\n", "\r\n"),
+        table().replace("time_s,fx", '"time_s","fx"'),
+        table().replace("\n", ",\n").replace("fz,", "fz", 1),
+    ],
+    ids=["semicolons", "tabs", "decimal commas", "both", "mark", "comments", "numpy", "windows", "quotes", "trailing"],
+)
+def test_however_it_is_laid_out_the_table_says_the_same(tmp_path: Path, text: str):
+    forces = read_force_table(write(tmp_path, text)).forces
+    np.testing.assert_allclose(forces.time_s, TIME)
+    np.testing.assert_allclose(forces.force_n, FORCE)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "cp1252", "utf-8"])
+def test_a_micro_sign_is_read_in_any_encoding(tmp_path: Path, encoding: str):
+    text = "t [\u00b5s];fx [mN];fy [mN];fz [mN]\n0;1;2;3\n1000;4;5;6\n"
+    forces = read_force_table(write(tmp_path, text, encoding=encoding)).forces
+    np.testing.assert_allclose(forces.time_s, [0, 1e-3])
+    np.testing.assert_allclose(forces.force_n, [[1e-3, 2e-3, 3e-3], [4e-3, 5e-3, 6e-3]])
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        "Time (s),Fx,Fy,Fz",
+        "timestamp,force_x,force_y,force_z",
+        "sec,Force X (N),Force Y (N),Force Z (N)",
+        "t,wrench.force.x,wrench.force.y,wrench.force.z",
+        "elapsed_s,sensor_fx_n,sensor_fy_n,sensor_fz_n",
+    ],
+)
+def test_columns_are_guessed_from_their_names(tmp_path: Path, names: str):
+    forces = read_force_table(write(tmp_path, table(header=names))).forces
+    np.testing.assert_allclose(forces.time_s, TIME)
+    np.testing.assert_allclose(forces.force_n, FORCE)
+
+
+@pytest.mark.parametrize(
+    "names", ["t,Fn,Ft", "t,normal_force_n,tangential_force_n", "t,f_n,f_t", "t,normal [N],shear [N]"]
+)
+def test_a_normal_and_a_tangential_force_lie_along_z_and_x(tmp_path: Path, names: str):
+    forces = read_force_table(write(tmp_path, f"{names}\n0,5,1\n0.1,6,2\n")).forces
+    np.testing.assert_array_equal(forces.force_n, [[1, 0, 5], [2, 0, 6]])
+
+
+@pytest.mark.parametrize(
+    ("unit", "newtons"), [("N", 1.0), ("mN", 1e-3), ("gf", 9.80665e-3), ("kgf", 9.80665), ("kN", 1e3)]
+)
+def test_units_are_read_from_brackets_or_declared(tmp_path: Path, unit: str, newtons: float):
+    named = read_force_table(write(tmp_path, table(header=f"t,fx [{unit}],fy [{unit}],fz [{unit}]"))).forces
+    declared = read_force_table(write(tmp_path, table()), force_unit=unit).forces
+    np.testing.assert_allclose(named.force_n, newtons * np.array(FORCE))
+    np.testing.assert_allclose(declared.force_n, newtons * np.array(FORCE))
+
+
+@pytest.mark.parametrize(
+    ("times", "seconds"),
+    [
+        ("0,0.001,0.002", 1e-3),
+        ("0,1,2", 1e-3),
+        ("0,10,20", 1e-2),
+        ("0,1000,2000", 1e-3),
+        ("0,1000000,2000000", 1e-3),
+        ("1700000000.000,1700000000.001,1700000000.002", 1e-3),
+        ("1700000000000,1700000000001,1700000000002", 1e-3),
+        ("1700000000000000,1700000000001000,1700000000002000", 1e-3),
+        ("1700000000000000000,1700000000001000000,1700000000002000000", 1e-3),
+    ],
+)
+def test_the_unit_of_time_is_guessed_and_told(tmp_path: Path, times: str, seconds: float):
+    text = "t,fx,fy,fz\n" + "".join(f"{time},0,0,1\n" for time in times.split(","))
+    read = read_force_table(write(tmp_path, text))
+    # double precision holds seconds since 1970 to 0.24 us
+    np.testing.assert_allclose(np.diff(read.forces.time_s), seconds, rtol=1e-3)
+    assert "guessed: 3 samples in" in read.notes[0]
+
+
+def test_what_is_declared_is_not_guessed(tmp_path: Path):
+    text = "t,clock,a,b,c\n9,0,1,2,3\n8,10,4,5,6\n"
+    read = read_force_table(
+        write(tmp_path, text), time_column="clock", force_columns=["C", "b", "a"], time_unit="ms", force_unit="mN"
+    )
+    np.testing.assert_allclose(read.forces.time_s, [0, 0.01])
+    np.testing.assert_allclose(read.forces.force_n, [[3e-3, 2e-3, 1e-3], [6e-3, 5e-3, 4e-3]])
+    assert read.notes == (
+        "forces.csv: times are those of column 'clock' (declared), in ms (declared).",
+        "forces.csv: forces are those of 'c', 'b', 'a' as x, y, z (declared), in mN (declared).",
+    )
+
+
+def test_what_was_assumed_is_told(tmp_path: Path):
+    assert read_force_table(write(tmp_path, table(separator=";", comma=True))).notes == (
+        "forces.csv: times are those of column 'time_s' (by its name), in s (by its name).",
+        "forces.csv: forces are those of 'fx', 'fy', 'fz' as x, y, z (by their names), in N (assumed, for the names "
+        "give no unit).",
+        "forces.csv: commas were read as decimal points.",
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"forces\.csv is empty"),
+        ("\n\n# nothing\n", r"forces\.csv is empty"),
+        ("time,fx,fy,fz\n", "has a header but no row"),
+        ("0,1,2,3\n1,1,2,3\n", "begins with numbers, not with the names of its columns"),
+        ("time\n1\n2\n", "has a single column 'time'"),
+        ("when,fx,fy,fz\n0,1,2,3\n", "no column that looks like the time among 'when', 'fx', 'fy', 'fz'; name it with"),
+        ("time,stamp,fx,fy,fz\n0,0,1,2,3\n", "the time could be any of 'time', 'stamp'; name the right one with"),
+        ("time,fx,fy\n0,1,2\n", "no columns that look like forces"),
+        ("time,fx,fx,fy,fz\n0,1,2,3,4\n", r"the force \(x\) could be any of 'fx', 'fx'"),
+        ("time,fx,fy,fz\n0,1,2,3\n1,1,much,3\n", r"line 3, 'fy' is 'much', not a number"),
+        ("time,fx,fy,fz\n0,1,2,3\n1,1,,3\n", r"line 3, 'fy' is empty"),
+        ("time,fx,fy,fz\n0,1,nan,3\n", r"line 2, 'fy' is 'nan', not a finite number"),
+        ("time,fx,fy,fz\n0,1,-inf,3\n", r"line 2, 'fy' is '-inf', not a finite number"),
+        ("time,fx,fy,fz\n0,1,2,3\n0,1,2,3\n", r"line 3: 'time' repeats \(0, then 0\)"),
+        ("time,fx,fy,fz\n# note\n0.2,1,2,3\n0.1,1,2,3\n", r"line 4: 'time' falls \(0\.2, then 0\.1\)"),
+        ("time,fx,fy,fz\n0,1,2,3\n1,1,2\n", "line 3 has 3 columns but the header 4; mend or drop the line"),
+        ("time,fx,fy,fz\n0,1,1,5,2,5,3,5\n", "where decimals are commas, separate the columns by semicolons"),
+        ("time;fx;fy;fz\n0;1,5;2;3\n1;1.5;2;3\n", "mixes decimal commas and points"),
+        ("time;fx;fy;fz\n0;1.000,5;2;3\n", r"line 2, 'fx' is '1\.000,5', not a number"),
+        ("time,fx,fy,fz\n0,1,2,3\n1,1,2,20000\n", r"line 3: 2e\+04 N is no force of a fingertip; declare the right"),
+        ("time,fx [V],fy [V],fz [V]\n0,1,2,3\n", "'fx .V.' is in 'V', which is no known unit of force"),
+        ("time [h],fx,fy,fz\n0,1,2,3\n", "'time .h.' is in 'h', which is no known unit of time"),
+    ],
+)
+def test_a_table_that_cannot_be_trusted_is_refused(tmp_path: Path, text: str, message: str):
+    with pytest.raises(RecordingError, match=message):
+        read_force_table(write(tmp_path, text))
+
+
+def test_what_is_no_text_is_refused(tmp_path: Path, rng: np.random.Generator):
+    path = tmp_path / "forces.csv"
+    path.write_bytes(rng.bytes(5000))
+    with pytest.raises(RecordingError, match=r"forces\.csv is not a text file; export the table as CSV"):
+        read_force_table(path)
+    with pytest.raises(RecordingError, match="does not exist; check the path"):
+        read_force_table(tmp_path / "nothing.csv")
+    with pytest.raises(RecordingError, match="cannot be read"):
+        read_force_table(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"time_column": "when"}, r"no column 'when', it has 'time_s', 'fx', 'fy', 'fz'; name one of them with time_c"),
+        ({"force_columns": ["fx", "fy", "fw"]}, "no column 'fw'"),
+        ({"force_columns": ["fx"]}, "1 force columns were named"),
+        ({"force_columns": ["fx", "fx", "fz"]}, "the force columns fx, fx, fz repeat"),
+        ({"time_unit": "weeks"}, "'weeks' is no unit of time; use one of s, ms, us, ns"),
+        ({"force_unit": "V"}, "'V' is no unit of force; use one of N, mN, kN, gf, kgf, lbf"),
+    ],
+)
+def test_a_declaration_that_fits_nothing_is_refused(tmp_path: Path, options: dict, message: str):
+    with pytest.raises(RecordingError, match=message):
+        read_force_table(write(tmp_path, table()), **options)

@@ -1,0 +1,175 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sliplens.errors import ImageError, InputError, RecordingError
+from sliplens.images import write_png
+from sliplens.recordings.formats.images import read_image_folder
+
+
+@pytest.fixture
+def frames(rng: np.random.Generator) -> np.ndarray:
+    return rng.integers(0, 256, (12, 20, 30, 3), dtype=np.uint8)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, frames: np.ndarray) -> Path:
+    """Twelve lossless frames whose names do not sort as text."""
+    folder = tmp_path / "trial 7"
+    folder.mkdir()
+    for index, frame in enumerate(frames):
+        suffix = ("png", "tiff", "bmp")[index % 3]
+        Image.fromarray(frame).save(folder / f"image_{index + 1}.{suffix}")
+    return folder
+
+
+def test_frames_come_in_natural_order(folder: Path, frames: np.ndarray):
+    capture = read_image_folder(folder, frame_rate=30.0)
+    np.testing.assert_array_equal(list(capture.read_frames()), frames)
+    np.testing.assert_allclose(capture.frame_time_s, np.arange(12) / 30)
+    assert (capture.name, capture.frame_size, capture.forces) == ("trial-7", (20, 30), None)
+    assert capture.notes == ("trial 7: frames were declared to be taken 30 times a second.",)
+
+
+def test_frames_can_be_read_again(folder: Path):
+    capture = read_image_folder(folder, frame_rate=30.0)
+    np.testing.assert_array_equal(list(capture.read_frames()), list(capture.read_frames()))
+
+
+def test_grey_frames_are_repeated_in_every_channel(tmp_path: Path, frames: np.ndarray):
+    Image.fromarray(frames[0, :, :, 0]).save(tmp_path / "1.png")
+    (frame,) = read_image_folder(tmp_path, frame_rate=30.0).read_frames()
+    np.testing.assert_array_equal(frame, np.repeat(frames[0, :, :, :1], 3, axis=2))
+
+
+def test_lossy_frames_are_told(tmp_path: Path, frames: np.ndarray):
+    Image.fromarray(frames[0]).save(tmp_path / "1.jpg")
+    write_png(tmp_path / "2.png", frames[1])
+    assert "1 of 2 frames are JPEG" in read_image_folder(tmp_path, frame_rate=30.0).notes[1]
+
+
+def test_a_table_of_times_orders_the_frames(folder: Path, frames: np.ndarray, tmp_path: Path):
+    rows = [f"C:\\camera\\{path.name},{10 - 0.1 * int(path.stem[6:])}" for path in folder.iterdir()]
+    table = tmp_path / "times.csv"
+    table.write_text("\n".join(["file,time_s", *rows, "image_99.png,0"]))
+    capture = read_image_folder(folder, times=table)
+    np.testing.assert_array_equal(list(capture.read_frames()), frames[::-1])
+    np.testing.assert_allclose(capture.frame_time_s, 8.8 + 0.1 * np.arange(12))
+    assert capture.notes == (
+        "times.csv: times of images are those of column 'time_s', in s (by its name), their names those of 'file'.",
+        "times.csv: 1 of 13 rows name no image of the folder.",
+    )
+
+
+def test_names_may_lack_their_ending(folder: Path, tmp_path: Path):
+    table = tmp_path / "times.csv"
+    table.write_text("image;stamp [ms]\n" + "".join(f"image_{number};{number},5\n" for number in range(1, 13)))
+    np.testing.assert_allclose(read_image_folder(folder, times=table).frame_time_s, (np.arange(1, 13) + 0.5) * 1e-3)
+
+
+def test_names_hold_times_where_that_is_declared(tmp_path: Path, frames: np.ndarray):
+    for frame, stamp in zip(frames, (12.5, 13.25, 101), strict=False):
+        write_png(tmp_path / f"cam0_{stamp}.png", frame)
+    np.testing.assert_allclose(read_image_folder(tmp_path, name_unit="s").frame_time_s, [12.5, 13.25, 101])
+    np.testing.assert_allclose(read_image_folder(tmp_path, name_unit="ms").frame_time_s, [0.0125, 0.01325, 0.101])
+
+
+def test_forces_lie_beside_the_frames(folder: Path, tmp_path: Path):
+    table = tmp_path / "forces.csv"
+    table.write_text("t,fx,fy,fz\n100,1,2,3\n100.1,1,2,3\n")
+    capture = read_image_folder(folder, frame_rate=30.0, forces=table, start_s=100.0, time_unit="s")
+    assert capture.forces is not None
+    np.testing.assert_allclose(capture.forces.time_s, [100, 100.1])
+    np.testing.assert_allclose(capture.frame_time_s, 100 + np.arange(12) / 30)
+    with pytest.raises(RecordingError, match=r"have no moment in common; declare with start_s"):
+        read_image_folder(folder, frame_rate=30.0, forces=table, time_unit="s")
+
+
+def test_times_must_be_given_in_one_way(folder: Path):
+    with pytest.raises(RecordingError, match="trial 7 have no times; give exactly one of times, frame_rate and name_"):
+        read_image_folder(folder)
+    with pytest.raises(RecordingError, match="more than one source of times"):
+        read_image_folder(folder, frame_rate=30.0, name_unit="s")
+    with pytest.raises(RecordingError, match=r"a frame rate of 0\.0 frames/s cannot be"):
+        read_image_folder(folder, frame_rate=0.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("file,time_s\nimage_1.png,0\n", "has no time for image_2.tiff; add a row"),
+        ("file,time_s\nimage_1.png,0\nimage_1.png,1\n", "line 3 names 'image_1.png' again"),
+        ("file,time_s\n" + "".join(f"image_{number},0\n" for number in range(1, 13)), "'time_s' repeats"),
+        ("file,time_s\nimage_1.png,soon\n", "line 2, 'time_s' is 'soon', not a number"),
+        ("who,time_s\nimage_1.png,0\n", "no column with the names of images among 'who', 'time_s'; call it file"),
+    ],
+)
+def test_a_table_of_times_that_cannot_be_trusted_is_refused(folder: Path, tmp_path: Path, text: str, message: str):
+    table = tmp_path / "times.csv"
+    table.write_text(text)
+    with pytest.raises(RecordingError, match=message):
+        read_image_folder(folder, times=table)
+
+
+def test_frames_of_two_sizes_are_refused(folder: Path, frames: np.ndarray):
+    write_png(folder / "image_5.png", frames[0, :10])
+    with pytest.raises(RecordingError, match=r"image_5\.png is 30 x 10 pixels but image_1\.png is 30 x 20"):
+        read_image_folder(folder, frame_rate=30.0)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "mode", "cure"),
+    [
+        (np.zeros((20, 30), dtype=np.uint16), "I;16", "16 bits a pixel; convert it to 8-bit RGB"),
+        (np.zeros((20, 30, 4), dtype=np.uint8), "RGBA", "4 channels .alpha.; drop the alpha channel"),
+    ],
+)
+def test_frames_of_another_depth_are_refused(folder: Path, pixels: np.ndarray, mode: str, cure: str):
+    image = Image.fromarray(pixels)
+    assert image.mode == mode
+    image.save(folder / "image_13.png")
+    capture = read_image_folder(folder, frame_rate=30.0)
+    with pytest.raises(ImageError, match=cure):
+        list(capture.read_frames())
+
+
+def test_damaged_images_are_refused(folder: Path):
+    first = folder / "image_1.png"
+    first.write_bytes(first.read_bytes()[:200])
+    capture = read_image_folder(folder, frame_rate=30.0)
+    with pytest.raises(ImageError, match=r"image_1\.png cannot be read as an image"):
+        list(capture.read_frames())
+    first.write_text("no image")
+    with pytest.raises(ImageError, match=r"image_1\.png cannot be read as an image"):
+        read_image_folder(folder, frame_rate=30.0)
+
+
+def test_an_absurd_size_is_refused(folder: Path):
+    first = folder / "image_1.png"
+    data = bytearray(first.read_bytes())
+    data[16:24] = (30_000).to_bytes(4, "big") * 2  # the header's width and height
+    first.write_bytes(data)
+    with pytest.raises(ImageError, match=r"image_1\.png cannot be read as an image"):
+        read_image_folder(folder, frame_rate=30.0)
+
+
+def test_several_images_in_a_file_are_refused(folder: Path, frames: np.ndarray):
+    pages = [Image.fromarray(frame) for frame in frames[:3]]
+    pages[0].save(folder / "image_2.tiff", save_all=True, append_images=pages[1:])
+    with pytest.raises(ImageError, match=r"image_2\.tiff holds 3 images; save one image a file"):
+        read_image_folder(folder, frame_rate=30.0)
+
+
+def test_a_folder_without_images_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="holds no image"):
+        read_image_folder(tmp_path, frame_rate=30.0)
+    with pytest.raises(InputError, match="does not exist"):
+        read_image_folder(tmp_path / "nothing", frame_rate=30.0)
+
+
+def test_names_without_numbers_are_refused(tmp_path: Path, frames: np.ndarray):
+    write_png(tmp_path / "start.png", frames[0])
+    with pytest.raises(RecordingError, match=r"start\.png has no number in its name; give its time in a table"):
+        read_image_folder(tmp_path, name_unit="s")

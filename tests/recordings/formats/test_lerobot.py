@@ -1,0 +1,435 @@
+"""Data sets written here in the layout of LeRobot v3.0 come back as they were; others are refused."""
+
+import contextlib
+import io
+import json
+import tracemalloc
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+from sliplens.errors import RecordingError
+from sliplens.recordings.formats.lerobot import read_lerobot
+
+FPS = 30
+HEIGHT, WIDTH = 48, 64
+LENGTHS = (7, 5, 6)
+FILES = (0, 0, 1)
+"""File of each episode: the first two share one, for data and for videos."""
+CAMERA, SCENE, FORCE = "observation.images.tactile", "observation.images.front", "observation.wrench"
+LOSSLESS = {"codec": "libx264rgb", "pix_fmt": "rgb24", "options": {"qp": "0", "g": "2", "bf": "0"}}
+TEMPLATE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+
+Edit = Callable[[dict[str, Any]], object]
+
+
+def write_video(path: Path, frames: np.ndarray, *, codec: str, pix_fmt: str, options: dict[str, str]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream(codec, rate=FPS, options=options)
+        stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], pix_fmt
+        stream.time_base = Fraction(1, FPS)
+        for index, pixels in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+            frame.pts, frame.time_base = index, Fraction(1, FPS)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def png(pixels: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def write_info(folder: Path, edit: Edit | None = None) -> None:
+    camera = {"dtype": "video", "shape": [HEIGHT, WIDTH, 3], "names": ["height", "width", "channels"]}
+    number = {"dtype": "float32", "shape": [1], "names": None}
+    axes = ["fx", "fy", "fz", "tx", "ty", "tz"]
+    info = {
+        "codebase_version": "v3.0",
+        "fps": FPS,
+        "total_episodes": len(LENGTHS),
+        "total_frames": sum(LENGTHS),
+        "chunks_size": 1000,
+        "data_path": f"data/{TEMPLATE}.parquet",
+        "video_path": f"videos/{{video_key}}/{TEMPLATE}.mp4",
+        "features": {
+            CAMERA: camera,
+            SCENE: dict(camera),
+            FORCE: {"dtype": "float32", "shape": [6], "names": axes},
+            "observation.state": {"dtype": "float32", "shape": [2], "names": ["x", "y"]},
+            "action.wrench": {"dtype": "float32", "shape": [6], "names": axes},
+            "timestamp": number,
+        },
+    }
+    if edit is not None:
+        edit(info)
+    (folder / "meta").mkdir(parents=True, exist_ok=True)
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+
+
+def write_table(path: Path, columns: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.table(columns), path)
+
+
+def write_dataset(
+    folder: Path, frames: np.ndarray, wrenches: np.ndarray, *, coding: dict[str, Any] = LOSSLESS, images: bool = False
+) -> Path:
+    """Write every episode's frames, rows and metadata as LeRobot lays them out."""
+    if images:
+        write_info(folder, lambda info: info["features"][CAMERA].update(dtype="image"))
+    else:
+        write_info(folder)
+    starts = np.cumsum([0, *LENGTHS])
+    episode_of = np.repeat(range(len(LENGTHS)), LENGTHS)
+    in_episode = np.arange(sum(LENGTHS)) - starts[episode_of]
+    for file in set(FILES):
+        own = np.isin(episode_of, [episode for episode, of in enumerate(FILES) if of == file])
+        place = TEMPLATE.format(chunk_index=0, file_index=file)
+        columns = {
+            "timestamp": pa.array((in_episode[own] / FPS).astype(np.float32)),
+            "frame_index": in_episode[own],
+            "episode_index": episode_of[own],
+            "index": np.flatnonzero(own),
+            "task_index": np.zeros(own.sum(), np.int64),
+            FORCE: pa.FixedSizeListArray.from_arrays(pa.array(wrenches[own].reshape(-1)), 6),
+            "observation.state": pa.array(wrenches[own][:, :2].tolist()),
+        }
+        if images:
+            columns[CAMERA] = [{"bytes": png(pixels), "path": "frame.png"} for pixels in frames[own]]
+        else:
+            for key, shown in ((CAMERA, frames), (SCENE, 255 - frames)):
+                write_video(folder / "videos" / key / f"{place}.mp4", shown[own], **coding)
+        write_table(folder / "data" / f"{place}.parquet", columns)
+    write_episodes(folder, starts)
+    return folder
+
+
+def write_episodes(folder: Path, starts: np.ndarray, **changes: Any) -> None:
+    first_of_file = [starts[FILES.index(file)] for file in FILES]
+    count = len(LENGTHS)
+    columns = {
+        "episode_index": list(range(count)),
+        "tasks": [["press"]] * count,
+        "length": list(LENGTHS),
+        "data/chunk_index": [0] * count,
+        "data/file_index": list(FILES),
+        "dataset_from_index": starts[:-1].tolist(),
+        "dataset_to_index": starts[1:].tolist(),
+    }
+    for key in (CAMERA, SCENE):
+        columns |= {
+            f"videos/{key}/chunk_index": [0] * count,
+            f"videos/{key}/file_index": list(FILES),
+            f"videos/{key}/from_timestamp": ((starts[:-1] - first_of_file) / FPS).tolist(),
+            f"videos/{key}/to_timestamp": ((starts[1:] - first_of_file) / FPS).tolist(),
+        }
+    write_table(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet", columns | changes)
+
+
+def split(values: np.ndarray) -> list[np.ndarray]:
+    return np.split(values, np.cumsum(LENGTHS)[:-1])
+
+
+@pytest.fixture
+def frames(rng: np.random.Generator) -> np.ndarray:
+    return rng.integers(0, 256, (sum(LENGTHS), HEIGHT, WIDTH, 3), dtype=np.uint8)
+
+
+@pytest.fixture
+def wrenches(rng: np.random.Generator) -> np.ndarray:
+    return rng.normal(size=(sum(LENGTHS), 6)).astype(np.float32)
+
+
+@pytest.fixture
+def dataset(tmp_path: Path, frames: np.ndarray, wrenches: np.ndarray) -> Path:
+    return write_dataset(tmp_path / "press v3", frames, wrenches)
+
+
+def test_episodes_come_back_without_loss(dataset, frames, wrenches):
+    captures = read_lerobot(dataset)
+    assert [capture.name for capture in captures] == [f"press-v3-{index:06d}" for index in range(3)]
+    for capture, shown, felt in zip(captures, split(frames), split(wrenches), strict=True):
+        np.testing.assert_array_equal(list(capture.read_frames()), shown)
+        assert capture.frame_size == (HEIGHT, WIDTH)
+        assert capture.forces is not None
+        np.testing.assert_array_equal(capture.forces.force_n, felt[:, :3])
+        np.testing.assert_array_equal(capture.forces.time_s, capture.frame_time_s)
+        # stored in single precision
+        np.testing.assert_allclose(capture.frame_time_s, np.arange(len(shown)) / FPS, atol=1e-7)
+
+
+def test_an_episode_is_read_alone_and_anew_at_every_call(dataset, frames):
+    (capture,) = read_lerobot(dataset, episode=1)
+    first, again = capture.read_frames(), capture.read_frames()
+    next(first)
+    np.testing.assert_array_equal(next(first), split(frames)[1][1])
+    np.testing.assert_array_equal(list(again), split(frames)[1])
+
+
+def test_an_episode_that_is_not_there_is_refused(dataset):
+    with pytest.raises(RecordingError, match=r"press v3 has no episode 3; it has 3, from 0 to 2"):
+        read_lerobot(dataset, episode=3)
+
+
+def test_key_frames_far_apart_and_frames_out_of_order_change_nothing(tmp_path, frames, wrenches):
+    options = {"qp": "0", "g": "250", "bf": "3", "b_strategy": "0", "x264-params": "b-pyramid=normal:open-gop=1"}
+    folder = write_dataset(tmp_path / "a", frames, wrenches, coding={**LOSSLESS, "options": options})
+    for capture, shown in zip(read_lerobot(folder), split(frames), strict=True):
+        np.testing.assert_array_equal(list(capture.read_frames()), shown)
+
+
+@pytest.mark.parametrize("key_frame", [2, 3, 4, 5])
+def test_a_key_frame_shown_after_the_episode_begins_loses_no_frame(tmp_path, frames, wrenches, key_frame):
+    params = f"bframes=3:b-adapt=0:open-gop=1:scenecut=0:keyint={key_frame}:min-keyint=1"
+    coding = {**LOSSLESS, "options": {"qp": "0", "x264-params": params}}
+    folder = write_dataset(tmp_path / "a", frames, wrenches, coding=coding)
+    for capture, shown in zip(read_lerobot(folder), split(frames), strict=True):
+        np.testing.assert_array_equal(list(capture.read_frames()), shown)
+
+
+@pytest.mark.skipif("libsvtav1" not in av.codecs_available, reason="FFmpeg was built without SVT-AV1")
+def test_frames_are_told_apart_in_the_lossy_video_that_lerobot_writes(tmp_path, wrenches):
+    # plain frames 14 grey values apart: coding and YUV move each by a few, never half way to its neighbour
+    level = 8 + 14 * np.arange(sum(LENGTHS), dtype=np.uint8)
+    frames = np.broadcast_to(level[:, None, None, None], (len(level), HEIGHT + 16, WIDTH, 3)).copy()
+    coding = {"codec": "libsvtav1", "pix_fmt": "yuv420p", "options": {"g": "2", "crf": "30", "preset": "12"}}
+    folder = write_dataset(tmp_path / "a", frames, wrenches, coding=coding)
+    for capture, shown in zip(read_lerobot(folder), split(frames), strict=True):
+        assert np.abs(np.array(list(capture.read_frames()), dtype=int) - shown).max() < 7
+        assert capture.notes == ("Frames are coded with loss (av1), which moves markers a little.",)
+
+
+def test_images_in_parquet_are_read_too(tmp_path, frames, wrenches):
+    captures = read_lerobot(write_dataset(tmp_path / "a", frames, wrenches, images=True))
+    for capture, shown in zip(captures, split(frames), strict=True):
+        np.testing.assert_array_equal(list(capture.read_frames()), shown)
+        assert capture.notes == ()
+
+
+def test_a_damaged_image_in_parquet_is_refused(tmp_path, frames, wrenches):
+    folder = write_dataset(tmp_path / "a", frames, wrenches, images=True)
+    path = folder / "data" / "chunk-000" / "file-001.parquet"
+    table = pq.read_table(path)
+    cells = table.column(CAMERA).to_pylist()
+    refusals = {
+        b"": "is not in the file; embed the images",
+        cells[3]["bytes"][:900]: "cannot be read as PNG or JPEG",
+        png(frames[0][:-1]): "is 47 x 64 pixels, the first is 48 x 64",
+        png(np.zeros((HEIGHT, WIDTH, 4), np.uint8)): "has pixels of mode RGBA",
+    }
+    for data, message in refusals.items():
+        cells[3]["bytes"] = data
+        pq.write_table(table.set_column(table.schema.get_field_index(CAMERA), CAMERA, pa.array(cells)), path)
+        (capture,) = read_lerobot(folder, episode=2)
+        with pytest.raises(RecordingError, match=f"frame 3 of {CAMERA}, episode 2 of .*, {message}"):
+            list(capture.read_frames())
+
+
+def test_a_camera_is_found_by_its_name_or_named(dataset, frames):
+    (capture,) = read_lerobot(dataset, camera_key=SCENE, episode=0)
+    np.testing.assert_array_equal(list(capture.read_frames()), 255 - split(frames)[0])
+    with pytest.raises(RecordingError, match=rf"has no camera wrist; it has {CAMERA}, {SCENE}"):
+        read_lerobot(dataset, camera_key="wrist")
+    write_info(dataset, lambda info: info["features"].pop(CAMERA))
+    (capture,) = read_lerobot(dataset, episode=0)
+    assert capture.notes[0] == f"{SCENE} was taken for the tactile camera, for there is no other."
+    write_info(dataset, lambda info: info["features"].update(gelsight=info["features"][CAMERA]))
+    with pytest.raises(RecordingError, match=rf"of which {CAMERA}, gelsight could be tactile; name the camera_key"):
+        read_lerobot(dataset)
+    write_info(dataset, lambda info: info["features"][CAMERA].update(info={"is_depth_map": True}))
+    assert SCENE in read_lerobot(dataset, episode=0)[0].source
+    write_info(dataset, lambda info: [info["features"].pop(key) for key in (CAMERA, SCENE)])
+    with pytest.raises(RecordingError, match="press v3 has no camera; record one"):
+        read_lerobot(dataset)
+
+
+def test_a_force_is_found_by_its_name_or_named(dataset, wrenches):
+    write_info(dataset, lambda info: info["features"].update(ft=info["features"][FORCE]))
+    with pytest.raises(RecordingError, match=rf"has forces {FORCE}, ft; name the force_key"):
+        read_lerobot(dataset)
+    assert read_lerobot(dataset, force_key=FORCE, episode=0)[0].forces is not None
+    with pytest.raises(RecordingError, match=rf"has no feature load; 3 or 6 numbers have {FORCE}, action.wrench, ft"):
+        read_lerobot(dataset, force_key="load")
+    with pytest.raises(RecordingError, match=r"observation\.state of .* is float32 of shape \[2\]; a force has 3 or 6"):
+        read_lerobot(dataset, force_key="observation.state")
+    write_info(dataset, lambda info: info["features"].pop(FORCE))
+    (capture,) = read_lerobot(dataset, episode=0)
+    assert capture.forces is None
+    assert capture.notes[0] == "There are no forces: no feature of 3 or 6 numbers is named like one."
+
+
+@pytest.mark.parametrize(
+    "names",
+    [["tx", "ty", "tz", "fx", "fy", "fz"], {"motors": ["torque_x", "torque_y", "torque_z", "fx", "fy", "fz"]}],
+    ids=["list", "groups"],
+)
+def test_torques_are_not_taken_for_forces(dataset, names):
+    write_info(dataset, lambda info: info["features"][FORCE].update(names=names))
+    with pytest.raises(RecordingError, match=r"observation\.wrench of .* begins with t.*; forces must come first"):
+        read_lerobot(dataset)
+
+
+@pytest.mark.parametrize("version", ["v2.0", "v2.1", "v1.6", "v4.0"])
+def test_another_version_is_refused_by_name_with_the_cure(dataset, version):
+    write_info(dataset, lambda info: info.update(codebase_version=version))
+    with pytest.raises(
+        RecordingError, match=rf"LeRobot data set of version {version}, v3\.0 is needed; convert it wit"
+    ):
+        read_lerobot(dataset)
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path):
+    (tmp_path / "meta").mkdir()
+    info = tmp_path / "meta" / "info.json"
+    with pytest.raises(RecordingError, match=r"info\.json does not exist; name the folder of a LeRobot data set"):
+        read_lerobot(tmp_path)
+    for text, message in {
+        "{": "is not valid JSON",
+        "[" * 100_000: "is not valid JSON",
+        "[]": "has no codebase_version",
+        '{"codebase_version": "v3.0", "fps": 0}': "has fps 0; write a positive number",
+        '{"codebase_version": "v3.0", "fps": "30"}': "has fps 30; write a positive number",
+        '{"codebase_version": "v3.0", "fps": 30, "features": {"a": 1}}': "lacks features with dtype and shape",
+    }.items():
+        info.write_text(text)
+        with pytest.raises(RecordingError, match=rf"info\.json {message}"):
+            read_lerobot(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "template",
+    [
+        "../{video_key}.mp4",
+        "videos/../../secret.mp4",
+        "/etc/{video_key}.mp4",
+        "C:\\videos\\{video_key}.mp4",
+        "..\\secret.mp4",
+        "{video_key.__class__}.mp4",
+        "{chunk_index:999999999d}.mp4",
+        "{0}.mp4",
+        "a\0b.mp4",
+        "",
+    ],
+)
+def test_a_template_that_leads_out_of_the_data_set_is_refused(dataset, template):
+    write_info(dataset, lambda info: info.update(video_path=template))
+    with pytest.raises(RecordingError, match="which leads out of the data set or cannot be filled in"):
+        read_lerobot(dataset)
+    write_info(dataset, lambda info: info.update(data_path=template))
+    with pytest.raises(RecordingError, match="which leads out of the data set or cannot be filled in"):
+        read_lerobot(dataset)
+
+
+def test_a_camera_named_like_a_path_is_refused(dataset):
+    write_info(dataset, lambda info: info["features"].update({"../tactile": info["features"].pop(CAMERA)}))
+    starts = np.cumsum([0, *LENGTHS])
+    write_episodes(
+        dataset,
+        starts,
+        **{f"videos/../tactile/{name}": [0, 0, 0] for name in ("chunk_index", "file_index", "from_timestamp")},
+    )
+    with pytest.raises(RecordingError, match="which leads out of the data set or cannot be filled in"):
+        read_lerobot(dataset)
+
+
+def test_a_play_list_dressed_as_a_video_is_not_followed(dataset, tmp_path, frames):
+    write_video(tmp_path / "secret.mp4", frames, **LOSSLESS)
+    video = dataset / "videos" / CAMERA / "chunk-000" / "file-000.mp4"
+    lists = (f"ffconcat version 1.0\nfile '{tmp_path}/secret.mp4'\n", f"#EXTM3U\n#EXTINF:1,\n{tmp_path}/secret.mp4\n")
+    for text in lists:
+        video.write_text(text)
+        with pytest.raises(RecordingError, match=r"file-000\.mp4 cannot be decoded as a video"):
+            read_lerobot(dataset)
+
+
+def test_a_missing_or_damaged_video_is_refused(dataset):
+    video = dataset / "videos" / CAMERA / "chunk-000" / "file-000.mp4"
+    whole = video.read_bytes()
+    video.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(RecordingError, match=r"file-000\.mp4 cannot be decoded as a video \(.*\); copy it again"):
+        read_lerobot(dataset)
+    video.unlink()
+    with pytest.raises(RecordingError, match=r"file-000\.mp4 does not exist; copy the data set again, with its videos"):
+        read_lerobot(dataset)
+
+
+def test_a_video_that_ends_too_early_is_refused_when_it_is_read(dataset, frames):
+    write_video(dataset / "videos" / CAMERA / "chunk-000" / "file-000.mp4", frames[:10], **LOSSLESS)
+    first, second, _ = read_lerobot(dataset)
+    assert len(list(first.read_frames())) == 7
+    shown = second.read_frames()
+    assert sum(1 for _ in zip(range(3), shown, strict=False)) == 3
+    with pytest.raises(RecordingError, match=r"file-000\.mp4 has no frame at 0\.333 s; it is cut off, or was not wri"):
+        next(shown)
+
+
+def test_tables_that_contradict_the_metadata_are_refused(dataset):
+    starts = np.cumsum([0, *LENGTHS])
+    write_episodes(dataset, starts, length=[7, 4, 6])
+    with pytest.raises(RecordingError, match=r"has 5 frames of episode 1, its metadata say 4; leave the episode out"):
+        read_lerobot(dataset)
+    write_episodes(dataset, starts, episode_index=[0, 1, 1])
+    with pytest.raises(RecordingError, match="lists episode 1 twice"):
+        read_lerobot(dataset)
+    write_episodes(dataset, starts, **{f"videos/{CAMERA}/from_timestamp": [0.0, None, 0.0]})
+    with pytest.raises(RecordingError, match=r"has rows without videos/.*/from_timestamp; finish writing the data set"):
+        read_lerobot(dataset)
+    write_episodes(dataset, starts, **{"data/file_index": ["0", "0", "1"]})
+    with pytest.raises(RecordingError, match="has no whole numbers in data/file_index"):
+        read_lerobot(dataset)
+    write_episodes(dataset, starts)
+    write_info(dataset, lambda info: info["features"][FORCE].update(shape=[3]))
+    with pytest.raises(RecordingError, match=r"does not hold 3 numbers a frame, as meta/info\.json says"):
+        read_lerobot(dataset)
+
+
+def test_missing_and_damaged_tables_are_refused(dataset):
+    data = dataset / "data" / "chunk-000" / "file-001.parquet"
+    pq.write_table(pq.read_table(data).drop_columns([FORCE]), data)
+    with pytest.raises(RecordingError, match=rf"file-001\.parquet lacks {FORCE}"):
+        read_lerobot(dataset)
+    data.write_bytes(data.read_bytes()[:-9])
+    with pytest.raises(RecordingError, match=r"file-001\.parquet is not a readable Parquet file"):
+        read_lerobot(dataset)
+    data.unlink()
+    with pytest.raises(RecordingError, match=r"file-001\.parquet does not exist"):
+        read_lerobot(dataset)
+    (dataset / "meta" / "episodes" / "chunk-000" / "file-000.parquet").unlink()
+    with pytest.raises(RecordingError, match="episodes lists no episode"):
+        read_lerobot(dataset)
+
+
+@pytest.mark.parametrize("images", [False, True], ids=["video", "images"])
+def test_a_data_set_with_any_byte_changed_raises_no_foreign_error(tmp_path, rng, frames, wrenches, images):
+    folder = write_dataset(tmp_path / "a", frames, wrenches, images=images)
+    for file in [path for path in folder.rglob("*") if path.is_file() and SCENE not in path.parts]:
+        whole = file.read_bytes()
+        for at in rng.integers(0, len(whole), 10):
+            damaged = bytearray(whole)
+            damaged[at] ^= 255
+            file.write_bytes(damaged)
+            with contextlib.suppress(RecordingError):
+                for capture in read_lerobot(folder):
+                    list(capture.read_frames())
+        file.write_bytes(whole)
+
+
+def test_memory_does_not_grow_with_the_length_of_an_episode(dataset):
+    (capture,) = read_lerobot(dataset, episode=0)
+    tracemalloc.start()
+    for _ in capture.read_frames():
+        pass
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 5 * HEIGHT * WIDTH * 3

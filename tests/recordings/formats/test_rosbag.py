@@ -1,0 +1,466 @@
+"""Bags written here with images and wrenches come back as they were; damaged and foreign ones are refused."""
+
+import contextlib
+import io
+import sqlite3
+import sys
+import tracemalloc
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sliplens.errors import InputError, RecordingError
+from sliplens.recordings.formats.rosbag import read_rosbag
+
+pytest.importorskip("rosbags")
+
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+TYPES = get_typestore(Stores.ROS2_HUMBLE)
+CAMERA, FORCE = "/tactile/image", "/wrench"
+HEIGHT, WIDTH, FRAMES = 12, 16, 5
+EPOCH_NS = 1_742_563_762_691_831_035
+"""A day in 2025: seconds since 1970 in double precision would round the stamps."""
+
+Event = tuple[str, Any, int]
+
+
+def make(kind: str, **fields: Any) -> Any:
+    return TYPES.types[kind](**fields)
+
+
+def header(time_ns: int) -> Any:
+    stamp = make("builtin_interfaces/msg/Time", sec=time_ns // 10**9, nanosec=time_ns % 10**9)
+    return make("std_msgs/msg/Header", stamp=stamp, frame_id="gel")
+
+
+def raw_image(pixels: np.ndarray, time_ns: int, *, encoding: str = "rgb8", padding: int = 0, **claims: Any) -> Any:
+    height, width = pixels.shape[:2]
+    rows = np.pad(pixels.reshape(height, -1), ((0, 0), (0, padding)))
+    fields = {
+        "header": header(time_ns),
+        "height": height,
+        "width": width,
+        "encoding": encoding,
+        "is_bigendian": 0,
+        "step": rows.shape[1],
+        "data": rows.reshape(-1),
+    }
+    return make("sensor_msgs/msg/Image", **(fields | claims))
+
+
+def compressed_image(data: bytes, time_ns: int, *, form: str = "rgb8; jpeg compressed bgr8") -> Any:
+    return make(
+        "sensor_msgs/msg/CompressedImage", header=header(time_ns), format=form, data=np.frombuffer(data, np.uint8)
+    )
+
+
+def wrench(force: Sequence[float], time_ns: int) -> Any:
+    def vector(x: float, y: float, z: float) -> Any:
+        return make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+    content = make("geometry_msgs/msg/Wrench", force=vector(*force), torque=vector(7.0, 8.0, 9.0))
+    return make("geometry_msgs/msg/WrenchStamped", header=header(time_ns), wrench=content)
+
+
+def encode(pixels: np.ndarray, form: str) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format=form)
+    return buffer.getvalue()
+
+
+def write_bag(
+    folder: Path,
+    events: Sequence[Event],
+    *,
+    storage: str = "MCAP",
+    compression: str | None = None,
+    topics: Sequence[tuple[str, str]] = (),
+) -> Path:
+    writer = Writer(folder, version=9, storage_plugin=StoragePlugin[storage])
+    if compression is not None:
+        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+    with writer:
+        connections = {}
+        for topic, kind in [*topics, *((topic, message.__msgtype__) for topic, message, _ in events)]:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=TYPES)
+        for topic, message, time_ns in events:
+            writer.write(connections[topic], time_ns, TYPES.serialize_cdr(message, message.__msgtype__))
+    return folder
+
+
+def frame_ns(index: int) -> int:
+    return EPOCH_NS + 33_333_333 * index
+
+
+def wrench_ns(index: int) -> int:
+    return EPOCH_NS - 5_000_001 + 10_000_000 * index
+
+
+@pytest.fixture
+def pixels(rng: np.random.Generator) -> np.ndarray:
+    return rng.integers(0, 256, (FRAMES, HEIGHT, WIDTH, 3), dtype=np.uint8)
+
+
+@pytest.fixture
+def forces(rng: np.random.Generator) -> np.ndarray:
+    return rng.normal(size=(14, 3))
+
+
+@pytest.fixture
+def frames_of(pixels: np.ndarray) -> Callable[..., list[Event]]:
+    """Camera events; each arrives 2 ms after its stamp."""
+
+    def frames(**fields: Any) -> list[Event]:
+        return [
+            (CAMERA, raw_image(image, frame_ns(index), **fields), frame_ns(index) + 2_000_000)
+            for index, image in enumerate(pixels)
+        ]
+
+    return frames
+
+
+@pytest.fixture
+def wrenches(forces: np.ndarray) -> list[Event]:
+    return [
+        (FORCE, wrench(force.tolist(), wrench_ns(index)), wrench_ns(index) + 1_000_000)
+        for index, force in enumerate(forces)
+    ]
+
+
+@pytest.fixture
+def recorded(frames_of: Callable[..., list[Event]], wrenches: list[Event]) -> list[Event]:
+    return in_order(frames_of(), wrenches)
+
+
+def in_order(*streams: Sequence[Event]) -> list[Event]:
+    return sorted((event for stream in streams for event in stream), key=lambda event: event[2])
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [("MCAP", None), ("MCAP", "STORAGE"), ("SQLITE3", None), ("SQLITE3", "MESSAGE"), ("SQLITE3", "FILE")],
+    ids=str,
+)
+def test_a_bag_comes_back_without_loss(tmp_path, pixels, forces, recorded, kind):
+    path = write_bag(tmp_path / "trial", recorded, storage=kind[0], compression=kind[1])
+    capture = read_rosbag(path)
+    np.testing.assert_array_equal(list(capture.read_frames()), pixels)
+    assert capture.forces is not None
+    np.testing.assert_array_equal(capture.forces.force_n, forces)
+    assert (capture.name, capture.frame_size, capture.notes) == ("trial", (HEIGHT, WIDTH), ())
+
+
+def test_frames_and_forces_count_from_the_first_of_them_without_rounding(tmp_path, recorded):
+    capture = read_rosbag(write_bag(tmp_path / "trial", recorded))
+    assert capture.forces is not None
+    first = wrench_ns(0)
+    assert capture.forces.time_s.tolist() == [(wrench_ns(index) - first) / 1e9 for index in range(14)]
+    assert capture.frame_time_s.tolist() == [(frame_ns(index) - first) / 1e9 for index in range(FRAMES)]
+    assert capture.frame_time_s[0] == 0.005000001
+
+
+@pytest.mark.parametrize("suffix", [("MCAP", ".mcap"), ("SQLITE3", ".db3")])
+def test_a_file_of_a_bag_is_read_like_its_folder(tmp_path, pixels, frames_of, suffix):
+    folder = write_bag(tmp_path / "trial 7", frames_of(), storage=suffix[0])
+    (file,) = folder.glob(f"*{suffix[1]}")
+    (folder / "metadata.yaml").unlink()
+    capture = read_rosbag(file)
+    np.testing.assert_array_equal(list(capture.read_frames()), pixels)
+    assert capture.name == "trial-7"
+
+
+@pytest.mark.parametrize("storage", ["MCAP", "SQLITE3"])
+def test_a_bag_split_into_files_is_read_as_one(tmp_path, pixels, forces, recorded, storage):
+    first = write_bag(tmp_path / "first", recorded[:9], storage=storage)
+    second = write_bag(tmp_path / "second", recorded[9:], storage=storage)
+    (file,) = second.glob("second.*")
+    file.rename(first / file.name)
+    metadata = first / "metadata.yaml"
+    text = metadata.read_text()
+    assert f"- first{file.suffix}\n" in text
+    metadata.write_text(text.replace(f"- first{file.suffix}\n", f"- first{file.suffix}\n  - {file.name}\n", 1))
+    capture = read_rosbag(first)
+    np.testing.assert_array_equal(list(capture.read_frames()), pixels)
+    assert capture.forces is not None
+    np.testing.assert_array_equal(capture.forces.force_n, forces)
+
+
+def test_frames_begin_anew_at_every_call(tmp_path, frames_of):
+    capture = read_rosbag(write_bag(tmp_path / "trial", frames_of()))
+    first, again = capture.read_frames(), capture.read_frames()
+    next(first)
+    np.testing.assert_array_equal(next(first), [*again][1])
+
+
+def test_bgr_is_turned_into_rgb_and_grey_is_repeated(tmp_path, pixels):
+    bgr = [(CAMERA, raw_image(image[..., ::-1], frame_ns(i), encoding="bgr8"), i) for i, image in enumerate(pixels)]
+    np.testing.assert_array_equal(list(read_rosbag(write_bag(tmp_path / "bgr", bgr)).read_frames()), pixels)
+    grey = [(CAMERA, raw_image(image[..., :1], frame_ns(i), encoding="mono8"), i) for i, image in enumerate(pixels)]
+    frames = np.array(list(read_rosbag(write_bag(tmp_path / "grey", grey)).read_frames()))
+    np.testing.assert_array_equal(frames, np.repeat(pixels[..., :1], 3, axis=-1))
+
+
+def test_padding_at_the_end_of_rows_is_left_out(tmp_path, pixels, frames_of):
+    capture = read_rosbag(write_bag(tmp_path / "trial", frames_of(padding=5)))
+    np.testing.assert_array_equal(list(capture.read_frames()), pixels)
+
+
+def test_compressed_images_are_what_pillow_makes_of_their_bytes(tmp_path, pixels):
+    for form in ("PNG", "JPEG"):
+        data = [encode(image, form) for image in pixels]
+        events = [(CAMERA, compressed_image(one, frame_ns(i)), i) for i, one in enumerate(data)]
+        frames = list(read_rosbag(write_bag(tmp_path / form, events)).read_frames())
+        np.testing.assert_array_equal(frames, [np.array(Image.open(io.BytesIO(one))) for one in data])
+        if form == "PNG":  # lossless: what was recorded
+            np.testing.assert_array_equal(frames, pixels)
+
+
+def test_a_grey_jpeg_is_repeated_in_three_channels(tmp_path, pixels):
+    data = encode(pixels[0, ..., 0], "JPEG")
+    (frame,) = read_rosbag(
+        write_bag(tmp_path / "trial", [(CAMERA, compressed_image(data, frame_ns(0), form="mono8; jpeg"), 0)])
+    ).read_frames()
+    expected = np.array(Image.open(io.BytesIO(data)))
+    np.testing.assert_array_equal(frame, np.stack([expected] * 3, axis=-1))
+
+
+@pytest.mark.parametrize(("encoding", "channels"), [("16UC1", 2), ("rgba8", 4), ("bayer_rggb8", 1), ("", 3)])
+def test_another_encoding_is_refused_by_name(tmp_path, rng, encoding, channels):
+    pixels = rng.integers(0, 256, (HEIGHT, WIDTH, channels), dtype=np.uint8)
+    path = write_bag(tmp_path / "trial", [(CAMERA, raw_image(pixels, frame_ns(0), encoding=encoding), 0)])
+    with pytest.raises(
+        RecordingError, match=rf"frame 0 of .* has encoding '{encoding}'; record it as rgb8, bgr8, mono8"
+    ):
+        read_rosbag(path)
+
+
+def test_another_kind_of_compressed_image_is_refused(tmp_path, pixels):
+    depth = compressed_image(b"\0" * 12 + encode(pixels[0], "PNG"), frame_ns(0), form="16UC1; compressedDepth png")
+    with pytest.raises(RecordingError, match=r"of format '16UC1; compressedDepth png', cannot be read as JPEG or PNG"):
+        read_rosbag(write_bag(tmp_path / "depth", [(CAMERA, depth, 0)]))
+    alpha = compressed_image(encode(np.zeros((4, 4, 4), np.uint8), "PNG"), frame_ns(0))
+    with pytest.raises(RecordingError, match=r"has pixels of mode RGBA; record it as 8-bit RGB or grey"):
+        read_rosbag(write_bag(tmp_path / "alpha", [(CAMERA, alpha, 0)]))
+
+
+def test_frames_of_changing_size_are_refused(tmp_path, pixels, frames_of):
+    small = (CAMERA, raw_image(pixels[0, :-2], frame_ns(FRAMES)), frame_ns(FRAMES) + 2_000_000)
+    with pytest.raises(RecordingError, match=r"frame 5 of .* is 10 x 16 pixels, those before it are 12 x 16; cut"):
+        read_rosbag(write_bag(tmp_path / "trial", [*frames_of(), small]))
+
+
+@pytest.mark.parametrize(
+    "claims",
+    [
+        {"height": 200_000, "width": 170_000, "step": 510_000},  # 100 GB
+        {"height": 2**32 - 1, "width": 1, "step": 2**32 - 1},  # more than 64 bits can count
+        {"height": HEIGHT + 1},
+    ],
+)
+def test_a_header_that_claims_more_than_there_is_is_refused_without_allocating(tmp_path, frames_of, claims):
+    path = write_bag(tmp_path / "trial", frames_of(**claims))
+    tracemalloc.start()
+    with pytest.raises(RecordingError, match=r"claims \d+ rows of \d+ bytes but holds 576 bytes; record it again"):
+        read_rosbag(path)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 64e6
+
+
+@pytest.mark.parametrize("claims", [{"height": 0}, {"width": 0}, {"step": 0}, {"width": WIDTH + 1}])
+def test_a_header_that_contradicts_itself_is_refused(tmp_path, frames_of, claims):
+    with pytest.raises(RecordingError, match=r"claims \d+ x \d+ pixels in rows of \d+ bytes, which cannot be in rgb8"):
+        read_rosbag(write_bag(tmp_path / "trial", frames_of(**claims)))
+
+
+def test_a_decompression_bomb_is_refused(tmp_path, monkeypatch, pixels):
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 50)
+    event = (CAMERA, compressed_image(encode(pixels[0], "PNG"), frame_ns(0)), 0)
+    with pytest.raises(RecordingError, match=r"frame 0 of .* cannot be read as JPEG or PNG \(.*decompression bomb"):
+        read_rosbag(write_bag(tmp_path / "trial", [event]))
+
+
+def test_a_compressed_frame_that_is_cut_short_is_refused_when_it_is_read(tmp_path, rng):
+    noise = rng.integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    whole, cut = encode(noise, "PNG"), encode(noise, "PNG")[:4000]
+    events = [(CAMERA, compressed_image(data, frame_ns(i)), i) for i, data in enumerate((whole, cut))]
+    frames = read_rosbag(write_bag(tmp_path / "trial", events)).read_frames()
+    np.testing.assert_array_equal(next(frames), noise)
+    with pytest.raises(RecordingError, match=r"frame 1 of .* is damaged \(.*; cut the bag before it"):
+        next(frames)
+
+
+def test_without_header_stamps_both_topics_take_the_time_of_the_bag(tmp_path, pixels, wrenches):
+    frames = [(CAMERA, raw_image(image, 0), frame_ns(i) + 2_000_000) for i, image in enumerate(pixels)]
+    capture = read_rosbag(write_bag(tmp_path / "trial", in_order(frames, wrenches)))
+    assert capture.forces is not None
+    first = wrench_ns(0) + 1_000_000
+    assert capture.frame_time_s.tolist() == [(frame_ns(i) + 2_000_000 - first) / 1e9 for i in range(FRAMES)]
+    assert capture.forces.time_s[0] == 0
+    assert capture.notes == (
+        f"5 of 5 messages of {CAMERA} have no header stamp: times are those at which the bag received the messages.",
+    )
+
+
+def test_clocks_that_never_meet_are_replaced_by_the_time_of_the_bag(tmp_path, pixels, wrenches):
+    since_boot = [(CAMERA, raw_image(im, 10**9 * (i + 1)), frame_ns(i) + 2_000_000) for i, im in enumerate(pixels)]
+    capture = read_rosbag(write_bag(tmp_path / "trial", in_order(since_boot, wrenches)))
+    assert capture.frame_time_s[0] == 0.006000001
+    assert f"header stamps of {CAMERA} and {FORCE} are of different clocks" in capture.notes[0]
+
+
+def test_stamps_out_of_order_are_refused(tmp_path, pixels):
+    swapped = [
+        (CAMERA, raw_image(im, frame_ns(t)), frame_ns(i))
+        for i, (im, t) in enumerate(zip(pixels, (0, 1, 3, 2, 4), strict=True))
+    ]
+    with pytest.raises(RecordingError, match=r"the frames of /tactile/image of .*: time does not rise at sample 3"):
+        read_rosbag(write_bag(tmp_path / "trial", swapped))
+
+
+def test_a_bag_without_wrenches_has_no_forces(tmp_path, frames_of):
+    capture = read_rosbag(write_bag(tmp_path / "a", frames_of()))
+    assert capture.forces is None
+    assert capture.notes == ("There are no forces: the bag has no topic of geometry_msgs/msg/WrenchStamped.",)
+    silent = write_bag(tmp_path / "b", frames_of(), topics=[(FORCE, "geometry_msgs/msg/WrenchStamped")])
+    assert read_rosbag(silent).notes == ("There are no forces: /wrench has no message.",)
+    with pytest.raises(RecordingError, match=r"/wrench of .* has no force sample; record the force sensor too"):
+        read_rosbag(silent, wrench_topic=FORCE)
+
+
+def test_of_several_topics_one_must_be_named(tmp_path, pixels, frames_of, wrenches):
+    other = [("/scene", raw_image(255 - image, frame_ns(i)), frame_ns(i)) for i, image in enumerate(pixels)]
+    path = write_bag(tmp_path / "trial", in_order(frames_of(), other, wrenches))
+    with pytest.raises(
+        RecordingError,
+        match=r"has 2 topics with images, /scene \(sensor_msgs/msg/Image\), /tactile/image \(.*\); name one of them",
+    ):
+        read_rosbag(path)
+    frames = read_rosbag(path, image_topic="/scene", wrench_topic=FORCE).read_frames()
+    np.testing.assert_array_equal(list(frames), 255 - pixels)
+    left = [("/left", message, time_ns) for _, message, time_ns in wrenches]
+    path = write_bag(tmp_path / "two", in_order(frames_of(), left, wrenches))
+    with pytest.raises(RecordingError, match=r"has 2 topics with wrenches, /left .*, /wrench .*; name one of them"):
+        read_rosbag(path)
+
+
+def test_a_topic_that_is_not_there_or_holds_something_else_is_refused(tmp_path, recorded):
+    path = write_bag(tmp_path / "trial", recorded)
+    with pytest.raises(
+        RecordingError, match=r"has no topic /camera; it has /tactile/image \(sensor_msgs/msg/Image\), /wr"
+    ):
+        read_rosbag(path, image_topic="/camera")
+    with pytest.raises(
+        RecordingError, match=r"/wrench of .* holds geometry_msgs/msg/WrenchStamped, no images; name one"
+    ):
+        read_rosbag(path, image_topic=FORCE)
+
+
+@pytest.mark.parametrize("storage", ["MCAP", "SQLITE3"])
+def test_an_empty_bag_is_refused(tmp_path, storage):
+    with pytest.raises(RecordingError, match=r"has no topic with images .*; record the camera too \(it has no topic\)"):
+        read_rosbag(write_bag(tmp_path / "nothing", [], storage=storage))
+    silent = write_bag(tmp_path / "silent", [], storage=storage, topics=[(CAMERA, "sensor_msgs/msg/Image")])
+    with pytest.raises(RecordingError, match=r"/tactile/image of .* has no frame; leave it out or record it again"):
+        read_rosbag(silent)
+
+
+@pytest.mark.parametrize("storage", ["MCAP", "SQLITE3"])
+def test_a_bag_that_is_cut_off_is_refused(tmp_path, recorded, storage):
+    path = write_bag(tmp_path / "trial", recorded, storage=storage)
+    (file,) = [*path.glob("*.mcap"), *path.glob("*.db3")]
+    whole = file.read_bytes()
+    for length in (0, 1, 8, 100, len(whole) // 2, len(whole) - 1):
+        file.write_bytes(whole[:length])
+        with pytest.raises(RecordingError, match=r"is not a readable ROS 2 bag|is cut off; copy it again"):
+            read_rosbag(path)
+
+
+def test_a_bag_with_any_byte_changed_raises_no_foreign_error(tmp_path, rng, recorded):
+    for storage in ("MCAP", "SQLITE3"):
+        path = write_bag(tmp_path / storage, recorded, storage=storage)
+        for file in path.iterdir():
+            whole = file.read_bytes()
+            for at in rng.integers(0, len(whole), 25):
+                damaged = bytearray(whole)
+                damaged[at] ^= 1 << rng.integers(8)
+                file.write_bytes(damaged)
+                with contextlib.suppress(RecordingError):
+                    list(read_rosbag(path).read_frames())
+            file.write_bytes(whole)
+
+
+def test_definitions_in_the_bag_are_not_needed(tmp_path, pixels, frames_of):
+    path = write_bag(tmp_path / "trial", frames_of(), storage="SQLITE3")
+    with contextlib.closing(sqlite3.connect(next(path.glob("*.db3")))) as database, database:
+        database.execute("DELETE FROM message_definitions")
+    np.testing.assert_array_equal(list(read_rosbag(path).read_frames()), pixels)
+
+
+def test_a_path_that_is_no_bag_is_refused(tmp_path, frames_of):
+    bag = write_bag(tmp_path / "bag", frames_of())
+    (bag / "metadata.yaml").unlink()
+    (tmp_path / "notes.txt").write_text("no bag")
+    (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
+    (tmp_path / "folder").mkdir()
+    refusals = {
+        "nothing": "does not exist; check the path",
+        "bag": r"has no metadata\.yaml; write it with `ros2 bag reindex`, or name bag\.mcap itself",
+        "folder": r"has no metadata\.yaml; .* or name the folder of one bag",
+        "notes.txt": r"is no ROS 2 bag; name its folder, or its \.mcap or \.db3 file",
+        "old.bag": "is a ROS 1 bag; convert it with `rosbags-convert",
+    }
+    for name, message in refusals.items():
+        with pytest.raises(RecordingError, match=message):
+            read_rosbag(tmp_path / name)
+
+
+def test_files_of_something_else_are_refused(tmp_path, frames_of):
+    with contextlib.closing(sqlite3.connect(tmp_path / "phone.db3")) as database, database:
+        database.execute("CREATE TABLE contacts (name TEXT)")
+    (tmp_path / "video.mcap").write_bytes(b"\0\0\0\x18ftypmp42" * 20)
+    for name in ("phone.db3", "video.mcap"):
+        with pytest.raises(RecordingError, match=f"{name} is not a readable ROS 2 bag"):
+            read_rosbag(tmp_path / name)
+    bag = write_bag(tmp_path / "bag", frames_of())
+    for text in ("", "- a list", "rosbag2_bagfile_information: {version: 99}", "a: [", "a: !!python/object:os.x {}"):
+        (bag / "metadata.yaml").write_text(text)
+        with pytest.raises(RecordingError, match="bag is not a readable ROS 2 bag"):
+            read_rosbag(bag)
+
+
+def test_memory_does_not_grow_with_the_length_of_the_bag(tmp_path, rng):
+    image = rng.integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    path = write_bag(tmp_path / "long", [(CAMERA, raw_image(image, frame_ns(i)), frame_ns(i)) for i in range(200)])
+    tracemalloc.start()
+    count = sum(1 for _ in read_rosbag(path).read_frames())
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert count == 200
+    # 46 MB of pixels in chunks of 1 MiB, each held a few times over while it is cut into messages
+    assert peak < 16e6
+
+
+def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch, frames_of):
+    path = write_bag(tmp_path / "trial", frames_of())
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    with pytest.raises(InputError, match=r'pip install "sliplens\[ros\]"'):
+        read_rosbag(path)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(("name", "topic"), [("tactip_db3", "/sensors/tactip"), ("tactip_mcap", "/servo/out/state")])
+def test_a_real_bag_without_images_has_its_topics_named(reference_folder, name, topic):
+    with pytest.raises(
+        RecordingError, match=rf"{name} has no topic with images .*; record the camera too \(it has .*{topic} \("
+    ):
+        read_rosbag(reference_folder / "rosbags" / name)
+    with pytest.raises(RecordingError, match=rf"{topic} of .*{name} holds .*, no images"):
+        read_rosbag(reference_folder / "rosbags" / name, image_topic=topic)

@@ -1,0 +1,391 @@
+import csv
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sliplens.errors import RecordingError
+from sliplens.images import write_png
+from sliplens.recordings.formats.gelsight import list_gelsight_clips, read_gelsight_clip
+from sliplens.recordings.formats.stored import least_contact, small_copies, stale_frames
+from sliplens.recordings.formats.video import read_video
+
+MILLISECOND = Fraction(1, 1000)
+SIZE = 64, 96
+
+
+def brightening(count: int) -> list[np.ndarray]:
+    """Frames whose brightness tells their number, even after lossy coding."""
+    return [np.full((*SIZE, 3), 20 + 6 * index, dtype=np.uint8) for index in range(count)]
+
+
+def write_video(
+    path: Path,
+    frames: list[np.ndarray],
+    *,
+    codec: str = "ffv1",
+    pixels: str = "bgr0",
+    stamps_ms: list[int] | None = None,
+    reordered: int = 0,
+    title: str = "",
+) -> Path:
+    """Write 25 frames a second, or milliseconds as they are given; `reordered` B-frames in a row."""
+    with av.open(str(path), "w") as container:
+        container.metadata["title"] = title
+        stream = container.add_stream(codec, rate=25)
+        assert isinstance(stream, av.VideoStream)
+        stream.height, stream.width = frames[0].shape[:2] if frames else SIZE
+        stream.pix_fmt = pixels
+        stream.codec_context.max_b_frames = reordered
+        stream.codec_context.gop_size = 12
+        stream.codec_context.bit_rate = 4_000_000
+        if codec == "libx264":
+            # keep the B-frames that were asked for
+            stream.options = {"b-adapt": "0", "threads": "1"}
+        if stamps_ms is not None:
+            stream.codec_context.time_base = stream.time_base = MILLISECOND
+        for index, pixel in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(pixel, format="rgb24")
+            frame.pts = index if stamps_ms is None else stamps_ms[index]
+            frame.time_base = Fraction(1, 25) if stamps_ms is None else MILLISECOND
+            container.mux(stream.encode(frame))
+        if frames:
+            container.mux(stream.encode())
+        else:
+            container.start_encoding()
+    return path
+
+
+LOSSY = [
+    ("a.mp4", "libx264", 0),
+    ("a.mp4", "libx264", 3),
+    ("a.mkv", "libx264", 3),
+    ("a.ts", "libx264", 3),
+    ("a.avi", "libx264", 3),
+    ("a.avi", "mpeg4", 0),
+    ("a.avi", "mpeg4", 2),
+    ("a.mp4", "mpeg4", 2),
+    ("a.avi", "mjpeg", 0),
+]
+
+
+def test_a_title_that_is_no_utf8_does_not_matter(tmp_path):
+    frames = [np.full((*SIZE, 3), level, dtype=np.uint8) for level in (0, 255)]
+    path = write_video(tmp_path / "pull.mkv", frames, title="Gr\u00fcn")
+    coded = path.read_bytes()
+    assert "Gr\u00fcn".encode() in coded
+    path.write_bytes(coded.replace("Gr\u00fcn".encode(), b"Gr\xff\xffn"))
+    assert len(read_video(path).frame_time_s) == 2
+
+
+def test_lossless_frames_come_back_as_they_were(tmp_path: Path, rng: np.random.Generator):
+    frames = list(rng.integers(0, 256, (5, *SIZE, 3), dtype=np.uint8))
+    capture = read_video(write_video(tmp_path / "trial 1.mkv", frames))
+    np.testing.assert_array_equal(list(capture.read_frames()), frames)
+    np.testing.assert_array_equal(list(capture.read_frames()), frames)
+    assert (capture.name, capture.frame_size, capture.forces, capture.notes) == ("trial-1", SIZE, None, ())
+
+
+@pytest.mark.parametrize(("name", "codec", "reordered"), LOSSY)
+def test_frames_come_in_the_order_they_are_shown(tmp_path: Path, name: str, codec: str, reordered: int):
+    pixels = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+    path = write_video(tmp_path / name, brightening(30), codec=codec, pixels=pixels, reordered=reordered)
+    capture = read_video(path)
+    shown = [frame.mean() for frame in capture.read_frames()]
+    np.testing.assert_allclose(shown, 20 + 6 * np.arange(30), atol=2.5)
+    np.testing.assert_allclose(capture.frame_time_s, np.arange(30) / 25, atol=1e-3)
+    assert "frames are coded with loss" in capture.notes[0]
+
+
+def test_frames_are_reordered_in_the_files_above(tmp_path: Path):
+    path = write_video(tmp_path / "a.mp4", brightening(30), codec="libx264", pixels="yuv420p", reordered=3)
+    with av.open(str(path)) as container:
+        stamps = [packet.pts for packet in container.demux(video=0) if packet.pts is not None]
+    assert stamps != sorted(stamps)
+
+
+@pytest.mark.parametrize("codec", ["ffv1", "libx264"])
+def test_a_variable_frame_rate_is_kept(tmp_path: Path, codec: str):
+    stamps = [0, 33, 67, 500, 501, 2000, 2040, 2080]
+    pixels = "bgr0" if codec == "ffv1" else "yuv420p"
+    path = write_video(tmp_path / "a.mkv", brightening(8), codec=codec, pixels=pixels, stamps_ms=stamps, reordered=0)
+    capture = read_video(path)
+    np.testing.assert_allclose(capture.frame_time_s, np.array(stamps) / 1000, atol=1e-9)
+    assert len(list(capture.read_frames())) == 8
+
+
+def test_a_declared_rate_takes_the_place_of_the_stamps(tmp_path: Path):
+    capture = read_video(write_video(tmp_path / "a.mkv", brightening(6)), frame_rate=8.0)
+    np.testing.assert_allclose(capture.frame_time_s, np.arange(6) / 8)
+    assert capture.notes == ("a.mkv: frames were declared to be taken 8 times a second, whatever its stamps say.",)
+
+
+def test_a_stream_without_stamps_needs_a_declared_rate(tmp_path: Path):
+    path = write_video(tmp_path / "a.h264", brightening(6), codec="libx264", pixels="yuv420p")
+    with pytest.raises(RecordingError, match=r"a\.h264 has no presentation stamps; declare its frame_rate"):
+        read_video(path)
+    capture = read_video(path, frame_rate=25.0)
+    np.testing.assert_allclose([frame.mean() for frame in capture.read_frames()], 20 + 6 * np.arange(6), atol=2.5)
+
+
+@pytest.mark.parametrize("rate", [0.0, -8.0, float("nan"), float("inf")])
+def test_a_rate_that_cannot_be_is_refused(tmp_path: Path, rate: float):
+    with pytest.raises(RecordingError, match="cannot be; declare a positive one"):
+        read_video(write_video(tmp_path / "a.mkv", brightening(2)), frame_rate=rate)
+
+
+def test_skipped_frames_keep_the_times_of_the_rest(tmp_path: Path):
+    path = write_video(tmp_path / "a.mkv", brightening(6))
+    capture = read_video(path, skip_frames=2)
+    np.testing.assert_array_equal(list(capture.read_frames()), brightening(6)[2:])
+    np.testing.assert_allclose(capture.frame_time_s, np.arange(2, 6) / 25, atol=1e-3)
+    assert capture.notes == ("a.mkv: the first 2 of 6 frames were left out.",)
+    with pytest.raises(RecordingError, match=r"a\.mkv has 6 frames, 6 were to be skipped; skip fewer"):
+        read_video(path, skip_frames=6)
+    with pytest.raises(RecordingError, match="-1 frames cannot be skipped"):
+        read_video(path, skip_frames=-1)
+
+
+def test_forces_lie_beside_the_video(tmp_path: Path):
+    path = write_video(tmp_path / "a.mkv", brightening(6))
+    table = tmp_path / "forces.csv"
+    table.write_text("t_s,fx,fy,fz\n10,1,2,3\n10.1,4,5,6\n")
+    capture = read_video(path, forces=table, start_s=10.0, skip_frames=1)
+    assert capture.forces is not None
+    np.testing.assert_array_equal(capture.forces.force_n, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_allclose(capture.frame_time_s, 10 + np.arange(1, 6) / 25, atol=1e-3)
+    assert "a.mkv: the first frame was declared to be taken at 10 s of the force clock." in capture.notes
+    with pytest.raises(RecordingError, match=r"have no moment in common; declare with start_s when the first frame"):
+        read_video(path, forces=table)
+    table.write_text("t_s,fx,fy,fz\n0,1,2,3\n0.1,4,5,6\n")
+    assert "taken to count from the same zero" in read_video(path, forces=table).notes[-1]
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "message"),
+    [
+        ("a.mp4", "mpeg4", r"a\.mp4 cannot be read as a video"),  # its table of contents stands at the end
+        (
+            "a.avi",
+            "mpeg4",
+            r"a\.avi is truncated or damaged: it ends before frame \d+, sooner than its header says; copy",
+        ),
+        ("a.mkv", "mpeg4", r"a\.mkv is truncated or damaged: it ends before frame \d+"),
+        ("a.mkv", "ffv1", r"a\.mkv is truncated or damaged: it ends before frame \d+"),
+    ],
+)
+def test_a_truncated_video_is_refused(tmp_path: Path, rng: np.random.Generator, name: str, codec: str, message: str):
+    noise = list(rng.integers(0, 256, (20, *SIZE, 3), dtype=np.uint8))
+    path = write_video(tmp_path / name, noise, codec=codec, pixels="bgr0" if codec == "ffv1" else "yuv420p")
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) * 6 // 10])
+    with pytest.raises(RecordingError, match=message):
+        read_video(path)
+
+
+@pytest.mark.parametrize("kept", [1, 2, 19])
+def test_not_one_frame_may_be_missing_at_the_end(tmp_path: Path, rng: np.random.Generator, kept: int):
+    noise = list(rng.integers(0, 256, (20, *SIZE, 3), dtype=np.uint8))
+    path = write_video(tmp_path / "a.mkv", noise)
+    with av.open(str(path)) as container:
+        starts = [packet.pos for packet in container.demux(video=0) if packet.pos is not None]
+    path.write_bytes(path.read_bytes()[: starts[kept]])
+    with pytest.raises(RecordingError, match=rf"it ends before frame {kept}, sooner than its header says"):
+        read_video(path)
+
+
+def test_names_in_another_encoding_do_no_harm(tmp_path: Path):
+    path = write_video(tmp_path / "a.mkv", brightening(3))
+    data = path.read_bytes()
+    assert b"Lavf" in data  # the name of the program that wrote it
+    path.write_bytes(data.replace(b"Lavf", b"Lav\xe9"))
+    assert len(list(read_video(path).read_frames())) == 3
+
+
+def test_damage_within_a_video_is_found_at_the_frame(tmp_path: Path, rng: np.random.Generator):
+    noise = list(rng.integers(0, 256, (30, *SIZE, 3), dtype=np.uint8))
+    path = write_video(tmp_path / "a.avi", noise, codec="mpeg4", pixels="yuv420p")
+    data = bytearray(path.read_bytes())
+    middle = data.index(b"00dc", len(data) // 2) + 200  # within the data of a frame
+    data[middle : middle + 300] = rng.bytes(300)
+    path.write_bytes(data)
+    capture = read_video(path, frame_rate=25.0)
+    with pytest.raises(RecordingError, match=r"frame \d+ of .*a\.avi cannot be decoded"):
+        list(capture.read_frames())
+
+
+def test_a_file_that_is_no_video_is_refused(tmp_path: Path, rng: np.random.Generator):
+    cases = {
+        "notes.txt": b"FFmpeg would play this text as a video\n" * 50,
+        "list.m3u8": b"#EXTM3U\n#EXTINF:1,\nother.mkv\n",
+        "noise.mp4": rng.bytes(4000),
+        "empty.avi": b"",
+    }
+    for name, data in cases.items():
+        (tmp_path / name).write_bytes(data)
+    write_png(tmp_path / "frame.png", brightening(1)[0])
+    for name in (*cases, "frame.png"):
+        with pytest.raises(RecordingError, match=rf"{name} cannot be read as a video \(.*\); copy or export it again"):
+            read_video(tmp_path / name)
+    with pytest.raises(RecordingError, match=r"nothing\.mp4 does not exist; name a video file"):
+        read_video(tmp_path / "nothing.mp4")
+    with pytest.raises(RecordingError, match="is no file; name a video file"):
+        read_video(tmp_path)
+
+
+def test_a_sound_file_is_refused(tmp_path: Path):
+    path = tmp_path / "a.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
+        assert isinstance(stream, av.AudioStream)
+        sound = av.AudioFrame.from_ndarray(np.zeros((1, 800), dtype=np.int16), format="s16", layout="mono")
+        sound.sample_rate = 8000
+        container.mux(stream.encode(sound))
+    with pytest.raises(RecordingError, match=r"a\.mkv has no video stream; name the file that the camera wrote"):
+        read_video(path)
+
+
+def test_a_video_without_frames_is_refused(tmp_path: Path):
+    with pytest.raises(RecordingError, match=r"a\.avi (holds no frame|cannot be read)"):
+        read_video(write_video(tmp_path / "a.avi", []))
+
+
+def test_an_absurd_frame_size_is_refused(tmp_path: Path):
+    path = write_video(tmp_path / "a.avi", brightening(2))
+    data = path.read_bytes()
+    header = data.index(b"strf") + 12  # width and height in the header of the stream
+    size = np.array([60_000, 60_000], dtype="<i4").tobytes()
+    path.write_bytes(data[:header] + size + data[header + 8 :])
+    with pytest.raises(RecordingError, match=r"a\.avi claims frames of \d+ x \d+ pixels; the file is damaged"):
+        read_video(path)
+
+
+def scene(rng: np.random.Generator, count: int) -> np.ndarray:
+    """A gel with camera noise."""
+    gel = np.linspace(60, 160, SIZE[1])[None, :, None] * np.array([1.0, 0.8, 1.2])
+    return np.clip(gel + rng.normal(0, 2, (count, *SIZE, 3)), 0, 255).astype(np.uint8)
+
+
+@settings(max_examples=20)
+@given(dark=st.integers(0, 12), brightness=st.floats(0.1, 0.9))
+def test_dark_frames_at_the_start_are_stale(dark: int, brightness: float):
+    frames = scene(np.random.default_rng(0), 60)
+    frames[:dark] = (brightness * frames[:dark]).astype(np.uint8)
+    assert stale_frames(frames) == dark
+
+
+def test_frames_up_to_a_leap_from_another_scene_are_stale(rng: np.random.Generator):
+    frames = scene(rng, 60)
+    frames[4:9, 10:50, 20:80] = 255 - frames[4:9, 10:50, 20:80]  # an earlier touch, after the gel was seen untouched
+    assert stale_frames(frames) == 9
+
+
+def test_a_touch_that_comes_and_goes_is_not_stale(rng: np.random.Generator):
+    frames = scene(rng, 60)
+    for start in (5, 30):
+        for step in range(10):
+            depth = 6 * min(step, 9 - step)
+            frames[start + step, 10:50, 20:80] += np.uint8(depth)
+    assert stale_frames(frames) == 0
+
+
+def test_steady_motion_is_not_stale(rng: np.random.Generator):
+    texture = rng.integers(0, 256, (SIZE[0], SIZE[1] + 180, 3), dtype=np.uint8)
+    assert stale_frames([texture[:, 3 * shift : 3 * shift + SIZE[1]] for shift in range(60)]) == 0
+
+
+def test_an_object_that_slides_away_at_the_start_is_not_stale(rng: np.random.Generator):
+    frames = scene(rng, 60)
+    for index in range(10):
+        frames[index, 10:50, 8 * index : 8 * index + 16] //= 2
+    assert stale_frames(frames) == 0
+
+
+def test_short_videos_have_no_rule_to_break(rng: np.random.Generator):
+    assert stale_frames([]) == 0
+    assert stale_frames(scene(rng, 2)) == 0
+
+
+def test_the_candidate_for_a_reference_shows_no_relief(rng: np.random.Generator):
+    frames = scene(rng, 12)
+    for index in set(range(12)) - {7}:
+        frames[index, 20:40, 30:70, 0] = 255
+    assert least_contact(small_copies(frames)) == 7
+
+
+def test_a_video_can_leave_out_its_stale_frames(tmp_path: Path, rng: np.random.Generator):
+    frames = scene(rng, 40)
+    frames[:3] //= 2
+    capture = read_video(write_video(tmp_path / "a.mkv", list(frames)), skip_stale=True)
+    np.testing.assert_array_equal(list(capture.read_frames()), frames[3:])
+    assert capture.notes == ("a.mkv: the first 3 of 40 frames were left out.",)
+
+
+@pytest.fixture(scope="session")
+def gelsight_folder(reference_folder: Path) -> Path:
+    folder = reference_folder / "gelsight_mini_slip"
+    if not folder.is_dir():
+        pytest.skip(f"the real GelSight clips are not at {folder}")
+    return folder
+
+
+@pytest.mark.real
+def test_every_gelsight_clip_has_the_frames_its_table_lists(gelsight_folder: Path):
+    with (gelsight_folder / "labels.csv").open(newline="") as stream:
+        frames = {row["file"]: int(row["n_frames"]) for row in csv.DictReader(stream)}
+    clips = list_gelsight_clips(gelsight_folder)
+    assert len(clips) == len(frames) == 104
+    for clip in clips:
+        capture = read_video(clip)
+        assert len(capture.frame_time_s) == frames[str(clip.relative_to(gelsight_folder))]
+        assert capture.frame_size == (240, 320)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    ("clip", "slipped", "stale"),
+    [
+        # counted by eye: dark or frozen frames, up to the first of a still, untouched gel
+        ("slip/jute_basket__exp_num_2/camera_0.avi", True, 12),
+        ("slip/cheese_tube__exp_num_7/camera_0.avi", True, 9),
+        ("slip/bag_peanuts__exp_num_2/camera_0.avi", True, 5),
+        ("noslip/wire3D__exp_num_1/camera_0.avi", False, 5),
+        ("slip/screw_driver_blue_gray__exp_num_7/camera_0.avi", True, 0),  # slides from the first frame on
+        ("noslip/plug_3D__exp_num_3/camera_0.avi", False, 0),
+    ],
+)
+def test_a_gelsight_clip_comes_without_its_pitfalls(gelsight_folder: Path, clip: str, slipped: bool, stale: int):
+    read = read_gelsight_clip(gelsight_folder / clip)
+    assert (read.slipped, read.stale_frames) == (slipped, stale)
+    assert f"{read.grasp}-camera_0" == read.capture.name
+    assert clip.split("/")[1].startswith(read.grasped)
+    copies = small_copies(read.capture.read_frames())
+    assert len(copies) == len(read.capture.frame_time_s)
+    assert 0 <= read.reference_index < len(copies)
+    np.testing.assert_allclose(read.capture.frame_time_s[0], stale / 8)
+    told = " ".join(read.capture.notes)
+    for pitfall in ("times are nominal", "one label for the whole clip", "no reference frame was recorded"):
+        assert pitfall in told
+
+
+@pytest.mark.real
+def test_a_clip_that_its_table_does_not_know_is_refused(gelsight_folder: Path, tmp_path: Path):
+    table = tmp_path / "labels.csv"
+    clip = gelsight_folder / "slip/jute_basket__exp_num_2/camera_0.avi"
+    with pytest.raises(RecordingError, match=r"labels\.csv, the labels of the clips, cannot be read"):
+        read_gelsight_clip(clip, labels=table)
+    table.write_text("file,slip_label,object,n_frames\nslip/other/camera_0.avi,1,other,9\n")
+    with pytest.raises(
+        RecordingError, match=r"does not list slip/jute_basket__exp_num_2/camera_0\.avi; name a clip of"
+    ):
+        read_gelsight_clip(clip, labels=table)
+    table.write_text("file,slip_label,object,n_frames\nslip/jute_basket__exp_num_2/camera_0.avi,1,jute_basket,9\n")
+    with pytest.raises(RecordingError, match=r"has 75 frames but labels\.csv says 9; copy the clip again"):
+        read_gelsight_clip(clip, labels=table)
+    table.write_text("clip,label\na,1\n")
+    with pytest.raises(RecordingError, match="is no table of GelSight clips; it needs columns file, n_frames, object"):
+        read_gelsight_clip(clip, labels=table)

@@ -1,0 +1,138 @@
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jaxtyping import Float32, Float64, Int64
+
+from sliplens.codec import Columns, load_record, load_result, save_arrays, save_record, save_result
+from sliplens.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows(Columns):
+    trial: np.ndarray
+    frame: Int64[np.ndarray, " rows"]
+    margin: Float64[np.ndarray, " rows"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    name: str
+    error: float | None
+    curve: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    input: str
+    parts: tuple[Part, ...]
+    by_name: Mapping[str, float]
+    rows: Rows
+    maps: Mapping[str, Float32[np.ndarray, "frames height width"]]
+    one: Float64[np.ndarray, " steps"]
+    notes: tuple[str, ...] = ()
+
+
+def found() -> Found:
+    return Found(
+        input="raw",
+        parts=(Part(name="a", error=None, curve=(0.0, 0.5)), Part(name="b", error=0.25, curve=())),
+        by_name={"dry": np.float64(0.5).item()},
+        rows=Rows(trial=np.array(["t", "t"]), frame=np.array([0, 1]), margin=np.array([np.nan, 1.0])),
+        maps={"grad-cam": np.ones((2, 3, 3), dtype=np.float32)},
+        one=np.array([1.0, np.inf]),
+    )
+
+
+def same(first: object, second: object) -> bool:
+    return np.array_equal(np.asarray(first), np.asarray(second), equal_nan=np.asarray(first).dtype.kind == "f")
+
+
+def test_a_result_comes_back_as_it_was(tmp_path):
+    save_result(found(), tmp_path)
+    back = load_result(tmp_path, Found, command="sliplens x")
+    wanted = found()
+    assert (back.input, back.by_name, back.notes) == (wanted.input, wanted.by_name, ())
+    assert back.parts == wanted.parts
+    assert all(same(getattr(back.rows, name), getattr(wanted.rows, name)) for name in ("trial", "frame", "margin"))
+    assert same(back.maps["grad-cam"], wanted.maps["grad-cam"])
+    assert same(back.one, wanted.one)
+    assert back.rows.frame.dtype == np.int64
+
+
+def test_columns_are_a_table_with_a_row_for_each_value():
+    table = found().rows.table()
+    assert table.column_names == ["trial", "frame", "margin"]
+    assert table.num_rows == len(found().rows) == 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('"raw"', "7", "expected `str`, got `int` at input"),
+        ('"error": 0.25', '"error": "x"', "at parts\\[1\\].error"),
+        ('"input"', '"output"', "missing required field `input`"),
+        ('"error": 0.25', '"error": NaN', "not valid JSON"),
+        ("0.0,\n", '"x",\n', "at parts\\[0\\].curve"),
+        ("{", "[", "not valid JSON"),
+    ],
+)
+def test_a_damaged_file_is_told_with_its_place_and_its_cure(tmp_path, old, new, said):
+    save_result(found(), tmp_path)
+    path = tmp_path / "result.json"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=said) as error:
+        load_result(tmp_path, Found, command="sliplens x")
+    assert str(path) in str(error.value)
+    assert "`sliplens x`" in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["result.json", "rows.parquet", "arrays.npz"])
+@pytest.mark.parametrize("damage", ["absent", "garbage"])
+def test_a_file_that_is_missing_or_no_such_file_is_told(tmp_path, name, damage):
+    save_result(found(), tmp_path)
+    if damage == "absent":
+        (tmp_path / name).unlink()
+    else:
+        (tmp_path / name).write_bytes(b"garbage")
+    with pytest.raises(InputError, match=name):
+        load_result(tmp_path, Found, command="sliplens x")
+
+
+def test_a_column_of_another_type_is_told(tmp_path):
+    wrong = Rows(trial=np.array([1.0]), frame=np.array([0]), margin=np.array([0.5]))
+    save_result(replace(found(), rows=wrong), tmp_path)
+    with pytest.raises(InputError, match="'trial' where texts belong"):
+        load_result(tmp_path, Found, command="sliplens x")
+
+
+def test_maps_of_another_shape_are_told(tmp_path):
+    @dataclass(frozen=True, kw_only=True)
+    class Flat:
+        maps: Mapping[str, Float32[np.ndarray, "frames pixels"]]
+
+    save_result(Flat(maps={"a": np.ones((2, 3), dtype=np.float32)}), tmp_path)
+    save_arrays({"maps/a": np.ones((2, 3, 3), dtype=np.float32)}, tmp_path / "arrays.npz")
+    with pytest.raises(InputError, match="shape"):
+        load_result(tmp_path, Flat, command="sliplens x")
+
+
+def test_a_number_that_is_not_finite_is_never_written(tmp_path):
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        save_record(Part(name="a", error=float("nan"), curve=()), tmp_path / "part.json")
+    assert not (tmp_path / "part.json").exists()
+
+
+def test_a_record_alone_comes_back(tmp_path: Path):
+    @dataclass(frozen=True, kw_only=True)
+    class Place:
+        folder: Path
+        share: float
+
+    place = Place(folder=tmp_path, share=0.5)
+    save_record(place, tmp_path / "place.json")
+    assert load_record(tmp_path / "place.json", Place, command="sliplens x") == place

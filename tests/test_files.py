@@ -1,0 +1,113 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sliplens.errors import InputError
+from sliplens.files import hash_json, output_folder, read_json, to_jsonable, write_json
+
+
+def make(target: Path, config: dict, *, text: str = "x", overwrite: bool = False) -> bool:
+    with output_folder(target, stage="test", config=config, overwrite=overwrite) as out:
+        if not out.complete:
+            (out.folder / "data.txt").write_text(text)
+        return out.complete
+
+
+def test_a_folder_appears_only_when_it_is_complete(tmp_path: Path):
+    target = tmp_path / "result"
+    with output_folder(target, stage="test", config={}) as out:
+        (out.folder / "data.txt").write_text("x")
+        assert not target.exists()
+    assert (target / "data.txt").read_text() == "x"
+    assert read_json(target / "run.json")["stage"] == "test"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["result"]
+
+
+def test_an_interrupted_folder_keeps_its_pieces_for_the_same_recipe_only(tmp_path: Path):
+    target = tmp_path / "result"
+
+    def interrupted(config: dict) -> list[str]:
+        found: list[str] = []
+        with pytest.raises(KeyboardInterrupt), output_folder(target, stage="test", config=config) as out:  # noqa: PT012
+            found += sorted(path.name for path in out.folder.iterdir() if not path.name.startswith("."))
+            (out.folder / "piece").write_text("x")
+            raise KeyboardInterrupt
+        return found
+
+    assert interrupted({"seed": 1}) == []
+    assert not target.exists()
+    assert interrupted({"seed": 1}) == ["piece"]
+    assert interrupted({"seed": 2}) == []
+
+
+def test_an_interrupted_replacement_goes_on_too(tmp_path: Path):
+    target = tmp_path / "result"
+    make(target, {"seed": 1})
+    with pytest.raises(KeyboardInterrupt), output_folder(target, stage="test", config={}, overwrite=True) as out:  # noqa: PT012
+        (out.folder / "piece").write_text("x")
+        raise KeyboardInterrupt
+    assert (target / "data.txt").read_text() == "x"
+    with output_folder(target, stage="test", config={}, overwrite=True) as out:
+        assert (out.folder / "piece").read_text() == "x"
+    assert not (target / "data.txt").exists()
+
+
+def test_a_mistake_before_the_first_piece_leaves_nothing_behind(tmp_path: Path):
+    with pytest.raises(InputError), output_folder(tmp_path / "result", stage="test", config={}):
+        raise InputError("the data are broken")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_same_recipe_finds_its_result_and_makes_nothing(tmp_path: Path):
+    assert make(tmp_path / "result", {"seed": 1}) is False
+    assert make(tmp_path / "result", {"seed": 1}, text="y") is True
+    assert (tmp_path / "result" / "data.txt").read_text() == "x"
+
+
+def test_another_recipe_is_refused_unless_told_to_overwrite(tmp_path: Path):
+    make(tmp_path / "result", {"seed": 1})
+    with pytest.raises(InputError, match=r"result holds a result of other settings; .* --overwrite"):
+        make(tmp_path / "result", {"seed": 2}, text="y")
+    assert (tmp_path / "result" / "data.txt").read_text() == "x"
+    make(tmp_path / "result", {"seed": 2}, text="y", overwrite=True)
+    assert (tmp_path / "result" / "data.txt").read_text() == "y"
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_folder_of_somebody_else_is_never_touched(tmp_path: Path, overwrite: bool):
+    target = tmp_path / "photos"
+    target.mkdir()
+    (target / "holiday.jpg").write_text("precious")
+    with pytest.raises(InputError, match=r"photos .*not made by sliplens"):
+        make(target, {}, overwrite=overwrite)
+    assert (target / "holiday.jpg").read_text() == "precious"
+
+
+def test_a_place_that_cannot_be_written_is_one_sentence(tmp_path: Path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match=r"cannot write to .*file .*; choose another output folder"):
+        make(tmp_path / "file" / "result", {})
+
+
+def test_hash_does_not_depend_on_the_order_of_keys():
+    assert hash_json({"a": 1, "b": (2, 3)}) == hash_json({"b": [2, 3], "a": 1})
+    assert hash_json({"a": 1}) != hash_json({"a": 2})
+
+
+def test_numpy_numbers_and_paths_become_json(tmp_path: Path):
+    value = {"a": np.float32(0.5), "b": Path("c"), "d": (np.int64(1),)}
+    assert json.loads(json.dumps(to_jsonable(value))) == {"a": 0.5, "b": "c", "d": [1]}
+
+
+def test_nan_is_not_written_as_json(tmp_path: Path):
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "x.json", {"a": float("nan")})
+    assert not (tmp_path / "x.json").exists()
+
+
+def test_broken_json_is_one_sentence(tmp_path: Path):
+    (tmp_path / "x.json").write_text("{")
+    with pytest.raises(InputError, match=r"x\.json is not valid JSON"):
+        read_json(tmp_path / "x.json")

@@ -1,0 +1,58 @@
+from dataclasses import replace
+
+import torch
+
+from sliplens.training.data import Augmentation
+
+NOTHING = Augmentation(rotation_deg=0.0, shift=0.0, colour=0.0, noise_sd=0.0, blur_probability=0.0)
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_no_augmentation_changes_nothing():
+    images = torch.rand(4, 3, 16, 16, generator=seeded())
+    # bilinear sampling at the pixels' own centres, exact but for the rounding of the grid (a few float32 epsilons)
+    torch.testing.assert_close(NOTHING(images, generator=seeded()), images, atol=1e-5, rtol=0)
+
+
+def test_the_same_state_gives_the_same_images():
+    images = torch.rand(4, 3, 16, 16, generator=seeded())
+    assert torch.equal(Augmentation()(images, generator=seeded(1)), Augmentation()(images, generator=seeded(1)))
+    assert not torch.equal(Augmentation()(images, generator=seeded(1)), Augmentation()(images, generator=seeded(2)))
+
+
+def test_every_image_is_turned_by_an_angle_of_its_own():
+    images = torch.rand(1, 3, 32, 32, generator=seeded()).expand(4, -1, -1, -1)
+    turned = replace(NOTHING, rotation_deg=10.0)(images, generator=seeded())
+    assert not torch.allclose(turned[0], turned[1], atol=1e-3)
+
+
+def test_shifts_move_the_picture_by_no_more_than_the_share():
+    images = torch.zeros(64, 1, 32, 32)
+    images[..., 16, 16] = 1
+    moved = replace(NOTHING, shift=0.1)(images.expand(-1, 3, -1, -1), generator=seeded())[:, 0]
+    places = torch.arange(32) - 16.0
+    down = (moved.sum(dim=2) * places).sum(dim=1) / moved.sum(dim=(1, 2))
+    along = (moved.sum(dim=1) * places).sum(dim=1) / moved.sum(dim=(1, 2))
+    # the centre of mass of a bilinearly moved dot is exactly where it moved to
+    assert 2.5 < down.abs().max() <= 3.2 + 1e-4
+    assert 2.5 < along.abs().max() <= 3.2 + 1e-4
+    assert down.mean().abs() < 0.8
+
+
+def test_colours_change_channel_by_channel_within_bounds():
+    images = torch.full((64, 3, 8, 8), 0.5)
+    changed = replace(NOTHING, colour=0.1)(images, generator=seeded())
+    factors = changed[:, :, 0, 0] / 0.5
+    torch.testing.assert_close(changed, (0.5 * factors)[:, :, None, None].expand_as(changed))
+    assert 0.9 <= factors.min() < 0.92
+    assert 1.08 < factors.max() <= 1.1
+
+
+def test_augmented_images_stay_in_range():
+    images = torch.rand(4, 3, 16, 16, generator=seeded()).round()
+    out = Augmentation(noise_sd=0.5, blur_probability=1.0)(images, generator=seeded())
+    assert out.min() >= 0
+    assert out.max() <= 1

@@ -1,0 +1,69 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from sliplens.models.encodings import get_encoding
+from sliplens.recordings import Dataset, Recording
+from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.store import save_recording
+from sliplens.training.data import UNTOUCHED, load_frames
+
+
+def test_frames_without_a_label_are_left_out(small_dataset: Dataset):
+    trials = small_dataset.select(split="train")
+    frames = load_frames(small_dataset, trials, encoding=get_encoding("difference"), image_size=32)
+    assert len(frames) == sum(trial.frames - 1 for trial in trials)
+    assert torch.isfinite(frames.safety_margin).all()
+
+
+def test_a_batch_is_what_encoding_the_frames_one_by_one_gives(small_dataset: Dataset):
+    trials = small_dataset.select(split="test")
+    encoding = get_encoding("difference")
+    frames = load_frames(small_dataset, trials, encoding=encoding, image_size=24)
+    recording = small_dataset.load(trials[1])
+    images, labels = frames.__getitems__([11, 15])
+    assert frames.trial[11] == recording.trial
+    expected = encoding.encode(recording.frames[[1, 5]], recording.reference, image_size=24)
+    assert torch.equal(images, expected)
+    np.testing.assert_allclose(labels.numpy(), recording.safety_margin[[1, 5]], rtol=1e-6)
+    assert torch.equal(frames[11][0], images[0])
+
+
+def test_progress_counts_trials(small_dataset: Dataset):
+    trials = small_dataset.select(split="train")
+    seen: list[tuple[int, int]] = []
+    load_frames(
+        small_dataset,
+        trials,
+        encoding=get_encoding("raw"),
+        image_size=32,
+        on_trial=lambda done, total: seen.append((done, total)),
+    )
+    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+def test_the_untouched_sensor_is_added_as_full_stick_only_when_asked_for(small_dataset: Dataset):
+    trials = small_dataset.select(split="train")
+    plain, more = (
+        load_frames(small_dataset, trials, encoding=get_encoding("difference"), image_size=32, untouched_share=share)
+        for share in (0.0, 0.2)
+    )
+    added = [row for row, frame in enumerate(more.frame) if frame == UNTOUCHED]
+    assert len(more) == len(plain) + len(added)
+    assert len(added) == 4 * 2  # a fifth of 11 labelled frames, rounded, in each of four trials
+    assert not more.images[added].any()
+    assert more.safety_margin[added].eq(1).all()
+    assert UNTOUCHED not in plain.frame
+
+
+def test_frames_whose_label_cannot_be_trusted_are_left_out(tmp_path: Path, recording: Recording):
+    doubted = replace(recording, valid=np.arange(12) < 7)
+    path = trial_path(tmp_path, "trial")
+    save_recording(doubted, path)
+    write_dataset_table(tmp_path, [trial_info(path, split="train")])
+    data = Dataset.open(tmp_path)
+    frames = load_frames(data, data.trials, encoding=get_encoding("difference"), image_size=32)
+    # frame 0 has no contact, frames 7 to 11 are not trusted
+    assert frames.frame == (1, 2, 3, 4, 5, 6)
