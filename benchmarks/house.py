@@ -105,9 +105,10 @@ def loose_dicts(tree: ast.Module) -> Iterator[str]:
                 annotations = [argument.annotation for argument in everything] + [node.returns]
                 if any(map(is_loose, annotations)):
                     yield f"{prefix}{node.name}"
-            elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-                if prefix and not node.target.id.startswith("_") and is_loose(node.annotation):
-                    yield f"{prefix}{node.target.id}"
+            elif prefix and isinstance(node, ast.AnnAssign) and is_loose(node.annotation):
+                name = ast.unparse(node.target)
+                if not name.startswith("_"):
+                    yield f"{prefix}{name}"
 
     return visit(tree.body, "")
 
