@@ -1,5 +1,6 @@
 """sliplens: how close a soft fingertip is to losing its grip, from its camera images, and why the network says so."""
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from sliplens._version import __version__
@@ -7,13 +8,20 @@ from sliplens._version import __version__
 if TYPE_CHECKING:
     from sliplens.models.checkpoint import load
 
+# where each name lives: importing sliplens alone imports neither torch nor NumPy
+_MODULES = {
+    "load": "sliplens.models.checkpoint",
+}
+
 __all__ = ["__version__", "load"]
 
 
 def __getattr__(name: str) -> Any:
-    """Find `load` when it is asked for: importing sliplens alone imports neither torch nor NumPy."""
-    if name == "load":
-        from sliplens.models.checkpoint import load  # noqa: PLC0415 (that is the point)
+    """Import a public name when it is asked for."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)
 
-        return load
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+def __dir__() -> list[str]:
+    return __all__
