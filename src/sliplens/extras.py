@@ -1,11 +1,42 @@
-"""OpenCV, which comes as an extra."""
+"""What may be installed beside sliplens: packages of its extras, and packages that add rows to its tables."""
 
 import os
 import sys
+from importlib import metadata
 from importlib.util import find_spec
 from types import ModuleType
+from typing import Any
 
 from sliplens.errors import InputError
+
+
+def entry_points(group: str) -> dict[str, Any]:
+    """Rows that installed packages add to a table, by name.
+
+    A package names them in its metadata: `[project.entry-points."sliplens.explainers"]`, `my-method = "package:row"`.
+
+    Parameters
+    ----------
+    group
+        Name of the table's group, such as `sliplens.explainers`.
+
+    Raises
+    ------
+    InputError
+        If a package names a row that cannot be imported.
+    """
+    rows = {}
+    for point in metadata.entry_points(group=group):
+        try:
+            rows[point.name] = point.load()
+        except Exception as error:  # whatever another package's import may raise
+            package = point.dist.name if point.dist else point.value
+            raise InputError(
+                f"the package {package} adds {point.name!r} to {group}, but {point.value} cannot be imported "
+                f"({error}); update or uninstall {package}"
+            ) from error
+    return rows
+
 
 ONNX_PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 """What the extra `onnx` installs."""

@@ -90,7 +90,7 @@ def test_the_batch_size_bounds_what_is_drawn_at_once_and_changes_nothing(weights
 
 def test_progress_is_told_in_images(weights, rng):
     toy, heard = Toy(weights), []
-    marker_faithfulness(toy.predict, toy.redraw, {"truth": weights}, rng=rng, on_image=lambda *at: heard.append(at))
+    marker_faithfulness(toy.predict, toy.redraw, {"truth": weights}, rng=rng, on_progress=lambda *at: heard.append(at))
     assert heard == [(1, 3), (2, 3), (3, 3)]
 
 

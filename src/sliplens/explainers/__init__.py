@@ -8,6 +8,7 @@ from sliplens.explainers.lrp import Lrp
 from sliplens.explainers.occlusion import Occlusion, find_markers
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.poly_cam_budget import Likeness
+from sliplens.extras import entry_points
 
 EXPLAINERS: dict[str, Explainer] = {
     "grad-cam": GradCam(),
@@ -20,8 +21,12 @@ EXPLAINERS: dict[str, Explainer] = {
     "occlusion": Occlusion(),
     "occlusion-marker": Occlusion(markers_px=find_markers),
     "lrp": Lrp(),
+    **entry_points("sliplens.explainers"),
 }
-"""The explainers by name, with their default options; use `dataclasses.replace` for others. `lrp` needs an extra."""
+"""The explainers by name, with their default options; use `dataclasses.replace` for others. `lrp` needs an extra.
+
+An installed package adds its own by the entry point `sliplens.explainers`.
+"""
 
 __all__ = [
     "EXPLAINERS",

@@ -1,6 +1,5 @@
 """The deletion score of the thesis: remove the most salient pixels and watch the answer."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +10,7 @@ from sliplens.arrays import require_saliency
 from sliplens.errors import InputError
 from sliplens.faithfulness.fills import Fill
 from sliplens.faithfulness.removal import Predict, Removal, answer_removals, answer_whole
+from sliplens.progress import OnProgress
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +112,7 @@ def deletion_curves(
     steps: int | None = None,
     seed: int = 0,
     batch_size: int = 128,
-    on_image: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> DeletionCurves:
     """Answers of a network while pixels are removed in a given order.
 
@@ -134,7 +134,7 @@ def deletion_curves(
         For the fill that adds noise.
     batch_size
         Masked images that are made and answered at a time: bounds the memory.
-    on_image
+    on_progress
         Called with the number of images done and the number of all.
     """
     shape = (images.shape[-2], images.shape[-1])
@@ -143,15 +143,15 @@ def deletion_curves(
     answers = answer_removals(
         predict,
         fill(images, references, seed),
-        (
+        [
             Removal(image=index, order=order, pixels=int(count))
             for index, order in enumerate(orders)
             for count in removed
-        ),
+        ],
         shape=shape,
         device=images.device,
         batch_size=batch_size,
-        on_answers=None if on_image is None else lambda done: on_image(done // steps, len(images)),
+        on_progress=on_progress,
     )
     return DeletionCurves(
         pixels_removed=removed,

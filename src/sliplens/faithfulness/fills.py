@@ -9,6 +9,7 @@ from torch.nn import functional
 from torchvision.transforms.v2 import functional as transforms
 
 from sliplens.errors import InputError
+from sliplens.extras import entry_points
 
 NOISE_SD = 0.01
 """Of ROAD, in units of the image's range."""
@@ -175,10 +176,14 @@ FILLS: dict[str, Fill] = {
     "blur": _static(_blurred),
     "reference": _reference,
     "noisy-linear": _noisy_linear,
+    **entry_points("sliplens.fills"),
 }
-"""`background` is the median colour of the image, what most of it shows; `reference` puts the untouched sensor in
+"""Fills by name; an installed package adds its own by the entry point `sliplens.fills`.
+
+`background` is the median colour of the image, what most of it shows; `reference` puts the untouched sensor in
 place; `noisy-linear` (ROAD) blends the pixels around, with a little noise, so that the shape of what was removed tells
-less."""
+less.
+"""
 
 
 def get_fill(name: str) -> Fill:

@@ -14,6 +14,7 @@ from sliplens.errors import InputError
 from sliplens.faithfulness.fills import Fill, Painter
 from sliplens.faithfulness.units import Units, random_unit_order, unit_order
 from sliplens.models.engines import Passes
+from sliplens.progress import OnProgress
 
 Predict: TypeAlias = Callable[[Tensor], Tensor] | Passes
 """From inputs (batch, 3, height, width) to answers (batch,), in margin units; or an engine made ready for many passes,
@@ -38,12 +39,12 @@ def answer_whole(predict: Predict, images: Tensor, *, batch_size: int) -> Float6
 def answer_removals(
     predict: Predict,
     paint: Painter,
-    removals: Iterable[Removal],
+    removals: Sequence[Removal],
     *,
     shape: tuple[int, int],
     device: torch.device,
     batch_size: int,
-    on_answers: Callable[[int], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> Float64[np.ndarray, " removals"]:
     """Answers on images of which parts are removed.
 
@@ -59,16 +60,17 @@ def answer_removals(
         Height and width of the images, and where they are.
     batch_size
         Images at a time; an engine has its own.
-    on_answers
-        Called with the number of answers so far.
+    on_progress
+        Called with the number of images done and of all; removals are given image by image.
     """
+    images = {removal.image for removal in removals}
     done = 0
 
     def count(answers: Tensor) -> None:
         nonlocal done
         done += len(answers)
-        if on_answers is not None:
-            on_answers(done)
+        if on_progress is not None:
+            on_progress(done * len(images) // len(removals), len(images))
 
     batches = _paint(paint, removals, shape=shape, device=device, batch_size=_size(predict, batch_size))
     return _collect(predict, batches, count)
@@ -218,7 +220,7 @@ def removal_curves(
     areas: Sequence[float] = AREAS,
     seed: int = 0,
     batch_size: int = 64,
-    on_image: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> RemovalCurves:
     """Answers of a network while parts of its input are removed, in several orders each.
 
@@ -238,7 +240,7 @@ def removal_curves(
         For the fill that adds noise.
     batch_size
         Images that are made and answered at a time: bounds the memory.
-    on_image
+    on_progress
         Called with the number of images done and the number of all.
 
     Raises
@@ -255,11 +257,11 @@ def removal_curves(
     told = answer_removals(
         predict,
         fill(images, references, seed),
-        (Removal(image=image, order=orders[order, image], pixels=int(removed[step])) for image, order, step in jobs),
+        [Removal(image=image, order=orders[order, image], pixels=int(removed[step])) for image, order, step in jobs],
         shape=shape,
         device=images.device,
         batch_size=batch_size,
-        on_answers=None if on_image is None else lambda done: on_image(done * len(images) // len(jobs), len(images)),
+        on_progress=on_progress,
     )
     answers = np.empty((len(orders), len(images), len(shares)))
     answers[:, :, 0] = answer_whole(predict, images, batch_size=batch_size)
@@ -295,7 +297,7 @@ def faithfulness(
     areas: Sequence[float] = AREAS,
     seed: int = 0,
     batch_size: int = 64,
-    on_image: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> dict[str, Faithfulness]:
     """Score the maps of several methods on the same images, against the same random orders.
 
@@ -305,7 +307,7 @@ def faithfulness(
 
     Parameters
     ----------
-    predict, images, references, fill, areas, seed, batch_size, on_image
+    predict, images, references, fill, areas, seed, batch_size, on_progress
         As `removal_curves` takes them.
     influence
         Maps by method, larger where a method says that a part matters more. Of signed relevance give the part that
@@ -339,7 +341,7 @@ def faithfulness(
         areas=areas,
         seed=seed,
         batch_size=batch_size,
-        on_image=on_image,
+        on_progress=on_progress,
     )
     changes = found.changes if towards is None else found.lost(towards)
     by_chance = changes[2 * len(influence) :].mean(axis=0)

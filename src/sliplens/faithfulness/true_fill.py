@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sliplens.errors import InputError
 from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness, Predict, RemovalCurves, answer_whole
+from sliplens.progress import OnProgress
 
 Redraw: TypeAlias = Callable[[int, Bool[np.ndarray, "variants markers"]], Float[Tensor, "variants 3 height width"]]
 """From the number of an image, and the markers that are put back in each variant, to the network's inputs."""
@@ -27,7 +28,7 @@ def marker_curves(
     orders: Int[np.ndarray, "orders images markers"],
     *,
     batch_size: int = 64,
-    on_image: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> RemovalCurves:
     """Answers of a network while markers are put back, in several orders each.
 
@@ -43,7 +44,7 @@ def marker_curves(
         Places among an image's markers, first to be put back first.
     batch_size
         Images that are drawn and answered at a time: bounds the memory.
-    on_image
+    on_progress
         Called with the number of images done and the number of all.
     """
     areas, (_, images, markers) = np.asarray(SHARES), orders.shape
@@ -58,8 +59,8 @@ def marker_curves(
             for start in range(0, len(distinct), batch_size)
         ]
         answers[:, image] = np.concatenate(told)[asked].reshape(back.shape[:2])
-        if on_image is not None:
-            on_image(image + 1, images)
+        if on_progress is not None:
+            on_progress(image + 1, images)
     return RemovalCurves(areas=areas, answers=answers)
 
 
@@ -80,13 +81,13 @@ def marker_faithfulness(
     towards: Float[np.ndarray, " images"] | None = None,
     random_orders: int = RANDOM_ORDERS,
     batch_size: int = 64,
-    on_image: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> dict[str, Faithfulness]:
     """Score the maps of several methods by putting markers back, against the same random orders.
 
     Parameters
     ----------
-    predict, redraw, batch_size, on_image
+    predict, redraw, batch_size, on_progress
         As `marker_curves` takes them.
     influence
         How much each marker matters, by method (`unit_means`): larger goes first. Of signed relevance give the part
@@ -110,7 +111,7 @@ def marker_faithfulness(
     images, markers = orders[0].shape[1:]
     by_chance = [[rng.permutation(markers) for _ in range(images)] for _ in range(random_orders)]
     asked = np.concatenate([*orders, np.array(by_chance)])
-    curves = marker_curves(predict, redraw, asked, batch_size=batch_size, on_image=on_image)
+    curves = marker_curves(predict, redraw, asked, batch_size=batch_size, on_progress=on_progress)
     changes = curves.changes if towards is None else curves.lost(towards)
     random = changes[2 * len(orders) :].mean(axis=0)
     return {

@@ -219,7 +219,7 @@ def score_curves(
             random_orders=random_orders,
             areas=STUDY_AREAS,
             seed=seed,
-            on_image=report,
+            on_progress=report,
         )
 
     works: dict[Setting, Scoring] = {setting: partial(remove, setting) for setting in known} | dict(further or {})

@@ -110,7 +110,7 @@ def score_explanations(
             if on_curve is not None:
                 on_curve(before + done, len(orders) * count)
 
-        curves[name] = deletion_curves(predict, inputs, order, fill=get_fill(fill), steps=steps, on_image=report)
+        curves[name] = deletion_curves(predict, inputs, order, fill=get_fill(fill), steps=steps, on_progress=report)
     names = [frame.id for frame in explained.frames]
     pq.write_table(
         pa.concat_tables([_table(method, curve, names) for method, curve in curves.items()]),
@@ -267,7 +267,7 @@ def score_remedies(
             if on_curve is not None:
                 on_curve(before + images, total)
 
-        found = deletion_curves(predict, inputs, one, fill=get_fill(fill), steps=steps, on_image=report)
+        found = deletion_curves(predict, inputs, one, fill=get_fill(fill), steps=steps, on_progress=report)
         done = before + len(inputs)
         return _split(found)
 

@@ -470,7 +470,7 @@ def true_curves(
         rng=np.random.default_rng(seed),
         towards=np.array(_towards(explained)),
         random_orders=random_orders,
-        on_image=on_frame,
+        on_progress=on_frame,
     )
 
 
