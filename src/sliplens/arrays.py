@@ -29,6 +29,15 @@ def require_saliency(
     ------
     SaliencyError
         If the map has another shape, or holds NaN or infinity.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.arrays import require_saliency
+    >>> require_saliency(np.array([[0.0, np.nan]]), (1, 2))
+    Traceback (most recent call last):
+        ...
+    sliplens.errors.SaliencyError: the saliency map holds NaN or infinity in 1 of 2 pixels; explain the frame again, ...
     """
     height, width = shape
     if saliency.shape != (height, width):

@@ -57,6 +57,13 @@ def deletion_score(
     References
     ----------
     Polak, eq. 2 (there in percent, hence divided by 100).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.faithfulness import deletion_score
+    >>> deletion_score(np.array(0.9), np.array([0.9, 0.4])).round(2)  # nothing destroyed; half of the range
+    array([1.  , 0.25])
     """
     return (1 - np.abs(base - masked)) ** 2
 
@@ -68,6 +75,13 @@ def summarise_deletion(auc: Float[np.ndarray, " images"]) -> DeletionSummary:
     ------
     InputError
         If there is no image.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.faithfulness import summarise_deletion
+    >>> summarise_deletion(np.array([0.25, 0.75]))
+    DeletionSummary(mean=0.5, sd=0.25, images=2)
     """
     if len(auc) == 0:
         raise InputError("there is no deletion curve to summarise; explain and score some frames first")
@@ -79,6 +93,13 @@ def deletion_order(saliency: Float[np.ndarray, "height width"]) -> Int[np.ndarra
 
     Ties go to the later pixel first: the order of an ascending stable sort read backwards, which is what the recorded
     masks of the thesis show.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.faithfulness import deletion_order
+    >>> deletion_order(np.array([[0.1, 0.9], [0.5, 0.1]]))
+    array([1, 2, 3, 0])
     """
     return np.argsort(saliency.ravel(), kind="stable")[::-1].copy()
 
@@ -136,6 +157,22 @@ def deletion_curves(
         Masked images that are made and answered at a time: bounds the memory.
     on_progress
         Called with the number of images done and the number of all.
+
+    Examples
+    --------
+    A network that reads the mean brightness: bright pixels on black, removed one by one.
+
+    >>> import numpy as np
+    >>> import torch
+    >>> from sliplens.faithfulness import deletion_curves, deletion_order, get_fill
+    >>> image = torch.zeros(1, 3, 2, 2)
+    >>> image[0, :, 0] = 1.0
+    >>> order = deletion_order(image[0, 0].numpy())[None]
+    >>> curves = deletion_curves(
+    ...     lambda inputs: inputs.mean(dim=(1, 2, 3)), image, order, fill=get_fill("black"), steps=4
+    ... )
+    >>> curves.predictions
+    array([[0.25, 0.  , 0.  , 0.  ]])
     """
     shape = (images.shape[-2], images.shape[-1])
     removed = deletion_steps(shape, steps=steps)

@@ -24,6 +24,13 @@ def tile_units(shape: tuple[int, int], *, size: int) -> Units:
     ------
     InputError
         If the tiles have no size.
+
+    Examples
+    --------
+    >>> from sliplens.faithfulness.units import tile_units
+    >>> tile_units((2, 4), size=2)
+    array([[0, 0, 1, 1],
+           [0, 0, 1, 1]])
     """
     if size < 1:
         raise InputError(f"tiles of {size} pixels are impossible; choose 1 or more")
@@ -77,6 +84,16 @@ def unit_order(
     ------
     SaliencyError
         If the map has another shape than the units, or holds NaN.
+
+    Examples
+    --------
+    The right tile is brighter on average: its pixels go first.
+
+    >>> import numpy as np
+    >>> from sliplens.faithfulness.units import tile_units, unit_order
+    >>> influence = np.array([[0.9, 0.0, 0.5, 0.6], [0.0, 0.0, 0.5, 0.6]])
+    >>> unit_order(influence, tile_units((2, 4), size=2))
+    array([2, 3, 6, 7, 0, 1, 4, 5])
     """
     require_saliency(influence, units.shape, where="the map to rank by")
     means = unit_means(influence, units)[units.ravel()]

@@ -26,6 +26,16 @@ def absolute_difference(
     References
     ----------
     Polak, *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning*, section 3.1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.images import absolute_difference
+    >>> untouched = np.full((2, 2, 3), 100, dtype=np.uint8)
+    >>> pressed = untouched + np.array([[[0], [30]], [[60], [90]]], dtype=np.uint8)
+    >>> absolute_difference(pressed, untouched)[..., 0]
+    array([[ 0, 30],
+           [60, 90]], dtype=uint8)
     """
     if frames.shape[-3:] != reference.shape:
         raise ImageError(
@@ -54,6 +64,15 @@ def signed_difference(
     ------
     ImageError
         If a frame's size differs from the reference's.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.images import signed_difference
+    >>> untouched = np.full((1, 3, 3), 100, dtype=np.uint8)
+    >>> frame = np.array([[[100] * 3, [140] * 3, [60] * 3]], dtype=np.uint8)
+    >>> signed_difference(frame, untouched)[..., 0]
+    array([[128, 148, 108]], dtype=uint8)
     """
     if frames.shape[-3:] != reference.shape:
         absolute_difference(frames, reference)  # says what is wrong

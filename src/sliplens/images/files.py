@@ -41,6 +41,17 @@ def read_image(path: Path, *, size: tuple[int, int] | None = None) -> UInt8[np.n
     ------
     ImageError
         If the file is missing, truncated or no image, is not 8-bit RGB, or has another size.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pathlib import Path
+    >>> import tempfile
+    >>> from sliplens.images import read_image, write_png
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_png(Path(folder) / "frame.png", np.zeros((4, 6, 3), dtype=np.uint8))
+    ...     read_image(Path(folder) / "frame.png").shape
+    (4, 6, 3)
     """
     try:
         with Image.open(path) as image:
@@ -108,5 +119,12 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def natural_key(text: str) -> list[tuple[int, int | str]]:
-    """Sort key that reads runs of digits as numbers."""
+    """Sort key that reads runs of digits as numbers.
+
+    Examples
+    --------
+    >>> from sliplens.images.files import natural_key
+    >>> sorted(["frame10.png", "frame2.png"], key=natural_key)
+    ['frame2.png', 'frame10.png']
+    """
     return [(0, int(part)) if part.isdecimal() else (1, part.lower()) for part in re.split(r"(\d+)", text)]

@@ -98,6 +98,15 @@ def affine_parts(
     ----------
     Zhang, Kan, Yang, Tse and Wang, *Effective Estimation of Contact Force and Torque for Vision-based Tactile Sensor
     with Helmholtz-Hodge Decomposition*, 2019.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.markers.estimators import affine_parts
+    >>> rest_px = np.array([[0.0, 0], [10, 0], [0, 10], [10, 10]])
+    >>> moved_px = np.array([3.0, 0]) + 0.05 * (rest_px - 5)  # 3 px to the right, and 5 % larger both ways
+    >>> affine_parts(rest_px, moved_px[None]).round(3)[0, :4]  # mean x and y, divergence, curl
+    array([3. , 0. , 0.1, 0. ])
     """
     offset = rest_px - rest_px.mean(axis=0)
     terms = np.concatenate([np.ones((len(offset), 1)), offset], axis=1)

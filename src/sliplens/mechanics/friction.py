@@ -32,6 +32,13 @@ def safety_margin(
     References
     ----------
     Polak, *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning*, eq. 1 (right-hand side).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.mechanics import safety_margin
+    >>> safety_margin(2.0, np.array([0.0, 0.8, 1.6]), 0.8)
+    array([1. , 0.5, 0. ])
     """
     normal = np.asarray(require_not_negative(normal_force_n, name="normal force", unit="N"))
     tangential = require_not_negative(tangential_force_n, name="tangential force", unit="N")
@@ -68,6 +75,15 @@ def stick_ratio(safety_margin: Numbers, *, profile_exponent: float = 2.0) -> Flo
     References
     ----------
     Johnson (1985), section 7.2 (sphere: c/a = Gamma^(1/3)); Jaeger, *J. Tribol.* 120 (1998) 677 (other profiles).
+
+    Examples
+    --------
+    Half of the margin is left where 63 % of the contact still sticks:
+
+    >>> import numpy as np
+    >>> from sliplens.mechanics import stick_ratio
+    >>> stick_ratio(np.array([1.0, 0.5, 0.0])).round(2)
+    array([1.  , 0.63, 0.  ])
     """
     require_positive(profile_exponent, name="profile exponent", unit="(no unit)")
     margin = np.asarray(safety_margin, dtype=np.float64)

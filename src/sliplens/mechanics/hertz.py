@@ -27,6 +27,12 @@ def reduced_modulus(*, youngs_modulus_pa: float, poisson_ratio: float) -> float:
     References
     ----------
     Johnson (1985), section 4.2.
+
+    Examples
+    --------
+    >>> from sliplens.mechanics import reduced_modulus
+    >>> round(reduced_modulus(youngs_modulus_pa=300e3, poisson_ratio=0.5))
+    400000
     """
     require_positive(youngs_modulus_pa, name="Young's modulus", unit="Pa")
     require_poisson_ratio(poisson_ratio)
@@ -53,6 +59,16 @@ def contact_radius(normal_force_n: Numbers, *, sphere_radius_m: float, reduced_m
     References
     ----------
     Johnson (1985), eq. 4.22.
+
+    Examples
+    --------
+    Eight times the force doubles the radius:
+
+    >>> import numpy as np
+    >>> from sliplens.mechanics import contact_radius
+    >>> force_n = np.array([0.5, 4.0])
+    >>> 1e3 * contact_radius(force_n, sphere_radius_m=0.02, reduced_modulus_pa=60e3).round(6)
+    array([ 5., 10.])
     """
     force = require_not_negative(normal_force_n, name="normal force", unit="N")
     require_positive(sphere_radius_m, name="sphere radius", unit="m")
@@ -78,6 +94,12 @@ def indentation(contact_radius_m: Numbers, *, sphere_radius_m: float) -> Numbers
     References
     ----------
     Johnson (1985), eq. 4.23.
+
+    Examples
+    --------
+    >>> from sliplens.mechanics import indentation
+    >>> round(indentation(0.004, sphere_radius_m=0.02), 6)
+    0.0008
     """
     require_positive(sphere_radius_m, name="sphere radius", unit="m")
     return require_not_negative(contact_radius_m, name="contact radius", unit="m") ** 2 / sphere_radius_m
@@ -105,6 +127,12 @@ def peak_pressure(contact_radius_m: Numbers, *, sphere_radius_m: float, reduced_
     References
     ----------
     Johnson (1985), eq. 4.24.
+
+    Examples
+    --------
+    >>> from sliplens.mechanics import peak_pressure
+    >>> round(peak_pressure(0.005, sphere_radius_m=0.02, reduced_modulus_pa=60e3))  # 3 P / (2 pi a^2) with P = 0.5 N
+    9549
     """
     require_positive(sphere_radius_m, name="sphere radius", unit="m")
     require_positive(reduced_modulus_pa, name="reduced modulus", unit="Pa")
@@ -135,6 +163,16 @@ def normal_displacement(distance_m: Numbers, *, contact_radius_m: Numbers, spher
     References
     ----------
     Johnson (1985), eqs. 3.41a and 3.42a with p0 of eq. 4.24.
+
+    Examples
+    --------
+    At the contact's edge the surface has sunk by half as much as in its middle:
+
+    >>> import numpy as np
+    >>> from sliplens.mechanics import normal_displacement
+    >>> u_z = normal_displacement(np.array([0.0, 0.004]), contact_radius_m=0.004, sphere_radius_m=0.02)
+    >>> (1e3 * u_z).round(3)
+    array([0.8, 0.4])
     """
     depth = indentation(contact_radius_m, sphere_radius_m=sphere_radius_m)
     s = _relative_distance(distance_m, contact_radius_m)

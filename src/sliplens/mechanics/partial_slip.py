@@ -85,6 +85,12 @@ def stick_radius(contact_radius_m: Numbers, safety_margin: Numbers) -> Numbers:
     References
     ----------
     Johnson (1985), eq. 7.30.
+
+    Examples
+    --------
+    >>> from sliplens.mechanics import stick_radius
+    >>> round(float(stick_radius(0.004, 0.125)), 6)
+    0.002
     """
     margin = np.asarray(safety_margin)
     if not np.all((margin >= 0) & (margin <= 1)):
@@ -129,6 +135,18 @@ def partial_slip_displacement(
     References
     ----------
     Johnson (1985), section 7.2.
+
+    Examples
+    --------
+    The stick zone moves as one piece; the rim of the contact stays behind:
+
+    >>> import numpy as np
+    >>> from sliplens.mechanics import partial_slip_displacement
+    >>> grip = {"friction_coefficient": 0.5, "safety_margin": 0.125, "poisson_ratio": 0.5}
+    >>> x_m = np.array([0.0, 0.002, 0.004])
+    >>> u_x, _ = partial_slip_displacement(x_m, 0.0, contact_radius_m=0.004, sphere_radius_m=0.02, **grip)
+    >>> (u_x[1:] / u_x[0]).round(2)
+    array([1.  , 0.68])
     """
     stick_m = stick_radius(contact_radius_m, safety_margin)
     strain_per_metre = _peak_strain(1.0, friction_coefficient, sphere_radius_m, poisson_ratio)

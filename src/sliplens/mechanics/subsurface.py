@@ -60,6 +60,17 @@ def buried_hertz_displacement(
     References
     ----------
     Johnson (1985), eq. 3.18 summed over the contact; Hanson and Johnson, *J. Tribol.* 115 (1993) 327 (closed forms).
+
+    Examples
+    --------
+    Under the contact's middle the gel gives way less, the deeper one looks:
+
+    >>> import numpy as np
+    >>> from sliplens.mechanics import buried_hertz_displacement
+    >>> sphere = {"contact_radius_m": 0.004, "sphere_radius_m": 0.02}
+    >>> _, u_z = buried_hertz_displacement(0.0, np.array([0.0, 0.02]), **sphere, poisson_ratio=0.5)
+    >>> (1e3 * u_z).round(2)
+    array([0.8 , 0.13])
     """
     nu = require_poisson_ratio(poisson_ratio)
     require_positive(sphere_radius_m, name="sphere radius", unit="m")

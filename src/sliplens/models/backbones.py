@@ -75,6 +75,13 @@ def histogram_targets(margins: Float[Tensor, " batch"], edges: Float[Tensor, " e
         Labels.
     edges
         Of bins of one width, rising.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from sliplens.models.backbones import histogram_targets
+    >>> histogram_targets(torch.tensor([0.5]), torch.linspace(0, 1, 4)).round(decimals=2)
+    tensor([[0.2400, 0.5200, 0.2400]])
     """
     sigma = _WIDTH_RATIO * (edges[1] - edges[0])
     below = 0.5 * (1 + torch.erf((edges - margins[:, None]) / (math.sqrt(2) * sigma)))
@@ -139,6 +146,14 @@ def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point") -> nn.
     References
     ----------
     Ma et al., *ShuffleNet V2* (2018); Polak, section 4 ("Training details").
+
+    Examples
+    --------
+    >>> import torch
+    >>> from sliplens.models import build_model
+    >>> network = build_model("shufflenet_v2_x0_5").eval()
+    >>> network(torch.zeros(2, 3, 32, 32)).shape
+    torch.Size([2, 1])
     """
     if backbone not in backbone_names():
         raise ModelError(f"there is no backbone named {backbone!r}; choose a TorchVision classifier such as resnet18")

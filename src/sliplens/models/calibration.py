@@ -108,6 +108,13 @@ def quantiles(
         Of the bins, rising.
     share
         Between 0 and 1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.models.calibration import quantiles
+    >>> quantiles(np.array([[0.5, 0.5]]), np.array([0.0, 0.5, 1.0]), 0.25)
+    array([0.25])
     """
     below = np.concatenate([np.zeros((len(probabilities), 1)), np.cumsum(probabilities, axis=1)], axis=1)
     below /= below[:, -1:]
@@ -139,6 +146,17 @@ def conformal_offset(
     References
     ----------
     Romano et al. (2019), eq. 6 and 7.
+
+    Examples
+    --------
+    Of nine answers, each off by as many hundredths as its number, eight must lie within the offset:
+
+    >>> import numpy as np
+    >>> from sliplens.models.calibration import conformal_offset
+    >>> margins = np.linspace(0.1, 0.9, 9)
+    >>> answers = margins + np.arange(1, 10) / 100
+    >>> round(conformal_offset(answers, answers, margins, level=0.8), 6)
+    0.08
     """
     missed = np.sort(np.maximum(low - margins, margins - high))
     rank = int(np.ceil(level * (len(missed) + 1)))

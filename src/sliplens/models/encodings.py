@@ -106,6 +106,17 @@ def get_encoding(name: str) -> Encoding:
     ------
     InputError
         If there is none of that name; the message lists those there are.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.models.encodings import get_encoding
+    >>> untouched = np.zeros((8, 8, 3), dtype=np.uint8)
+    >>> frame = untouched + np.uint8(40)
+    >>> get_encoding("difference").encode(frame[None], untouched, image_size=4).amax()  # by its own maximum
+    tensor(1.)
+    >>> get_encoding("amplitude").encode(frame[None], untouched, image_size=4).amax()  # 40 / 255
+    tensor(0.1569)
     """
     if name not in ENCODINGS:
         raise InputError(f"there is no input named {name!r}; choose one of {', '.join(ENCODINGS)}")

@@ -369,6 +369,22 @@ def assign_splits(plan: SplitPlan, trials: Sequence[TrialLike]) -> SplitResult:
     ------
     InputError
         If a trial is listed twice or fits no rule, or trials are to be dealt by what none of them tells.
+
+    Examples
+    --------
+    Every wet trial tests; the dry ones are dealt by object, three quarters to train:
+
+    >>> from sliplens.recordings.splits import SplitPlan, SplitRule, TrialFacts, assign_splits
+    >>> trials = [
+    ...     TrialFacts(trial=f"{cup}-{surface}", sensor="tip", day=1, condition=surface, object=cup)
+    ...     for cup in ("mug", "jar", "can", "box")
+    ...     for surface in ("dry", "wet")
+    ... ]
+    >>> dealt = SplitRule(share={"train": 0.75, "validation": 0.25}, by="object")
+    >>> plan = SplitPlan(rules=(SplitRule(condition=("wet",), name="test"), dealt))
+    >>> splits = assign_splits(plan, trials).splits
+    >>> splits[1::2], sorted(splits[::2])
+    (('test', 'test', 'test', 'test'), ['train', 'train', 'train', 'validation'])
     """
     twice = [name for name, count in Counter(trial.trial for trial in trials).items() if count > 1]
     if twice:

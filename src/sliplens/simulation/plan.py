@@ -161,6 +161,13 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
     -------
     tuple of TrialPlan
         Dry before wet within a day; the same for the same recipe.
+
+    Examples
+    --------
+    >>> from sliplens.simulation import SimulationRecipe, plan_trials
+    >>> plans = plan_trials(SimulationRecipe(dry_trials=8, wet_trials=2, days=4))
+    >>> [plan.trial for plan in plans if plan.split == "test"]
+    ['day4-dry-001', 'day4-dry-002', 'day4-wet-001', 'day4-wet-002']
     """
     tested, recipe_hash = recipe.tested, recipe.hash
     days = _draw_days(recipe)
