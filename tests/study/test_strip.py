@@ -1,0 +1,51 @@
+import numpy as np
+import pytest
+
+from sliplens.codec import load_result, save_result
+from sliplens.errors import RecordingError
+from sliplens.models import load_checkpoint
+from sliplens.results.strip import Strip
+from sliplens.study.strip import explain_trial
+
+from ..conftest import make_recording
+
+
+@pytest.fixture(scope="module")
+def run(difference_run):
+    return load_checkpoint(difference_run)
+
+
+@pytest.fixture(scope="module")
+def strip(run) -> Strip:
+    levels = (10 / 11, 6 / 11, 0.0)
+    return explain_trial(run, make_recording("t"), source="simulated", method="occlusion", levels=levels)
+
+
+def test_a_strip_shows_the_frames_nearest_to_its_levels(strip):
+    margins = strip.readings.safety_margin[list(strip.shown)]
+    # 12 frames fall evenly from 1 to 0, and the first has no contact
+    assert margins == pytest.approx([10 / 11, 6 / 11, 0.0])
+    assert np.array_equal(strip.pictures, make_recording("t").frames[list(strip.shown)])
+
+
+def test_a_strip_reads_as_the_network_does(strip, run):
+    recording = make_recording("t")
+    answers = run.predict(run.encode(recording.frames, recording.reference)).numpy()
+    # float32 answers of the same passes, kept as float64
+    assert strip.readings.prediction == pytest.approx(answers, abs=1e-6)
+    assert np.isnan(strip.readings.safety_margin[0])
+
+
+def test_a_strip_comes_back_from_its_folder(strip, tmp_path):
+    save_result(strip, tmp_path)
+    back = load_result(tmp_path, Strip, command="sliplens demo")
+    assert (back.trial, back.shown, back.method) == (strip.trial, strip.shown, strip.method)
+    assert np.array_equal(back.relevance, strip.relevance)
+    assert np.array_equal(back.readings.prediction, strip.readings.prediction)
+
+
+def test_a_trial_without_labels_is_refused(run):
+    recording = make_recording("t")
+    recording.safety_margin[:] = np.nan
+    with pytest.raises(RecordingError, match="no labelled frame"):
+        explain_trial(run, recording, source="real")
