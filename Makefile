@@ -9,6 +9,8 @@ BENCHMARKS := $(sort $(wildcard benchmarks/*.py))
 
 # idle threads that spin take the cores from those that work
 export OMP_WAIT_POLICY := passive
+# what is imported is compiled once: torch alone takes every process six seconds anew
+unexport PYTHONDONTWRITEBYTECODE
 # the real recordings, where they are at hand; tests and the demo do without them where they are not
 export SLIPLENS_REFERENCE ?= ../shared/reference
 
@@ -23,8 +25,8 @@ install: $(INSTALLED) ## set up .venv with the pinned packages and sliplens itse
 demo: $(INSTALLED) ## run the whole path once, within 10 minutes: runs/demo/report.html
 	$(BIN)/sliplens demo runs/demo
 
-test: $(INSTALLED) ## run the tests
-	$(BIN)/pytest
+test: $(INSTALLED) ## run the tests on all cores; the last line says how long they took
+	$(BIN)/pytest --durations 10
 
 check: $(INSTALLED) ## lint, format, types, floors
 	$(BIN)/ruff check
@@ -75,6 +77,6 @@ $(UV):
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
 
 $(INSTALLED): $(UV) requirements.txt pyproject.toml
-	$(UV) pip install --quiet --python $(BIN)/python -r requirements.txt
+	$(UV) pip install --quiet --compile-bytecode --python $(BIN)/python -r requirements.txt
 	$(UV) pip install --quiet --python $(BIN)/python --no-build-isolation --no-deps -e .
 	@touch $@
