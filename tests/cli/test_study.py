@@ -8,7 +8,7 @@ from command_line import refused, run
 
 from sliplens.recordings import Dataset
 
-STAGES = ("evaluate", "explain", "score", "deletion", "faithfulness", "randomisation", "looks", "timing")
+STAGES = ("evaluate", "explain", "score", "remedies", "faithfulness", "randomisation", "map-quality", "timing")
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def test_a_study_makes_every_stage_and_the_page_and_keeps_what_is_there(
         assert {one["method"] for one in told["scores"] if one["control"]} == {"edges", "input", "centre", "randomised"}
     # as after an interruption: one stage is missing, the others stay as they are; now each network has its process
     before = {path: path.stat().st_mtime_ns for path in output.glob("*/result.json")}
-    gone = output / "looks-raw"
+    gone = output / "map-quality-raw"
     for path in gone.iterdir():
         path.unlink()
     gone.rmdir()

@@ -24,7 +24,7 @@ EQUAL_AREAS = (0.01, 0.02, 0.05, 0.1, 0.2)
 LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 SCORED = (0.4, 0.2, 0.0)
 GAINS = {"grad-cam": -0.05, "integrated-gradients": 0.06, "poly-cam": 0.16, "edges": 0.02, "centre": 0.01}
-LOOKS = {
+MAP_MEASURES = {
     "grad-cam": {"resolution": 0.05, "total_variation": 0.01, "gini": 0.4, "noise_stability": 0.98},
     "integrated-gradients": {"resolution": 0.7, "total_variation": 0.2, "gini": 0.7, "noise_stability": 0.6},
     "poly-cam": {"resolution": 0.6, "total_variation": 0.05, "gini": 0.6, "noise_stability": 0.95},
@@ -46,7 +46,7 @@ class Made:
     raw_more: float = 0.0
     spread: float = 0.01
     """Of the gains over trials."""
-    looks: Mapping[str, Mapping[str, float]] = field(default_factory=lambda: LOOKS)
+    looks: Mapping[str, Mapping[str, float]] = field(default_factory=lambda: MAP_MEASURES)
     rougher_told: bool = True
     top_share: float = 0.8
     """Of the network's effects that two markers hold."""
@@ -286,8 +286,8 @@ def write_remedies(
             "told": f"{mode}, {fill}", "fill": fill, "mode": mode, "stop": stop, "better": better, "methods": methods,
         }  # fmt: skip
     folder = write_run(
-        workspace / f"deletion-{name}",
-        "deletion",
+        workspace / f"remedies-{name}",
+        "remedies",
         {},
         {"input": name, "source": "simulated", "variants": variants, "alarms": []},
     )
@@ -419,7 +419,7 @@ def write_others(workspace: Path, name: str, made: Made) -> None:
         for gap in [looks[first]["total_variation"] - looks[second]["total_variation"]]
     ]
     told = {**origin, "frames": 42, "methods": looks, "comparisons": rougher if made.rougher_told else []}
-    write_run(workspace / f"looks-{name}", "looks", {}, told)
+    write_run(workspace / f"map-quality-{name}", "map-quality", {}, told)
     seconds = {"grad-cam": 0.02, "integrated-gradients": 0.4, "poly-cam": 3.0}
     timed = {
         method: {"seconds": one, "seconds_without_forward": one - 0.01, "low": one * 0.9, "high": one * 1.1}

@@ -13,7 +13,7 @@ from sliplens.report.study.claims import all_of, judge_claims, judge_gap, most_o
 from .made_up import write_run
 from .study_results import (
     GAINS,
-    LOOKS,
+    MAP_MEASURES,
     METHODS,
     Made,
     write_choice,
@@ -86,9 +86,9 @@ def test_grad_cam_below_an_edge_filter_is_unfaithful_though_above_chance(judged)
     [(0.2, 0.6, "holds"), (0.005, 0.6, "does not hold"), (0.2, 0.99, "does not hold"), (0.03, 0.6, "undecided")],
 )
 def test_integrated_gradients_is_noisy_by_both_measures_or_not(judged, variation, stability, outcome):
-    own = {**LOOKS["integrated-gradients"], "total_variation": variation, "noise_stability": stability}
+    own = {**MAP_MEASURES["integrated-gradients"], "total_variation": variation, "noise_stability": stability}
 
-    made = Made(looks={**LOOKS, "integrated-gradients": own}, rougher_told=False)
+    made = Made(looks={**MAP_MEASURES, "integrated-gradients": own}, rougher_told=False)
     assert judged(made)["noisy", RAW].outcome == outcome
 
 
@@ -97,8 +97,8 @@ def test_integrated_gradients_is_noisy_by_both_measures_or_not(judged, variation
     ("variation", "outcome"), [(0.2, "holds"), (0.0505, "undecided"), (0.03, "does not hold"), (0.005, "does not hold")]
 )
 def test_rougher_counts_beyond_the_interval_alone(judged, variation, outcome):
-    own = {**LOOKS["integrated-gradients"], "total_variation": variation}
-    answer = judged(Made(looks={**LOOKS, "integrated-gradients": own}))["noisy", RAW]
+    own = {**MAP_MEASURES["integrated-gradients"], "total_variation": variation}
+    answer = judged(Made(looks={**MAP_MEASURES, "integrated-gradients": own}))["noisy", RAW]
     assert answer.outcome == outcome
     assert any("less Poly-CAM" in finding.compared and finding.gap is not None for finding in answer.findings)
 
@@ -293,7 +293,8 @@ def test_a_fill_counts_once_whatever_the_units(judged, tmp_path):
 
 def test_without_scores_nothing_is_believed(tmp_path, rng):
     write_choice(tmp_path, Made())
-    write_run(tmp_path / "looks-raw", "looks", {}, {"input": "raw", "source": "simulated", "frames": 1, "methods": {}})
+    origin = {"input": "raw", "source": "simulated"}
+    write_run(tmp_path / "map-quality-raw", "map-quality", {}, {**origin, "frames": 1, "methods": {}})
 
     statements = judge_study(load_results(tmp_path), rng=rng)
 

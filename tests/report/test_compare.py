@@ -3,7 +3,8 @@ import pytest
 
 from sliplens.intervals import bootstrap_difference
 from sliplens.report.tables import agreement, compare_deletion, compare_errors
-from sliplens.results.records import DeletionCurve, Predictions
+from sliplens.results.faithfulness import DeletionCurve
+from sliplens.results.records import Predictions
 
 
 def predictions(error: np.ndarray, *, order: np.ndarray | None = None) -> Predictions:

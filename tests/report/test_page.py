@@ -12,7 +12,7 @@ import pytest
 from sliplens.errors import InputError
 from sliplens.plots.saliency import build_panel, choose_frames
 from sliplens.report import build_report, load_results
-from sliplens.results.records import ExplainedFrame
+from sliplens.results.explanation import ExplainedFrame
 
 HOSTILE = "<script>alert(1)</script>"
 

@@ -35,7 +35,7 @@ THESIS_FIGURES = {
     "fig-21-removal-poly-cam",
 }
 OWN_FIGURES = {"randomisation", "sound-curves-difference", "sound-curves-raw", "truth-difference", "truth-raw"}
-STAGES = ("deletion", "faithfulness", "randomisation", "looks", "timing", "truth")
+STAGES = ("remedies", "faithfulness", "randomisation", "map-quality", "timing", "truth")
 
 
 class Reader(HTMLParser):

@@ -32,7 +32,14 @@ def test_every_stage_is_read(study):
     assert found.states is not None
     assert found.inputs == {"raw"}
     assert found.source == "simulated"
-    for table in (found.deletion, found.faithfulness, found.randomisation, found.looks, found.timing, found.truth):
+    for table in (
+        found.remedies,
+        found.faithfulness,
+        found.randomisation,
+        found.map_quality,
+        found.timing,
+        found.truth,
+    ):
         assert set(table) == {"raw"}
 
 
@@ -62,7 +69,7 @@ def test_rows_may_stand_in_any_order(study):
 
 
 def test_curves_that_stop_early_keep_their_length(study):
-    remedies = load_results(study).study.deletion["raw"]
+    remedies = load_results(study).study.remedies["raw"]
 
     stopped = remedies.curves["stop-at-half", "grad-cam"]
     assert len(stopped) == 18
@@ -83,7 +90,7 @@ def test_markers_keep_their_places(study):
 
 
 def test_null_is_unknown(study):
-    change(study / "looks-raw" / "result.json", ("methods", "poly-cam", "resolution"), None)
+    change(study / "map-quality-raw" / "result.json", ("methods", "poly-cam", "resolution"), None)
     change(study / "truth-raw" / "result.json", ("network_against_margin",), None)
     change(study / "truth-raw" / "result.json", ("intervals", "poly-cam", "spearman_margin"), None)
     change(study / "randomisation-raw" / "result.json", ("methods", "poly-cam", "similarity", 1), None)
@@ -91,7 +98,7 @@ def test_null_is_unknown(study):
 
     found = load_results(study).study
 
-    assert found.looks["raw"].methods["poly-cam"]["resolution"] is None
+    assert found.map_quality["raw"].methods["poly-cam"]["resolution"] is None
     assert found.truth["raw"].network_against_margin is None
     assert found.truth["raw"].methods["poly-cam"].margin is None
     assert found.randomisation["raw"].methods["poly-cam"].similarity[1] is None
@@ -106,14 +113,14 @@ def test_null_is_unknown(study):
         ("states", ("frame_size",), [24], r"has 1 numbers as 'frame_size'"),
         ("states", ("frames",), [], r"states/result.json names no frame"),
         ("states", ("frames", 0, "id"), "../x", r"'../x.raw.png' in .*states is no file name"),
-        ("deletion-raw", ("variants", "insertion", "mode"), "up", r"has 'up' as 'mode' where deletion or insertion"),
+        ("remedies-raw", ("variants", "insertion", "mode"), "up", r"has 'up' as 'mode' where deletion or insertion"),
         ("faithfulness-raw", ("scores", 0, "srg"), 0.1, r"has 0.1 as 'srg' where an object belongs"),
         ("faithfulness-raw", ("scores", 0, "srg", "low"), "x", r"at scores\[0\] at srg has 'x' as 'low'"),
         ("faithfulness-raw", ("scores", 0, "at"), {"all": 1.0}, r"names an area under 'at' that is no number"),
         ("faithfulness-raw", ("scores", 0, "method"), "none", r"lacks the curves of reference / pixel / none"),
         ("randomisation-raw", ("methods", "poly-cam", "layers"), [1], r"has 1 layers but 4 similarities"),
         ("randomisation-raw", ("methods", "poly-cam", "similarity"), 1, r"'similarity' where a list of numbers"),
-        ("looks-raw", ("methods", "poly-cam", "gini"), "much", r"has 'much' as 'gini' where a finite number"),
+        ("map-quality-raw", ("methods", "poly-cam", "gini"), "much", r"has 'much' as 'gini' where a finite number"),
         ("timing-raw", ("methods", "poly-cam", "seconds"), None, r"lacks 'seconds'"),
         ("truth-raw", ("areas",), [], r"has \[\] as 'areas' where an object belongs"),
         ("truth-raw", ("meta", 0, "holds"), 1, r"has 1 as 'holds' where true or false belongs"),
@@ -133,7 +140,7 @@ def test_malformed_fields_are_told_in_one_sentence(study, file, place, value, me
     ("file", "message"),
     [
         ("faithfulness-raw/curves.parquet", r"curves.parquet does not exist"),
-        ("deletion-raw/deletion.parquet", r"deletion.parquet does not exist"),
+        ("remedies-raw/deletion.parquet", r"deletion.parquet does not exist"),
         ("truth-raw/effects.parquet", r"effects.parquet does not exist"),
         ("truth-raw/maps.npz", r"maps.npz does not exist"),
         ("states/markers.parquet", r"markers.parquet does not exist"),

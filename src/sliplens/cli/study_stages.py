@@ -128,7 +128,7 @@ class Stages:
                     trained, material().explained, folder, seed=self.seed, on_curve=bar
                 ),
             ),
-            "deletion": (
+            "remedies": (
                 "Trying the thesis's remedies",
                 {"steps": STEPS},
                 lambda folder, bar: score_remedies(
@@ -162,7 +162,7 @@ class Stages:
                 {"stages": STAGES, "statistics": "images"},
                 lambda folder, bar: check_randomisation(material(), folder, seed=self.seed, on_method=bar),
             ),
-            "looks": (
+            "map-quality": (
                 "Measuring how maps look",
                 {},
                 lambda folder, bar: check_looks(material(), self.data, folder, seed=self.seed, on_method=bar),

@@ -30,8 +30,9 @@ from sliplens.plots.style import (
     methods_in_order,
     short_input_name,
 )
+from sliplens.results.faithfulness import DeletionCurve
 from sliplens.results.files import read_learning_curve
-from sliplens.results.records import BinScore, DeletionCurve, Predictions, Training
+from sliplens.results.records import BinScore, Predictions, Training
 
 MARGIN_LABEL = "Safety margin Γ (%)"
 

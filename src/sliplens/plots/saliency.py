@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from sliplens.arrays import require_saliency
 from sliplens.plots.layout import Picture, png_picture
 from sliplens.plots.style import in_order, input_name, method_name, methods_in_order, percent, source_name
-from sliplens.results.records import Explained, ExplainedFrame
+from sliplens.results.explanation import Explained, ExplainedFrame
 
 # perceptually uniform, rises in lightness, and read alike under every common colour blindness
 COLORMAP = "inferno"

@@ -8,6 +8,8 @@ from sliplens.errors import InputError
 from sliplens.files import RUN_FILE, read_json, require_folder
 from sliplens.report.study.readers import STUDY_READERS, gather_study
 from sliplens.report.workspace import Results
+from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
+from sliplens.results.faithfulness import DeletionScores, MethodScore
 from sliplens.results.fields import Fields
 from sliplens.results.files import (
     read_deletion,
@@ -16,20 +18,7 @@ from sliplens.results.files import (
     read_predictions,
     read_saliency,
 )
-from sliplens.results.records import (
-    BinScore,
-    ConditionScores,
-    Evaluation,
-    Explained,
-    ExplainedFrame,
-    Method,
-    MethodScore,
-    Run,
-    Scored,
-    Simulation,
-    SplitCount,
-    Training,
-)
+from sliplens.results.records import BinScore, ConditionScores, Evaluation, Run, Simulation, SplitCount, Training
 
 RESULT_FILE = "result.json"
 
@@ -200,7 +189,9 @@ def _read_explained(run: Run, fields: Fields) -> Explained:
         image_size=size,
         frames=frames,
         methods={
-            name: Method(seconds_per_frame=inner.optional_number("seconds_per_frame"), warnings=inner.texts("warnings"))
+            name: MethodNotes(
+                seconds_per_frame=inner.optional_number("seconds_per_frame"), warnings=inner.texts("warnings")
+            )
             for name, inner in methods.items()
         },
         pictures=read_pictures(run.folder / "frames", frames, size=size, command=fields.command),
@@ -210,8 +201,8 @@ def _read_explained(run: Run, fields: Fields) -> Explained:
     )
 
 
-def _read_scored(run: Run, fields: Fields) -> Scored:
-    return Scored(
+def _read_scored(run: Run, fields: Fields) -> DeletionScores:
+    return DeletionScores(
         run=run,
         input=fields.text("input"),
         source=fields.text("source"),

@@ -39,7 +39,8 @@ from sliplens.report.tables import (
     table_training,
 )
 from sliplens.report.workspace import Results
-from sliplens.results.records import Predictions, Scored
+from sliplens.results.faithfulness import DeletionScores
+from sliplens.results.records import Predictions
 
 
 def chart_bins(results: Results) -> Chart:
@@ -141,7 +142,7 @@ def chart_learning(results: Results) -> Chart:
     return Chart(pictures=(picture,), caption=f"Learning curves. {'; '.join(told)}.", columns=1)
 
 
-def chart_faithfulness(results: Results, scores: dict[str, Scored]) -> Chart:
+def chart_faithfulness(results: Results, scores: dict[str, DeletionScores]) -> Chart:
     """Chart the deletion curves, one picture an input."""
     pictures, frames = [], set()
     for name in inputs_in_order(scores):
@@ -156,7 +157,7 @@ def chart_faithfulness(results: Results, scores: dict[str, Scored]) -> Chart:
             for method in methods_in_order(scored.curves)
         )
 
-        def plot(ax: Axes, scored: Scored = scored, pixels: int = pixels, name: str = name) -> None:
+        def plot(ax: Axes, scored: DeletionScores = scored, pixels: int = pixels, name: str = name) -> None:
             plot_faithfulness(scored.curves, pixels=pixels, ax=ax).set_title(input_name(name))
 
         pictures.append(draw_picture(plot, alt=f"Deletion curves of {input_name(name)}: {drawn}", size_in=(4.2, 3.4)))

@@ -22,7 +22,8 @@ from sliplens.plots.style import (
 )
 from sliplens.report.thesis import ACCURACY, DELETION, MARK, NETWORK_PIXELS, SECONDS
 from sliplens.report.workspace import Results
-from sliplens.results.records import DeletionCurve, Predictions, Scored
+from sliplens.results.faithfulness import DeletionCurve, DeletionScores
+from sliplens.results.records import Predictions
 
 
 def compare_errors(first: Predictions, second: Predictions, *, rng: np.random.Generator) -> Difference | None:
@@ -149,7 +150,7 @@ def table_accuracy(results: Results) -> Table:
     )
 
 
-def table_deletion(scores: dict[str, Scored], *, rng: np.random.Generator) -> Table:
+def table_deletion(scores: dict[str, DeletionScores], *, rng: np.random.Generator) -> Table:
     """Tabulate the deletion score by input and method, with the random control (thesis, Table 2)."""
     rows = []
     for name in inputs_in_order(scores):
@@ -180,7 +181,7 @@ def table_deletion(scores: dict[str, Scored], *, rng: np.random.Generator) -> Ta
     )
 
 
-def against_control(scored: Scored, method: str, *, rng: np.random.Generator) -> Difference | None:
+def against_control(scored: DeletionScores, method: str, *, rng: np.random.Generator) -> Difference | None:
     """Difference of a method's D_AUC from the random control's; None for the control itself or without one."""
     if method == CONTROL or not {method, CONTROL} <= set(scored.curves):
         return None

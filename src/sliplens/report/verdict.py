@@ -20,7 +20,8 @@ from sliplens.plots.style import (
 from sliplens.report.tables import against_control, agreement, compare_errors
 from sliplens.report.thesis import NETWORK_PIXELS
 from sliplens.report.workspace import Results
-from sliplens.results.records import Explained, Scored
+from sliplens.results.explanation import Explained
+from sliplens.results.faithfulness import DeletionScores
 
 Tone = Literal["good", "plain", "caution"]
 
@@ -112,7 +113,7 @@ def _winners(results: Results, *, rng: np.random.Generator) -> list[Statement]:
     return statements
 
 
-def _faithfulness(scored: Scored, *, rng: np.random.Generator) -> Statement:
+def _faithfulness(scored: DeletionScores, *, rng: np.random.Generator) -> Statement:
     topic = f"Faithfulness, {input_name(scored.input).lower()}"
     if scored.source != "simulated":
         topic += f", {source_name(scored.source)}"
@@ -160,7 +161,7 @@ def _what_deletion_measures(results: Results) -> Statement:
     return Statement(topic="How far to trust D", text=text, tone="caution")
 
 
-def _last_step(scored: Scored) -> float | None:
+def _last_step(scored: DeletionScores) -> float | None:
     values = [one.last_step_mean for one in scored.methods.values() if one.last_step_mean is not None]
     return float(np.mean(values)) if values else None
 

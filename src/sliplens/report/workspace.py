@@ -3,8 +3,10 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sliplens.report.study.records import Study
-from sliplens.results.records import Evaluation, Explained, Run, Scored, Simulation, Training
+from sliplens.results.explanation import Explained
+from sliplens.results.faithfulness import DeletionScores
+from sliplens.results.records import Evaluation, Run, Simulation, Training
+from sliplens.results.study import Study
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +31,6 @@ class Results:
     trainings: dict[str, Training] = field(default_factory=dict)
     evaluations: dict[str, Evaluation] = field(default_factory=dict)
     explanations: dict[tuple[str, str], Explained] = field(default_factory=dict)
-    scores: dict[tuple[str, str], Scored] = field(default_factory=dict)
+    scores: dict[tuple[str, str], DeletionScores] = field(default_factory=dict)
     study: Study = field(default_factory=Study)
     notes: tuple[str, ...] = ()

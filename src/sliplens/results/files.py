@@ -12,7 +12,9 @@ from jaxtyping import Float, UInt8
 from sliplens.arrays import require_saliency
 from sliplens.errors import ImageError, InputError, SaliencyError
 from sliplens.images import read_image
-from sliplens.results.records import DeletionCurve, ExplainedFrame, Predictions
+from sliplens.results.explanation import ExplainedFrame
+from sliplens.results.faithfulness import DeletionCurve
+from sliplens.results.records import Predictions
 
 
 def read_learning_curve(path: Path, *, command: str) -> dict[str, Float[np.ndarray, " epochs"]]:

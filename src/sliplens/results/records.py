@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int, UInt8
+from jaxtyping import Bool, Float64, Int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,69 +115,3 @@ class Evaluation:
     input: str
     conditions: dict[str, ConditionScores]
     predictions: Predictions
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExplainedFrame:
-    """A frame that was explained: label (None if unknown), answer, and the answer on its reference, in margin units."""
-
-    id: str
-    condition: str
-    safety_margin: float | None
-    prediction: float
-    reference_prediction: float | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Method:
-    """What a method cost, and what it complained about."""
-
-    seconds_per_frame: float | None
-    warnings: tuple[str, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Explained:
-    """Frames, their pictures as the network saw them, and the saliency of each method."""
-
-    run: Run
-    input: str
-    source: str
-    image_size: int
-    frames: tuple[ExplainedFrame, ...]
-    methods: dict[str, Method]
-    pictures: UInt8[np.ndarray, "frames height width 3"]
-    saliency: dict[str, Float[np.ndarray, "frames height width"]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class MethodScore:
-    """Deletion score D_AUC over frames: mean and standard deviation, and mean D once the last pixel is gone."""
-
-    mean: float
-    sd: float
-    last_step_mean: float | None
-    frames: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class DeletionCurve:
-    """Deletion score D of each frame while pixels are removed, and the answers it comes from, in margin units."""
-
-    frame_ids: tuple[str, ...]
-    pixels_removed: Int[np.ndarray, " steps"]
-    scores: Float64[np.ndarray, "frames steps"]
-    predictions: Float64[np.ndarray, "frames steps"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scored:
-    """How far the explanations of one network can be believed."""
-
-    run: Run
-    input: str
-    source: str
-    fill: str
-    methods: dict[str, MethodScore]
-    alarms: tuple[str, ...]
-    curves: dict[str, DeletionCurve]

@@ -20,11 +20,10 @@ from sliplens.plots.style import (
     methods_in_order,
     signed,
 )
-from sliplens.report.study.localised import Effects, Truth
-from sliplens.report.study.scored import Faithful, RemovalCurve
 from sliplens.report.verdict import Statement, judge_accuracy, tell_scale
 from sliplens.report.workspace import Results
-from sliplens.results.records import DeletionCurve
+from sliplens.results.faithfulness import DeletionCurve, RemovalCurve, RemovalScores
+from sliplens.results.study import MarkerEffects, Truth
 
 
 def compare_gain(first: RemovalCurve, second: RemovalCurve, *, rng: np.random.Generator) -> Difference | None:
@@ -82,7 +81,7 @@ def compare_thesis_score(
     return paired_difference(means[0], means[1], trials=names, rng=rng)
 
 
-def share_of_strongest(effects: Effects, *, count: int, rng: np.random.Generator) -> Difference | None:
+def share_of_strongest(effects: MarkerEffects, *, count: int, rng: np.random.Generator) -> Difference | None:
     """Share of a network's effects, in size, that its strongest markers hold; trials are resampled.
 
     None where no marker has any effect.
@@ -106,7 +105,7 @@ def share_of_strongest(effects: Effects, *, count: int, rng: np.random.Generator
     return paired_difference(np.array(shares), np.zeros(len(shares)), trials=np.array(kept), rng=rng)
 
 
-def settings(faithful: Faithful) -> list[tuple[str, str]]:
+def settings(faithful: RemovalScores) -> list[tuple[str, str]]:
     """Fills and units that were scored, in the order they are read."""
     found = {(fill, unit) for fill, unit, _ in faithful.curves}
     fills = in_order({fill for fill, _ in found}, FILL_NAMES)
@@ -114,12 +113,12 @@ def settings(faithful: Faithful) -> list[tuple[str, str]]:
     return [(fill, unit) for unit in units for fill in fills if (fill, unit) in found]
 
 
-def controls(faithful: Faithful) -> set[str]:
+def controls(faithful: RemovalScores) -> set[str]:
     """Names of the maps that know nothing of the network."""
     return {score.method for score in faithful.scores if score.control}
 
 
-def best_control(faithful: Faithful, fill: str, unit: str) -> str | None:
+def best_control(faithful: RemovalScores, fill: str, unit: str) -> str | None:
     """Name the control with the highest gain under a fill and unit."""
     gains = {
         name: faithful.curves[key]
@@ -172,7 +171,7 @@ class Standing:
         return 2 * len(self.beaten) > len(self.tested)
 
 
-def rank_methods(faithful: Faithful, truth: Truth | None = None) -> list[Standing]:
+def rank_methods(faithful: RemovalScores, truth: Truth | None = None) -> list[Standing]:
     """Rank the methods: those that beat the best control in most settings first, by their gain.
 
     Parameters
@@ -221,7 +220,7 @@ def judge_study(results: Results, *, rng: np.random.Generator) -> tuple[Statemen
     return (*statements, *judge_accuracy(results, rng=rng), *tell_scale(results))
 
 
-def _believe(faithful: Faithful, results: Results) -> Statement:
+def _believe(faithful: RemovalScores, results: Results) -> Statement:
     topic = f"Which to believe, {input_name(faithful.input).lower()}"
     truth = results.study.truth.get(faithful.input)
     ranked = rank_methods(faithful, truth)
@@ -262,7 +261,7 @@ def _tell_none(ranked: list[Standing]) -> str:
     )
 
 
-def _tell_lead(faithful: Faithful, best: Standing, others: list[Standing]) -> str:
+def _tell_lead(faithful: RemovalScores, best: Standing, others: list[Standing]) -> str:
     if not others:
         return ""
     rival = others[0]
@@ -281,7 +280,7 @@ def _tell_lead(faithful: Faithful, best: Standing, others: list[Standing]) -> st
     return f" It is ahead of {name}, the next, under {listed(ahead)}{but}."
 
 
-def _against(faithful: Faithful, method: str, rival: str) -> dict[tuple[str, str], Difference]:
+def _against(faithful: RemovalScores, method: str, rival: str) -> dict[tuple[str, str], Difference]:
     gaps = {}
     for one in faithful.comparisons:
         if (one.first, one.second) == (method, rival):
@@ -319,7 +318,7 @@ def _tell_truth(results: Results, name: str, method: str) -> str:
     )
 
 
-def _votes(faithful: Faithful, method: str) -> list[tuple[str, str]]:
+def _votes(faithful: RemovalScores, method: str) -> list[tuple[str, str]]:
     """One setting a fill: by pixels where that was done, or a fill tried with several units would count twice."""
     chosen: dict[str, tuple[str, str]] = {}
     for fill, unit in settings(faithful):

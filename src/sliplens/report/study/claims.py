@@ -33,11 +33,10 @@ from sliplens.report.study.believing import (
     share_of_strongest,
     tell_interval,
 )
-from sliplens.report.study.localised import Truth
-from sliplens.report.study.records import Looks
-from sliplens.report.study.scored import Faithful
 from sliplens.report.thesis import THESIS_POLY_CAM
 from sliplens.report.workspace import Results
+from sliplens.results.faithfulness import RemovalScores
+from sliplens.results.study import MapQuality, Truth
 
 Outcome = Literal["holds", "does not hold", "undecided"]
 OUTCOMES: tuple[Outcome, ...] = ("holds", "does not hold", "undecided")
@@ -154,7 +153,9 @@ def claim_difference(results: Results, *, rng: np.random.Generator) -> Claim:
     )
 
 
-def _compare_inputs(difference: Faithful, raw: Faithful, results: Results, *, rng: np.random.Generator) -> Answer:
+def _compare_inputs(
+    difference: RemovalScores, raw: RemovalScores, results: Results, *, rng: np.random.Generator
+) -> Answer:
     findings, by_setting, claimed = [], {}, (*RIVALS, poly_cams(difference)[0])
     for fill, unit in settings(difference):
         methods = [one for one in claimed if (fill, unit, one) in difference.curves and (fill, unit, one) in raw.curves]
@@ -201,7 +202,7 @@ def _thesis_score_of_inputs(results: Results, *, rng: np.random.Generator) -> li
     ]
 
 
-def poly_cams(faithful: Faithful) -> list[str]:
+def poly_cams(faithful: RemovalScores) -> list[str]:
     """Poly-CAM as in the thesis, and ours: the claim is of the first, and the second is what is used now."""
     scored = {method for _, _, method in faithful.curves}
     return [one for one in (THESIS_POLY_CAM, POLY_CAM) if one in scored] or [POLY_CAM]
@@ -231,7 +232,7 @@ def claim_noisy(results: Results) -> Claim:
     """Integrated Gradients is noisy: rougher than the other methods, and less stable under sensor noise."""
     answers = []
     for name in inputs_in_order(results.study.inputs)[::-1]:
-        looks = results.study.looks.get(name)
+        looks = results.study.map_quality.get(name)
         answers.append(
             Answer(
                 subject=input_name(name),
@@ -250,7 +251,7 @@ def claim_noisy(results: Results) -> Claim:
     )
 
 
-def _noisiest(looks: Looks) -> Answer:
+def _noisiest(looks: MapQuality) -> Answer:
     subject = input_name(looks.input)
     findings, outcomes, parts = [], [], []
     for measure, sign in _MEASURES.items():
@@ -294,7 +295,7 @@ def _noisiest(looks: Looks) -> Answer:
     )
 
 
-def _rougher(looks: Looks, others: Iterable[str]) -> dict[str, Difference]:
+def _rougher(looks: MapQuality, others: Iterable[str]) -> dict[str, Difference]:
     """How much rougher its maps are than those of the others, where that was compared."""
     gaps = {}
     for name in others:
@@ -411,7 +412,7 @@ def _claim_poly_cam(results: Results, *, rng: np.random.Generator) -> Claim:
 
 
 def _best_of(
-    faithful: Faithful, method: str, claimants: list[str], results: Results, *, rng: np.random.Generator
+    faithful: RemovalScores, method: str, claimants: list[str], results: Results, *, rng: np.random.Generator
 ) -> Answer:
     rivals = list(RIVALS)
     findings, by_setting = [], {}
@@ -476,7 +477,7 @@ def _claim_grad_cam(results: Results, *, rng: np.random.Generator) -> Claim:
     )
 
 
-def _no_better(faithful: Faithful, method: str, *, rng: np.random.Generator) -> Answer:
+def _no_better(faithful: RemovalScores, method: str, *, rng: np.random.Generator) -> Answer:
     findings, by_setting = [], {}
     for fill, unit in settings(faithful):
         own = faithful.curves.get((fill, unit, method))

@@ -18,7 +18,8 @@ from sliplens.plots.layout import Chart, figure_picture, place_axes, place_text,
 from sliplens.plots.saliency import choose_frames, overlay_saliency, plot_colour_bar, stretch_saliency
 from sliplens.plots.style import GREY, drawing_style
 from sliplens.report.workspace import Results
-from sliplens.results.records import DeletionCurve, Explained
+from sliplens.results.explanation import Explained
+from sliplens.results.faithfulness import DeletionCurve
 
 CELL_IN = 1.5
 _GAP_IN, _LEFT_IN, _HEAD_IN, _WORDS_IN, _BAR_IN = 0.06, 1.25, 0.42, 0.2, 0.75

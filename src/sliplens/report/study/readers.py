@@ -5,24 +5,27 @@ from typing import Any
 
 from sliplens.errors import InputError
 from sliplens.intervals import Difference
-from sliplens.report.study.localised import REGIONS, Localisation, MetaTest, Truth
-from sliplens.report.study.records import (
-    LOOKS,
+from sliplens.report.study.scored_readers import read_faithful, read_gap, read_interval, read_remedies
+from sliplens.report.study.tables_on_disk import read_effects, read_state_frames, read_truth_maps
+from sliplens.results.fields import Fields
+from sliplens.results.records import Run
+from sliplens.results.study import (
+    MAP_MEASURES,
+    REGIONS,
     Choice,
     ChosenFrame,
     ChosenTrial,
-    Looks,
+    Localisation,
+    MapQuality,
+    MetaTest,
     MethodTime,
     Randomisation,
     RandomisedMethod,
     States,
     Study,
     Timing,
+    Truth,
 )
-from sliplens.report.study.scored_readers import read_faithful, read_gap, read_interval, read_remedies
-from sliplens.report.study.tables_on_disk import read_effects, read_state_frames, read_truth_maps
-from sliplens.results.fields import Fields
-from sliplens.results.records import Run
 
 
 def _read_choice(run: Run, fields: Fields) -> Choice:
@@ -100,13 +103,13 @@ def _read_randomisation(run: Run, fields: Fields) -> Randomisation:
     )
 
 
-def _read_looks(run: Run, fields: Fields) -> Looks:
-    return Looks(
+def _read_looks(run: Run, fields: Fields) -> MapQuality:
+    return MapQuality(
         run=run,
         **_origin(fields),
         frames=fields.integer("frames"),
         methods={
-            name: {measure: inner.optional_number(measure) for measure in LOOKS}
+            name: {measure: inner.optional_number(measure) for measure in MAP_MEASURES}
             for name, inner in fields.inner("methods").items()
         },
         # studies made before these were kept have none
@@ -198,10 +201,10 @@ def _origin(fields: Fields) -> dict[str, Any]:
 STUDY_READERS: dict[str, Callable[[Run, Fields], Any]] = {
     "choice": _read_choice,
     "states": _read_states,
-    "deletion": read_remedies,
+    "remedies": read_remedies,
     "faithfulness": read_faithful,
     "randomisation": _read_randomisation,
-    "looks": _read_looks,
+    "map-quality": _read_looks,
     "timing": _read_timing,
     "truth": _read_truth,
 }
@@ -217,8 +220,8 @@ def gather_study(found: dict[tuple[str, str, str], Any]) -> Study:
         Results by stage, input and source.
     """
     by_input = {
-        stage: {key[1]: value for key, value in found.items() if key[0] == stage}
-        for stage in ("deletion", "faithfulness", "randomisation", "looks", "timing", "truth")
+        stage.replace("-", "_"): {key[1]: value for key, value in found.items() if key[0] == stage}
+        for stage in ("remedies", "faithfulness", "randomisation", "map-quality", "timing", "truth")
     }
     single = {key[0]: value for key, value in found.items() if key[0] in {"choice", "states"}}
     return Study(choice=single.get("choice"), states=single.get("states"), **by_input)

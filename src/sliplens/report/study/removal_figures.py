@@ -43,9 +43,9 @@ from sliplens.report.study.plates import (
     show_map,
     told_frame,
 )
-from sliplens.report.study.scored import Faithful, RemovalCurve
 from sliplens.report.workspace import Results
-from sliplens.results.records import DeletionCurve, Explained, Scored
+from sliplens.results.explanation import Explained
+from sliplens.results.faithfulness import DeletionCurve, DeletionScores, RemovalCurve, RemovalScores
 
 SHARES = (0.01, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Of the image, that are gone in the columns of a figure."""
@@ -105,7 +105,7 @@ def plate_highlighted(results: Results) -> Plate | None:
     """Draw the frame without all that has a saliency above 0.5, a row an input (thesis, Fig. 10)."""
     rows, numbers, told, methods = [], _columns(), [], _all_methods(results)
     for name in inputs_in_order(results.study.inputs)[::-1]:
-        found, remedies = _material(results, name), results.study.deletion.get(name)
+        found, remedies = _material(results, name), results.study.remedies.get(name)
         variant = None if remedies is None else remedies.variants.get(_HALF)
         if found is None or remedies is None or variant is None:
             continue
@@ -144,7 +144,7 @@ def removal_methods(results: Results) -> list[str]:
     return _all_methods(results)
 
 
-def _illustrate(explained: Explained, scored: Scored, method: str, index: int) -> Plate:
+def _illustrate(explained: Explained, scored: DeletionScores, method: str, index: int) -> Plate:
     curve, own = scored.curves[method], explained.frames[index]
     steps = _steps(curve, explained, index)
     cells = [
@@ -186,7 +186,7 @@ def _illustrate(explained: Explained, scored: Scored, method: str, index: int) -
     )
 
 
-def _material(results: Results, name: str) -> tuple[Explained, Scored, int] | None:
+def _material(results: Results, name: str) -> tuple[Explained, DeletionScores, int] | None:
     explained = explained_of(results, name)
     scored = results.scores.get((name, results.study.source))
     if explained is None or scored is None:
@@ -273,7 +273,7 @@ _LETTERS = 20
 """Of a line beside a chart."""
 
 
-def plate_removal_curves(faithful: Faithful) -> Plate | None:
+def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
     """Draw change against area, most and least influential first and at random, by method and fill; None without."""
     known = controls(faithful)
     methods = methods_in_order({method for _, _, method in faithful.curves} - known - set(CONTROLS))
@@ -377,7 +377,7 @@ def plate_randomisation(results: Results) -> Plate | None:
     )
 
 
-def _tell_gains(faithful: Faithful, methods: list[str]) -> str:
+def _tell_gains(faithful: RemovalScores, methods: list[str]) -> str:
     fill, unit = settings(faithful)[0]
     gains = {
         method: float(faithful.curves[fill, unit, method].srg.mean())
@@ -389,7 +389,7 @@ def _tell_gains(faithful: Faithful, methods: list[str]) -> str:
     return f"Under {fill_name(fill, unit)} it is {told}."
 
 
-def _removal_numbers(faithful: Faithful) -> dict[str, list]:
+def _removal_numbers(faithful: RemovalScores) -> dict[str, list]:
     kinds = ("most_first", "least_first", "random")
     columns: dict[str, list] = {name: [] for name in ("fill", "unit", "method", "area", *kinds)}
     for (fill, unit, method), curve in faithful.curves.items():

@@ -33,7 +33,8 @@ from sliplens.report.study.plates import (
     shown_frames,
 )
 from sliplens.report.workspace import Results
-from sliplens.results.records import DeletionCurve, Explained, Scored
+from sliplens.results.explanation import Explained
+from sliplens.results.faithfulness import DeletionCurve, DeletionScores
 
 _STATE_FIGURES = {"difference": "fig-15-methods-difference", "raw": "fig-16-methods-raw"}
 
@@ -291,21 +292,21 @@ def _charts(count: int, *, each: tuple[float, float]) -> tuple[Figure, list[Axes
     return figure, axes[:count]
 
 
-def _scored(results: Results) -> dict[str, Scored]:
+def _scored(results: Results) -> dict[str, DeletionScores]:
     found = {name: one for (name, source), one in results.scores.items() if source == results.study.source}
     return {name: found[name] for name in inputs_in_order(found)[::-1]}
 
 
-def _pixels(scored: Scored) -> int:
+def _pixels(scored: DeletionScores) -> int:
     return max(int(curve.pixels_removed.max()) for curve in scored.curves.values())
 
 
-def _tell_order(scored: Scored) -> str:
+def _tell_order(scored: DeletionScores) -> str:
     means = {method: float(curve.scores.mean()) for method, curve in scored.curves.items()}
     return ", ".join(f"{method_name(one)} {means[one]:.3f}" for one in sorted(means, key=lambda one: means[one]))
 
 
-def _thesis_numbers(scored: dict[str, Scored]) -> dict[str, list]:
+def _thesis_numbers(scored: dict[str, DeletionScores]) -> dict[str, list]:
     columns: dict[str, list] = {
         name: []
         for name in (

@@ -4,16 +4,16 @@ from typing import Any
 
 from sliplens.errors import InputError
 from sliplens.intervals import Difference
-from sliplens.report.study.scored import (
+from sliplens.report.study.tables_on_disk import read_removal_curves, read_variant_curves
+from sliplens.results.faithfulness import (
     Agreement,
     Comparison,
-    Faithful,
+    MethodScore,
     Remedies,
-    SoundScore,
+    RemovalScore,
+    RemovalScores,
     Variant,
-    VariantScore,
 )
-from sliplens.report.study.tables_on_disk import read_removal_curves, read_variant_curves
 from sliplens.results.fields import Fields
 from sliplens.results.records import Run
 
@@ -38,7 +38,7 @@ def read_remedies(run: Run, fields: Fields) -> Remedies:
     )
 
 
-def read_faithful(run: Run, fields: Fields) -> Faithful:
+def read_faithful(run: Run, fields: Fields) -> RemovalScores:
     """Read the sound scores, their comparisons, and the curve of each method."""
     scores = tuple(_read_score(row) for row in fields.rows("scores"))
     curves = read_removal_curves(run.folder / "curves.parquet", command=fields.command)
@@ -47,7 +47,7 @@ def read_faithful(run: Run, fields: Fields) -> Faithful:
         raise InputError(
             f"{run.folder / 'curves.parquet'} lacks the curves of {absent[0]}; make it again with `{fields.command}`"
         )
-    return Faithful(
+    return RemovalScores(
         run=run,
         input=fields.text("input"),
         source=fields.text("source"),
@@ -80,8 +80,8 @@ def read_faithful(run: Run, fields: Fields) -> Faithful:
     )
 
 
-def _read_score(row: Fields) -> SoundScore:
-    return SoundScore(
+def _read_score(row: Fields) -> RemovalScore:
+    return RemovalScore(
         fill=row.text("fill"),
         unit=row.text("unit"),
         method=row.text("method"),
@@ -119,7 +119,7 @@ def _read_variant(inner: Fields) -> Variant:
         stop=inner.optional_number("stop"),
         better=_one_of(inner, "better", ("lower", "higher")),
         methods={
-            name: VariantScore(
+            name: MethodScore(
                 mean=method.number("mean"),
                 sd=method.number("sd"),
                 last_step_mean=method.optional_number("last_step_mean"),

@@ -132,7 +132,7 @@ def _faithfulness(results: Results) -> tuple[Section, list[Plate | Table | Notes
 
 
 def _removal(results: Results) -> tuple[Section, list[Plate | Table | Notes | None]]:
-    found, source = results.study.deletion, results.study.source
+    found, source = results.study.remedies, results.study.source
     blocks: list[Plate | Table | Notes | None] = [plate_deletion(results), plate_faithfulness(results)]
     for name in _names(found):
         blocks += [table_remedies(found[name], results.scores.get((name, source))), _alarms(name, found[name].alarms)]
@@ -167,7 +167,7 @@ def _randomisation(results: Results) -> tuple[Section, list[Plate | Table | Note
 
 
 def _maps(results: Results) -> tuple[Section, list[Plate | Table | Notes | None]]:
-    states, looks = results.study.states, results.study.looks
+    states, looks = results.study.states, results.study.map_quality
     blocks: list[Plate | Table | Notes | None] = [
         None if states is None else plate_contact_states(states),
         Notes(title="Markers that could not be followed", sentences=states.untracked, tone="caution")

@@ -23,7 +23,6 @@ from sliplens.plots.style import (
     signed,
 )
 from sliplens.report.study.believing import rank_methods
-from sliplens.report.study.localised import Truth
 from sliplens.report.study.plates import (
     CELL_IN,
     Cell,
@@ -34,9 +33,9 @@ from sliplens.report.study.plates import (
     show_map,
     shown_frames,
 )
-from sliplens.report.study.records import StateFrame, States
 from sliplens.report.workspace import Results
-from sliplens.results.records import Explained
+from sliplens.results.explanation import Explained
+from sliplens.results.study import StateFrame, States, Truth
 
 _SURE = 0.2  # confidence of a field below which it is a guess, as `plot_field` draws it
 _METHOD = "poly-cam"

@@ -18,17 +18,15 @@ from sliplens.plots.style import (
     signed,
 )
 from sliplens.report.study.believing import mean_at, settings, tell_bounds, tell_interval
-from sliplens.report.study.localised import REGIONS, Localisation, Truth
-from sliplens.report.study.records import LOOKS, Choice, Looks, Randomisation, Timing
-from sliplens.report.study.scored import Faithful, Remedies, SoundScore, VariantScore
 from sliplens.report.tables import Cell, Kind, Shade, Table, table_head, tell_spread
 from sliplens.report.thesis import DELETION, MARK, NETWORK_PIXELS, SECONDS, thesis_row
-from sliplens.results.records import MethodScore, Scored
+from sliplens.results.faithfulness import DeletionScores, MethodScore, Remedies, RemovalScore, RemovalScores
+from sliplens.results.study import MAP_MEASURES, REGIONS, Choice, Localisation, MapQuality, Randomisation, Timing, Truth
 
 _AREAS = (0.01, 0.02, 0.05, 0.1, 0.2)
 
 
-def table_scores(faithful: Faithful, scored: Scored | None) -> Table:
+def table_scores(faithful: RemovalScores, scored: DeletionScores | None) -> Table:
     """Tabulate the thesis's deletion score (its Table 2) beside the symmetric gain under every fill."""
     columns = settings(faithful)
     scores = {score.key: score for score in faithful.scores}
@@ -64,7 +62,7 @@ def table_scores(faithful: Faithful, scored: Scored | None) -> Table:
     )
 
 
-def table_equal_areas(faithful: Faithful) -> Table | None:
+def table_equal_areas(faithful: RemovalScores) -> Table | None:
     """Tabulate the change where equal areas are gone, under the most natural fill; None without scores."""
     found = settings(faithful)
     if not found:
@@ -93,7 +91,7 @@ def table_equal_areas(faithful: Faithful) -> Table | None:
     )
 
 
-def table_agreement(faithful: Faithful) -> Table | None:
+def table_agreement(faithful: RemovalScores) -> Table | None:
     """Tabulate Kendall's tau between the fills' rankings of the methods as a map of heat; None where it is unknown."""
     rows = [one for one in faithful.agreement if one.unit == "pixel"] or list(faithful.agreement)
     if not rows:
@@ -118,7 +116,7 @@ def table_agreement(faithful: Faithful) -> Table | None:
     )
 
 
-def table_remedies(remedies: Remedies, scored: Scored | None) -> Table:
+def table_remedies(remedies: Remedies, scored: DeletionScores | None) -> Table:
     """Tabulate the thesis's own remedies for its score, and insertion, beside the score as it was."""
     methods = methods_in_order({name for one in remedies.variants.values() for name in one.methods})
     rows = []
@@ -151,11 +149,11 @@ def table_remedies(remedies: Remedies, scored: Scored | None) -> Table:
     )
 
 
-def _highest(scores: list[SoundScore]) -> float | None:
+def _highest(scores: list[RemovalScore]) -> float | None:
     return max((score.srg.estimate for score in scores if not score.control), default=None)
 
 
-def _gain_cell(score: SoundScore | None, best: float | None) -> Cell:
+def _gain_cell(score: RemovalScore | None, best: float | None) -> Cell:
     if score is None:
         return Cell(text=UNKNOWN)
     kind: Kind = "best" if not score.control and score.srg.estimate == best else "number"
@@ -176,7 +174,7 @@ def _shade(tau: float | None) -> Shade:
     return shades[0] if tau is None else shades[sum(tau >= step for step in steps)]
 
 
-def _score_cell(score: MethodScore | VariantScore | None, best: float | None) -> Cell:
+def _score_cell(score: MethodScore | MethodScore | None, best: float | None) -> Cell:
     if score is None:
         return Cell(text=UNKNOWN)
     return Cell(text=tell_spread(score.mean, score.sd), kind="best" if score.mean == best else "number")
@@ -193,14 +191,14 @@ _REGION_NAMES = {"markers": "markers", "slip_annulus": "slip annulus", "edges": 
 _TRUTHS = ("oracle", "degraded-oracle")
 
 
-def table_looks(looks: dict[str, Looks]) -> Table:
+def table_looks(looks: dict[str, MapQuality]) -> Table:
     """Tabulate what the eye judges of maps."""
     names = inputs_in_order(looks)
     rows = [
         (
             Cell(text=input_name(name), kind="name"),
             Cell(text=method_name(method), kind="name"),
-            *(Cell(text=decimals(looks[name].methods[method][measure], 3)) for measure in LOOKS),
+            *(Cell(text=decimals(looks[name].methods[method][measure], 3)) for measure in MAP_MEASURES),
         )
         for name in names
         for method in methods_in_order(looks[name].methods)
@@ -211,7 +209,7 @@ def table_looks(looks: dict[str, Looks]) -> Table:
         "markers (1 = told apart). Total variation: mean step between pixels over the map's range (noise has 1/3). "
         "Gini: 1 = one pixel has all. Stability: correlation of the map with that of the frame under other sensor "
         "noise, and with that of the next frame.",
-        head=table_head("Input", "Method", *(_LOOK_NAMES[measure] for measure in LOOKS)),
+        head=table_head("Input", "Method", *(_LOOK_NAMES[measure] for measure in MAP_MEASURES)),
         rows=tuple(rows),
     )
 

@@ -10,12 +10,10 @@ from jaxtyping import Float, UInt8
 
 from sliplens.errors import ImageError, InputError
 from sliplens.images import read_image
-from sliplens.report.study.localised import Effects
-from sliplens.report.study.records import StateFrame
-from sliplens.report.study.scored import Key, RemovalCurve
+from sliplens.results.faithfulness import DeletionCurve, Key, RemovalCurve
 from sliplens.results.fields import Fields
 from sliplens.results.files import read_table
-from sliplens.results.records import DeletionCurve
+from sliplens.results.study import MarkerEffects, StateFrame
 
 _CURVES = ("most_first", "least_first", "random")
 
@@ -76,7 +74,7 @@ def read_variant_curves(path: Path, *, command: str) -> dict[tuple[str, str], di
     return found
 
 
-def read_effects(path: Path, *, command: str) -> Effects:
+def read_effects(path: Path, *, command: str) -> MarkerEffects:
     """Read what putting each marker back does.
 
     Raises
@@ -86,7 +84,7 @@ def read_effects(path: Path, *, command: str) -> Effects:
     """
     numbers = ("x_px", "y_px", "network_effect", "margin_effect")
     table = read_table(path, ("frame_id", "trial", "marker", "state", *numbers), command=command)
-    return Effects(
+    return MarkerEffects(
         frame_id=_texts(table, "frame_id"),
         trial=_texts(table, "trial"),
         marker=_numbers(table, "marker").astype(np.int64),

@@ -1,14 +1,18 @@
-"""Records of a study: which trials were taken, and what its stages saved beside the results of any workspace."""
+"""Stages of a study: what was chosen, what the camera saw, and how the explanations were tested."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float, Float64, Int, UInt8
 
 from sliplens.intervals import Difference
-from sliplens.report.study.localised import Truth
-from sliplens.report.study.scored import Faithful, Remedies
+from sliplens.results.faithfulness import Remedies, RemovalScores
 from sliplens.results.records import Run
+
+REGIONS = ("markers", "slip_annulus", "edges")
+"""Areas in which a map may lie."""
+MAP_MEASURES = ("resolution", "total_variation", "gini", "noise_stability", "frame_stability")
+"""Measures of how a map looks."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,11 +101,8 @@ class Randomisation:
     alarms: tuple[str, ...]
 
 
-LOOKS = ("resolution", "total_variation", "gini", "noise_stability", "frame_stability")
-
-
 @dataclass(frozen=True, kw_only=True)
-class Looks:
+class MapQuality:
     """What the eye judges of maps, as means over frames, by method and measure (`LOOKS`); None where undefined."""
 
     run: Run
@@ -138,22 +139,84 @@ class Timing:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Localisation:
+    """Where a method's relevance lies (share of its mass, share of its strongest pixels, by `REGIONS`), and how well it
+    ranks the markers as the network's answer and the true margin do.
+    """
+
+    mass: dict[str, float | None]
+    rank: dict[str, float | None]
+    spearman_network: float | None
+    spearman_margin: float | None
+    network: Difference | None
+    """Interval of `spearman_network`."""
+    margin: Difference | None
+    """Interval of `spearman_margin`."""
+    edges: Difference | None
+    """Mass on the edges of markers less the share of the image that they cover."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetaTest:
+    """Whether a score ranks a perfect map above a damaged one above chance, under one fill."""
+
+    fill: str
+    holds: bool
+    oracle: float
+    degraded: float
+    random: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkerEffects:
+    """What putting one marker back does to the network's answer and to the true margin, a row a marker and frame."""
+
+    frame_id: np.ndarray
+    trial: np.ndarray
+    marker: Int[np.ndarray, " rows"]
+    x_px: Float64[np.ndarray, " rows"]
+    y_px: Float64[np.ndarray, " rows"]
+    network: Float64[np.ndarray, " rows"]
+    margin: Float64[np.ndarray, " rows"]
+    state: Int[np.ndarray, " rows"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Truth:
+    """What a network should have looked at, which only a simulation tells."""
+
+    run: Run
+    input: str
+    source: str
+    frames: int
+    areas: dict[str, float | None]
+    methods: dict[str, Localisation]
+    network_against_margin: Difference | None
+    meta: tuple[MetaTest, ...]
+    told: str
+    effects: MarkerEffects
+    frame_ids: tuple[str, ...]
+    network_maps: Float[np.ndarray, "frames height width"]
+    margin_maps: Float[np.ndarray, "frames height width"]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Study:
     """All that a study adds to a workspace; tables are by input, and empty where a stage was not run."""
 
     choice: Choice | None = None
     states: States | None = None
-    deletion: dict[str, Remedies] = field(default_factory=dict)
-    faithfulness: dict[str, Faithful] = field(default_factory=dict)
+    remedies: dict[str, Remedies] = field(default_factory=dict)
+    faithfulness: dict[str, RemovalScores] = field(default_factory=dict)
     randomisation: dict[str, Randomisation] = field(default_factory=dict)
-    looks: dict[str, Looks] = field(default_factory=dict)
+    map_quality: dict[str, MapQuality] = field(default_factory=dict)
     timing: dict[str, Timing] = field(default_factory=dict)
     truth: dict[str, Truth] = field(default_factory=dict)
 
     @property
     def inputs(self) -> set[str]:
         """Inputs that some stage tells of; both where none does."""
-        tables = (self.deletion, self.faithfulness, self.randomisation, self.looks, self.timing, self.truth)
+        tables = (self.remedies, self.faithfulness, self.randomisation, self.map_quality, self.timing, self.truth)
         found = {name for table in tables for name in table} | set(self.choice.inputs if self.choice else ())
         return found or {"difference", "raw"}
 
@@ -162,10 +225,10 @@ class Study:
         """Where the study's frames come from."""
         if self.choice is not None:
             return self.choice.source
-        tables = (self.deletion, self.faithfulness, self.randomisation, self.looks, self.timing, self.truth)
+        tables = (self.remedies, self.faithfulness, self.randomisation, self.map_quality, self.timing, self.truth)
         return next((one.source for table in tables for one in table.values()), "simulated")
 
     def __bool__(self) -> bool:
         """Whether anything of a study was run."""
-        tables = (self.deletion, self.faithfulness, self.randomisation, self.looks, self.timing, self.truth)
+        tables = (self.remedies, self.faithfulness, self.randomisation, self.map_quality, self.timing, self.truth)
         return any(tables) or self.choice is not None or self.states is not None

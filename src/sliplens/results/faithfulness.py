@@ -1,26 +1,49 @@
-"""Records of how far explanations can be believed: the thesis's remedies, and curves of removal in margin units."""
+"""Scores of explanations: by deletion as the thesis does, and by removal against controls."""
 
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int
 
 from sliplens.intervals import Difference
-from sliplens.results.records import DeletionCurve, Run
+from sliplens.results.records import Run
 
 Key = tuple[str, str, str]
 """Fill, unit and method."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class VariantScore:
-    """Score D of one method under a variant of the thesis's deletion."""
+class MethodScore:
+    """Deletion score D_AUC over frames: mean and standard deviation, and mean D once the last pixel is gone."""
 
     mean: float
     sd: float
     last_step_mean: float | None
     frames: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeletionCurve:
+    """Deletion score D of each frame while pixels are removed, and the answers it comes from, in margin units."""
+
+    frame_ids: tuple[str, ...]
+    pixels_removed: Int[np.ndarray, " steps"]
+    scores: Float64[np.ndarray, "frames steps"]
+    predictions: Float64[np.ndarray, "frames steps"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeletionScores:
+    """How far the explanations of one network can be believed."""
+
+    run: Run
+    input: str
+    source: str
+    fill: str
+    methods: dict[str, MethodScore]
+    alarms: tuple[str, ...]
+    curves: dict[str, DeletionCurve]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +55,7 @@ class Variant:
     mode: Literal["deletion", "insertion"]
     stop: float | None
     better: Literal["lower", "higher"]
-    methods: dict[str, VariantScore]
+    methods: dict[str, MethodScore]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +72,7 @@ class Remedies:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SoundScore:
+class RemovalScore:
     """What removal says of one method under one fill and unit, in margin units."""
 
     fill: str
@@ -109,7 +132,7 @@ class RemovalCurve:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Faithful:
+class RemovalScores:
     """The sound scores of one network's explanations."""
 
     run: Run
@@ -118,7 +141,7 @@ class Faithful:
     frames: int
     trials: int
     random_orders: int
-    scores: tuple[SoundScore, ...]
+    scores: tuple[RemovalScore, ...]
     comparisons: tuple[Comparison, ...]
     agreement: tuple[Agreement, ...]
     alarms: tuple[str, ...]
