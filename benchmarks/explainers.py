@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     def timed(work: Callable[[], object], repeats: int = options.repeats) -> float:
         return median_seconds(work, repeats=repeats, device=options.device)
 
-    seconds, explainers = {}, EXPLAINERS | {"occlusion-marker": Occlusion(markers_px=marker_grid(options.size))}
+    seconds, explainers = {}, dict(EXPLAINERS) | {"occlusion-marker": Occlusion(markers_px=marker_grid(options.size))}
     for name in options.methods:
         explain = explainers[name]
         # thousands of passes average out on their own; one call after the warm-up is enough

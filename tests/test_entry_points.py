@@ -1,4 +1,4 @@
-"""Rows that installed packages add to tables."""
+"""Rows that installed packages add to the tables of sliplens."""
 
 import sys
 from pathlib import Path
@@ -6,32 +6,68 @@ from pathlib import Path
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.extras import entry_points
+from sliplens.explainers import EXPLAINERS
+from sliplens.extras import Table
+from sliplens.faithfulness import FILLS
+from sliplens.models.backbones import BACKBONES
+from sliplens.models.encodings import ENCODINGS
+
+TABLES = {
+    "sliplens.backbones": BACKBONES,
+    "sliplens.encodings": ENCODINGS,
+    "sliplens.explainers": EXPLAINERS,
+    "sliplens.fills": FILLS,
+}
 
 
 @pytest.fixture
-def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Install a package that adds a row to a table of fills."""
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Put a package on the path whose metadata add a row to a group."""
 
-    def install(row: str) -> None:
-        (tmp_path / "other_fills.py").write_text("ROW = 'a fill'\n")
-        info = tmp_path / "other_fills-1.0.dist-info"
+    def add(group: str, row: str, code: str = "ROW = 'a row'\n") -> None:
+        (tmp_path / "other_rows.py").write_text(code)
+        info = tmp_path / "other_rows-1.0.dist-info"
         info.mkdir()
-        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other-fills\nVersion: 1.0\n")
-        (info / "entry_points.txt").write_text(f"[sliplens.fills]\nother = {row}\n")
+        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other-rows\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text(f"[{group}]\n{row}\n")
         monkeypatch.syspath_prepend(str(tmp_path))
 
-    yield install
-    sys.modules.pop("other_fills", None)
+    yield add
+    sys.modules.pop("other_rows", None)
 
 
-def test_a_package_adds_a_row(installed):
-    installed("other_fills:ROW")
-    assert entry_points("sliplens.fills") == {"other": "a fill"}
-    assert entry_points("sliplens.explainers") == {}
+@pytest.mark.parametrize("group", TABLES)
+def test_an_installed_package_adds_a_row_to_every_table(install, group):
+    table = TABLES[group]
+    assert table.group == group
+    ours = dict(table)
+    install(group, "other = other_rows:ROW")
+    fresh = Table(table.noun, table.group, ours)  # `table` has been walked, and keeps what it found
+    assert fresh["other"] == fresh.pick("other") == "a row"
+    assert list(fresh) == [*ours, "other"]
 
 
-def test_a_row_that_cannot_be_imported_names_its_package(installed):
-    installed("other_fills:MISSING")
-    with pytest.raises(InputError, match=r"other-fills adds .other. to sliplens.fills.*update or uninstall"):
-        entry_points("sliplens.fills")
+def test_a_table_is_walked_without_importing_what_nobody_asks_for(install):
+    install("sliplens.levels", "other = other_rows:ROW", code="raise RuntimeError('loaded')\n")
+    assert Table("level", "sliplens.levels", {"black": 0.0})["black"] == 0.0
+
+
+def test_a_package_that_imports_sliplens_first_can_add_to_it(install):
+    code = "from sliplens.faithfulness import FILLS\nlist(FILLS)\nROW = FILLS['grey']\n"
+    install("sliplens.other", "other = other_rows:ROW", code=code)
+    assert Table("fill", "sliplens.other", {})["other"] is FILLS["grey"]
+
+
+def test_a_row_that_cannot_be_imported_names_its_package(install):
+    install("sliplens.levels", "other = other_rows:MISSING")
+    table = Table("level", "sliplens.levels", {})
+    with pytest.raises(InputError, match=r"other-rows adds the level 'other', .* update or uninstall other-rows"):
+        list(table)
+
+
+def test_no_package_replaces_a_row_of_sliplens(install):
+    install("sliplens.fills", "grey = other_rows:ROW")
+    table = Table("fill", "sliplens.fills", {"grey": 0.5})
+    assert table["grey"] == 0.5
+    with pytest.raises(InputError, match="adds the fill 'grey', a name that is taken"):
+        list(table)

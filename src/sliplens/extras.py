@@ -2,40 +2,94 @@
 
 import os
 import sys
+from collections.abc import Iterator, Mapping
+from functools import cached_property
 from importlib import metadata
 from importlib.util import find_spec
 from types import ModuleType
-from typing import Any
+from typing import TypeVar
 
 from sliplens.errors import InputError
 
+Row = TypeVar("Row")
 
-def entry_points(group: str) -> dict[str, Any]:
-    """Rows that installed packages add to a table, by name.
 
-    A package names them in its metadata: `[project.entry-points."sliplens.explainers"]`, `my-method = "package:row"`.
+class Table(Mapping[str, Row]):
+    """Rows by name: those of sliplens, then those that installed packages add through an entry point.
+
+    A package names its rows in its metadata: `[project.entry-points."sliplens.fills"]`, `my-fill = "package:row"`. They
+    are imported when the table is walked or a name is not one of ours, not before: a package may import sliplens first.
 
     Parameters
     ----------
+    noun
+        What a row is, for messages.
     group
-        Name of the table's group, such as `sliplens.explainers`.
+        Group of the entry points, such as `sliplens.fills`.
+    rows
+        Those of sliplens; no package replaces one.
 
     Raises
     ------
     InputError
-        If a package names a row that cannot be imported.
+        When rows of packages are asked for: if one cannot be imported, or has a name that is taken.
+
+    Examples
+    --------
+    >>> from sliplens.extras import Table
+    >>> levels = Table("level", "sliplens.levels", {"black": 0.0, "white": 1.0})
+    >>> levels["white"], list(levels)
+    (1.0, ['black', 'white'])
+    >>> levels.pick("pink")
+    Traceback (most recent call last):
+        ...
+    sliplens.errors.InputError: there is no level named 'pink'; choose one of black, white
     """
-    rows = {}
-    for point in metadata.entry_points(group=group):
-        try:
-            rows[point.name] = point.load()
-        except Exception as error:  # whatever another package's import may raise
+
+    def __init__(self, noun: str, group: str, rows: Mapping[str, Row]) -> None:
+        self.noun, self.group = noun, group
+        self._rows = dict(rows)
+
+    def __getitem__(self, name: str) -> Row:
+        return self._rows[name] if name in self._rows else self._added[name]
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self._rows
+        yield from self._added
+
+    def __len__(self) -> int:
+        return len(self._rows) + len(self._added)
+
+    def pick(self, name: str) -> Row:
+        """Row of a name that a user gave.
+
+        Raises
+        ------
+        InputError
+            If there is none; the message lists those there are.
+        """
+        if name not in self:
+            raise InputError(f"there is no {self.noun} named {name!r}; choose one of {', '.join(self)}")
+        return self[name]
+
+    @cached_property
+    def _added(self) -> dict[str, Row]:
+        rows = {}
+        for point in metadata.entry_points(group=self.group):
             package = point.dist.name if point.dist else point.value
-            raise InputError(
-                f"the package {package} adds {point.name!r} to {group}, but {point.value} cannot be imported "
-                f"({error}); update or uninstall {package}"
-            ) from error
-    return rows
+            if point.name in self._rows or point.name in rows:
+                raise InputError(
+                    f"the package {package} adds the {self.noun} {point.name!r}, a name that is taken; "
+                    f"rename it there, or uninstall {package}"
+                )
+            try:
+                rows[point.name] = point.load()
+            except Exception as error:  # whatever another package's import may raise
+                raise InputError(
+                    f"the package {package} adds the {self.noun} {point.name!r}, but {point.value} cannot be imported "
+                    f"({error}); update or uninstall {package}"
+                ) from error
+        return rows
 
 
 ONNX_PACKAGES = ("onnx", "onnxscript", "onnxruntime")

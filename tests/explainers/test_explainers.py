@@ -25,7 +25,7 @@ NAMES = [name for name in EXPLAINERS if name != "lrp"]
 every_explainer = pytest.mark.parametrize("name", NAMES)
 # an untrained network is so rough that integrated gradients would go to their most steps in every test
 SHORT = IntegratedGradients(steps=4, max_steps=8)
-QUICK = EXPLAINERS | {
+QUICK = dict(EXPLAINERS) | {
     "integrated-gradients": SHORT,
     "expected-gradients": ExpectedGradients(integrated=SHORT),
     "smooth-grad": SmoothGrad(samples=3),

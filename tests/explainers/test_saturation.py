@@ -7,7 +7,7 @@ from torch import nn
 from sliplens.explainers import EXPLAINERS, GradCam, IntegratedGradients, SmoothGrad
 
 # noise as small as a flat network is flat for
-METHODS = EXPLAINERS | {"smooth-grad": SmoothGrad(samples=4, noise=0.01)}
+METHODS = dict(EXPLAINERS) | {"smooth-grad": SmoothGrad(samples=4, noise=0.01)}
 BY_GRADIENT = ("grad-cam", "hires-cam", "layer-cam", "smooth-grad", "integrated-gradients")
 
 

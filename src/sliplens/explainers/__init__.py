@@ -8,9 +8,9 @@ from sliplens.explainers.lrp import Lrp
 from sliplens.explainers.occlusion import Occlusion, find_markers
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.poly_cam_budget import Likeness
-from sliplens.extras import entry_points
+from sliplens.extras import Table
 
-EXPLAINERS: dict[str, Explainer] = {
+_ROWS: dict[str, Explainer] = {
     "grad-cam": GradCam(),
     "integrated-gradients": IntegratedGradients(),
     "poly-cam": PolyCam(),
@@ -21,8 +21,8 @@ EXPLAINERS: dict[str, Explainer] = {
     "occlusion": Occlusion(),
     "occlusion-marker": Occlusion(markers_px=find_markers),
     "lrp": Lrp(),
-    **entry_points("sliplens.explainers"),
 }
+EXPLAINERS = Table("method", "sliplens.explainers", _ROWS)
 """The explainers by name, with their default options; use `dataclasses.replace` for others. `lrp` needs an extra.
 
 An installed package adds its own by the entry point `sliplens.explainers`.

@@ -9,7 +9,7 @@ from torch.nn import functional
 from torchvision.transforms.v2 import functional as transforms
 
 from sliplens.errors import InputError
-from sliplens.extras import entry_points
+from sliplens.extras import Table
 
 NOISE_SD = 0.01
 """Of ROAD, in units of the image's range."""
@@ -180,7 +180,7 @@ def _noisy_linear(images: Images, _references: Images | None, seed: int) -> Pain
     return lambda rows, gone: noisy_linear(images[rows], gone, noise=noise[rows])
 
 
-FILLS: dict[str, Fill] = {
+_ROWS: dict[str, Fill] = {
     "grey": _constant(0.5),
     "black": _constant(0.0),
     "white": _constant(1.0),
@@ -188,8 +188,8 @@ FILLS: dict[str, Fill] = {
     "blur": _static(_blurred),
     "reference": _reference,
     "noisy-linear": _noisy_linear,
-    **entry_points("sliplens.fills"),
 }
+FILLS = Table("fill", "sliplens.fills", _ROWS)
 """Fills by name; an installed package adds its own by the entry point `sliplens.fills`.
 
 `background` is the median colour of the image, what most of it shows; `reference` puts the untouched sensor in
@@ -215,6 +215,4 @@ def get_fill(name: str) -> Fill:
     >>> paint(torch.tensor([0]), torch.tensor([[[True, False]]]))[0, 0]
     tensor([[0.5000, 1.0000]])
     """
-    if name not in FILLS:
-        raise InputError(f"there is no fill named {name!r}; choose one of {', '.join(FILLS)}")
-    return FILLS[name]
+    return FILLS.pick(name)

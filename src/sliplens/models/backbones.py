@@ -1,6 +1,7 @@
 """Backbones: any TorchVision classifier, with the outputs that its head needs."""
 
 import math
+from collections.abc import Callable
 
 import torch
 import torchvision
@@ -9,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sliplens.errors import ModelError
+from sliplens.extras import Table
 
 BINS = 60
 LOWEST, HIGHEST = -0.1, 1.1
@@ -118,9 +120,13 @@ def head_outputs(head: str) -> int:
 DEFAULT_BACKBONE = "shufflenet_v2_x1_0"
 
 
-def backbone_names() -> list[str]:
-    """Names of the classifiers that TorchVision can build."""
-    return torchvision.models.list_models(module=torchvision.models)
+BACKBONES: Table[Callable[..., nn.Module]] = Table(
+    "backbone",
+    "sliplens.backbones",
+    {name: torchvision.models.get_model_builder(name) for name in torchvision.models.list_models(torchvision.models)},
+)
+"""What builds a classifier, called with `num_classes`: TorchVision's, and those that installed packages add by the
+entry point `sliplens.backbones`."""
 
 
 def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point") -> nn.Module:
@@ -129,7 +135,7 @@ def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point") -> nn.
     Parameters
     ----------
     backbone
-        Name in TorchVision's table of classifiers.
+        Row of `BACKBONES`.
     head
         `point` for one number, `histogram` for the mean of a distribution (`HistogramRegressor`).
 
@@ -141,7 +147,7 @@ def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point") -> nn.
     Raises
     ------
     ModelError
-        If TorchVision has no classifier, or sliplens no head, of that name.
+        If there is no backbone or head of that name.
 
     References
     ----------
@@ -155,7 +161,7 @@ def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point") -> nn.
     >>> network(torch.zeros(2, 3, 32, 32)).shape
     torch.Size([2, 1])
     """
-    if backbone not in backbone_names():
+    if backbone not in BACKBONES:
         raise ModelError(f"there is no backbone named {backbone!r}; choose a TorchVision classifier such as resnet18")
-    model = torchvision.models.get_model(backbone, weights=None, num_classes=head_outputs(head))
+    model = BACKBONES[backbone](num_classes=head_outputs(head))
     return HistogramRegressor(model) if head == "histogram" else model

@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from sliplens.errors import InputError
+from sliplens.extras import Table
 from sliplens.images import absolute_difference, signed_difference
 
 Frames = UInt8[np.ndarray, "batch height width 3"]
@@ -88,7 +88,7 @@ def _keep(frames: Frames, reference: Reference) -> Frames:
     return frames
 
 
-ENCODINGS = {
+_ROWS = {
     # |T_n - T_0| by its own maximum and T_n itself, both as the thesis; T_n - T_0; |T_n - T_0| with its amplitude
     "difference": Encoding(name="difference", compare=absolute_difference, empty_is_black=True),
     "raw": Encoding(name="raw", compare=_keep, empty_is_black=False),
@@ -97,6 +97,8 @@ ENCODINGS = {
     ),
     "amplitude": Encoding(name="amplitude", compare=absolute_difference, empty_is_black=True, own_maximum=False),
 }
+ENCODINGS = Table("input", "sliplens.encodings", _ROWS)
+"""Encodings by name; an installed package adds its own by the entry point `sliplens.encodings`."""
 
 
 def get_encoding(name: str) -> Encoding:
@@ -118,6 +120,4 @@ def get_encoding(name: str) -> Encoding:
     >>> get_encoding("amplitude").encode(frame[None], untouched, image_size=4).amax()  # 40 / 255
     tensor(0.1569)
     """
-    if name not in ENCODINGS:
-        raise InputError(f"there is no input named {name!r}; choose one of {', '.join(ENCODINGS)}")
-    return ENCODINGS[name]
+    return ENCODINGS.pick(name)
