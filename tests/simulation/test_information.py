@@ -182,7 +182,7 @@ class TestBothModels:
 @pytest.mark.parametrize("wet", [False, True])
 def test_priors_have_the_spread_of_what_is_drawn(wet, rng):
     ranges = Nuisances()
-    days = [draw_day(ranges, quantile=rng.uniform(), rng=rng) for _ in range(20_000)]
+    days = [draw_day(ranges, quantile=rng.uniform(), rng=rng) for _ in range(8_000)]
     drawn = [draw_grasp(ranges, day=day, wet=wet, rng=rng) for day in days]
     # where in its trial a frame lies, from start to end
     when = rng.uniform(-1, 1, len(drawn))
@@ -201,8 +201,8 @@ def test_priors_have_the_spread_of_what_is_drawn(wet, rng):
     }
     prior = prior_sigma(ranges, wet=wet)
     for name, values in columns.items():
-        # a deviation from 20,000 draws errs by 0.5 %; four of that, and the product's higher orders
-        assert prior[name] == pytest.approx(np.std(values), rel=0.025), name
+        # a deviation from 8,000 draws errs by 0.8 %; three of that, and the product's higher orders
+        assert prior[name] == pytest.approx(np.std(values), rel=0.03), name
 
 
 def test_the_camera_sees_the_rings_of_the_real_crop():

@@ -165,7 +165,7 @@ def test_the_band_of_the_margin_covers(trial: Trial):
     for number in range(20):
         rng = np.random.default_rng(number)
         contact = trial.contact(noise_n=0.03, rng=rng)
-        friction = estimate_friction(contact, contact_threshold_n=0.1, rng=rng)
+        friction = estimate_friction(contact, contact_threshold_n=0.1, rng=rng, draws=50)
         labels = label_frames(trial.frame_time_s, contact, friction=friction)
         used = labels.valid & (truth < 0.9)  # at 1 the margin cannot err upwards
         shares.append(np.mean(np.abs(labels.safety_margin - truth)[used] <= labels.safety_margin_sigma[used]))
