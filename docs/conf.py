@@ -10,6 +10,8 @@ copyright = "2026, the sliplens developers"
 release = version = __version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+# a field may be named as a builtin is (`object`): which one is meant nobody need say
+suppress_warnings = ["ref.python"]
 exclude_patterns = ["_build"]
 html_theme = "alabaster"
 html_theme_options = {"description": "How close a fingertip is to losing its grip, and why.", "page_width": "1080px"}

@@ -6,14 +6,16 @@ from typing import TYPE_CHECKING, Any
 from sliplens._version import __version__
 
 if TYPE_CHECKING:
+    from sliplens.errors import SliplensError
     from sliplens.models.checkpoint import load
 
 # where each name lives: importing sliplens alone imports neither torch nor NumPy
 _MODULES = {
+    "SliplensError": "sliplens.errors",
     "load": "sliplens.models.checkpoint",
 }
 
-__all__ = ["__version__", "load"]
+__all__ = ["SliplensError", "__version__", "load"]
 
 
 def __getattr__(name: str) -> Any:

@@ -20,7 +20,9 @@ from sliplens.errors import InputError
 from sliplens.files import write_json
 
 RESULT_FILE = "result.json"
+"""Record of a folder."""
 ARRAYS_FILE = "arrays.npz"
+"""Arrays beside it."""
 
 Record = TypeVar("Record")
 

@@ -31,3 +31,15 @@ class ModelError(SliplensError):
 
 class SaliencyError(SliplensError):
     """A saliency map that does not fit its image or is not finite."""
+
+
+__all__ = [
+    "CheckpointError",
+    "ContactError",
+    "ImageError",
+    "InputError",
+    "ModelError",
+    "RecordingError",
+    "SaliencyError",
+    "SliplensError",
+]

@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
+
+__all__ = ["FEWEST_UNITS", "Difference", "bootstrap_difference", "paired_difference"]
 
 FEWEST_UNITS = 5
 """Resampling fewer trials or frames says little."""
@@ -61,7 +63,7 @@ def paired_difference(
     first: Float[np.ndarray, " images"],
     second: Float[np.ndarray, " images"],
     *,
-    trials: np.ndarray | None = None,
+    trials: Shaped[np.ndarray, " images"] | None = None,
     rng: np.random.Generator,
 ) -> Difference:
     """Difference of two scores of the same images; whole trials are resampled where they are named.

@@ -490,3 +490,26 @@ def get_estimator(name: str) -> MarginEstimator:
     if name not in ESTIMATORS:
         raise InputError(f"estimator {name!r} is not known; choose {', '.join(ESTIMATORS)}")
     return ESTIMATORS[name]()
+
+
+__all__ = [
+    "ESTIMATORS",
+    "Constant",
+    "Eccentricity",
+    "FeatureRegression",
+    "FieldTrial",
+    "MarginEstimator",
+    "StickArea",
+    "affine_parts",
+    "displacement_entropy",
+    "edge_over_centre",
+    "field_trial",
+    "find_hold",
+    "get_estimator",
+    "helmholtz_hodge",
+    "mean_shear",
+    "pressed_centre",
+    "rigid_residual",
+    "shear_over_divergence",
+    "stick_area",
+]

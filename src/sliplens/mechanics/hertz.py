@@ -186,7 +186,7 @@ def normal_displacement(distance_m: Numbers, *, contact_radius_m: Numbers, spher
 
 
 def normal_slope(distance_m: Numbers, *, contact_radius_m: Numbers, sphere_radius_m: float) -> Numbers:
-    """Slope -du_z/dr of the surface under Hertz's pressure: how steeply the dent rises away from its centre.
+    """Slope -du_z/dr of the surface under Hertz's pressure, the ratio of its rise to the way from the dent's centre.
 
     Inside the contact r / R; outside (2 a / (pi R)) [s asin(1/s) - sqrt(s^2 - 1) / s] with s = r/a.
 

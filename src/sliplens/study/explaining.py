@@ -222,7 +222,7 @@ _SALIENCY = ".saliency"
 
 @dataclass(frozen=True, kw_only=True)
 class ExplainedFrame:
-    """One explained frame; `safety_margin` is None where there is no label."""
+    """One explained frame, its numbers in margin units; `safety_margin` is None where there is no label."""
 
     id: str
     trial: str

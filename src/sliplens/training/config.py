@@ -33,7 +33,7 @@ class TrainConfig:
     """AdamW with one warm-up and one cosine descent, or Ranger21 with its own schedule and defaults."""
     learning_rate: float = 2e-3
     weight_decay: float = 1e-2
-    """Of AdamW; Ranger21 keeps its own."""
+    """Share of each weight, times the learning rate, that AdamW takes away a step; Ranger21 keeps its own."""
     mixed_precision: bool = False
     """16-bit floats where they are safe; on a GPU alone, for a CPU is not faster with them."""
     max_minutes: float | None = None

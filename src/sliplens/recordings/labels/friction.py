@@ -181,7 +181,7 @@ class FrictionEstimate:
     """Static coefficient of friction mu_s."""
     low: float
     high: float
-    """Ends of the 68 % interval."""
+    """Ends of the coefficient's 68 % interval."""
     onset_s: float | None
     """First gross slip, on the force sensor's clock; None where it is not known to slip."""
     found: Found
@@ -233,7 +233,7 @@ def given_friction(
     mu
         Static coefficient of friction.
     low, high
-        Ends of its 68 % interval.
+        Ends of the coefficient's 68 % interval.
     onset_s
         When the contact first slips, if it is known to.
     """

@@ -82,7 +82,7 @@ class Lag:
     sigma_s: float
     """Standard uncertainty of the lag."""
     correlation: float
-    """Of image motion and force rate, at this lag; NaN where it was given by hand."""
+    """Correlation coefficient of image motion and force rate at this lag; NaN where it was given by hand."""
     doubt: str = ""
     """Why the lag cannot be told from this trial, a sentence for people; empty where it can."""
 
