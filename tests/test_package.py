@@ -1,7 +1,12 @@
 """Laws of the package as a whole."""
 
+import re
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
 
 
 def run_python(code: str) -> str:
@@ -26,3 +31,22 @@ def test_asking_for_help_does_not_import_torch():
 
 def test_importing_the_report_does_not_import_torch():
     assert run_python("import sys, sliplens.report; print('torch' in sys.modules)").strip() == "False"
+
+
+def test_the_floors_are_told_as_they_are_held():
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
+    held = [
+        name for layer in layers for name in re.findall(r"\w+", layer) if (ROOT / "src" / "sliplens" / name).is_dir()
+    ]
+    _, _, section = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("## Floors")
+    told = re.findall(r"^(\w+)", section.split("```")[1], flags=re.MULTILINE)
+    assert told[: len(held)] == held
+
+
+def test_contributing_names_files_that_there_are():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    named = re.findall(r"`((?:\w+/)+(?:\w+\.py)?|\w+\.py)`", text)
+    folders = [ROOT, ROOT / "src" / "sliplens", ROOT / "src" / "sliplens" / "faithfulness"]
+    assert len(named) > 10
+    assert not [name for name in named if not any((folder / name).exists() for folder in folders)]
