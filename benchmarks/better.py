@@ -23,10 +23,10 @@ from torch import Tensor
 
 from sliplens.errors import SliplensError
 from sliplens.explainers import PolyCam, capture, find_layers
+from sliplens.explainers.activations import find_published_layers
 from sliplens.explainers.channels import combine
-from sliplens.explainers.frozen_model import still
+from sliplens.explainers.frozen_model import frozen
 from sliplens.explainers.occlusion import marker_regions, markers_in_recording
-from sliplens.explainers.poly_cam_thesis import find_published_layers
 from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.localisation import relevance_mass, relevance_rank
 from sliplens.faithfulness.removal import faithfulness
@@ -95,7 +95,7 @@ def make_maps(trained: TrainedModel, case: Case, *, options: argparse.Namespace)
     model, image, reference = trained.model, case.image[None], case.reference
     added = (case.image - reference).abs().mean(dim=0)
     ours = PolyCam(budget=options.budget, levels=True)(model, image, reference=reference)
-    with still(model), torch.no_grad():
+    with frozen(model), torch.no_grad():
         alone, published = (
             unit_weights(model, image, [layer.name for layer in find(model, image)])
             for find in (find_layers, find_published_layers)
@@ -130,7 +130,7 @@ def judge(trained: TrainedModel, case: Case, *, options: argparse.Namespace) -> 
     maps = {name: one.float().numpy() for name, one in make_maps(trained, case, options=options).items()}
     scores: dict[str, dict[str, float]] = {name: {} for name in maps}
     both = torch.stack([case.image, case.reference])
-    with still(trained.model), torch.no_grad():
+    with frozen(trained.model), torch.no_grad():
         answers = trained.predict(both)
         ready = prepare(trained.model, both, answers, passes=FULL_BUDGET_PASSES)
         for fill in options.fills:

@@ -8,7 +8,7 @@ import torch
 from sliplens.errors import InputError
 from sliplens.explainers import Likeness, PolyCam
 from sliplens.explainers.maps import pearson_r, top_overlap
-from sliplens.explainers.poly_cam_budget import Field
+from sliplens.explainers.poly_cam_budget import GaussianProcess
 from sliplens.models import engines as passes
 
 
@@ -28,7 +28,7 @@ def effects(places):
 
 def test_the_estimate_is_that_of_the_dense_formula(places, effects):
     kernel = kernel_of(places)
-    field = Field(kernel)
+    field = GaussianProcess(kernel)
     for _ in range(2):
         field.learn(effects[field.choose(6, importance=torch.ones(40, dtype=torch.float64))])
     chosen = torch.tensor(field.chosen)
@@ -49,7 +49,7 @@ def test_the_estimate_is_that_of_the_dense_formula(places, effects):
 def test_each_choice_is_where_the_most_is_at_stake(places):
     kernel = kernel_of(places)
     importance = torch.linspace(1, 2, 40, dtype=torch.float64)
-    field = Field(kernel)
+    field = GaussianProcess(kernel)
     chosen = field.choose(5, importance=importance).tolist()
     for count in range(5):
         before = torch.tensor(chosen[:count], dtype=torch.long)
@@ -61,7 +61,7 @@ def test_each_choice_is_where_the_most_is_at_stake(places):
 
 
 def test_draws_scatter_as_the_field_says(places, effects):
-    field = Field(kernel_of(places))
+    field = GaussianProcess(kernel_of(places))
     field.learn(effects[field.choose(10, importance=torch.ones(40, dtype=torch.float64))])
     estimate, deviation = field.estimate()
     draws = field.draws(4000, generator=torch.Generator().manual_seed(1))
@@ -171,7 +171,7 @@ def test_all_rounds_use_one_engine(network, images, monkeypatch):
         prepared.append(passes.prepare(*arguments, **options))
         return prepared[-1]
 
-    monkeypatch.setattr("sliplens.explainers.poly_cam.prepare", prepare)
+    monkeypatch.setattr("sliplens.explainers.frozen_model.prepare", prepare)
     explain = PolyCam(budget=0.25, likeness=Likeness(pearson_r=1.0), engine="folded")
     assert explain(network("small shufflenet"), images[:2]).engine == "folded"
     assert len(prepared) == 1

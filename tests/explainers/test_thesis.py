@@ -7,7 +7,7 @@ from torchvision import models
 
 from sliplens.errors import InputError, ModelError
 from sliplens.explainers import PolyCam, capture
-from sliplens.explainers.poly_cam_thesis import find_published_layers
+from sliplens.explainers.activations import find_published_layers
 
 PUBLISHED = [
     "conv1",

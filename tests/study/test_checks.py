@@ -21,6 +21,7 @@ class ShowsTheImage:
 
     def __call__(self, _model: nn.Module, images: Tensor, **_options: object) -> Explanation:
         return Explanation(
+            images=images,
             relevance=images.mean(dim=1),
             method="image",
             target="nothing",

@@ -180,14 +180,14 @@ def _measure_rates(image_size: int) -> _Rates:
     """
     import torch
 
-    from sliplens.explainers.frozen_model import still
+    from sliplens.explainers.frozen_model import frozen
     from sliplens.models import build_model
     from sliplens.models.engines import prepare
 
     with torch.random.fork_rng(devices=[]), torch.no_grad():
         model = build_model()
         images = torch.zeros(64, 3, image_size, image_size)
-        with still(model):
+        with frozen(model):
             some = images[:2]
             ready = prepare(model, some, model(some).reshape(2), passes=len(INPUTS) * _LEVELS * _POLY_CAM_PASSES)
             engine = _best_rate(lambda: list(ready.run(images.split(ready.batch_size))), images=len(images))

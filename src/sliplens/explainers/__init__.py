@@ -2,7 +2,8 @@
 
 from sliplens.explainers.activations import Layer, capture, find_layers
 from sliplens.explainers.cam import GradCam, HiResCam, LayerCam
-from sliplens.explainers.explanation import Approximation, Explainer, Explanation, Level, Progress
+from sliplens.explainers.contract import Explainer
+from sliplens.explainers.explanation import Approximation, Explanation, Level
 from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients, SmoothGrad
 from sliplens.explainers.lrp import Lrp
 from sliplens.explainers.occlusion import Occlusion, find_markers
@@ -44,7 +45,6 @@ __all__ = [
     "Lrp",
     "Occlusion",
     "PolyCam",
-    "Progress",
     "SmoothGrad",
     "capture",
     "find_layers",

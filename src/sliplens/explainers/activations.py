@@ -1,18 +1,18 @@
-"""The layers of a network whose maps are explained, found by running it."""
+"""Layers whose output is a map, found by running the network, and their activations."""
 
 import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
-from itertools import groupby
+from itertools import groupby, pairwise
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from sliplens.errors import ModelError
-from sliplens.explainers.frozen_model import still
+from sliplens.explainers.frozen_model import frozen
 
 
 @contextmanager
@@ -105,7 +105,7 @@ def find_layers(
     Parameters
     ----------
     model
-        Network; it is held `still` for the pass.
+        Network; it is `frozen` for the pass.
     images
         Images to run it on; one is enough.
     names
@@ -119,7 +119,7 @@ def find_layers(
     root = _record(model, images)
     layers = _distinct(_main_path(root))
     if names is not None:
-        return _named(model, root, names, found=layers)
+        return _named(model, root, names, others=layers)
     if not layers:
         raise ModelError(
             f"{type(model).__name__} has no layer with a spatial map for images of {images.shape[-2]} x "
@@ -131,48 +131,63 @@ def find_layers(
 def recall_layers(
     model: nn.Module, images: Float[Tensor, "batch 3 height width"], *, names: Sequence[str] | None = None
 ) -> tuple[Layer, ...]:
-    """What `find_layers` found the last time for this network, these names and images of this size, else find them.
+    """As `find_layers`, but searched for once for each network, image size and choice of names.
 
     A search costs a pass with hooks on every module, as much as a whole Grad-CAM. It is made again when a module was
     added, taken away or replaced.
-
-    Parameters
-    ----------
-    model, images, names
-        As for `find_layers`.
-
-    Raises
-    ------
-    ModelError
-        As `find_layers`.
     """
     modules = tuple((name, weakref.ref(module)) for name, module in model.named_modules())
     key = (modules, tuple(images.shape[1:]), None if names is None else tuple(names))
-    known = _FOUND.get(model)
+    known = _RECALLED.get(model)
     if known is None or known[0] != key:
-        _FOUND[model] = known = (key, find_layers(model, images, names=names))
+        _RECALLED[model] = known = (key, find_layers(model, images, names=names))
     return known[1]
 
 
-_FOUND: weakref.WeakKeyDictionary[nn.Module, tuple[object, tuple[Layer, ...]]] = weakref.WeakKeyDictionary()
+_RECALLED: weakref.WeakKeyDictionary[nn.Module, tuple[object, tuple[Layer, ...]]] = weakref.WeakKeyDictionary()
 
 
-def map_calls(model: nn.Module, images: Float[Tensor, "batch 3 height width"]) -> list[tuple[str, Shape | None]]:
-    """Names of all modules in the order in which their calls end, with the shape of their output.
+def find_published_layers(model: nn.Module, images: Float[Tensor, "batch 3 height width"]) -> tuple[Layer, ...]:
+    """Layers as the public code finds them: every module that ends just before the size of the output changes.
+
+    Modules are listed as they end, insides before their block. For TorchVision's ShuffleNetV2 at 224 px these are ten:
+    conv1, maxpool, stage2.0.branch1, stage2.0.branch2.2, stage2, stage3.0.branch1, stage3.0.branch2.2, stage3,
+    stage4.0.branch1 and stage4.0.branch2.2. The size goes down and up again inside a block with two branches, and
+    the last layer is missed, since what follows it is no map.
 
     Parameters
     ----------
     model
-        Network; it is held `still` for the pass.
+        Network; it is frozen for the pass.
     images
         Images to run it on; one is enough.
 
-    Returns
-    -------
-    list
-        Name, and (channels, height, width) of the output where it is a map, else None.
+    Raises
+    ------
+    ModelError
+        If there is no such layer.
+
+    References
+    ----------
+    Public code of Poly-CAM, `find_layer_list`.
     """
-    return [(call.name, call.output_shape) for call in _finished(_record(model, images))]
+    ended = [(call.name, call.output_shape) for call in _finished(_record(model, images))]
+    layers: dict[str, Layer] = {}
+    for (name, shape), (_, following) in pairwise(ended):
+        if shape is None and following is None:
+            continue
+        if shape is None or following is None:
+            break  # the public code stops at what flattens
+        if following[1:] != shape[1:]:
+            layers[name] = _layer(name, shape)
+            if following[1:] == (1, 1):
+                break
+    if not layers:
+        raise ModelError(
+            f"{type(model).__name__} has no layer where the size of the map changes, which score='thesis' looks for; "
+            "name layers"
+        )
+    return tuple(layers.values())
 
 
 def _record(model: nn.Module, images: Tensor) -> _Call:
@@ -191,7 +206,7 @@ def _record(model: nn.Module, images: Tensor) -> _Call:
     def leave(_module: nn.Module, _arguments: object, output: object) -> None:
         open_calls.pop().output_shape = _map_shape(output)
 
-    with ExitStack() as stack, torch.no_grad(), still(model):
+    with ExitStack() as stack, torch.no_grad(), frozen(model):
         for name, module in model.named_modules():
             stack.callback(module.register_forward_pre_hook(enter(name)).remove)
             stack.callback(module.register_forward_hook(leave).remove)
@@ -242,7 +257,7 @@ def _layer(name: str, shape: Shape) -> Layer:
     return Layer(name=name, channels=shape[0], height=shape[1], width=shape[2])
 
 
-def _named(model: nn.Module, root: _Call, names: Sequence[str], *, found: tuple[Layer, ...]) -> tuple[Layer, ...]:
+def _named(model: nn.Module, root: _Call, names: Sequence[str], *, others: tuple[Layer, ...]) -> tuple[Layer, ...]:
     known = [name for name, _ in model.named_modules() if name]
     shapes: dict[str, Shape | None] = {}
     for call in _finished(root):
@@ -250,13 +265,13 @@ def _named(model: nn.Module, root: _Call, names: Sequence[str], *, found: tuple[
         shapes[call.name] = call.output_shape
     for name in names:
         if name not in known:
-            choices = [layer.name for layer in found] + get_close_matches(name, known, n=3)
+            choices = [layer.name for layer in others] + get_close_matches(name, known, n=3)
             raise ModelError(
                 f"{type(model).__name__} has no layer {name!r}; choose among {', '.join(dict.fromkeys(choices))} "
                 "or another name of model.named_modules()"
             )
         if not _is_spatial(shapes.get(name)):
-            choices = ", ".join(layer.name for layer in found)
+            choices = ", ".join(layer.name for layer in others)
             raise ModelError(f"layer {name!r} gives no spatial map; choose among {choices or 'none'}")
     if not names:
         raise ModelError("the list of layers is empty; name at least one, or pass None to have them found")

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from sliplens.errors import ModelError
 from sliplens.explainers.activations import Layer, capture, recall_layers
-from sliplens.explainers.contract import Found, Method, require_at_least_one
-from sliplens.explainers.explanation import Progress, check_slopes
-from sliplens.explainers.frozen_model import Held
+from sliplens.explainers.contract import Method, require_at_least_one
+from sliplens.explainers.explanation import Explanation, check_slopes
+from sliplens.explainers.frozen_model import FrozenModel
 from sliplens.explainers.maps import spread
+from sliplens.progress import OnProgress
 
 
 def grad_cam_map(
@@ -103,69 +104,56 @@ class _Cam(Method):
     def _cells(self, activations: Tensor, gradients: Tensor, *, change: Tensor) -> Tensor:
         """Relevance of the layer's cells in margin units."""
 
-    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
-        layer = self._find_layer(held)
-        parts, predictions, empty_predictions = [], [], []
-        empty = empty_prediction = None
-        for part in torch.arange(len(held.images)).split(self.batch_size):
+    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
+        layer = self._find_layer(frozen)
+        maps, predictions, reference_predictions = [], [], []
+        empty = reference_prediction = torch.empty(0)
+        for part in torch.arange(len(frozen.images)).split(self.batch_size):
             # images and references in one pass; one reference for all is looked at once
-            shared = held.references[: 0 if parts else 1]
-            references = held.references[part] if len(held.references) > 1 else shared
-            seen = _differentiate(held, torch.cat([held.images[part], references]), count=len(part), layer=layer)
-            activations, prediction = seen.activations[: len(part)], seen.predictions[: len(part)]
+            shared = frozen.references[: 0 if maps else 1]
+            references = frozen.references[part] if len(frozen.references) > 1 else shared
+            activations, gradients, prediction = _differentiate(
+                frozen, torch.cat([frozen.images[part], references]), count=len(part), layer=layer
+            )
             if len(references):
-                empty, empty_prediction = seen.activations[len(part) :], seen.predictions[len(part) :]
-            assert empty is not None  # the first pass has references
-            assert empty_prediction is not None
-            change = (prediction - empty_prediction)[:, None, None, None]
-            contrast = activations - empty if self.contrast else activations
-            cells = self._cells(contrast, seen.gradients, change=change)
-            parts.append(spread(cells, (held.images.shape[-2], held.images.shape[-1])))
+                empty, reference_prediction = activations[len(part) :], prediction[len(part) :]
+            activations, prediction = activations[: len(part)], prediction[: len(part)]
+            change = (prediction - reference_prediction)[:, None, None, None]
+            cells = self._cells(activations - empty if self.contrast else activations, gradients, change=change)
+            maps.append(spread(cells, (frozen.images.shape[-2], frozen.images.shape[-1])))
             predictions.append(prediction)
-            empty_predictions.append(empty_prediction.expand_as(prediction))
+            reference_predictions.append(reference_prediction.expand_as(prediction))
             if on_progress is not None:
-                on_progress(sum(map(len, parts)), len(held.images))
-        subject = held.predicted(torch.cat(predictions), torch.cat(empty_predictions))
-        relevance = torch.cat(parts)
-        return Found(
-            subject=subject,
-            relevance=relevance,
+                on_progress(sum(map(len, maps)), len(frozen.images))
+        comparison = frozen.compared(torch.cat(predictions), torch.cat(reference_predictions))
+        relevance = torch.cat(maps)
+        return comparison.explanation(
+            relevance,
             method=self.method,
             complete=self.contrast and self.complete,
             target=f"{'f(x) - f(reference)' if self.contrast else 'f(x)'}, through layer {layer.name}",
-            findings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=subject.change.tolist()),
+            warnings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=comparison.change.tolist()),
         )
 
-    def _find_layer(self, held: Held) -> Layer:
+    def _find_layer(self, frozen: FrozenModel) -> Layer:
         names = None if self.layer is None else (self.layer,)
         try:
-            return recall_layers(held.model, held.images[:1], names=names)[-1]
+            return recall_layers(frozen.model, frozen.images[:1], names=names)[-1]
         except ModelError:
-            held.predict_all()  # a model that gives no number has a greater fault than one without layers
+            frozen.compare()  # a model that gives no number has a greater fault than one without layers
             raise
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Seen:
-    """One pass of images, followed by references, and the gradients at the images."""
-
-    activations: Tensor
-    gradients: Tensor
-    predictions: Tensor
-
-
-def _differentiate(held: Held, batch: Tensor, *, count: int, layer: Layer) -> _Seen:
-    """Activations and predictions of a batch, and the gradients of the first `count` predictions in them."""
-    with capture(held.model, [layer.name], differentiable=True) as outputs:
-        predictions = held.predict(batch)
+def _differentiate(frozen: FrozenModel, batch: Tensor, *, count: int, layer: Layer) -> tuple[Tensor, Tensor, Tensor]:
+    """Activations, gradients of the first `count` predictions in them, and predictions of a batch."""
+    with capture(frozen.model, [layer.name], differentiable=True) as outputs:
+        predictions = frozen.predict(batch)
     if not predictions.requires_grad:
         raise ModelError(
             f"the output does not depend on layer {layer.name!r}; choose a layer on the path to the output"
         )
     (gradients,) = torch.autograd.grad(predictions[:count].sum(), outputs[layer.name])
-    return _Seen(
-        activations=outputs[layer.name].detach(), gradients=gradients[:count], predictions=predictions.detach()
-    )
+    return outputs[layer.name].detach(), gradients[:count], predictions.detach()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""The effect of each channel's region on the prediction: masked images, made as they are needed."""
+"""Channels of Poly-CAM: the region of each, its effect on the prediction, and the map that weighted channels make."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -7,9 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from sliplens.explainers.activations import Layer, find_layers
+from sliplens.explainers.activations import Layer, find_layers, find_published_layers
 from sliplens.explainers.maps import FLOOR, resize, to_masks
-from sliplens.explainers.poly_cam_thesis import find_published_layers, thesis_support
 from sliplens.models.engines import Passes
 
 
@@ -36,53 +35,75 @@ VARIANTS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Predictions:
-    """Predictions of one image and of its masked versions, in margin units."""
+class MaskedPredictions:
+    """Predictions of one image x, of what it is blended with, b, and of its masked versions, in margin units."""
 
     image: Float[Tensor, ""]
     """f(x)."""
     empty: Float[Tensor, ""]
     """f(b), the image with everything removed."""
-    kept: Float[Tensor, " channels"] | None
-    """f(b + (x - b) M) for each channel's mask M, or None where the variant has no such pass."""
-    removed: Float[Tensor, " channels"] | None
-    """f(b + (x - b)(1 - M)), or None."""
+    variant: Variant
+    """What the rows of `points` are."""
+    points: Float[Tensor, "points channels"]
+    """What `measure` returns."""
+
+    @property
+    def kept(self) -> Float[Tensor, " channels"] | None:
+        """f(b + (x - b) M) for each channel's mask M, or None where the variant has no such pass."""
+        return self.points[0] if self.variant.keep else None
+
+    @property
+    def removed(self) -> Float[Tensor, " channels"] | None:
+        """f(b + (x - b)(1 - M)), or None."""
+        return self.points[-1] if self.variant.remove else None
 
 
-def channel_effects(predictions: Predictions) -> Float[Tensor, " channels"]:
-    """Effect of each channel's region in margin units: 0 for the empty mask, f(x) - f(b) for the full one.
+def regression_support(predictions: MaskedPredictions) -> Float[Tensor, " channels"]:
+    """Share of f(x) - f(b) that each channel's region supports: 0 for the empty mask, 1 for the full one.
 
     The mean of what the region adds to the reference, f(b + (x - b) M) - f(b), and of what the image loses without it,
-    f(x) - f(b + (x - b)(1 - M)), or the one of them that was measured. Unlike a softmax or sigmoid of the output it
-    is signed and does not saturate.
+    f(x) - f(b + (x - b)(1 - M)), or the one of them that was measured, over f(x) - f(b); 0 where that is 0. Unlike a
+    softmax or sigmoid of the output it is signed and does not saturate. The division changes no map, since each is
+    normalised, and keeps the numbers clear of the floor of 1e-12 in `combine`.
     """
     effects = []
     if predictions.kept is not None:
         effects.append(predictions.kept - predictions.empty)
     if predictions.removed is not None:
         effects.append(predictions.image - predictions.removed)
-    return torch.stack(effects).mean(dim=0)
+    effect, change = torch.stack(effects).mean(dim=0), predictions.image - predictions.empty
+    return effect / change if change else torch.zeros_like(effect)
 
 
-def _supporting_share(predictions: Predictions) -> Float[Tensor, " channels"]:
-    """Each effect as a share of f(x) - f(b), positive where it supports the change; 0 where nothing changed.
+def thesis_support(predictions: MaskedPredictions) -> Float[Tensor, " channels"]:
+    """What the public code makes the weights of, for a network with one output.
 
-    The division changes no map, since each is normalised, and keeps the numbers clear of the floor of 1e-12 in
-    `combine`.
+    The score is a sigmoid s of the percentage. PCAM+: s(kept); PCAM-: s(image) - s(removed); PCAM+/-:
+    s(kept) + s(image) - s(removed). In float32 s is 1 from 17 % on, so that there the weights of PCAM+/- are all
+    1 and those of PCAM- all 0.
+
+    References
+    ----------
+    Englebert, Cornu and De Vleeschouwer, *Poly-CAM*, ICPR 2022, eqs. 8 to 10, and its public code for the sigmoid of
+    a single output.
     """
-    effects, change = channel_effects(predictions), predictions.image - predictions.empty
-    return effects / change if change else torch.zeros_like(effects)
+    parts = []
+    if predictions.kept is not None:
+        parts.append(_sigmoid_of_percent(predictions.kept))
+    if predictions.removed is not None:
+        parts.append(_sigmoid_of_percent(predictions.image) - _sigmoid_of_percent(predictions.removed))
+    return torch.stack(parts).sum(dim=0)
 
 
-def _thesis_support(predictions: Predictions) -> Float[Tensor, " channels"]:
-    return thesis_support(predictions.image, kept=predictions.kept, removed=predictions.removed)
+def _sigmoid_of_percent(margins: Tensor) -> Tensor:
+    return torch.sigmoid(100 * margins)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
     """A way to weigh channels, with what belongs to it."""
 
-    support: Callable[[Predictions], Tensor]
+    support: Callable[[MaskedPredictions], Tensor]
     """How far each channel speaks for the prediction; below 0 it speaks against it, and gets no weight."""
     layers: Callable[[nn.Module, Tensor], tuple[Layer, ...]]
     """Layers of a network, fine to coarse or as they run, found with one image."""
@@ -92,8 +113,8 @@ class Score:
 
 
 SCORES = {
-    "regression": Score(support=_supporting_share, layers=find_layers, as_published=False),
-    "thesis": Score(support=_thesis_support, layers=find_published_layers, as_published=True),
+    "regression": Score(support=regression_support, layers=find_layers, as_published=False),
+    "thesis": Score(support=thesis_support, layers=find_published_layers, as_published=True),
 }
 
 
@@ -153,23 +174,11 @@ class Regions:
     """One image and the regions of all its channels, those of every layer in a row."""
 
     image: Float[Tensor, "3 height width"]
-    """x."""
+    """Image x."""
     empty: Float[Tensor, "3 height width"]
-    """b, what is shown outside a region."""
+    """What is shown outside a region, b."""
     masks: tuple[Float[Tensor, "_channels _rows _columns"], ...]
-    """M, in [0, 1], at the resolution of each layer."""
-
-    @classmethod
-    def of(
-        cls,
-        activations: list[Float[Tensor, "_channels _rows _columns"]],
-        *,
-        image: Float[Tensor, "3 height width"],
-        empty: Float[Tensor, "3 height width"],
-        as_published: bool = False,
-    ) -> "Regions":
-        """Regions from the activations of each layer; see `to_masks`."""
-        return cls(image=image, empty=empty, masks=tuple(to_masks(a, as_published=as_published) for a in activations))
+    """Masks M in [0, 1] at the resolution of each layer; see `to_masks`."""
 
     @property
     def layer_sizes(self) -> list[int]:
@@ -232,25 +241,12 @@ def measure(
             # in pieces, where even one channel's images are more than a batch
             yield from regions.blends(part, variant=variant).split(passes.batch_size)
 
-    waiting, found = list(parts), []
+    waiting, points = list(parts), []
     pieces: list[Tensor] = []
-    for answers in passes.run(batches()):
-        pieces.append(answers)
+    for predictions in passes.run(batches()):
+        pieces.append(predictions)
         if sum(map(len, pieces)) == variant.passes * len(waiting[0]):
-            found.append(torch.cat(pieces).reshape(variant.passes, -1))
+            points.append(torch.cat(pieces).reshape(variant.passes, -1))
             on_channels(len(waiting.pop(0)))
             pieces = []
-    return torch.cat(found, dim=1) if found else regions.image.new_zeros(variant.passes, 0)
-
-
-def as_predictions(
-    points: Float[Tensor, "points channels"], *, variant: Variant, image: Float[Tensor, ""], empty: Float[Tensor, ""]
-) -> Predictions:
-    """Name the rows that `measure` returns."""
-    rows = iter(points)
-    return Predictions(
-        image=image,
-        empty=empty,
-        kept=next(rows) if variant.keep else None,
-        removed=next(rows) if variant.remove else None,
-    )
+    return torch.cat(points, dim=1) if points else regions.image.new_zeros(variant.passes, 0)

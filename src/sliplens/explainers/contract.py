@@ -1,40 +1,23 @@
-"""The call that all explainers share: checks, the network held still, the clock, the record."""
+"""The call that all explainers share: checks, a frozen network, the clock, the record."""
 
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import replace
+from typing import Protocol, runtime_checkable
 
-from jaxtyping import Float, Shaped
+import torch
+from jaxtyping import Shaped
 from torch import Tensor, nn
 
 from sliplens.errors import InputError
-from sliplens.explainers.explanation import Explanation, Progress
-from sliplens.explainers.frozen_model import Clock, Held, Subject, holding
+from sliplens.explainers.explanation import Explanation
+from sliplens.explainers.frozen_model import FrozenModel, freeze
+from sliplens.progress import OnProgress
 
 
-@dataclass(frozen=True, kw_only=True)
-class Found:
-    """What a method found out of a batch."""
-
-    subject: Subject
-    """What was explained, with both predictions."""
-    relevance: Float[Tensor, "batch height width"]
-    """Signed maps in margin units, in the network's type."""
-    method: str
-    """Key of the explainer in `EXPLAINERS`."""
-    target: str = "f(x) - f(reference)"
-    """What the relevance adds up to, in words."""
-    complete: bool
-    """Whether the relevance of an image is meant to add up to f(x) - f(b)."""
-    findings: Iterable[str] = ()
-    """Warnings of the method itself."""
-    more: Mapping[str, Any] = field(default_factory=dict)
-    """Further fields of `Explanation`."""
-
-
-class Method(ABC):
-    """An explainer whose own work is one function of checked images and a network that is held still."""
+@runtime_checkable
+class Explainer(Protocol):
+    """A frozen dataclass whose fields are the options of a method and whose call explains a batch."""
 
     def __call__(
         self,
@@ -42,25 +25,55 @@ class Method(ABC):
         images: Shaped[Tensor, "*batch channels height width"],
         *,
         reference: Shaped[Tensor, "..."] | None = None,
-        on_progress: Progress | None = None,
+        on_progress: OnProgress | None = None,
+    ) -> Explanation:
+        """Explain f(x) - f(reference) of a regressor with one output.
+
+        Parameters
+        ----------
+        model
+            Network from images (batch, 3, height, width) to one safety margin each, (batch,) or (batch, 1).
+            It is put into evaluation mode for the call and given back as it was.
+        images
+            Images x, float in [0, 1], shape (batch, 3, height, width).
+        reference
+            What the images are compared with, float in [0, 1], one for all (3, height, width) or one each
+            (batch, 3, height, width); by default zeros, the untouched sensor of difference images.
+        on_progress
+            Called with the pieces of work done and their total.
+
+        Raises
+        ------
+        ImageError
+            If the images or the reference have a wrong shape, type or range, or hold NaN.
+        ModelError
+            If the network has several outputs, predicts NaN, or lacks a layer that the method needs.
+        """
+        ...
+
+
+class Method(ABC):
+    """An explainer whose own work is one function of checked images and a frozen network."""
+
+    def __call__(
+        self,
+        model: nn.Module,
+        images: Shaped[Tensor, "*batch channels height width"],
+        *,
+        reference: Shaped[Tensor, "..."] | None = None,
+        on_progress: OnProgress | None = None,
     ) -> Explanation:
         """Explain a batch; see `Explainer` for the arguments and errors."""
-        clock = Clock()
-        with holding(model, images, reference=reference) as held:
-            found = self._explain(held, on_progress=on_progress)
-        return found.subject.explanation(
-            found.relevance,
-            method=found.method,
-            clock=clock,
-            complete=found.complete,
-            target=found.target,
-            findings=found.findings,
-            **found.more,
-        )
+        start = time.perf_counter()
+        with freeze(model, images, reference=reference) as frozen:
+            explanation = self._explain(frozen, on_progress=on_progress)
+        if explanation.relevance.is_cuda:
+            torch.cuda.synchronize(explanation.relevance.device)
+        return replace(explanation, seconds=time.perf_counter() - start)
 
     @abstractmethod
-    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
-        """Make the maps of `held.images`; gradients are on."""
+    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
+        """Explain `frozen.images` (`Comparison.explanation`); gradients are on."""
 
 
 def require_at_least_one(name: str, **options: int) -> None:

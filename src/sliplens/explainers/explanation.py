@@ -1,15 +1,12 @@
-"""Sentences that tell a reader when a map should not be trusted."""
+"""An explanation, and the sentences that tell a reader when its maps should not be trusted."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
+import pyarrow as pa
 import torch
-from jaxtyping import Float, Shaped
-from torch import Tensor, nn
-
-Progress = Callable[[int, int], None]
-"""Called with the pieces of work done and their total, after each piece."""
+from jaxtyping import Float
+from torch import Tensor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +39,8 @@ class Approximation:
 class Explanation:
     """Why a network predicts f(x) rather than f(reference), for a batch of images."""
 
+    images: Float[Tensor, "batch 3 height width"]
+    """Images x as the network saw them, in [0, 1]."""
     relevance: Float[Tensor, "batch height width"]
     """Signed contribution of each pixel in margin units (float32): above zero where it raises the prediction."""
     method: str
@@ -63,7 +62,7 @@ class Explanation:
     approximations: tuple[Approximation, ...] = ()
     """For each image what its map has in common with the exact one; empty where the map is exact."""
     engine: str = "plain"
-    """What ran the network: as it is (`plain`), or an engine of `passes` that was found to answer as it does."""
+    """What ran the network: as it is (`plain`), or an engine of `models.engines` that answers as it does."""
 
     @property
     def change(self) -> Float[Tensor, " batch"]:
@@ -83,42 +82,16 @@ class Explanation:
         peak = supporting.amax(dim=(1, 2), keepdim=True)
         return supporting / torch.where(peak > 0, peak, torch.ones_like(peak))
 
-
-@runtime_checkable
-class Explainer(Protocol):
-    """A frozen dataclass whose fields are the options of a method and whose call explains a batch."""
-
-    def __call__(
-        self,
-        model: nn.Module,
-        images: Shaped[Tensor, "*batch channels height width"],
-        *,
-        reference: Shaped[Tensor, "..."] | None = None,
-        on_progress: Progress | None = None,
-    ) -> Explanation:
-        """Explain f(x) - f(reference) of a regressor with one output.
-
-        Parameters
-        ----------
-        model
-            Network from images (batch, 3, height, width) to one safety margin each, (batch,) or (batch, 1).
-            It is put into evaluation mode for the call and given back as it was.
-        images
-            Images x, float in [0, 1], shape (batch, 3, height, width).
-        reference
-            What the images are compared with, float in [0, 1], one for all (3, height, width) or one each
-            (batch, 3, height, width); by default zeros, the untouched sensor of difference images.
-        on_progress
-            Called with the pieces of work done and their total.
-
-        Raises
-        ------
-        ImageError
-            If the images or the reference have a wrong shape, type or range, or hold NaN.
-        ModelError
-            If the network has several outputs, predicts NaN, or lacks a layer that the method needs.
-        """
-        ...
+    def frame(self) -> pa.Table:
+        """Arrow table of the predictions, a row an image, in margin units; a gap that is not promised is NaN."""
+        gap = torch.full_like(self.change, torch.nan) if self.completeness_gap is None else self.completeness_gap
+        columns = {
+            "prediction": self.prediction,
+            "reference_prediction": self.reference_prediction,
+            "change": self.change,
+            "completeness_gap": gap,
+        }
+        return pa.table({name: values.cpu().numpy() for name, values in columns.items()})
 
 
 CLOSE = 0.02  # margin units; a difference below the regressor's own error explains nothing
@@ -135,17 +108,7 @@ def check_maps(
     reference_prediction: Float[Tensor, " batch"],
     completeness_gap: Float[Tensor, " batch"] | None,
 ) -> tuple[str, ...]:
-    """List what is wrong with each map, one sentence a finding, in the order of the images.
-
-    Parameters
-    ----------
-    relevance
-        Signed maps in margin units.
-    prediction, reference_prediction
-        f(x) and f(reference) in margin units.
-    completeness_gap
-        |sum of the relevance - (f(x) - f(reference))| in margin units, or None where it is not promised.
-    """
+    """What is wrong with each map, one sentence a finding, in the order of the images; all in margin units."""
     findings = []
     for index, (image_map, high, low) in enumerate(
         zip(relevance, prediction.tolist(), reference_prediction.tolist(), strict=True)
@@ -178,7 +141,7 @@ def check_maps(
 def check_weights(
     layers: Sequence[str], weights: Sequence[Sequence[Float[Tensor, " _channels"]]], *, change: Sequence[float]
 ) -> Iterator[str]:
-    """List what is wrong with the weights of the channels, one sentence for each image and layer.
+    """What is wrong with the weights of the channels, one sentence for each image and layer.
 
     Parameters
     ----------
@@ -207,18 +170,18 @@ def check_weights(
 
 
 def check_approximations(approximations: Sequence[Approximation]) -> Iterator[str]:
-    """Say where an approximate map is not expected to be like the exact one."""
-    for index, one in enumerate(approximations):
-        if not (one.pearson_r >= ALIKE_R and one.top_overlap >= ALIKE_TOP):
+    """Where an approximate map is not expected to be like the exact one."""
+    for index, map_ in enumerate(approximations):
+        if not (map_.pearson_r >= ALIKE_R and map_.top_overlap >= ALIKE_TOP):
             yield (
-                f"image {index}: with {one.measured} of {one.channels} channels measured the map is expected to "
-                f"correlate with the exact one at {one.pearson_r:.3f} and to share {one.top_overlap:.0%} of its "
+                f"image {index}: with {map_.measured} of {map_.channels} channels measured the map is expected to "
+                f"correlate with the exact one at {map_.pearson_r:.3f} and to share {map_.top_overlap:.0%} of its "
                 "strongest pixels; raise the budget"
             )
 
 
 def check_slopes(sizes: Sequence[float], *, change: Sequence[float]) -> Iterator[str]:
-    """Say where the gradients at an image are next to nothing, though there is something to explain.
+    """Where the gradients at an image are next to nothing, though there is something to explain.
 
     Gradient times contrast is as large as what it explains where the network is linear: the sum of its sizes is then at
     least |f(x) - f(reference)|. Where that sum is below a tenth of it, the gradients would not explain more than a

@@ -1,4 +1,4 @@
-"""SmoothGrad: the gradient averaged over noisy copies of the image."""
+"""Integrated Gradients along the line from the reference, Expected Gradients, SmoothGrad."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,9 +9,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.explainers.contract import Found, Method, require_at_least_one
-from sliplens.explainers.explanation import Progress, check_slopes
-from sliplens.explainers.frozen_model import Held, Subject, holding, require_images
+from sliplens.explainers.contract import Method, require_at_least_one
+from sliplens.explainers.explanation import Explanation, check_slopes
+from sliplens.explainers.frozen_model import FrozenModel, freeze
+from sliplens.progress import OnProgress
 
 _NODES = 4  # of a piece; the slope along the path has kinks, on which more nodes to a piece are wasted
 _ROUNDING = 1e-6  # of |f|: a gap that float32 predictions cannot resolve is no gap
@@ -19,12 +20,12 @@ _ROUNDING = 1e-6  # of |f|: a gap that float32 predictions cannot resolve is no 
 
 @dataclass(frozen=True, kw_only=True)
 class Line:
-    """What the gradients from a reference to an image add up to."""
+    """Integral of the gradients from a reference to an image."""
 
     relevance: Float[Tensor, "height width"]
-    """In margin units."""
+    """Relevance in margin units."""
     slope: float
-    """Of the last piece, next to the image: what its relevance would be, sign left out, if it were the whole line."""
+    """Sum of the sizes of the relevance, were the last piece of the line, next to the image, the whole of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,50 +76,44 @@ class IntegratedGradients(Method):
         if not self.tolerance > 0:
             raise InputError(f"integrated gradients' tolerance is {self.tolerance}; give a share above 0")
 
-    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
-        subject = held.predict_all()
-        ends = torch.stack([subject.reference_prediction, subject.prediction], dim=1)
+    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
+        comparison = frozen.compare()
         slopes = []
 
         def integral(index: int) -> Tensor:
             line = self.integrate(
-                subject, subject.images[index], subject.reference[index], ends=(ends[index, 0], ends[index, 1])
+                comparison,
+                image=comparison.images[index],
+                reference=comparison.reference[index],
+                prediction=comparison.prediction[index],
+                reference_prediction=comparison.reference_prediction[index],
             )
             slopes.append(line.slope)
             return line.relevance
 
-        return Found(
-            subject=subject,
-            relevance=subject.each_image(integral, on_progress=on_progress),
+        return comparison.explanation(
+            comparison.map_each(integral, on_progress=on_progress),
             method="integrated-gradients",
             complete=True,
-            findings=check_slopes(slopes, change=subject.change.tolist()),
+            warnings=check_slopes(slopes, change=comparison.change.tolist()),
         )
 
     def integrate(
         self,
-        subject: Subject,
+        frozen: FrozenModel,
+        *,
         image: Float[Tensor, "3 height width"],
         reference: Float[Tensor, "3 height width"],
-        *,
-        ends: tuple[Float[Tensor, ""], Float[Tensor, ""]],
-    ) -> "Line":
-        """Relevance of one image against one reference.
-
-        Parameters
-        ----------
-        subject
-            The network.
-        image, reference
-            x and b.
-        ends
-            f(b) and f(x).
-        """
-        change = float(ends[1] - ends[0])
+        prediction: Float[Tensor, ""],
+        reference_prediction: Float[Tensor, ""],
+    ) -> Line:
+        """Relevance of one image x against one reference b, whose predictions are f(x) and f(b)."""
+        ends = reference_prediction, prediction
+        change = float(prediction - reference_prediction)
         allowed = max(self.tolerance * abs(change), _ROUNDING * max(abs(float(end)) for end in ends))
         fixed = self.steps == self.max_steps
         pieces, nodes = (1, self.steps) if fixed else (max(1, self.steps // _NODES), min(self.steps, _NODES))
-        path = _Path(subject, image, reference, nodes=nodes, batch_size=self.batch_size)
+        path = _Path(frozen, image=image, reference=reference, nodes=nodes, batch_size=self.batch_size)
         edges = torch.linspace(0, 1, pieces + 1, dtype=torch.float64, device=image.device)
         heights = torch.cat([ends[0][None], path.predict(edges[1:-1]), ends[1][None]]).double()
         starts, stops, rises = edges[:-1], edges[1:], heights.diff()
@@ -146,10 +141,10 @@ class IntegratedGradients(Method):
 class _Path:
     """The straight line from a reference to an image."""
 
-    def __init__(self, subject: Subject, image: Tensor, reference: Tensor, *, nodes: int, batch_size: int) -> None:
-        self._subject, self._image, self._reference = subject, image, reference
+    def __init__(self, frozen: FrozenModel, *, image: Tensor, reference: Tensor, nodes: int, batch_size: int) -> None:
+        self._frozen, self._image, self._reference = frozen, image, reference
         self._nodes, self._batch_size = nodes, batch_size
-        self._captum = attr.IntegratedGradients(subject.predict)
+        self._captum = attr.IntegratedGradients(frozen.predict)
 
     def _at(self, times: Tensor) -> Tensor:
         shares = times.to(self._image.dtype)[:, None, None, None]
@@ -158,13 +153,13 @@ class _Path:
     @torch.no_grad()
     def predict(self, times: Tensor) -> Tensor:
         """Predictions at some points, 0 the reference and 1 the image."""
-        parts = [self._subject.predict(self._at(part)) for part in times.split(self._batch_size) if len(part)]
+        parts = [self._frozen.predict(self._at(part)) for part in times.split(self._batch_size) if len(part)]
         return torch.cat(parts) if parts else self._image.new_zeros(0)
 
     def integrate(self, starts: Tensor, stops: Tensor) -> Tensor:
         """Relevance (pieces, height, width) of each piece of the line."""
         together = max(1, self._batch_size // self._nodes)
-        found = []
+        pieces = []
         for start, stop in zip(starts.split(together), stops.split(together), strict=True):
             contributions = self._captum.attribute(
                 self._at(stop),
@@ -172,8 +167,8 @@ class _Path:
                 n_steps=self._nodes,
                 internal_batch_size=max(len(start), min(self._batch_size, len(start) * self._nodes)),
             )
-            found.append(contributions.detach().sum(dim=1))
-        return torch.cat(found)
+            pieces.append(contributions.detach().sum(dim=1))
+        return torch.cat(pieces)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,31 +197,35 @@ class ExpectedGradients(Method):
     background: Float[Tensor, "frames 3 height width"] | None = None
     integrated: IntegratedGradients = field(default_factory=IntegratedGradients)
 
-    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
-        alone = held.predict_all()
+    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
+        alone = frozen.compare()
         if self.background is None:
             frames, heights = alone.reference[:, None], alone.reference_prediction[:, None]
         else:
             # checked as images are, and brought to the network's type
-            with holding(held.model, require_images(self.background), reference=None) as behind:
-                heights = behind.predict_all().prediction.expand(len(alone.images), -1)
+            with freeze(frozen.model, self.background, reference=None) as behind:
+                heights = behind.compare().prediction.expand(len(alone.images), -1)
                 frames = behind.images.expand(len(alone.images), -1, -1, -1, -1)
-        subject = alone.predicted(alone.prediction, heights.mean(dim=1))
+        comparison = alone.compared(alone.prediction, heights.mean(dim=1))
 
         def mean_over(index: int) -> Tensor:
-            image, end = subject.images[index], subject.prediction[index]
+            image, prediction = comparison.images[index], comparison.prediction[index]
             pairs = zip(frames[index], heights[index], strict=True)
-            lines = [self.integrated.integrate(subject, image, frame, ends=(start, end)) for frame, start in pairs]
+            lines = [
+                self.integrated.integrate(
+                    comparison, image=image, reference=frame, prediction=prediction, reference_prediction=height
+                )
+                for frame, height in pairs
+            ]
             return torch.stack([line.relevance for line in lines]).mean(dim=0)
 
         only = ("no background was given, so the reference alone stands for it, as in integrated gradients",)
-        return Found(
-            subject=subject,
-            relevance=subject.each_image(mean_over, on_progress=on_progress),
+        return comparison.explanation(
+            comparison.map_each(mean_over, on_progress=on_progress),
             method="expected-gradients",
             complete=True,
             target="f(x) - f(reference)" if self.background is None else "f(x) - mean of f over the background",
-            findings=only if self.background is None else (),
+            warnings=only if self.background is None else (),
         )
 
 
@@ -265,12 +264,12 @@ class SmoothGrad(Method):
         if not self.noise >= 0:
             raise InputError(f"SmoothGrad's noise is {self.noise}; give a standard deviation of at least 0")
 
-    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
-        subject = held.predict_all()
-        tunnel = attr.NoiseTunnel(attr.Saliency(subject.predict))
+    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
+        comparison = frozen.compare()
+        tunnel = attr.NoiseTunnel(attr.Saliency(comparison.predict))
 
         def smoothed(index: int) -> Tensor:
-            image, empty = subject.images[index, None], subject.reference[index, None]
+            image, empty = comparison.images[index, None], comparison.reference[index, None]
             # Captum draws from the global state, which is given back as it was
             with torch.random.fork_rng(devices=[image.device] if image.is_cuda else []):
                 torch.manual_seed(self.seed)
@@ -284,12 +283,11 @@ class SmoothGrad(Method):
                 )
             return (gradient.detach() * (image - empty)).sum(dim=1)[0]
 
-        relevance = subject.each_image(smoothed, on_progress=on_progress)
-        return Found(
-            subject=subject,
-            relevance=relevance,
+        relevance = comparison.map_each(smoothed, on_progress=on_progress)
+        return comparison.explanation(
+            relevance,
             method="smooth-grad",
             complete=False,
             target="the linear model of f at x",
-            findings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=subject.change.tolist()),
+            warnings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=comparison.change.tolist()),
         )

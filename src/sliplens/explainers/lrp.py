@@ -7,12 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor, fx, nn
 
-from sliplens.explainers.contract import Found, Method
-from sliplens.explainers.explanation import Progress
-from sliplens.explainers.frozen_model import Held
+from sliplens.explainers.contract import Method
+from sliplens.explainers.explanation import Explanation
+from sliplens.explainers.frozen_model import FrozenModel
 from sliplens.extras import require_packages
 from sliplens.models.backbones import HistogramRegressor
 from sliplens.models.engines import fold_batch_norm
+from sliplens.progress import OnProgress
 
 _KEPT = 0.1  # share of f(x) by which the relevance may miss it without a warning
 
@@ -43,28 +44,27 @@ class Lrp(Method):
 
     batch_size: int = 32
 
-    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
+    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
         require_packages("zennit", extra="lrp", purpose="LRP")
-        subject = held.predict_all()
-        copy = fold_batch_norm(subject.model)
+        comparison = frozen.compare()
+        copy = fold_batch_norm(comparison.model)
         for module in copy.modules():
             if isinstance(module, fx.GraphModule):
                 _name_functions(module)
         parts, done = [], 0
-        for part in subject.images.split(self.batch_size):
+        for part in comparison.images.split(self.batch_size):
             parts.append(_propagate(copy, part))
             done += len(part)
             if on_progress is not None:
-                on_progress(done, len(subject.images))
+                on_progress(done, len(comparison.images))
         relevance = torch.cat(parts)
-        shares = (relevance.sum(dim=(1, 2)) / subject.prediction).tolist()
-        return Found(
-            subject=subject,
-            relevance=relevance,
+        shares = (relevance.sum(dim=(1, 2)) / comparison.prediction).tolist()
+        return comparison.explanation(
+            relevance,
             method="lrp",
             complete=False,
             target="f(x)",
-            findings=[
+            warnings=[
                 f"image {index}: LRP hands back {share:.3g} times f(x); biases keep some of it, products make more"
                 for index, share in enumerate(shares)
                 if not abs(share - 1) <= _KEPT

@@ -11,11 +11,11 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.explainers.contract import Found, Method, require_at_least_one
-from sliplens.explainers.explanation import Progress
-from sliplens.explainers.frozen_model import Held
+from sliplens.explainers.contract import Method, require_at_least_one
+from sliplens.explainers.explanation import Explanation
+from sliplens.explainers.frozen_model import FrozenModel
 from sliplens.markers import detect_markers
-from sliplens.models.engines import prepare
+from sliplens.progress import OnProgress
 from sliplens.recordings import Recording
 
 
@@ -159,16 +159,10 @@ class Occlusion(Method):
             raise InputError(f"occlusion's radius_px is {self.radius_px}; give a radius above 0 pixels")
 
     @torch.no_grad()
-    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
-        subject = held.predict_all()
-        tiles = -(-subject.images.shape[-2] // self.tile_px) * -(-subject.images.shape[-1] // self.tile_px)
-        passes = prepare(
-            subject.model,
-            torch.cat([subject.images[:1], subject.reference[:1]]),
-            torch.stack([subject.prediction[0], subject.reference_prediction[0]]),
-            # markers are about as many
-            passes=len(subject.images) * tiles,
-        )
+    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
+        comparison = frozen.compare()
+        tiles = -(-comparison.images.shape[-2] // self.tile_px) * -(-comparison.images.shape[-1] // self.tile_px)
+        passes = comparison.prepare(len(comparison.images) * tiles)  # markers are about as many
 
         def predict(images: Tensor) -> Tensor:
             return torch.cat(list(passes.run(images.split(passes.batch_size))))
@@ -176,7 +170,7 @@ class Occlusion(Method):
         captum = attr.FeatureAblation(predict)
 
         def lost(index: int) -> Tensor:
-            image, empty = subject.images[index], subject.reference[index]
+            image, empty = comparison.images[index], comparison.reference[index]
             regions = self._regions(image, empty).to(image.device)
             effects = captum.attribute(
                 image[None],
@@ -188,14 +182,13 @@ class Occlusion(Method):
             return effects[0, 0] / regions.flatten().bincount()[regions]
 
         by_tile = self.markers_px is None
-        return Found(
-            subject=subject,
-            relevance=subject.each_image(lost, on_progress=on_progress),
+        return comparison.explanation(
+            comparison.map_each(lost, on_progress=on_progress),
             method="occlusion" if by_tile else "occlusion-marker",
             complete=False,
             target="f(x) - f(x with one region as in the reference), "
             + (f"tiles of {self.tile_px} px" if by_tile else "markers"),
-            more={"engine": passes.engine},
+            engine=passes.engine,
         )
 
     def _regions(self, image: Tensor, empty: Tensor) -> Tensor:

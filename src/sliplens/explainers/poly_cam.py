@@ -8,13 +8,14 @@ from torch import Tensor
 
 from sliplens.errors import InputError
 from sliplens.explainers.activations import Layer, capture, find_layers
-from sliplens.explainers.channels import SCORES, VARIANTS, Regions, as_predictions, combine, measure, scale_to
-from sliplens.explainers.contract import Found, Method
-from sliplens.explainers.explanation import Approximation, Level, Progress, check_approximations, check_weights
-from sliplens.explainers.frozen_model import Held, Subject
-from sliplens.explainers.maps import local_change
+from sliplens.explainers.channels import SCORES, VARIANTS, MaskedPredictions, Regions, combine, measure, scale_to
+from sliplens.explainers.contract import Method
+from sliplens.explainers.explanation import Approximation, Explanation, Level, check_approximations, check_weights
+from sliplens.explainers.frozen_model import Comparison, FrozenModel
+from sliplens.explainers.maps import local_change, to_masks
 from sliplens.explainers.poly_cam_budget import Likeness, estimate_weights, mask_kernel
-from sliplens.models.engines import Passes, prepare
+from sliplens.models.engines import Passes
+from sliplens.progress import OnProgress
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +59,7 @@ class PolyCam(Method):
         What that should be: more channels are measured until it is expected, all of them if need be. None to stop at
         the budget, whatever the map is like.
     engine
-        What runs the masked images; see `passes.prepare`.
+        What runs the masked images; see `models.engines.prepare`.
     batch_size
         Masked images in one pass; None for what suits the engine.
     levels
@@ -94,19 +95,23 @@ class PolyCam(Method):
             raise InputError(f"Poly-CAM's budget is {self.budget}; give a share of the channels, above 0 and at most 1")
 
     @torch.no_grad()
-    def _explain(self, held: Held, *, on_progress: Progress | None) -> Found:
+    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
         """Progress counts the channels of every image."""
-        subject = held.predict_all()
-        layers = self._find_layers(subject)
+        comparison = frozen.compare()
+        layers = self._find_layers(comparison)
         channels = sum(layer.channels for layer in layers)
-        count = _Count(total=len(subject.images) * channels, report=on_progress)
+        count = _Count(total=len(comparison.images) * channels, on_progress=on_progress)
         # one engine for all rounds and images
-        passes = self._prepare(subject, round(self.budget * channels))
+        passes = comparison.prepare(
+            len(comparison.images) * round(self.budget * channels) * VARIANTS[self.variant].passes,
+            engine=self.engine,
+            batch_size=self.batch_size,
+        )
         weights, saliencies, shown, approximations = [], [], [], []
-        for index in range(len(subject.images)):
-            activations = _activations(subject, index, layers)
-            shown_at = self._shown_at(subject, index)
-            shares, estimated = self._weights(subject, index, activations, shown_at, passes=passes, count=count)
+        for index in range(len(comparison.images)):
+            activations = _activations(comparison, index, layers)
+            shown_at = self._shown_at(comparison, index)
+            shares, estimated = self._weights(comparison, index, activations, shown_at, passes=passes, count=count)
             weights.append(shares)
             approximations += estimated
             saliencies.append(combine(activations, shares, size=_size(shown_at)))
@@ -119,57 +124,44 @@ class PolyCam(Method):
             )
             for depth, layer in enumerate(layers)
         )
-        return Found(
-            subject=subject,
-            relevance=scale_to(torch.stack(shown), total=subject.change),
+        return comparison.explanation(
+            scale_to(torch.stack(shown), total=comparison.change),
             method="poly-cam",
             complete=True,
-            findings=(
-                *check_weights([layer.name for layer in layers], weights, change=subject.change.tolist()),
+            warnings=(
+                *check_weights([layer.name for layer in layers], weights, change=comparison.change.tolist()),
                 *check_approximations(approximations),
             ),
-            more={
-                "levels": levels if self.levels else (),
-                "approximations": tuple(approximations),
-                "engine": passes.engine,
-            },
+            levels=levels if self.levels else (),
+            approximations=tuple(approximations),
+            engine=passes.engine,
         )
 
     @property
     def _place(self) -> int:
-        """Of the level that is shown, among those that are measured."""
+        """Place of the level that is shown among those that are measured."""
         return self.level if self.levels else 0
 
-    def _shown_at(self, subject: Subject, index: int) -> Tensor:
+    def _shown_at(self, comparison: Comparison, index: int) -> Tensor:
         """Where the image shows something: where x = b no mask has an effect."""
         if SCORES[self.score].as_published:
-            return torch.ones_like(subject.images[index, 0])
-        return local_change(subject.images[index], subject.reference[index])
+            return torch.ones_like(comparison.images[index, 0])
+        return local_change(comparison.images[index], comparison.reference[index])
 
-    def _find_layers(self, subject: Subject) -> tuple[Layer, ...]:
-        image = subject.images[:1]
+    def _find_layers(self, comparison: Comparison) -> tuple[Layer, ...]:
+        image = comparison.images[:1]
         if self.layers is None:
-            layers = SCORES[self.score].layers(subject.model, image)
+            layers = SCORES[self.score].layers(comparison.model, image)
         else:
-            layers = find_layers(subject.model, image, names=self.layers)
+            layers = find_layers(comparison.model, image, names=self.layers)
         if not 0 <= self.level < len(layers):
             raise InputError(f"Poly-CAM has no level {self.level} for {len(layers)} layers; count from 0, the finest")
         # a level is made of its own layer and the coarser ones: the finer ones are measured only where they are kept
         return layers if self.levels else layers[self.level :]
 
-    def _prepare(self, subject: Subject, channels: int) -> Passes:
-        return prepare(
-            subject.model,
-            torch.cat([subject.images[:1], subject.reference[:1]]),
-            torch.stack([subject.prediction[0], subject.reference_prediction[0]]),
-            passes=len(subject.images) * channels * VARIANTS[self.variant].passes,
-            engine=self.engine,
-            batch_size=self.batch_size,
-        )
-
     def _weights(
         self,
-        subject: Subject,
+        comparison: Comparison,
         index: int,
         activations: list[Tensor],
         shown_at: Tensor,
@@ -179,65 +171,64 @@ class PolyCam(Method):
     ) -> tuple[list[Tensor], list[Approximation]]:
         """Weight >= 0 of each channel, layer by layer, and how far they are estimates."""
         score, variant = SCORES[self.score], VARIANTS[self.variant]
-        image, empty = subject.prediction[index], subject.reference_prediction[index]
-        black = torch.zeros_like(subject.images[index])
+        image, empty = comparison.prediction[index], comparison.reference_prediction[index]
+        black = torch.zeros_like(comparison.images[index])
         if score.as_published:
-            empty = subject.predict(black[None])[0]
-        regions = Regions.of(
-            activations,
-            image=subject.images[index],
-            empty=black if score.as_published else subject.reference[index],
-            as_published=score.as_published,
+            empty = comparison.predict(black[None])[0]
+        regions = Regions(
+            image=comparison.images[index],
+            empty=black if score.as_published else comparison.reference[index],
+            masks=tuple(to_masks(maps, as_published=score.as_published) for maps in activations),
         )
 
-        def points(channels: Int[Tensor, " some"]) -> Float[Tensor, "points some"]:
-            return measure(regions, channels, passes=passes, variant=variant, on_channels=count.add)
+        def supports(points: Float[Tensor, "points some"]) -> Float[Tensor, " some"]:
+            return score.support(MaskedPredictions(image=image, empty=empty, variant=variant, points=points))
 
-        def supports(found: Float[Tensor, "points some"]) -> Float[Tensor, " some"]:
-            return score.support(as_predictions(found, variant=variant, image=image, empty=empty))
+        def measured(channels: Int[Tensor, " some"]) -> Float[Tensor, "points some"]:
+            return measure(regions, channels, passes=passes, variant=variant, on_channels=count.add)
 
         # an empty mask keeps nothing and removes nothing, which needs no pass
         at_empty = torch.stack([empty] * variant.keep + [image] * variant.remove)[:, None]
         active = regions.active()
         count.add(sum(regions.layer_sizes) - len(active))
         if self.budget < 1 and len(active):
-            found = estimate_weights(
+            weights, approximation = estimate_weights(
                 activations,
                 mask_kernel(regions, active),
                 active=active,
                 budget=self.budget,
                 likeness=self.likeness,
                 at_empty=supports(at_empty)[0],
-                measure=lambda channels: supports(points(channels)),
+                measure=lambda channels: supports(measured(channels)),
                 to_map=lambda weights: combine(activations, weights, size=_size(shown_at))[self._place] * shown_at,
                 seed=self.seed,
             )
-            count.add(len(active) - found.approximation.measured)
-            return found.weights, [found.approximation]
-        every = at_empty.repeat(1, sum(regions.layer_sizes))
-        every[:, active] = points(active)
-        return list(torch.relu(supports(every)).split(regions.layer_sizes)), []
+            count.add(len(active) - approximation.measured)
+            return weights, [approximation]
+        points = at_empty.repeat(1, sum(regions.layer_sizes))
+        points[:, active] = measured(active)
+        return list(torch.relu(supports(points)).split(regions.layer_sizes)), []
 
 
 def _size(image: Tensor) -> tuple[int, int]:
     return image.shape[-2], image.shape[-1]
 
 
-def _activations(subject: Subject, index: int, layers: tuple[Layer, ...]) -> list[Tensor]:
-    with capture(subject.model, [layer.name for layer in layers]) as outputs:
-        subject.predict(subject.images[index, None])
+def _activations(comparison: Comparison, index: int, layers: tuple[Layer, ...]) -> list[Tensor]:
+    with capture(comparison.model, [layer.name for layer in layers]) as outputs:
+        comparison.predict(comparison.images[index, None])
     return [outputs[layer.name][0] for layer in layers]
 
 
 @dataclass
 class _Count:
-    """Channels done, reported as they are."""
+    """Channels done."""
 
     total: int
-    report: Progress | None
+    on_progress: OnProgress | None
     done: int = 0
 
     def add(self, channels: int) -> None:
         self.done += channels
-        if self.report is not None and channels:
-            self.report(self.done, self.total)
+        if self.on_progress is not None and channels:
+            self.on_progress(self.done, self.total)

@@ -1,4 +1,4 @@
-"""Poly-CAM from some of the channels, chosen where they matter to the map, with the error that this leaves."""
+"""Poly-CAM on a budget: some channels are measured, the others estimated, with the error that this leaves."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -51,7 +51,7 @@ def _pooled(masks: Tensor) -> Tensor:
     return functional.adaptive_avg_pool2d(masks[:, None], _GRID)[:, 0]
 
 
-class Field:
+class GaussianProcess:
     """The effects of all channels as a Gaussian process, of which some are measured one after another.
 
     The factor L of the covariance is built column by column (a pivoted Cholesky decomposition), so that the variance
@@ -158,16 +158,6 @@ class Likeness:
                 raise InputError(f"the likeness asks for a {name} of {getattr(self, name)}; give a number from 0 to 1")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Estimated:
-    """The weights of all channels, most of them estimated."""
-
-    weights: list[Tensor]
-    """Of the channels of each layer, >= 0."""
-    approximation: Approximation
-    """What the map is expected to have in common with the exact one."""
-
-
 def estimate_weights(
     activations: Sequence[Float[Tensor, "_channels _rows _columns"]],
     kernel: Float[Tensor, "some some"],
@@ -179,7 +169,7 @@ def estimate_weights(
     measure: Callable[[Int[Tensor, " part"]], Float[Tensor, " part"]],
     to_map: Callable[[list[Tensor]], Float[Tensor, "height width"]],
     seed: int,
-) -> Estimated:
+) -> tuple[list[Tensor], Approximation]:
     """Measure the support of some channels and estimate that of the others from it; a weight is the support, or 0.
 
     The supports are taken for a Gaussian process over the masks (`mask_kernel`). An error of a channel's support costs
@@ -217,6 +207,11 @@ def estimate_weights(
         The map that weights of each layer give.
     seed
         Of the draws.
+
+    Returns
+    -------
+    tuple
+        Weights >= 0 of each layer's channels, and what their map is expected to have in common with the exact one.
     """
     search = _Search(activations, kernel, active=active, at_empty=at_empty, measure=measure, to_map=to_map, seed=seed)
     count = min(len(active), max(1, math.ceil(budget * len(active))))
@@ -226,18 +221,19 @@ def estimate_weights(
     for step in range(1, rounds + 1):
         search.explore(first + (count - first) * step // rounds)
     while True:
-        found = search.judge()
-        if likeness is None or count == len(active) or _reached(found, likeness):
-            return Estimated(weights=search.weights(), approximation=found)
+        approximation = search.judge()
+        if likeness is None or count == len(active) or _reached(approximation, likeness):
+            return search.weights(), approximation
         wanted = math.ceil(_GROWTH * count)
         count = len(active) if wanted > _NEARLY_ALL * len(active) else wanted
         search.explore(count)
 
 
-def _reached(found: Approximation, likeness: Likeness) -> bool:
+def _reached(approximation: Approximation, likeness: Likeness) -> bool:
     # not "short > allowed": of a map that holds NaN nothing is expected
     return all(
-        _SURE * (1 - getattr(found, name)) <= 1 - getattr(likeness, name) for name in ("pearson_r", "top_overlap")
+        _SURE * (1 - getattr(approximation, name)) <= 1 - getattr(likeness, name)
+        for name in ("pearson_r", "top_overlap")
     )
 
 
@@ -257,47 +253,49 @@ class _Search:
     ) -> None:
         self._activations, self._active, self._at_empty = activations, active, at_empty
         self._measure, self._to_map, self._seed = measure, to_map, seed
-        self._field = Field(kernel)
-        self._norms = [one.flatten(1).norm(dim=1) for one in activations]
+        self._process = GaussianProcess(kernel)
+        self._norms = [activation.flatten(1).norm(dim=1) for activation in activations]
         self._dtype = kernel.dtype
 
     def explore(self, until: int) -> None:
         """Measure channels until there are so many."""
-        count = until - len(self._field.chosen)
+        count = until - len(self._process.chosen)
         if count < 1:
             return
-        chosen = self._field.choose(count, importance=self._importance().to(self._dtype))
+        chosen = self._process.choose(count, importance=self._importance().to(self._dtype))
         order = chosen.argsort()
         supports = torch.empty(len(chosen), dtype=self._dtype, device=chosen.device)
         supports[order] = self._measure(self._active[chosen[order]]).to(supports)
-        self._field.learn(supports)
+        self._process.learn(supports)
 
     def weights(self) -> list[Tensor]:
-        """Of the channels of each layer."""
-        return self._weights(self._field.estimate()[0])
+        """Weights of the channels of each layer."""
+        return self._weights(self._process.estimate()[0])
 
     def judge(self) -> Approximation:
         """What the map is expected to have in common with the exact one."""
-        estimate, _ = self._field.estimate()
+        estimate, _ = self._process.estimate()
         result = self._to_map(self._weights(estimate))
         generator = torch.Generator().manual_seed(self._seed)
-        drawn = [self._to_map(self._weights(supports)) for supports in self._field.draws(_DRAWS, generator=generator)]
+        drawn = [self._to_map(self._weights(supports)) for supports in self._process.draws(_DRAWS, generator=generator)]
         return Approximation(
-            measured=len(self._field.chosen),
+            measured=len(self._process.chosen),
             channels=len(self._active),
-            pearson_r=fmean(pearson_r(result, one) for one in drawn),
-            top_overlap=fmean(top_overlap(result, one) for one in drawn),
+            pearson_r=fmean(pearson_r(result, other) for other in drawn),
+            top_overlap=fmean(top_overlap(result, other) for other in drawn),
         )
 
     def _importance(self) -> Tensor:
         """What an error of each support costs the map."""
-        if not self._field.chosen:
+        if not self._process.chosen:
             return torch.cat([norm / norm.norm().clamp_min(FLOOR) for norm in self._norms])[self._active]
-        estimate, deviation = self._field.estimate()
+        estimate, deviation = self._process.estimate()
         strength = torch.cat(
             [
-                norm / layer_map(one, weights).norm().clamp_min(FLOOR)
-                for norm, one, weights in zip(self._norms, self._activations, self._weights(estimate), strict=True)
+                norm / layer_map(activation, weights).norm().clamp_min(FLOOR)
+                for norm, activation, weights in zip(
+                    self._norms, self._activations, self._weights(estimate), strict=True
+                )
             ]
         )[self._active]
         odds = estimate / deviation.clamp_min(FLOOR)
@@ -306,4 +304,4 @@ class _Search:
     def _weights(self, supports: Tensor) -> list[Tensor]:
         every = self._at_empty.to(supports).repeat(sum(map(len, self._activations)))
         every[self._active] = supports
-        return list(torch.relu(every).to(self._at_empty.dtype).split([len(one) for one in self._activations]))
+        return list(torch.relu(every).to(self._at_empty.dtype).split([len(norm) for norm in self._norms]))
