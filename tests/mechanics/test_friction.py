@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sliplens.errors import ContactError
-from sliplens.mechanics import safety_margin, stick_ratio
+from sliplens.mechanics import safety_margin, stick_radius, stick_ratio
 
 FEW = settings(max_examples=25, deadline=None)
 margins = st.floats(0, 1)
@@ -62,3 +62,8 @@ def test_stick_ratio_keeps_missing_labels():
 def test_impossible_loads_are_refused(call, message):
     with pytest.raises(ContactError, match=message):
         call()
+
+
+def test_a_margin_without_contact_has_no_stick_radius():
+    with pytest.raises(ContactError, match="leave out the frames without contact"):
+        stick_radius(0.008, np.nan)

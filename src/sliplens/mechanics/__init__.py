@@ -1,42 +1,24 @@
-"""Contact mechanics: a sphere pressed on a flat, partial slip, and the friction cone."""
+"""Contact mechanics: a sphere pressed on a gel and pulled along it, and how much of the friction is left.
 
-from sliplens.mechanics.friction import safety_margin, stick_ratio
-from sliplens.mechanics.hertz import (
-    contact_radius,
-    indentation,
-    normal_displacement,
-    normal_slope,
-    peak_pressure,
-    radial_displacement,
-    reduced_modulus,
-)
-from sliplens.mechanics.partial_slip import (
-    partial_slip_displacement,
-    shear_displacement,
-    stick_displacement,
-    stick_radius,
-)
-from sliplens.mechanics.subsurface import (
-    buried_hertz_displacement,
-    buried_partial_slip_displacement,
-    buried_shear_displacement,
-)
+Symbols, with SI units: normal force P or F_n, positive when pressing, and tangential force Q or F_t; coefficient of
+friction mu; safety margin Gamma; radius R of the sphere, a of the contact and c of its part that sticks; of the gel
+Young's modulus E, shear modulus G, Poisson's ratio nu and reduced modulus E*. Johnson (1985) is *Contact Mechanics*,
+Cambridge University Press.
+"""
+
+from sliplens.mechanics.displacement import hertz_displacement, partial_slip_displacement, shear_displacement
+from sliplens.mechanics.friction import safety_margin, stick_radius, stick_ratio
+from sliplens.mechanics.hertz import contact_radius, indentation, normal_slope, reduced_modulus
 
 __all__ = [
-    "buried_hertz_displacement",
-    "buried_partial_slip_displacement",
-    "buried_shear_displacement",
     "contact_radius",
+    "hertz_displacement",
     "indentation",
-    "normal_displacement",
     "normal_slope",
     "partial_slip_displacement",
-    "peak_pressure",
-    "radial_displacement",
     "reduced_modulus",
     "safety_margin",
     "shear_displacement",
-    "stick_displacement",
     "stick_radius",
     "stick_ratio",
 ]

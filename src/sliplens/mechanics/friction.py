@@ -15,15 +15,6 @@ def safety_margin(
     1 is a contact without tangential load, 0 the onset of full slip. It is not the share of the contact that sticks;
     see `stick_ratio`.
 
-    Parameters
-    ----------
-    normal_force_n
-        Normal force F_n in newtons, positive when pressing.
-    tangential_force_n
-        Magnitude F_t of the tangential force, in newtons.
-    friction_coefficient
-        Coefficient of friction mu.
-
     Raises
     ------
     ContactError
@@ -62,8 +53,6 @@ def stick_ratio(safety_margin: Numbers, *, profile_exponent: float = 2.0) -> Flo
 
     Parameters
     ----------
-    safety_margin
-        Gamma, 0 to 1; NaN where nothing presses stays NaN.
     profile_exponent
         Exponent n of the gap; 2 for a sphere.
 
@@ -93,3 +82,27 @@ def stick_ratio(safety_margin: Numbers, *, profile_exponent: float = 2.0) -> Flo
             "give them as fractions, not in percent"
         )
     return np.asarray(margin ** (2 / (profile_exponent + 1)))
+
+
+def stick_radius(contact_radius_m: Numbers, safety_margin: Numbers) -> Numbers:
+    """Radius c = a Gamma^(1/3) of the circle that still sticks, in metres.
+
+    Raises
+    ------
+    ContactError
+        If a margin lies outside [0, 1] or is NaN.
+
+    References
+    ----------
+    Johnson (1985), eq. 7.30.
+
+    Examples
+    --------
+    >>> from sliplens.mechanics import stick_radius
+    >>> round(float(stick_radius(0.004, 0.125)), 6)
+    0.002
+    """
+    margin = np.asarray(safety_margin)
+    if not np.all((margin >= 0) & (margin <= 1)):
+        raise ContactError("safety margins must lie in [0, 1]; leave out the frames without contact")
+    return contact_radius_m * np.cbrt(margin)

@@ -7,10 +7,10 @@ from jaxtyping import Float
 
 from sliplens.errors import ContactError
 from sliplens.mechanics import (
-    buried_hertz_displacement,
-    buried_partial_slip_displacement,
     contact_radius,
+    hertz_displacement,
     indentation,
+    partial_slip_displacement,
     reduced_modulus,
     stick_radius,
 )
@@ -126,7 +126,7 @@ def move_markers(
     centre_m = np.asarray(grasp.contact_offset) * sphere_m
     from_centre = rest[:, :2] - centre_m
     distance = np.linalg.norm(from_centre, axis=-1)
-    outward, inward = buried_hertz_displacement(
+    outward, inward = hertz_displacement(
         distance,
         depth_m,
         contact_radius_m=contact_m[:, None],
@@ -141,7 +141,7 @@ def move_markers(
     moved = rest + outward[..., None] * np.append(from_centre, np.zeros((len(rest), 1)), axis=1)
     moved += inward[..., None] * np.append(np.tan(grasp.tilt_rad), -1)
     for friction, margin in _tractions(loading):
-        along, across, sunk = buried_partial_slip_displacement(
+        along, across, sunk = partial_slip_displacement(
             from_centre @ pull,
             from_centre @ athwart,
             depth_m,

@@ -1,7 +1,8 @@
-"""Displacements below the gel's surface, where markers lie, under the loads of `hertz` and `partial_slip`.
+"""Displacements of the gel, at its surface and below, where markers lie: under pressure, and in partial slip.
 
-Depth z runs into the gel, and so does u_z. The fields are closed forms, right to 1e-11 of themselves at any depth and
-distance; at depth 0 they are the surface's. Numbers and arrays broadcast: frames can run down and markers across.
+Depth z runs from the unloaded surface (0) into the gel, and so does u_z; the tangential load points along x, and places
+are relative to the contact's centre. The fields are closed forms, right to 1e-11 of themselves at any depth and
+distance, and 0 where nothing touches (a = 0). Numbers and arrays broadcast: frames can run down and markers across.
 """
 
 from dataclasses import dataclass
@@ -11,8 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from sliplens.mechanics.checks import Numbers, require_not_negative, require_poisson_ratio, require_positive
-from sliplens.mechanics.partial_slip import Field, stick_radius
+from sliplens.mechanics.friction import stick_radius
 
+Field: TypeAlias = tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]
 SpatialField: TypeAlias = tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."], Float[np.ndarray, "..."]]
 
 _POINT = 1e-30
@@ -21,7 +23,7 @@ _FAR = 50.0
 """From about this many contact radii on, 1 - p acot p is summed as a series: its terms would cancel."""
 
 
-def buried_hertz_displacement(
+def hertz_displacement(
     distance_m: Numbers,
     depth_m: Numbers,
     *,
@@ -32,19 +34,6 @@ def buried_hertz_displacement(
     """Displacements (u_r, u_z) inside the gel under Hertz's pressure, in metres.
 
     Unlike the surface, the inside of an incompressible gel is pushed outwards.
-
-    Parameters
-    ----------
-    distance_m
-        Distance r from the axis through the contact's centre, in metres.
-    depth_m
-        Depth z below the unloaded surface, in metres; 0 is the surface.
-    contact_radius_m
-        Contact radius a, in metres; where it is 0 the displacement is 0.
-    sphere_radius_m
-        Radius R of the sphere, in metres.
-    poisson_ratio
-        Poisson's ratio of the gel, 0 to 0.5.
 
     Returns
     -------
@@ -66,9 +55,9 @@ def buried_hertz_displacement(
     Under the contact's middle the gel gives way less, the deeper one looks:
 
     >>> import numpy as np
-    >>> from sliplens.mechanics import buried_hertz_displacement
+    >>> from sliplens.mechanics import hertz_displacement
     >>> sphere = {"contact_radius_m": 0.004, "sphere_radius_m": 0.02}
-    >>> _, u_z = buried_hertz_displacement(0.0, np.array([0.0, 0.02]), **sphere, poisson_ratio=0.5)
+    >>> _, u_z = hertz_displacement(0.0, np.array([0.0, 0.02]), **sphere, poisson_ratio=0.5)
     >>> (1e3 * u_z).round(2)
     array([0.8 , 0.13])
     """
@@ -85,7 +74,7 @@ def buried_hertz_displacement(
     return np.asarray(u_r), np.asarray(u_z)
 
 
-def buried_shear_displacement(
+def shear_displacement(
     x_m: Numbers,
     y_m: Numbers,
     depth_m: Numbers,
@@ -98,16 +87,8 @@ def buried_shear_displacement(
 
     Parameters
     ----------
-    x_m, y_m
-        Position from the axis through the contact's centre, in metres; the load points along x.
-    depth_m
-        Depth z below the unloaded surface, in metres; 0 is the surface.
-    contact_radius_m
-        Radius a of the loaded circle, in metres; where it is 0 the displacement is 0.
     peak_strain
         Traction at the centre over the shear modulus, q0 / G.
-    poisson_ratio
-        Poisson's ratio of the gel, 0 to 0.5.
 
     Returns
     -------
@@ -136,7 +117,7 @@ def buried_shear_displacement(
     return np.asarray(u_x), np.asarray(u_y), np.asarray(u_z)
 
 
-def buried_partial_slip_displacement(
+def partial_slip_displacement(
     x_m: Numbers,
     y_m: Numbers,
     depth_m: Numbers,
@@ -150,24 +131,7 @@ def buried_partial_slip_displacement(
     """Displacements (u_x, u_y, u_z) inside the gel under a pressed sphere's growing tangential load, in metres.
 
     The full-slip traction mu p over the contact, less the same over the stick zone; the pressure's own displacement is
-    `buried_hertz_displacement`. Only at the surface does the stick zone move as one piece.
-
-    Parameters
-    ----------
-    x_m, y_m
-        Position from the axis through the contact's centre, in metres; the load points along x.
-    depth_m
-        Depth z below the unloaded surface, in metres; 0 is the surface.
-    contact_radius_m
-        Contact radius a, in metres; where it is 0 the displacement is 0.
-    sphere_radius_m
-        Radius R of the sphere, in metres.
-    friction_coefficient
-        Coefficient of friction mu; 0 gives 0.
-    safety_margin
-        Gamma = 1 - Q / (mu P), 0 to 1.
-    poisson_ratio
-        Poisson's ratio of the gel, 0 to 0.5.
+    `hertz_displacement`.
 
     Raises
     ------
@@ -178,6 +142,18 @@ def buried_partial_slip_displacement(
     References
     ----------
     Johnson (1985), section 7.2.
+
+    Examples
+    --------
+    At the surface the stick zone moves as one piece; the rim of the contact stays behind:
+
+    >>> import numpy as np
+    >>> from sliplens.mechanics import partial_slip_displacement
+    >>> grip = {"friction_coefficient": 0.5, "safety_margin": 0.125, "poisson_ratio": 0.5}
+    >>> x_m = np.array([0.0, 0.002, 0.004])
+    >>> u_x, _, _ = partial_slip_displacement(x_m, 0.0, 0.0, contact_radius_m=0.004, sphere_radius_m=0.02, **grip)
+    >>> (u_x[1:] / u_x[0]).round(2)
+    array([1.  , 0.68])
     """
     nu = require_poisson_ratio(poisson_ratio)
     require_positive(sphere_radius_m, name="sphere radius", unit="m")
@@ -186,7 +162,7 @@ def buried_partial_slip_displacement(
     # the stick zone's traction is mu p0 c / a, and p0 / a does not depend on the load
     strain_per_metre = 4 * friction / (np.pi * (1 - nu) * sphere_radius_m)
     whole, stuck = (
-        buried_shear_displacement(
+        shear_displacement(
             x_m,
             y_m,
             depth_m,
