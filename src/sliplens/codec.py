@@ -83,6 +83,20 @@ def load_record(path: Path, kind: type[Record], *, command: str) -> Record:
     ------
     InputError
         If the file is missing, is not JSON, or holds something else than the record declares.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from dataclasses import dataclass
+    >>> from pathlib import Path
+    >>> from sliplens.codec import load_record, save_record
+    >>> @dataclass(frozen=True)
+    ... class Grip:
+    ...     normal_force_n: float
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     save_record(Grip(2.5), Path(folder) / "grip.json")
+    ...     load_record(Path(folder) / "grip.json", Grip, command="sliplens grip")
+    Grip(normal_force_n=2.5)
     """
     return from_builtins(_read_json(path, command=command), kind, where=path, command=command)
 
@@ -94,6 +108,20 @@ def from_builtins(values: object, kind: type[Record], *, where: Path | str, comm
     ------
     InputError
         If it holds something else than the record declares.
+
+    Examples
+    --------
+    A mistake in a file is one sentence:
+
+    >>> from dataclasses import dataclass
+    >>> from sliplens.codec import from_builtins
+    >>> @dataclass(frozen=True)
+    ... class Grip:
+    ...     normal_force_n: float
+    >>> from_builtins({"normal_force_n": "much"}, Grip, where="grip.json", command="sliplens grip")
+    Traceback (most recent call last):
+        ...
+    sliplens.errors.InputError: grip.json is not what was written: expected `float`, got `str` at normal_force_n; ...
     """
     try:
         return msgspec.convert(values, kind, dec_hook=_decode)

@@ -148,6 +148,19 @@ def output_folder(target: Path, *, stage: str, config: Mapping[str, Any], overwr
     ------
     InputError
         If the target exists with another configuration, or is not a folder that sliplens made.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from sliplens.files import output_folder
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     target = Path(folder) / "greeting"
+    ...     with output_folder(target, stage="greet", config={"to": "you"}) as output:
+    ...         _ = (output.folder / "hello.txt").write_text("hello")
+    ...         before = target.exists()
+    ...     before, sorted(path.name for path in target.iterdir())
+    (False, ['hello.txt', 'run.json'])
     """
     recipe = to_jsonable(config)
     config_hash = hash_json({"stage": stage, "config": recipe, "sliplens": __version__})

@@ -36,7 +36,17 @@ class Stages(Protocol):
 
 @contextmanager
 def stage(on_progress: OnProgress | None, title: str) -> Iterator[OnProgress]:
-    """Begin a stage of long work; gives the callback for its progress, which may be called whatever was given."""
+    """Begin a stage of long work; gives the callback for its progress, which may be called whatever was given.
+
+    Examples
+    --------
+    >>> from sliplens.progress import stage
+    >>> with stage(lambda done, total: print(f"{done} of {total}"), "Explain") as count:
+    ...     for frame in range(2):
+    ...         count(frame + 1, 2)
+    1 of 2
+    2 of 2
+    """
     if isinstance(on_progress, Stages):
         with on_progress.stage(title) as count:
             yield count
