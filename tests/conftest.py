@@ -5,9 +5,6 @@ from pathlib import Path
 
 # threads that spin while they wait take the cores from those that work; must be set before torch is imported
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-# side by side, each process of the tests has one thread: more would only wait for each other
-if "PYTEST_XDIST_WORKER" in os.environ:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import pytest
@@ -33,6 +30,8 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """A process a core for the whole suite; none for what was named, which is sooner done than they would start."""
     if config.args_source is pytest.Config.ArgsSource.ARGS:
         return 0
+    # for the processes to come, a thread each: more would only wait for each other
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, MOST_WORKERS)
 
 
