@@ -58,6 +58,19 @@ class IntegratedGradients(Method):
     References
     ----------
     Sundararajan, Taly and Yan, *Axiomatic attribution for deep networks*, ICML 2017, eq. 1; each piece by Captum.
+
+    Examples
+    --------
+    A network that reads the mean brightness, and an image with one bright pixel:
+
+    >>> import torch
+    >>> from sliplens.explainers import IntegratedGradients
+    >>> network = torch.nn.Sequential(torch.nn.AdaptiveAvgPool3d(1), torch.nn.Flatten())
+    >>> images = torch.zeros(1, 3, 2, 2)
+    >>> images[0, :, 0, 1] = 1.0
+    >>> IntegratedGradients()(network, images).relevance
+    tensor([[[0.0000, 0.2500],
+             [0.0000, 0.0000]]])
     """
 
     steps: int = 32

@@ -27,6 +27,15 @@ def spread(maps: Float[Tensor, "*maps rows columns"], size: tuple[int, int]) -> 
     Pixel p receives sum over cells i of B[p, i] m[i] / sum over p' of B[p', i], B the bilinear weights (corners not
     aligned). Where the sizes divide evenly, as 7 into 224, the column sums are all (height / rows)(width / columns)
     and this is the usual bilinear map over that number; elsewhere plain resizing would change the total.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from sliplens.explainers.maps import spread
+    >>> coarse = torch.tensor([[1.0, -0.5], [0.25, 0.25]])
+    >>> fine = spread(coarse, (8, 8))
+    >>> fine.shape, fine.sum()
+    (torch.Size([8, 8]), tensor(1.))
     """
     rows, columns = (_received(maps, axis=axis, pixels=pixels) for axis, pixels in zip((-2, -1), size, strict=True))
     return resize(maps / (rows[:, None] * columns), size)
@@ -105,6 +114,14 @@ def top_overlap(
         Maps of one size.
     share
         Of the pixels, that count as strongest.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from sliplens.explainers.maps import top_overlap
+    >>> one, other = torch.tensor([[3.0, 2.0], [1.0, 0.0]]), torch.tensor([[3.0, 0.0], [1.0, 2.0]])
+    >>> top_overlap(one, other, share=0.5)
+    0.5
     """
     count = max(1, round(share * one.numel()))
     strongest = torch.zeros(one.numel(), dtype=torch.bool, device=one.device)

@@ -31,6 +31,13 @@ def relevance_mass(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "
     References
     ----------
     Arras, Osman and Samek, *CLEVR-XAI* (2022): relevance mass accuracy.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.faithfulness.localisation import relevance_mass
+    >>> relevance_mass(np.array([[0.6, 0.2, 0.2]]), np.array([[True, False, False]]))
+    0.6
     """
     _require(saliency, truth)
     if saliency.min() < 0:
@@ -45,6 +52,15 @@ def relevance_rank(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "
     References
     ----------
     Arras, Osman and Samek, *CLEVR-XAI* (2022): relevance rank accuracy.
+
+    Examples
+    --------
+    Of the two highest pixels one lies inside the truth:
+
+    >>> import numpy as np
+    >>> from sliplens.faithfulness.localisation import relevance_rank
+    >>> relevance_rank(np.array([[0.9, 0.5, 0.1, 0.0]]), np.array([[True, False, True, False]]))
+    0.5
     """
     _require(saliency, truth)
     size = int(truth.sum())

@@ -14,6 +14,13 @@ def total_variation(saliency: Float[np.ndarray, "height width"]) -> float:
     """Mean absolute step between neighbouring pixels, over the range of the map; 0 for a constant one.
 
     A map of independent even noise has 1/3, a smooth one a few percent.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.faithfulness.map_quality import total_variation
+    >>> total_variation(np.array([[0.0, 1.0], [0.0, 1.0]]))  # two steps of four are of the whole range
+    0.5
     """
     span = float(np.ptp(saliency))
     if span == 0:
@@ -28,6 +35,13 @@ def gini(saliency: Float[np.ndarray, "height width"]) -> float:
     References
     ----------
     Chalasani et al., *Concise Explanations of Neural Networks using Adversarial Training* (2020), sparsity.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.faithfulness.map_quality import gini
+    >>> gini(np.ones((2, 2))), gini(np.array([[1.0, 0.0], [0.0, 0.0]]))
+    (0.0, 0.75)
     """
     values = np.sort(np.abs(saliency).ravel())
     total = values.sum()
