@@ -18,12 +18,8 @@ def require_saliency(
 
     Parameters
     ----------
-    saliency
-        Map to check.
     shape
         Height and width of the image that the map explains, in pixels.
-    where
-        What the map is called in the message.
 
     Raises
     ------

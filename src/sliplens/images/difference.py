@@ -9,14 +9,7 @@ from sliplens.errors import ImageError
 def absolute_difference(
     frames: UInt8[np.ndarray, "*batch height width 3"], reference: UInt8[np.ndarray, "_ _ 3"]
 ) -> UInt8[np.ndarray, "*batch height width 3"]:
-    """Absolute difference |T_n - T_0| of frames against the reference frame, in grey levels.
-
-    Parameters
-    ----------
-    frames
-        One or more frames T_n, uint8.
-    reference
-        The sensor untouched, T_0, uint8, of the same height and width.
+    """Absolute difference |T_n - T_0| of frames T_n against the reference frame T_0, in grey levels.
 
     Raises
     ------
@@ -37,11 +30,7 @@ def absolute_difference(
     array([[ 0, 30],
            [60, 90]], dtype=uint8)
     """
-    if frames.shape[-3:] != reference.shape:
-        raise ImageError(
-            f"frame of {_size(frames)} pixels against a reference of {_size(reference)}; "
-            "record the reference with the same camera settings"
-        )
+    _require_same_size(frames, reference)
     # max - min instead of a subtraction: it stays in uint8 and cannot wrap
     return np.maximum(frames, reference) - np.minimum(frames, reference)
 
@@ -52,13 +41,6 @@ def signed_difference(
     """Signed difference T_n - T_0 of frames against the reference frame, in 8 bits: half the grey levels, plus 128.
 
     What brightens lies above 128, what darkens below; a step is two grey levels, less than the noise of a camera.
-
-    Parameters
-    ----------
-    frames
-        One or more frames T_n, uint8.
-    reference
-        The sensor untouched, T_0, uint8, of the same height and width.
 
     Raises
     ------
@@ -74,11 +56,15 @@ def signed_difference(
     >>> signed_difference(frame, untouched)[..., 0]
     array([[128, 148, 108]], dtype=uint8)
     """
-    if frames.shape[-3:] != reference.shape:
-        absolute_difference(frames, reference)  # says what is wrong
+    _require_same_size(frames, reference)
     # T_n / 2 - T_0 / 2 + 128 without leaving uint8: halves of both, rounded alike, so that equal pixels give 128
     return (frames >> 1) + (np.uint8(128) - (reference >> 1))
 
 
-def _size(image: np.ndarray) -> str:
-    return f"{image.shape[-3]} x {image.shape[-2]}"
+def _require_same_size(frames: np.ndarray, reference: np.ndarray) -> None:
+    if frames.shape[-3:] != reference.shape:
+        frame, untouched = (f"{image.shape[-3]} x {image.shape[-2]}" for image in (frames, reference))
+        raise ImageError(
+            f"frame of {frame} pixels against a reference of {untouched}; "
+            "record the reference with the same camera settings"
+        )

@@ -13,18 +13,19 @@ from sliplens.files import require_folder
 
 IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"})
 
-_CURES = {
-    "L": "1 channel (grey); convert it to 8-bit RGB",
-    "1": "1 channel (black and white); convert it to 8-bit RGB",
-    "P": "a colour palette; convert it to 8-bit RGB",
-    "LA": "2 channels (grey and alpha); convert it to 8-bit RGB",
-    "RGBA": "4 channels (alpha); drop the alpha channel",
-    "CMYK": "4 channels (CMYK); convert it to 8-bit RGB",
-    "I;16": "16 bits a pixel; convert it to 8-bit RGB",
-    "I": "more than 8 bits a pixel; convert it to 8-bit RGB",
-    "F": "floating-point pixels; convert it to 8-bit RGB",
+_OTHER_MODES = {
+    "L": "1 channel (grey)",
+    "1": "1 channel (black and white)",
+    "P": "a colour palette",
+    "LA": "2 channels (grey and alpha)",
+    "RGBA": "4 channels (alpha)",
+    "CMYK": "4 channels (CMYK)",
+    "I;16": "16 bits a pixel",
+    "I": "more than 8 bits a pixel",
+    "F": "floating-point pixels",
 }
 _BITS_PER_SAMPLE = 258  # TIFF tag
+_DAMAGE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)  # what Pillow raises
 
 
 def read_image(path: Path, *, size: tuple[int, int] | None = None) -> UInt8[np.ndarray, "height width 3"]:
@@ -55,16 +56,15 @@ def read_image(path: Path, *, size: tuple[int, int] | None = None) -> UInt8[np.n
     """
     try:
         with Image.open(path) as image:
-            bits = getattr(image, "tag_v2", {}).get(_BITS_PER_SAMPLE, (8,))
-            if image.mode != "RGB" or max(bits) > 8:
-                cure = _CURES.get(image.mode, f"mode {image.mode}; convert it to 8-bit RGB")
-                if max(bits) > 8:
-                    cure = f"{max(bits)} bits a pixel; convert it to 8-bit RGB"
-                raise ImageError(f"{path} has {cure}")
+            bits = max(getattr(image, "tag_v2", {}).get(_BITS_PER_SAMPLE, (8,)))
+            if image.mode != "RGB" or bits > 8:
+                what = f"{bits} bits a pixel" if bits > 8 else _OTHER_MODES.get(image.mode, f"mode {image.mode}")
+                cure = "drop the alpha channel" if image.mode == "RGBA" else "convert it to 8-bit RGB"
+                raise ImageError(f"{path} has {what}; {cure}")
             pixels = np.array(image)
     except FileNotFoundError:
         raise ImageError(f"{path} does not exist; check the path") from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except _DAMAGE as error:
         raise ImageError(f"{path} cannot be read as an image ({error}); copy or export it again") from None
     if size is not None and pixels.shape[:2] != tuple(size):
         raise ImageError(
@@ -97,9 +97,9 @@ def decode_png(data: bytes, *, where: str) -> UInt8[np.ndarray, "height width 3"
     try:
         with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
             if image.mode != "RGB":
-                raise ImageError(f"{where} has {_CURES.get(image.mode, image.mode)}")
+                raise ImageError(f"{where} has {_OTHER_MODES.get(image.mode, image.mode)}; make the data set again")
             return np.array(image)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except _DAMAGE as error:
         raise ImageError(f"{where} cannot be read as PNG ({error}); make the data set again") from None
 
 
