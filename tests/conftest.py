@@ -1,6 +1,7 @@
 """Fixtures that several tests share."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 # threads that spin while they wait take the cores from those that work; must be set before torch is imported
@@ -9,6 +10,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import numpy as np
 import pytest
 import torch
+from dots import draw_dots, make_grid
 from hypothesis import settings
 
 from sliplens.images import absolute_difference, write_png
@@ -16,6 +18,7 @@ from sliplens.models import Manifest, build_model, save_checkpoint
 from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
+from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SimulationRecipe, plan_trials, simulate_trial
 
 # the same examples every time: a change is judged by its own doing, and a failure can be looked at again
 settings.register_profile("sliplens", derandomize=True, deadline=None)
@@ -161,3 +164,26 @@ def difference_folder(tmp_path: Path, small_dataset: Dataset) -> Path:
             folder / f"frame{index}_{percent}.png", absolute_difference(recording.frames[index], recording.reference)
         )
     return folder
+
+
+@pytest.fixture(scope="session")
+def trials() -> dict[str, Recording]:
+    """A simulated trial of each sensor, to full slip and back."""
+    return {
+        sensor.name: simulate_trial(
+            plan_trials(
+                SimulationRecipe(dry_trials=3, wet_trials=0, frames_per_trial=40, release=True, sensor=sensor, seed=7)
+            )[0]
+        )
+        for sensor in (CHROMATOUCH, FLAT_GEL)
+    }
+
+
+@pytest.fixture
+def dots() -> Callable[..., np.ndarray]:
+    return draw_dots
+
+
+@pytest.fixture
+def grid() -> Callable[..., np.ndarray]:
+    return make_grid

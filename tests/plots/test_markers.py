@@ -16,6 +16,8 @@ from sliplens.plots.markers import (
 )
 from sliplens.recordings import ContactState
 
+pytest.importorskip("cv2", reason="markers are found with OpenCV, of the extra `markers`")
+
 
 @pytest.fixture(scope="module")
 def tracked(trials):

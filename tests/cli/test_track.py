@@ -10,6 +10,8 @@ from sliplens.markers import track_markers
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
 
+pytest.importorskip("cv2", reason="markers are found with OpenCV, of the extra `markers`")
+
 
 @pytest.fixture
 def moving(dots, grid, rng):
