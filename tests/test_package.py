@@ -29,8 +29,12 @@ def test_asking_for_help_does_not_import_torch():
     assert run_python(code).strip().endswith("False")
 
 
-def test_importing_the_report_does_not_import_torch():
-    assert run_python("import sys, sliplens.report; print('torch' in sys.modules)").strip() == "False"
+def test_importing_commands_and_pages_imports_nothing_that_only_some_need():
+    code = (
+        "import sys, sliplens.cli, sliplens.cli.view, sliplens.report, sliplens.plots.clip, sliplens.plots.viewer\n"
+        "print({'torch', 'matplotlib.pyplot', 'av', 'rerun', 'cv2'} & set(sys.modules))"
+    )
+    assert run_python(code).strip() == "set()"
 
 
 def test_the_floors_are_told_as_they_are_held():

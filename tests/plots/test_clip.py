@@ -1,4 +1,3 @@
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -277,11 +276,3 @@ def test_missing_pyav_is_told_with_its_cure(trial, tmp_path, monkeypatch):
         write_clip(trial, tmp_path / "trial.mp4")
 
     assert not list(tmp_path.iterdir())
-
-
-def test_importing_the_report_does_not_import_pyav():
-    code = "import sys, sliplens.report, sliplens.plots.clip; print('av' in sys.modules)"
-
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-
-    assert done.stdout.strip() == "False"

@@ -362,11 +362,6 @@ def test_rerun_switched_off_writes_no_empty_file(
     assert not list(tmp_path.iterdir())
 
 
-def test_nothing_imports_rerun_before_it_is_needed():
-    code = "import sys, sliplens.cli, sliplens.cli.view, sliplens.plots.viewer; sys.exit('rerun' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
 def test_an_open_viewer_is_given_what_a_file_is(
     monkeypatch: pytest.MonkeyPatch, trial: Recording, simulated: dict[str, list[pa.RecordBatch]], tmp_path: Path
 ):
