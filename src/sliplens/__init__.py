@@ -7,15 +7,19 @@ from sliplens._version import __version__
 
 if TYPE_CHECKING:
     from sliplens.errors import SliplensError
+    from sliplens.explainers.table import explain
+    from sliplens.faithfulness.scoring import score
     from sliplens.models.checkpoint import load
 
 # where each name lives: importing sliplens alone imports neither torch nor NumPy
 _MODULES = {
     "SliplensError": "sliplens.errors",
+    "explain": "sliplens.explainers.table",
     "load": "sliplens.models.checkpoint",
+    "score": "sliplens.faithfulness.scoring",
 }
 
-__all__ = ["SliplensError", "__version__", "load"]
+__all__ = ["SliplensError", "__version__", "explain", "load", "score"]
 
 
 def __getattr__(name: str) -> Any:

@@ -9,25 +9,7 @@ from sliplens.explainers.lrp import Lrp
 from sliplens.explainers.occlusion import Occlusion, find_markers
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.poly_cam_budget import Likeness
-from sliplens.extras import Table
-
-_ROWS: dict[str, Explainer] = {
-    "grad-cam": GradCam(),
-    "integrated-gradients": IntegratedGradients(),
-    "poly-cam": PolyCam(),
-    "hires-cam": HiResCam(),
-    "layer-cam": LayerCam(),
-    "expected-gradients": ExpectedGradients(),
-    "smooth-grad": SmoothGrad(),
-    "occlusion": Occlusion(),
-    "occlusion-marker": Occlusion(markers_px=find_markers),
-    "lrp": Lrp(),
-}
-EXPLAINERS = Table("method", "sliplens.explainers", _ROWS)
-"""The explainers by name, with their default options; use `dataclasses.replace` for others. `lrp` needs an extra.
-
-An installed package adds its own by the entry point `sliplens.explainers`.
-"""
+from sliplens.explainers.table import EXPLAINERS, explain, get_explainer
 
 __all__ = [
     "EXPLAINERS",
@@ -47,6 +29,8 @@ __all__ = [
     "PolyCam",
     "SmoothGrad",
     "capture",
+    "explain",
     "find_layers",
     "find_markers",
+    "get_explainer",
 ]

@@ -70,6 +70,11 @@ class Explanation:
         return self.prediction - self.reference_prediction
 
     @property
+    def influence(self) -> Float[Tensor, "batch height width"]:
+        """Relevance that works towards the target, in margin units: signed by sign(f(x) - f(reference))."""
+        return self.change.sign().to(self.relevance.dtype)[:, None, None] * self.relevance
+
+    @property
     def saliency(self) -> Float[Tensor, "batch height width"]:
         """The supporting evidence in [0, 1], for viewing: 1 at the strongest pixel of each image.
 
@@ -78,7 +83,7 @@ class Explanation:
         below the reference's (s = -1) the pixels that lower it are shown, which a plain ReLU would hide. A map
         without supporting evidence stays zero, and so does every map where f(x) = f(reference).
         """
-        supporting = torch.relu(self.change.sign().to(self.relevance.dtype)[:, None, None] * self.relevance)
+        supporting = torch.relu(self.influence)
         peak = supporting.amax(dim=(1, 2), keepdim=True)
         return supporting / torch.where(peak > 0, peak, torch.ones_like(peak))
 

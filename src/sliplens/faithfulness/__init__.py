@@ -10,15 +10,22 @@ from sliplens.faithfulness.deletion import (
     summarise_deletion,
 )
 from sliplens.faithfulness.fills import FILLS, get_fill
+from sliplens.faithfulness.removal import Faithfulness, RemovalCurves, removal_curves
+from sliplens.faithfulness.scoring import score, score_by_deletion
 
 __all__ = [
     "FILLS",
     "DeletionCurves",
     "DeletionSummary",
+    "Faithfulness",
+    "RemovalCurves",
     "deletion_curves",
     "deletion_order",
     "deletion_score",
     "get_fill",
     "random_order",
+    "removal_curves",
+    "score",
+    "score_by_deletion",
     "summarise_deletion",
 ]

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import pyarrow as pa
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
@@ -23,11 +24,14 @@ class DeletionCurves:
         Pixels that are gone at each step.
     base, predictions
         Answer on the whole image, and at each step, in margin units.
+    control
+        The same in random order, where it was asked for: a method that does not beat it has shown nothing.
     """
 
     pixels_removed: Int[np.ndarray, " steps"]
     base: Float64[np.ndarray, " images"]
     predictions: Float64[np.ndarray, "images steps"]
+    control: "DeletionCurves | None" = None
 
     @property
     def scores(self) -> Float64[np.ndarray, "images steps"]:
@@ -38,6 +42,18 @@ class DeletionCurves:
     def auc(self) -> Float64[np.ndarray, " images"]:
         """D_AUC of each image: the mean of D over the steps."""
         return self.scores.mean(axis=1)
+
+    def frame(self) -> pa.Table:
+        """Arrow table, a row for each image and step: pixels removed, prediction in margin units, score D."""
+        images, steps = self.predictions.shape
+        return pa.table(
+            {
+                "image": np.repeat(np.arange(images), steps),
+                "pixels_removed": np.tile(self.pixels_removed, images),
+                "prediction": self.predictions.ravel(),
+                "score": self.scores.ravel(),
+            }
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,11 +1,12 @@
 """Removal curves: how far the answer moves as the most, the least, and random parts of an image are removed."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import TypeAlias
 
 import numpy as np
+import pyarrow as pa
 import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
@@ -13,6 +14,7 @@ from torch import Tensor
 from sliplens.errors import InputError
 from sliplens.faithfulness.fills import Fill, Painter
 from sliplens.faithfulness.units import Units, random_unit_order, unit_order
+from sliplens.intervals import Difference, paired_difference
 from sliplens.models.engines import Passes
 from sliplens.progress import OnProgress
 
@@ -161,10 +163,42 @@ class Faithfulness:
     curves
         Change of the answer at each step: the most, the least influential parts, and random ones removed first (the
         mean over the random orders). Along the target where it was given, else its size.
+    method, fill
+        Names of what was scored, and of what removed pixels became; empty where nobody named them.
+    controls
+        The same of maps that know nothing of the network, by name (`CONTROLS`), where they were scored too.
+    alarms
+        Why the score may not measure the maps, a sentence each.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.faithfulness import Faithfulness
+    >>> first, last, random = [[0, 0.4, 0.4]], [[0, 0.0, 0.4]], [[0, 0.2, 0.4]]
+    >>> faithfulness = Faithfulness(areas=np.array([0, 0.5, 1.0]), curves=np.array([first, last, random]))
+    >>> faithfulness.symmetric_gain, faithfulness.at(0.5)[0]
+    (array([0.2]), array([0.4]))
     """
 
     areas: Float64[np.ndarray, " steps"]
     curves: Float64[np.ndarray, "3 images steps"]
+    method: str = ""
+    fill: str = ""
+    controls: Mapping[str, "Faithfulness"] = field(default_factory=dict)
+    alarms: tuple[str, ...] = ()
+
+    @classmethod
+    def of_orders(
+        cls, curves: RemovalCurves, names: Iterable[str], *, towards: Float[np.ndarray, " images"] | None
+    ) -> "dict[str, Faithfulness]":
+        """Scores by method from curves whose orders are most and least first of each method, then the random ones."""
+        names = list(names)
+        changes = curves.changes if towards is None else curves.lost(towards)
+        random = changes[2 * len(names) :].mean(axis=0)
+        return {
+            name: cls(areas=curves.areas, curves=np.stack([changes[2 * row], changes[2 * row + 1], random]))
+            for row, name in enumerate(names)
+        }
 
     @property
     def most_first(self) -> Float64[np.ndarray, " images"]:
@@ -195,6 +229,30 @@ class Faithfulness:
     def gain_over_random(self) -> Float64[np.ndarray, " images"]:
         """Most influential first less random orders."""
         return self.most_first - self.random
+
+    def interval(self, *, trials: np.ndarray | None = None, seed: int = 0) -> Difference:
+        """Mean symmetric gain over the images in margin units, with its 95 % interval.
+
+        Parameters
+        ----------
+        trials
+            Trial of each image: whole trials are resampled, since frames of one resemble one another.
+        seed
+            Seed of the resampling.
+        """
+        nothing = np.zeros_like(self.symmetric_gain)
+        return paired_difference(self.symmetric_gain, nothing, trials=trials, rng=np.random.default_rng(seed))
+
+    def frame(self) -> pa.Table:
+        """Arrow table of the curves, a row for each image and share of it removed, in margin units."""
+        images, steps = self.curves.shape[1:]
+        return pa.table(
+            {
+                "image": np.repeat(np.arange(images), steps),
+                "area": np.tile(self.areas, images),
+                **dict(zip(("most_first", "least_first", "random"), self.curves.reshape(3, -1), strict=True)),
+            }
+        )
 
     def at(self, area: float) -> Float64[np.ndarray, "3 images"]:
         """Changes where a share of the image is gone: most first, least first, random.
@@ -327,12 +385,12 @@ def faithfulness(
     Has Learned* (2017), most and least relevant first.
     """
     orders = [
-        np.stack([unit_order(one, unit, least_first=least) for one, unit in zip(maps, units, strict=True)])
+        np.stack([unit_order(values, unit, least_first=least) for values, unit in zip(maps, units, strict=True)])
         for maps in influence.values()
         for least in (False, True)
     ]
     orders += [np.stack([random_unit_order(unit, rng=rng) for unit in units]) for _ in range(random_orders)]
-    found = removal_curves(
+    curves = removal_curves(
         predict,
         images,
         np.stack(orders),
@@ -343,11 +401,4 @@ def faithfulness(
         batch_size=batch_size,
         on_progress=on_progress,
     )
-    changes = found.changes if towards is None else found.lost(towards)
-    by_chance = changes[2 * len(influence) :].mean(axis=0)
-    return {
-        name: Faithfulness(
-            areas=found.areas, curves=np.stack([changes[2 * number], changes[2 * number + 1], by_chance])
-        )
-        for number, name in enumerate(influence)
-    }
+    return Faithfulness.of_orders(curves, influence, towards=towards)

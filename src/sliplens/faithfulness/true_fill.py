@@ -112,9 +112,4 @@ def marker_faithfulness(
     by_chance = [[rng.permutation(markers) for _ in range(images)] for _ in range(random_orders)]
     asked = np.concatenate([*orders, np.array(by_chance)])
     curves = marker_curves(predict, redraw, asked, batch_size=batch_size, on_progress=on_progress)
-    changes = curves.changes if towards is None else curves.lost(towards)
-    random = changes[2 * len(orders) :].mean(axis=0)
-    return {
-        name: Faithfulness(areas=curves.areas, curves=np.stack([changes[2 * number], changes[2 * number + 1], random]))
-        for number, name in enumerate(influence)
-    }
+    return Faithfulness.of_orders(curves, influence, towards=towards)

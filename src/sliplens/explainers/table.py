@@ -1,0 +1,166 @@
+"""Explainers by name, and the call that explains frames with one of them."""
+
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from sliplens.errors import ImageError, InputError
+from sliplens.explainers.cam import GradCam, HiResCam, LayerCam
+from sliplens.explainers.contract import Explainer
+from sliplens.explainers.explanation import Explanation
+from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients, SmoothGrad
+from sliplens.explainers.lrp import Lrp
+from sliplens.explainers.occlusion import Occlusion, find_markers
+from sliplens.explainers.poly_cam import PolyCam
+from sliplens.extras import Table
+from sliplens.models import TrainedModel
+from sliplens.models.checkpoint import find_run, load_checkpoint
+from sliplens.progress import OnProgress
+
+_ROWS: dict[str, Explainer] = {
+    "grad-cam": GradCam(),
+    "integrated-gradients": IntegratedGradients(),
+    "poly-cam": PolyCam(),
+    "hires-cam": HiResCam(),
+    "layer-cam": LayerCam(),
+    "expected-gradients": ExpectedGradients(),
+    "smooth-grad": SmoothGrad(),
+    "occlusion": Occlusion(),
+    "occlusion-marker": Occlusion(markers_px=find_markers),
+    "lrp": Lrp(),
+}
+EXPLAINERS = Table("method", "sliplens.explainers", _ROWS)
+"""The explainers by name, with their default options; use `dataclasses.replace` for others. `lrp` needs an extra.
+
+An installed package adds its own by the entry point `sliplens.explainers`.
+"""
+
+
+def explain(
+    run: TrainedModel | Path | str,
+    frames: UInt8[np.ndarray, "batch height width 3"],
+    *,
+    reference: UInt8[np.ndarray, "height width 3"] | None = None,
+    method: str | Explainer = "poly-cam",
+    on_progress: OnProgress | None = None,
+    **options: Any,
+) -> Explanation:
+    """Explain why a network reads these safety margins rather than that of the untouched sensor.
+
+    Parameters
+    ----------
+    run
+        The network, its folder, or the name of one that comes with sliplens.
+    frames
+        Camera frames T_n, 8-bit RGB; without a reference, absolute difference images |T_n - T_0|.
+    reference
+        Frame of the untouched sensor, T_0. A network on difference images needs none.
+    method
+        Row of `EXPLAINERS`, or an explainer.
+    on_progress
+        Called with the pieces of work done and their total.
+    options
+        Options of the method, such as `budget=0.25` of `poly-cam`: the fields of its class.
+
+    Returns
+    -------
+    Explanation
+        Signed maps in margin units, and what a reader should know before trusting them.
+
+    Raises
+    ------
+    InputError
+        If there is no such method or option, or the network needs a reference.
+    ImageError
+        If the frames are not of the size the network's sensor has.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.explainers import explain
+    >>> touched = np.zeros((1, 224, 224, 3), dtype=np.uint8)
+    >>> touched[:, 80:120, 90:150] = 90
+    >>> explanation = explain("chromatouch-difference", touched, method="grad-cam")
+    >>> explanation.relevance.shape, explanation.frame().num_rows
+    (torch.Size([1, 224, 224]), 1)
+    """
+    trained = open_run(run)
+    explainer = get_explainer(method, **options) if isinstance(method, str) else method
+    images, empty = network_images(trained, frames, reference)
+    inputs = trained.encoding.normalise(images).to(trained.device)
+    return explainer(trained.model, inputs, reference=empty.to(trained.device), on_progress=on_progress)
+
+
+def open_run(run: TrainedModel | Path | str) -> TrainedModel:
+    """Network that a caller named: itself, its folder, or the name of one that comes with sliplens."""
+    return run if isinstance(run, TrainedModel) else load_checkpoint(find_run(Path(run)))
+
+
+def get_explainer(method: str, **options: Any) -> Explainer:
+    """Look up an explainer by name, with other options than its row of the table has.
+
+    Parameters
+    ----------
+    method
+        Row of `EXPLAINERS`.
+    options
+        Fields of its class.
+
+    Raises
+    ------
+    InputError
+        If there is no such method, or it has no such option; the message lists those there are.
+
+    Examples
+    --------
+    >>> from sliplens.explainers import get_explainer
+    >>> get_explainer("occlusion", tile_px=8).tile_px
+    8
+    """
+    explainer = EXPLAINERS.pick(method)
+    known = [field.name for field in fields(explainer)] if is_dataclass(explainer) else []
+    for name in options:
+        if name not in known:
+            raise InputError(f"{method} has no option {name!r}; it has {', '.join(known) or 'none'}")
+    return replace(explainer, **options) if options else explainer  # pyright: ignore[reportArgumentType]
+
+
+def network_images(
+    trained: TrainedModel,
+    frames: UInt8[np.ndarray, "batch height width 3"],
+    reference: UInt8[np.ndarray, "height width 3"] | None,
+) -> tuple[UInt8[Tensor, "batch 3 size size"], Float[Tensor, "3 size size"]]:
+    """Images of a network before they are normalised, 8 bits, and the input of the untouched sensor, in [0, 1].
+
+    Parameters
+    ----------
+    trained
+        The network.
+    frames, reference
+        As `explain` takes them.
+
+    Raises
+    ------
+    InputError
+        If the network needs a reference.
+    ImageError
+        If there is no frame, or the frames are not of the size the network's sensor has.
+    """
+    if not len(frames):
+        raise ImageError("there is no frame to explain; give one at least")
+    trained.require_frame_size(frames.shape[1:3])
+    encoding, image_size = trained.encoding, trained.manifest.image_size
+    if reference is not None:
+        compared = encoding.compare(frames, reference)
+        return encoding.resize(compared, image_size=image_size), encoding.empty(reference, image_size=image_size)
+    if not encoding.empty_is_black:
+        raise InputError(
+            f"a network on {encoding.name} images needs the untouched sensor; give it as reference, on the command "
+            "line with --reference IMAGE"
+        )
+    return encoding.resize(frames, image_size=image_size), torch.zeros(3, image_size, image_size)
