@@ -14,9 +14,10 @@ from sliplens.simulation.information import (
     margin_bound,
     marker_sensitivity,
     prior_sigma,
+    reading_gain,
     visible_markers,
 )
-from sliplens.simulation.intervention import NOISE_PX, FilmedTrial, marker_readings, reading_gain
+from sliplens.simulation.intervention import NOISE_PX, FilmedTrial, marker_readings
 from sliplens.simulation.nuisances import Grasp
 from sliplens.simulation.trials import prepare_trial
 

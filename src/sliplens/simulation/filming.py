@@ -31,10 +31,10 @@ class Film:
     motion: Motion
     noise: Noise | None
     marker_rest_px: Float[np.ndarray, "markers 2"]
-    """Where the camera sees the untouched markers, the jitter of the print and the seat of the camera included."""
+    """Untouched markers as the camera sees them, with the jitter of the print and the seat of the camera."""
     marker_px: Float[np.ndarray, "frames markers 2"]
     blur_px: Float[np.ndarray, " frames_and_reference"]
-    """The untouched sensor first, as in the picks."""
+    """Blur of the untouched sensor, then of each frame, as in the picks."""
     noise_picks: NoisePicks
     texture: Float32[np.ndarray, "3 markers side side"]
     light: Float32[np.ndarray, "3 height width"]
@@ -91,7 +91,7 @@ class Film:
         )
 
     def contact_map(self, frames: slice) -> UInt8[np.ndarray, "frames height width"]:
-        """Where the camera sees the skin touch the object: 0 nowhere, 1 slipping, 2 sticking.
+        """Map of the contact as the camera sees it: 0 outside, 1 slipping, 2 sticking.
 
         The contact of a dome is seen as the flat lens that it is, displaced and enlarged by its indentation.
         """
@@ -144,17 +144,17 @@ class Film:
 
 @dataclass(frozen=True, kw_only=True)
 class _Seat:
-    """How the camera is seated that day: turned about the image of the skin's middle, and shifted."""
+    """Seat of the camera on its day: turned about the image of the skin's middle, and shifted."""
 
     day: Day
     middle: Float[np.ndarray, "2"]
 
     def see(self, points_px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Where points are seen that a camera seated as drawn would see at `points_px`."""
+        """Pixels of this camera for pixels of one that sits as drawn."""
         return (points_px - self.middle) @ self._turn() + self.middle + np.asarray(self.day.camera_shift_px)
 
     def unsee(self, points_px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Where a camera seated as drawn would see what is seen at `points_px`: the inverse of `see`."""
+        """Pixels of a camera that sits as drawn for pixels of this one: the inverse of `see`."""
         return (points_px - self.middle - np.asarray(self.day.camera_shift_px)) @ self._turn().T + self.middle
 
     def _turn(self) -> Float[np.ndarray, "2 2"]:

@@ -6,7 +6,7 @@ Lengths are in metres: x right, y down, z towards the object; the skin's foremos
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -14,65 +14,7 @@ from jaxtyping import Float, Float32
 from sliplens.errors import ContactError
 
 
-@runtime_checkable
-class Geometry(Protocol):
-    """What the simulator asks of a fingertip's shape."""
-
-    @property
-    def sphere_radius_m(self) -> float:
-        """Radius of the sphere in the contact: the fingertip's own, or that of the ball pressed on a flat one."""
-        ...
-
-    @property
-    def centre_px(self) -> tuple[float, float]:
-        """Where the camera sees the skin's middle: x, y."""
-        ...
-
-    @property
-    def markers(self) -> int:
-        """How many markers there are."""
-        ...
-
-    def marker_scale(self) -> Float[np.ndarray, " markers"]:
-        """Size of each marker at rest, over the sensor's marker radius."""
-        ...
-
-    def marker_positions(self, depth_m: float = 0.0) -> Float[np.ndarray, "markers 3"]:
-        """Where the markers lie at rest, so deep under the skin."""
-        ...
-
-    def skin_point(self, sideways_m: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
-        """Point of the skin at rest, so far from the axis."""
-        ...
-
-    def slope_cosine(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
-        """Cosine between the skin's normal at rest and the camera's axis."""
-        ...
-
-    def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-        """Pixel coordinates (x, y) of points."""
-        ...
-
-    def camera_distance(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
-        """Distance of points from the camera."""
-        ...
-
-    def rays(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """How far each pixel looks sideways (x and y) for each metre ahead."""
-        ...
-
-    def face_distance_squared(
-        self,
-        rays: Float[np.ndarray, "height width 2"],
-        *,
-        contact_centre_m: Float[np.ndarray, "2"],
-        indentation_m: Float[np.ndarray, " frames"],
-    ) -> Float32[np.ndarray, "frames height width"]:
-        """Squared distance from the contact's centre at which each ray meets the object's face, in square metres."""
-        ...
-
-
-def squared_distance(
+def _squared_distance(
     rays: Float[np.ndarray, "height width 2"],
     *,
     height: Float[np.ndarray, " frames"],
@@ -122,10 +64,10 @@ class Dome:
 
     radius_m: float
     camera_offset: float
-    """How far the camera lies behind the dome's centre, in dome radii."""
+    """Distance of the camera behind the dome's centre, in dome radii."""
     focal_px_per_rad: float
     centre_px: tuple[float, float]
-    """Where the apex is seen: x, y."""
+    """Pixel (x, y) at which the apex is seen."""
     ring_spacing_deg: float
     ring_counts: tuple[int, ...]
     """Markers in each ring, from the one at the apex outwards."""
@@ -164,19 +106,15 @@ class Dome:
 
     @property
     def markers(self) -> int:
-        """How many markers there are."""
+        """Number of markers."""
         return sum(self.ring_counts)
-
-    def marker_rings(self) -> np.ndarray:
-        """Ring of each marker, 0 at the apex; shape (markers,)."""
-        return np.repeat(np.arange(len(self.ring_counts)), self.ring_counts)
 
     def marker_scale(self) -> Float[np.ndarray, " markers"]:
         """Size of each marker at rest, over the sensor's marker radius."""
-        return np.asarray(self.ring_scale)[self.marker_rings()]
+        return np.repeat(self.ring_scale, self.ring_counts)
 
     def marker_positions(self, depth_m: float = 0.0) -> Float[np.ndarray, "markers 3"]:
-        """Where the markers lie on the untouched dome.
+        """Places of the markers under the skin of the untouched dome, in metres.
 
         Raises
         ------
@@ -198,7 +136,7 @@ class Dome:
         return direction * (self.radius_m - depth_m)
 
     def skin_point(self, sideways_m: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
-        """Point of the skin at rest, so far from the axis."""
+        """Point of the skin at rest at a distance (x, y) from the axis."""
         return np.append(sideways_m, np.sqrt(self.radius_m**2 - sideways_m @ sideways_m))
 
     def slope_cosine(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
@@ -229,7 +167,7 @@ class Dome:
         return np.linalg.norm(points + np.array([0.0, 0.0, self.camera_offset * self.radius_m]), axis=-1)
 
     def rays(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """How far each pixel looks sideways (x and y) for each metre ahead."""
+        """Slopes (x, y) of the pixels' lines of sight: metres sideways for each metre ahead."""
         away = (pixels - np.asarray(self.centre_px)) / self.focal_px_per_rad
         # rays at a right angle to the axis never meet the object; these stay finite and far away
         angle = np.minimum(np.linalg.norm(away, axis=-1), 1.5)
@@ -249,7 +187,7 @@ class Dome:
         """
         centre = contact_centre_m
         height = self.radius_m * (1 + self.camera_offset) - indentation_m + centre @ centre / (2 * self.radius_m)
-        return squared_distance(rays / (1 + rays @ centre / self.radius_m)[..., None], height=height, centre=centre)
+        return _squared_distance(rays / (1 + rays @ centre / self.radius_m)[..., None], height=height, centre=centre)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -266,10 +204,10 @@ class FlatPad:
 
     ball_radius_m: float
     camera_distance_m: float
-    """From the camera to the skin."""
+    """Distance from the camera to the skin."""
     focal_px: float
     centre_px: tuple[float, float]
-    """Where the middle of the skin is seen: x, y."""
+    """Pixel (x, y) at which the middle of the skin is seen."""
     spacing_m: float
     columns: int
     rows: int
@@ -294,7 +232,7 @@ class FlatPad:
 
     @property
     def markers(self) -> int:
-        """How many dots there are."""
+        """Number of dots."""
         return self.columns * self.rows
 
     def marker_scale(self) -> Float[np.ndarray, " markers"]:
@@ -302,7 +240,7 @@ class FlatPad:
         return np.ones(self.markers)
 
     def marker_positions(self, depth_m: float = 0.0) -> Float[np.ndarray, "markers 3"]:
-        """Where the dots lie in the untouched gel.
+        """Places of the dots in the untouched gel, in metres.
 
         Raises
         ------
@@ -320,7 +258,7 @@ class FlatPad:
         return np.stack([across.ravel(), down.ravel(), np.full(self.markers, -depth_m)], axis=-1)
 
     def skin_point(self, sideways_m: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
-        """Point of the skin at rest, so far from the axis."""
+        """Point of the skin at rest at a distance (x, y) from the axis."""
         return np.append(sideways_m, 0.0)
 
     def slope_cosine(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
@@ -337,7 +275,7 @@ class FlatPad:
         return np.linalg.norm(points + np.array([0.0, 0.0, self.camera_distance_m]), axis=-1)
 
     def rays(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """How far each pixel looks sideways (x and y) for each metre ahead."""
+        """Slopes (x, y) of the pixels' lines of sight: metres sideways for each metre ahead."""
         return (pixels - np.asarray(self.centre_px)) / self.focal_px
 
     def face_distance_squared(
@@ -352,4 +290,8 @@ class FlatPad:
         The ball's face is taken at the depth of the contact's edge, delta / 2, where it matters.
         """
         height = self.camera_distance_m - indentation_m / 2
-        return squared_distance(rays, height=height, centre=contact_centre_m)
+        return _squared_distance(rays, height=height, centre=contact_centre_m)
+
+
+Geometry: TypeAlias = Dome | FlatPad
+"""Shape of a fingertip; another one has the same properties and methods."""

@@ -19,7 +19,7 @@ from sliplens.simulation.sensor import Sensor
 MARGIN = "margin"
 """The unknown that is asked for."""
 _STEP = 1e-4
-"""Of the central differences: their error grows with its square, that of rounding (1e-12 px) over it."""
+"""Step of the central differences: their error grows with its square, that of rounding (1e-12 px) over it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class Touch:
     grasp: Grasp
     modulus_factor: float = 1.0
     marker_depth: float = 0.03
-    """In radii of the contact's sphere."""
+    """Depth of the markers under the skin, in radii of the contact's sphere."""
 
 
 def _grasp(field: str, axis: int | None = None) -> Callable[[Touch, float], Touch]:
@@ -60,7 +60,7 @@ NUISANCES: dict[str, Callable[[Touch, float], Touch]] = {
     "shear_exponent": _grasp("shear_exponent"),
     "marker_depth": lambda touch, step: replace(touch, marker_depth=touch.marker_depth + step),
 }
-"""How each nuisance shifts a touch; lengths in radii of the contact's sphere, angles in radians, `log_` relative."""
+"""Shift of a touch by each nuisance; lengths in radii of the contact's sphere, angles in radians, `log_` relative."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +82,7 @@ def visible_markers(sensor: Sensor) -> Int[np.ndarray, " markers"]:
 def marker_sensitivity(
     margins: Float[np.ndarray, " frames"], *, sensor: Sensor, touch: Touch, displacement: str | None = None
 ) -> Sensitivity:
-    """How the visible markers shift with the safety margin and with every nuisance, by central differences.
+    """Shift of the visible markers with the safety margin and with every nuisance, by central differences.
 
     Parameters
     ----------
@@ -231,17 +231,57 @@ def _bound(
 ) -> float:
     if wrong := set(prior) - set(unknowns):
         raise ContactError(f"there is no unknown {sorted(wrong)[0]!r}; choose from {', '.join(unknowns)}")
+    rows, scale = _observations(jacobian, unknowns, noise_px, prior)
+    # what of the margin's column no nuisance can imitate is what tells it
+    margin, nuisances = rows[:, 0], (rows / scale)[:, 1:]
+    evidence = np.linalg.norm(margin - nuisances @ np.linalg.lstsq(nuisances, margin, rcond=None)[0])
+    return float(1 / evidence) if evidence > 0 else float("inf")
+
+
+def reading_gain(
+    jacobian: Float[np.ndarray, "coordinates unknowns"],
+    unknowns: tuple[str, ...],
+    *,
+    noise_px: float,
+    prior: Mapping[str, float],
+) -> Float[np.ndarray, " coordinates"]:
+    """Gain of the best linear estimator of the margin: how far its reading moves with each coordinate, per pixel.
+
+    The margin's row of (J^T J / sigma^2 + diag(1 / prior^2))^-1 J^T / sigma^2: with infinite priors the best linear
+    unbiased estimator, else the posterior mean.
+
+    Parameters
+    ----------
+    jacobian, unknowns
+        Derivatives of the coordinates, as in `Sensitivity`; the margin first.
+    noise_px, prior
+        As for `margin_bound`.
+
+    Raises
+    ------
+    ContactError
+        If the noise or a standard deviation is not positive.
+    """
+    rows, scale = _observations(jacobian, unknowns, noise_px, prior)
+    return np.linalg.pinv(rows / scale)[0, : len(jacobian)] / (scale[0] * noise_px)
+
+
+def _observations(
+    jacobian: Float[np.ndarray, "coordinates unknowns"],
+    unknowns: tuple[str, ...],
+    noise_px: float,
+    prior: Mapping[str, float],
+) -> tuple[Float[np.ndarray, "rows kept"], Float[np.ndarray, " kept"]]:
+    """Rows of the least squares, a prior being one more observation, and the length of each column.
+
+    Metres, radians and shares stand in one matrix: a column over its length has no unit.
+    """
     sigma = {MARGIN: np.inf, **prior}
     if not (noise_px > 0 and min(sigma.values()) > 0):
         raise ContactError("noise and priors must be positive; leave out of `prior` what is known")
     kept = [index for index, name in enumerate(unknowns) if name in sigma]
-    precision = np.array([1 / sigma[unknowns[index]] for index in kept])
-    # a prior is one more observation; what of the margin's column no nuisance can imitate is what tells it
-    rows = np.concatenate([jacobian[:, kept] / noise_px, np.diag(precision)])
-    scale = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
-    margin, nuisances = rows[:, 0], (rows / scale)[:, 1:]
-    told = np.linalg.norm(margin - nuisances @ np.linalg.lstsq(nuisances, margin, rcond=None)[0])
-    return float(1 / told) if told > 0 else float("inf")
+    rows = np.concatenate([jacobian[:, kept] / noise_px, np.diag([1 / sigma[unknowns[index]] for index in kept])])
+    return rows, np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
 
 
 def _sigma(limits: Range) -> float:
@@ -249,11 +289,11 @@ def _sigma(limits: Range) -> float:
 
 
 def _drift_sigma(limits: Range) -> float:
-    """Of a relative change d p, with p even in [-1, 1] through a trial: E[d^2] / 3 in variance."""
+    """Standard deviation of a relative change d p, p even in [-1, 1] through a trial: its variance is E[d^2] / 3."""
     low, high = limits
     return float(np.sqrt((low**2 + low * high + high**2) / 9))
 
 
 def _log_sigma(limits: Range) -> float:
-    """Of the logarithm of an even draw, on a grid fine enough for four digits."""
+    """Standard deviation of the logarithm of an even draw, on a grid fine enough for four digits."""
     return float(np.std(np.log(np.linspace(*limits, 10_001))))

@@ -1,6 +1,5 @@
 """A stored simulated trial made anew, so that markers can be put back while all else, the noise too, stays."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,10 +15,10 @@ from sliplens.files import RUN_FILE, read_json
 from sliplens.recordings import Recording
 from sliplens.simulation.filming import Film, batches
 from sliplens.simulation.information import (
-    MARGIN,
     Touch,
     marker_sensitivity,
     prior_sigma,
+    reading_gain,
     visible_markers,
 )
 from sliplens.simulation.loading import Loading
@@ -64,7 +63,7 @@ class Outlines:
 
     rest_px: Float[np.ndarray, "markers 2"]
     rest_radius_px: Float[np.ndarray, " markers"]
-    """Of the widest channel."""
+    """Radius in the widest channel."""
     now_px: Float[np.ndarray, "markers 2"]
     now_radius_px: Float[np.ndarray, " markers"]
 
@@ -104,7 +103,7 @@ def rebuild_trial(folder: Path, recording: Recording, *, recipe: SimulationRecip
     Parameters
     ----------
     folder
-        Of its data set.
+        Folder of its data set.
     recording
         The trial, with its truth.
     recipe
@@ -217,50 +216,15 @@ def marker_outlines(film: Film, frame: int) -> Outlines:
 
 
 NOISE_PX = 0.1
-"""Of each coordinate of a marker that is followed in images of this noise, as in docs/limit.md."""
+"""Standard deviation of each coordinate of a marker that is followed in images of this noise (docs/limit.md)."""
 _NEAREST_END = 0.02
 """Margins nearer to 0 or 1 are read with the gain of this one, or of one less this: the ends have no derivative."""
-
-
-def reading_gain(
-    jacobian: Float[np.ndarray, "coordinates unknowns"],
-    unknowns: tuple[str, ...],
-    *,
-    noise_px: float,
-    prior: Mapping[str, float],
-) -> Float[np.ndarray, " coordinates"]:
-    """Gain of the best linear estimator of the margin: how far its reading moves with each coordinate, per pixel.
-
-    The margin's row of (J^T J / sigma^2 + diag(1 / prior^2))^-1 J^T / sigma^2: with infinite priors the best linear
-    unbiased estimator, else the posterior mean.
-
-    Parameters
-    ----------
-    jacobian, unknowns
-        Derivatives of the coordinates, as in `Sensitivity`; the margin first.
-    noise_px, prior
-        As for `margin_bound`.
-
-    Raises
-    ------
-    ContactError
-        If the noise or a standard deviation is not positive.
-    """
-    sigma = {MARGIN: np.inf, **prior}
-    if not (noise_px > 0 and min(sigma.values()) > 0):
-        raise ContactError("noise and priors must be positive; leave out of `prior` what is known")
-    kept = [index for index, name in enumerate(unknowns) if name in sigma]
-    # a prior is one more observation
-    rows = np.concatenate([jacobian[:, kept] / noise_px, np.diag([1 / sigma[unknowns[index]] for index in kept])])
-    # metres, radians and shares in one matrix: each in its own unit length
-    scale = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
-    return np.linalg.pinv(rows / scale)[0, : len(jacobian)] / (scale[0] * noise_px)
 
 
 def marker_readings(
     trial: FilmedTrial, frame: int, *, noise_px: float = NOISE_PX
 ) -> tuple[Int[np.ndarray, " markers"], Float[np.ndarray, " markers"]]:
-    """What each marker that lies wholly in the image adds to the best reading of a frame's margin.
+    """Part of each marker that lies wholly in the image in the best reading of a frame's margin.
 
     Parameters
     ----------

@@ -19,12 +19,12 @@ from sliplens.simulation.nuisances import Grasp
 from sliplens.simulation.sensor import Sensor
 
 _FITTED_FRICTION = 0.775
-"""Ascribed to the trial of the real images, which names none: the geometric mean of the dry range (assumed)."""
+"""Friction ascribed to the trial of the real images, which names none: the dry range's geometric mean (assumed)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Displacement:
-    """How a fingertip gives way: an elastic half-space held by its base, and a shear of the whole skin."""
+    """Give of a fingertip: an elastic half-space held by its base, and a shear of the whole skin."""
 
     layer: float
     """Indentation over Hertz's for the same contact: on a hard core the gel is a layer; a thin one has half of it."""

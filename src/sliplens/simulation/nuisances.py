@@ -26,9 +26,9 @@ class Nuisances:
     """
 
     dry_friction: Range = (0.5, 1.2)
-    """By day; days are spread over the range."""
+    """Friction of a day's dry object; days are spread over the range."""
     dry_friction_factor: Range = (0.9, 1.1)
-    """By trial, of the day's friction."""
+    """Friction of a dry trial over its day's."""
     wet_friction: Range = (0.15, 0.7)
     wet_friction_drift: Range = (-0.15, 0.15)
     """Relative change over a wet trial."""
@@ -43,7 +43,7 @@ class Nuisances:
     contact_offset: Range = (0.0, 0.12)
     tilt_deg: Range = (-5.0, 5.0)
     shear_direction_deg: Range = (75.0, 105.0)
-    """90 pulls down the image, as the thesis does."""
+    """Direction of the pull; 90 is down the image, as in the thesis."""
     shear_exponent: Range = (0.45, 0.7)
     creep: Range = (0.03, 0.08)
     creep_time_s: Range = (0.5, 3.0)
@@ -52,13 +52,13 @@ class Nuisances:
     illumination_gradient: Range = (0.0, 0.25)
     """Brightness lost across the image, in a direction drawn by day."""
     glare: Range = (0.5, 1.1)
-    """Of the lamps' reflections, over the sensor's."""
+    """Strength of the lamps' reflections over the sensor's."""
     camera_shift_px: Range = (-3.0, 3.0)
     camera_rotation_deg: Range = (-3.0, 3.0)
     marker_jitter_px: float = 0.4
     """Standard deviation of the markers' centres, by sensor."""
     marker_depth: Range = (0.0, 0.1)
-    """Under the skin, by sensor."""
+    """Depth of a sensor's markers under the skin."""
     marker_radius: Range = (0.95, 1.05)
     marker_contrast: Range = (0.85, 1.15)
     blur_px: Range = (0.0, 1.0)
@@ -99,7 +99,7 @@ _NOT_NEGATIVE = frozenset(
 
 @dataclass(frozen=True, kw_only=True)
 class Day:
-    """What stays the same for a day: the friction of the dry object, the gel's stiffness, light and camera."""
+    """Facts of a day: the friction of the dry object, the gel's stiffness, light and camera."""
 
     friction: float = 0.775
     modulus_factor: float = 1.0
@@ -114,29 +114,29 @@ class Day:
 
 @dataclass(frozen=True, kw_only=True)
 class Unit:
-    """What stays the same for one built sensor: where its markers came to lie, their size and dye."""
+    """Facts of one built sensor: where its markers came to lie, their size and dye."""
 
     marker_jitter_px: Float[np.ndarray, "markers 2"]
     marker_depth: float
-    """Under the skin, in radii of the contact's sphere."""
+    """Depth of the markers under the skin, in radii of the contact's sphere."""
     radius_factor: Float[np.ndarray, " markers"]
     contrast_factor: Float[np.ndarray, " markers"]
     texture_seed: int
-    """Of the grain of its print."""
+    """Seed of the grain of its print."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Grasp:
-    """What stays the same for one trial; the defaults are the trial of the real images, as far as they tell."""
+    """Facts of one trial; the defaults are the trial of the real images, as far as they tell."""
 
     friction: float = 0.775
-    """The images name none: the geometric mean of the dry range (assumed)."""
+    """Coefficient of friction; the images name none: the geometric mean of the dry range (assumed)."""
     friction_drift: float = 0.0
     kinetic_ratio: float = 1.0
     stick_slip_share: float = 0.0
     stick_slip_hz: float = 4.0
     normal_force_n: float = 1.86
-    """What gives the fitted radius of contact with the sensor's effective modulus."""
+    """Force that gives the fitted radius of contact with the sensor's effective modulus."""
     normal_force_drift: float = 0.0
     contact_offset: tuple[float, float] = (0.092, -0.033)
     tilt_rad: tuple[float, float] = (0.0, 0.0)

@@ -43,22 +43,22 @@ class SimulationRecipe:
     wet_trials: int = 10
     frames_per_trial: int = 200
     frame_totals: FrameTotals | None = None
-    """If given, trials differ in length by a tenth so that each split has exactly so many frames."""
+    """Frames of each split, if given: trials then differ in length by a tenth to make them up."""
     release: bool = False
     """Let go of the object at the end of each trial."""
     days: int = 4
     test_day: int | None = None
     """The last day if None."""
     test_days: int = 1
-    """How many of the last days test, where no `test_day` is named: with one alone, one friction and one light decide
+    """Number of last days that test, where no `test_day` is named: with one alone, one friction and one light decide
     the score."""
     validation_share: float = 0.25
-    """Of the dry trials of the days between."""
+    """Share of the dry trials of the days between that validates."""
     sensor: Sensor = CHROMATOUCH
     displacement: str | None = None
-    """How the markers move; see `move_markers`. The sensor's default if None."""
+    """Model that moves the markers, see `move_markers`; the sensor's default if None."""
     sensors: int = 2
-    """How many were built: their markers differ a little."""
+    """Number of sensors built: their markers differ a little."""
     seed: int = 0
     nuisances: Nuisances = field(default_factory=Nuisances)
 
@@ -117,7 +117,7 @@ class SimulationRecipe:
 
     @property
     def resolved_displacement(self) -> str:
-        """How the markers move."""
+        """Model that moves the markers."""
         return self.sensor.displacements[0] if self.displacement is None else self.displacement
 
     @property
@@ -139,13 +139,13 @@ class TrialPlan:
     """train, validation or test."""
     frames: int
     seed: int
-    """Of this trial alone: other trials come and go without changing it."""
+    """Seed of this trial alone: other trials come and go without changing it."""
     unit: int
-    """Which built sensor, from 0."""
+    """Number of the built sensor, from 0."""
     unit_seed: int
     day_draw: Day
     recipe: SimulationRecipe
-    """For what all trials have in common."""
+    """Recipe that all trials have in common."""
     recipe_hash: str
 
 

@@ -114,12 +114,12 @@ _PATCH = 32
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """What the camera sees in a batch of frames, before noise."""
+    """View of the camera in a batch of frames, before noise."""
 
     centres_px: Float[np.ndarray, "frames markers 2"]
     markers: DrawnMarkers
     texture: Float32[np.ndarray, "3 markers side side"]
-    """From `draw_texture`."""
+    """Grain of the print, from `draw_texture`."""
     light: Float32[np.ndarray, "3 height width"]
     """Brightness over the sensor's, the same for all frames."""
     empty: Float32[np.ndarray, "3 height width"]
@@ -127,7 +127,7 @@ class Scene:
     haze: Float32[np.ndarray, "3 height width"]
     """Grey levels that full contact adds."""
     touch: Float[np.ndarray, " frames"]
-    """How much of the haze each frame has."""
+    """Share of the haze that each frame has."""
     relief: Float32[np.ndarray, "3 height width"] | None
     """Relative change of brightness where the skin slopes by 1; None where slopes do not show."""
     slope: Float32[np.ndarray, "frames height width"] | None

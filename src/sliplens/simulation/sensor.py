@@ -26,7 +26,7 @@ class Noise:
     background: tuple[float, float, float]
     marker: tuple[float, float, float]
     edge: float
-    """How far the noise of a marker's edge, where the video's compression rings, exceeds that inside: at a share s of
+    """Excess of the noise of a marker's edge, where the video's compression rings, over that inside: at a share s of
     marker in the pixel the noise has s (1 + edge (1 - s)) of the marker's excess over the background's."""
     smoothness: float
     """Weight w of the neighbour's noise in a pixel; the lag-1 correlation is w / (1 + w^2)."""
@@ -40,7 +40,7 @@ class Noise:
 
 @dataclass(frozen=True, kw_only=True)
 class NoisePicks:
-    """Which two fields of the bank each frame adds, and where their windows begin (row, column)."""
+    """Two fields of the bank that each frame adds, and where their windows begin (row, column)."""
 
     field: Int[np.ndarray, "frames 2"]
     corner: Int[np.ndarray, "frames 2 2"]
@@ -203,11 +203,11 @@ class Light:
     """A coloured lamp at the side of the gel: skin that leans towards it brightens, skin that leans away darkens."""
 
     direction_deg: float
-    """From where it shines, as seen in the image: 0 from the right, 90 from below."""
+    """Direction it shines from, as seen in the image: 0 from the right, 90 from below."""
     share: Rgb
-    """Of the background's brightness."""
+    """Share of the background's brightness."""
     fall: float
-    """Share of that won at the edge of the image near the lamp, and lost at the other."""
+    """Share of its light won at the edge of the image near the lamp, and lost at the other."""
     relief: float
     """Relative change of its brightness for a slope of 1."""
 
@@ -217,11 +217,11 @@ class Glare:
     """Reflections of the lamps, evenly spaced on a circle round the view."""
 
     centre_px: tuple[float, float]
-    """Of the circle: x, y."""
+    """Centre (x, y) of the circle."""
     radius_px: float
     lamps: int = 6
     bearing_deg: float
-    """Where the first lamp is seen, from the right towards below."""
+    """Bearing of the first lamp, from the right towards below."""
     width_px: float
     """Standard deviation of a lamp's glare."""
     colour: Rgb
@@ -243,17 +243,17 @@ class Sensor:
     name: str
     geometry: Geometry
     youngs_modulus_pa: float
-    """Of the gel."""
+    """Young's modulus of the gel."""
     poisson_ratio: float
     effective_modulus_pa: float | None = None
-    """What the calibrated marker motion needs, core and large strains included; radius and modulus are not separable
-    there. None where no motion was calibrated."""
+    """Modulus that the calibrated marker motion needs, core and large strains included; radius and modulus are not
+    separable there. None where no motion was calibrated."""
     image_size_px: int
     look: MarkerLook
     background: Rgb
-    """In the middle of the image."""
+    """Colour in the middle of the image."""
     lights: tuple[Light, ...] = ()
-    """What makes slopes of the skin visible; none where the skin is lit evenly."""
+    """Lamps that make slopes of the skin visible; none where the skin is lit evenly."""
     glare: Glare | None = None
     vignette: float
     """Brightness lost at half the image's diagonal, growing with the square of the distance from its middle."""
