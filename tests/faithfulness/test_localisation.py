@@ -4,8 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sliplens.errors import InputError, SaliencyError
-from sliplens.faithfulness.localisation import marker_agreement, relevance_mass, relevance_rank
-from sliplens.faithfulness.units import marker_units
+from sliplens.faithfulness.localisation import relevance_mass, relevance_rank
 
 
 @pytest.fixture
@@ -47,13 +46,3 @@ def test_what_cannot_be_localised_is_refused(truth: np.ndarray):
     with pytest.raises(SaliencyError, match=r"the map has shape \(3, 3\) but its image is 8 x 10"):
         relevance_rank(np.ones((3, 3)), truth)
     assert np.isnan(relevance_mass(np.zeros((8, 10)), truth))
-
-
-def test_markers_agree_by_rank_alone(rng: np.random.Generator):
-    centres = np.array([[x, y] for x in (10.0, 30.0, 50.0) for y in (10.0, 30.0)])
-    units = marker_units((40, 60), centres, reach_px=8.0)
-    effects = rng.normal(size=6)
-    relevance = np.append(np.exp(effects), 100.0)[units]  # rising in the effect; what lies beyond does not count
-    assert marker_agreement(relevance, units, effects) == pytest.approx(1)
-    assert marker_agreement(-relevance, units, effects) == pytest.approx(-1)
-    assert np.isnan(marker_agreement(np.ones((40, 60)), units, effects))

@@ -47,11 +47,6 @@ def hires_cam_map(
 ) -> Float[Tensor, "batch rows columns"]:
     """HiResCAM: sum over c of df/dA_c A_c, cell by cell, in margin units; Grad-CAM where the gradient is constant.
 
-    Parameters
-    ----------
-    activations, gradients
-        A, the output of a layer, and df/dA.
-
     References
     ----------
     Draelos and Carin, *Use HiResCAM instead of Grad-CAM for faithful explanations of convolutional neural networks*,
@@ -65,11 +60,6 @@ def layer_cam_map(
     gradients: Float[Tensor, "batch channels rows columns"],
 ) -> Float[Tensor, "batch rows columns"]:
     """LayerCAM before its last ReLU: sum over c of relu(df/dA_c) A_c, cell by cell, in margin units.
-
-    Parameters
-    ----------
-    activations, gradients
-        A, the output of a layer, and df/dA.
 
     References
     ----------
@@ -190,10 +180,7 @@ class HiResCam(_Cam):
     As Grad-CAM, but each cell is weighted by its own gradient (`hires_cam_map`), so that the map shows where the layers
     behind look. With the mean over space as head the two are the same.
 
-    Parameters
-    ----------
-    layer, contrast, batch_size
-        As for `GradCam`.
+    Options are those of `GradCam`.
     """
 
     method: ClassVar[str] = "hires-cam"
@@ -212,10 +199,7 @@ class LayerCam(_Cam):
     s = sign(f(x) - f(b)) the map is s sum over c of relu(s df/dA_c) (A_c(x) - A_c(b)). The rest is left out, so the map
     adds up to nothing in particular and has no completeness gap.
 
-    Parameters
-    ----------
-    layer, contrast, batch_size
-        As for `GradCam`.
+    Options are those of `GradCam`.
     """
 
     method: ClassVar[str] = "layer-cam"

@@ -79,8 +79,8 @@ class _Sum(nn.Module):
         super().__init__()
         self.inner = inner
 
-    def forward(self, one: Tensor, other: Tensor) -> Tensor:
-        return self.inner(torch.stack(torch.broadcast_tensors(one, other), dim=-1))
+    def forward(self, left: Tensor, right: Tensor) -> Tensor:
+        return self.inner(torch.stack(torch.broadcast_tensors(left, right), dim=-1))
 
 
 class _Mean(nn.Module):

@@ -97,10 +97,10 @@ def local_change(
     return functional.avg_pool2d(padded, 2 * reach + 1, stride=1)[0, 0]
 
 
-def pearson_r(one: Float[Tensor, "height width"], other: Float[Tensor, "height width"]) -> float:
+def pearson_r(first: Float[Tensor, "height width"], second: Float[Tensor, "height width"]) -> float:
     """Correlation of two maps over their pixels; NaN where one of them is constant."""
-    one, other = (values.flatten().double() - values.double().mean() for values in (one, other))
-    return float(one @ other / (one.norm() * other.norm()))
+    first, second = (values.flatten().double() - values.double().mean() for values in (first, second))
+    return float(first @ second / (first.norm() * second.norm()))
 
 
 def top_overlap(

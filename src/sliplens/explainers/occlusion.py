@@ -47,29 +47,14 @@ def find_markers(
 
 
 def markers_in_frame(frame: UInt8[np.ndarray, "height width 3"], *, image_size: int) -> Float[Tensor, "markers 2"]:
-    """Places (x, y) of the markers of a camera frame, in pixels of the network's square image.
-
-    Raises
-    ------
-    InputError
-        If OpenCV is missing.
-    ImageError
-        If too few markers are found.
-    """
+    """Places (x, y) of the markers of a camera frame, in the network's image; errors as `find_markers`."""
     return _scaled(detect_markers(frame).centre_px, frame.shape[:2], image_size)
 
 
 def markers_in_recording(recording: Recording, row: int, *, image_size: int) -> Float[Tensor, "markers 2"]:
     """Places (x, y) of the markers in one frame of a trial, in pixels of the network's square image.
 
-    The simulator's own where the trial has a truth, else found in the frame.
-
-    Raises
-    ------
-    InputError
-        If OpenCV is missing where markers have to be found.
-    ImageError
-        If too few markers are found.
+    The simulator's own where the trial has a truth, else found in the frame, with the errors of `find_markers`.
     """
     if recording.truth is None:
         return markers_in_frame(recording.frames[row], image_size=image_size)

@@ -28,13 +28,6 @@ def mask_kernel(regions: Regions, channels: Int[Tensor, " some"]) -> Float[Tenso
     the reference a mask shows nothing. The kernel is the roughest of the Matern family, which asks no smoothness of
     the network; its length is three times the median distance.
 
-    Parameters
-    ----------
-    regions
-        Of one image.
-    channels
-        Of all layers in a row.
-
     References
     ----------
     Rasmussen and Williams, *Gaussian processes for machine learning* (2006), eq. 4.18.
@@ -78,12 +71,7 @@ class GaussianProcess:
     def choose(self, count: int, *, importance: Float[Tensor, " channels"]) -> Int[Tensor, " count"]:
         """Choose channels, each the one with the most importance x standard deviation left after those before it.
 
-        Parameters
-        ----------
-        count
-            How many.
-        importance
-            What an error of the channel's effect costs, >= 0.
+        Importance is what an error of the channel's effect costs, >= 0.
         """
         chosen = []
         self._factor = torch.cat([self._factor, self._factor.new_zeros(len(self._factor), count)], dim=1)

@@ -45,7 +45,7 @@ def follows_last_step(
     score, last
         Score of each image, and its value at the last step.
     name
-        Of the score, for the sentence.
+        Name of the score, for the sentence.
     """
     if len(score) < _FEWEST or np.std(score) == 0 or np.std(last) == 0:
         return []
@@ -63,13 +63,13 @@ def saturated(answers: Float[np.ndarray, " images"]) -> list[str]:
 
 def flat_maps(maps: Mapping[str, Float[np.ndarray, "images height width"]]) -> list[str]:
     """Say which methods gave maps that are constant, or hold NaN: they rank nothing."""
-    told = []
+    alarms = []
     for method, values in maps.items():
         bad = int(np.sum(~np.isfinite(values).all(axis=(1, 2))))
         flat = int(np.sum(values.max(axis=(1, 2)) == values.min(axis=(1, 2))))
-        told += [f"{method}: {bad} of {len(values)} maps hold NaN or infinity"] if bad else []
-        told += [f"{method}: {flat} of {len(values)} maps are constant and rank nothing"] if flat else []
-    return told
+        alarms += [f"{method}: {bad} of {len(values)} maps hold NaN or infinity"] if bad else []
+        alarms += [f"{method}: {flat} of {len(values)} maps are constant and rank nothing"] if flat else []
+    return alarms
 
 
 def rankings_disagree(scores: Mapping[str, Mapping[str, float]]) -> list[str]:
@@ -84,7 +84,7 @@ def rankings_disagree(scores: Mapping[str, Mapping[str, float]]) -> list[str]:
     ----------
     Kendall, *A new measure of rank correlation* (1938).
     """
-    told, names = [], list(scores)
+    alarms, names = [], list(scores)
     for number, first in enumerate(names):
         for second in names[number + 1 :]:
             methods = sorted(set(scores[first]) & set(scores[second]))
@@ -93,27 +93,27 @@ def rankings_disagree(scores: Mapping[str, Mapping[str, float]]) -> list[str]:
             ranked = ([scores[fill][method] for method in methods] for fill in (first, second))
             tau = float(np.asarray(kendalltau(*ranked))[0])
             if not tau >= _SAME_ORDER:
-                told.append(
+                alarms.append(
                     f"{first} and {second} rank the methods differently (Kendall's tau {tau:.2f}): which is best "
                     "depends on what removed pixels become"
                 )
-    return told
+    return alarms
 
 
-def controls_win(found: Mapping[str, Faithfulness], controls: Mapping[str, Faithfulness]) -> list[str]:
+def controls_win(scores: Mapping[str, Faithfulness], controls: Mapping[str, Faithfulness]) -> list[str]:
     """Say which methods gain no more than a map that knows nothing of the network, or than random orders.
 
     Parameters
     ----------
-    found, controls
+    scores, controls
         Scores of the methods, and of the controls, on the same images.
     """
-    told = []
+    alarms = []
     best = max(controls, key=lambda name: float(controls[name].symmetric_gain.mean()), default=None)
-    for method, score in found.items():
+    for method, score in scores.items():
         gain = float(score.symmetric_gain.mean())
         if gain <= 0:
-            told.append(f"{method} does not beat a random order: its symmetric gain is {gain:.3f}")
+            alarms.append(f"{method} does not beat a random order: its symmetric gain is {gain:.3f}")
         elif best is not None and gain <= (control := float(controls[best].symmetric_gain.mean())):
-            told.append(f"{method} gains {gain:.3f}, no more than the control {best} ({control:.3f})")
-    return told
+            alarms.append(f"{method} gains {gain:.3f}, no more than the control {best} ({control:.3f})")
+    return alarms

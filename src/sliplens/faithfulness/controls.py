@@ -9,7 +9,7 @@ from torch.nn import functional
 
 Maps = Float[Tensor, "images height width"]
 _CENTRE_SD = 0.25
-"""Of the centred Gaussian, in widths of the image."""
+"""Standard deviation of the centred Gaussian, in widths of the image."""
 
 
 def edges(images: Float[Tensor, "images 3 height width"]) -> Maps:

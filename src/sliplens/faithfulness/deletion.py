@@ -214,10 +214,16 @@ def deletion_curves(
 
 
 def saliency_orders(saliency: Float[np.ndarray, "images height width"], shape: tuple[int, int]) -> np.ndarray:
-    """Deletion orders of several maps, each checked against the image's shape and for NaN."""
+    """Deletion orders of several maps.
+
+    Raises
+    ------
+    SaliencyError
+        If a map has another shape than the image, or holds NaN.
+    """
     return np.stack(
         [
-            deletion_order(require_saliency(one, shape, where=f"saliency map {index}"))
-            for index, one in enumerate(saliency)
+            deletion_order(require_saliency(each, shape, where=f"saliency map {index}"))
+            for index, each in enumerate(saliency)
         ]
     )

@@ -12,7 +12,7 @@ from sliplens.errors import InputError
 from sliplens.extras import Table
 
 NOISE_SD = 0.01
-"""Of ROAD, in units of the image's range."""
+"""Standard deviation of ROAD's noise, in units of the image's range."""
 _KERNEL = torch.tensor([[1 / 12, 1 / 6, 1 / 12], [1 / 6, 0.0, 1 / 6], [1 / 12, 1 / 6, 1 / 12]])
 _SMALL = 8
 _TOLERANCE = 1e-3
@@ -62,7 +62,7 @@ def noisy_linear(
     # channels last: the small convolution of every step is six times as fast on a CPU; a mask for each colour, since
     # there a product with one for all of them takes six times as long
     each, mask = (
-        one.contiguous(memory_format=torch.channels_last) for one in (images, gone[:, None].expand(images.shape))
+        values.contiguous(memory_format=torch.channels_last) for values in (images, gone[:, None].expand(images.shape))
     )
     filled = _solve(each, mask, tolerance=tolerance)
     if noise is not None:
@@ -93,8 +93,8 @@ def _solve(
     # in place wherever it can be: fresh memory of this size costs more than the arithmetic
     scratch = torch.empty_like(filled)
 
-    def dot(one: Tensor, other: Tensor) -> Tensor:
-        return torch.mul(one, other, out=scratch).sum(dim=(1, 2, 3), keepdim=True)
+    def dot(left_values: Tensor, right_values: Tensor) -> Tensor:
+        return torch.mul(left_values, right_values, out=scratch).sum(dim=(1, 2, 3), keepdim=True)
 
     # a whole image that is gone has its mean for a solution, and a matrix that is singular
     inside = hole * (known > 0)
@@ -199,12 +199,12 @@ less.
 
 
 def get_fill(name: str) -> Fill:
-    """Look up a fill by name.
+    """Fill of a name.
 
     Raises
     ------
     InputError
-        If there is none of that name; the message lists those there are.
+        If there is none; the message lists those there are.
 
     Examples
     --------

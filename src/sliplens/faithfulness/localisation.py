@@ -2,11 +2,9 @@
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import spearmanr
 
 from sliplens.arrays import require_saliency
 from sliplens.errors import InputError
-from sliplens.faithfulness.units import Units, unit_means
 
 
 def relevance_mass(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "height width"]) -> float:
@@ -70,34 +68,6 @@ def relevance_rank(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "
     # of the pixels at the cut, as many as are still wanted: on average their share inside
     wanted = size - int(above.sum())
     return float((inside[above].sum() + wanted * inside[level].mean()) / size)
-
-
-def marker_agreement(
-    relevance: Float[np.ndarray, "_ _"], units: Units, effects: Float[np.ndarray, " markers"]
-) -> float:
-    """Spearman's rank correlation between a map's mean over each marker and what moving that marker really does.
-
-    Parameters
-    ----------
-    relevance
-        Signed map or saliency.
-    units
-        Number of each pixel's marker (`marker_units`); units beyond the markers are left out.
-    effects
-        Change of the answer, or of the true margin, when this marker alone is put back where it rested.
-
-    Returns
-    -------
-    float
-        Between -1 and 1; NaN where one of the two does not vary.
-    """
-    require_saliency(relevance, units.shape, where="the map")
-    means = unit_means(relevance, units)[: len(effects)]
-    # a marker outside the image has no pixel
-    seen = np.isfinite(means)
-    if seen.sum() < 2 or np.ptp(means[seen]) == 0 or np.ptp(effects[seen]) == 0:
-        return float("nan")
-    return float(np.asarray(spearmanr(means[seen], effects[seen]))[0])
 
 
 def _require(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "height width"]) -> None:

@@ -72,11 +72,11 @@ def resolution(saliency: Float[np.ndarray, "height width"], markers_px: Float[np
     if len(markers_px) < 2:
         raise InputError("resolution needs two markers or more")
     _, nearest = KDTree(markers_px).query(markers_px, k=2)
-    pairs = {(min(one, other), max(one, other)) for one, other in np.asarray(nearest).tolist()}
+    pairs = {(min(first, second), max(first, second)) for first, second in np.asarray(nearest).tolist()}
     depths = []
-    for one, other in sorted(pairs):
+    for first, second in sorted(pairs):
         along = np.linspace(0, 1, _SAMPLES)[:, None]
-        x, y = ((1 - along) * markers_px[one] + along * markers_px[other]).T
+        x, y = ((1 - along) * markers_px[first] + along * markers_px[second]).T
         values = map_coordinates(saliency, [y, x], order=1, mode="nearest")
         third = _SAMPLES // 3
         peaks = (values[: third + 1].max(), values[-third - 1 :].max())

@@ -53,13 +53,13 @@ def cascade(
     Parameters
     ----------
     model
-        Left as it is.
+        Network; left as it is.
     seed
-        Of the new weights.
+        Seed of the new weights.
     stages
-        Give so many steps, evenly spread, the last of which has all weights new; every layer if None.
+        Number of steps, evenly spread, the last of which has all weights new; every layer if None.
     images
-        What the statistics of new normalisation layers are of, two at least; None for 0 and 1.
+        Images whose statistics new normalisation layers get, two at least; None for 0 and 1.
 
     References
     ----------
@@ -155,7 +155,7 @@ def randomisation_scores(
         after = explain(step.model, images)
         similarity.append(stability(before, after))
         layers.append(step.randomised)
-    first, last = (np.array([histogram_entropy(one) for one in maps]) for maps in (before, after))
+    first, last = (np.array([histogram_entropy(values) for values in maps]) for maps in (before, after))
     with np.errstate(invalid="ignore", divide="ignore"):
         rise = (last - first) / first
     return RandomisationScores(layers=tuple(layers), similarity=np.stack(similarity), complexity_rise=rise)

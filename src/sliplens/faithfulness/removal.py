@@ -83,16 +83,16 @@ def _paint(
 ) -> Iterator[Tensor]:
     ranked, rank = None, torch.empty(0)
     left = iter(removals)
-    while some := list(islice(left, batch_size)):
-        gone = torch.empty((len(some), *shape), dtype=torch.bool)
-        for at, removal in enumerate(some):
+    while batch := list(islice(left, batch_size)):
+        gone = torch.empty((len(batch), *shape), dtype=torch.bool)
+        for row, removal in enumerate(batch):
             if removal.order is not ranked:
                 ranked = removal.order
                 rank = torch.empty(len(ranked), dtype=torch.int32)
                 rank[torch.from_numpy(ranked)] = torch.arange(len(ranked), dtype=torch.int32)
                 rank = rank.view(shape)
-            gone[at] = rank < removal.pixels
-        rows = torch.tensor([removal.image for removal in some], device=device)
+            gone[row] = rank < removal.pixels
+        rows = torch.tensor([removal.image for removal in batch], device=device)
         yield paint(rows, gone.to(device))
 
 
@@ -312,7 +312,7 @@ def removal_curves(
     shape = (images.shape[-2], images.shape[-1])
     removed = np.round(shares * shape[0] * shape[1]).astype(np.int64)
     jobs = list(_jobs(orders, removed))
-    told = answer_removals(
+    answered = answer_removals(
         predict,
         fill(images, references, seed),
         [Removal(image=image, order=orders[order, image], pixels=int(removed[step])) for image, order, step in jobs],
@@ -323,7 +323,7 @@ def removal_curves(
     )
     answers = np.empty((len(orders), len(images), len(shares)))
     answers[:, :, 0] = answer_whole(predict, images, batch_size=batch_size)
-    for (image, order, step), value in zip(jobs, told, strict=True):
+    for (image, order, step), value in zip(jobs, answered, strict=True):
         answers[order, image, step] = value
     answers[:, :, -1] = answers[0, :, -1]
     return RemovalCurves(areas=shares, answers=answers)

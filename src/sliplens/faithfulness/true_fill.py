@@ -54,11 +54,11 @@ def marker_curves(
         rank = np.argsort(orders[:, image], axis=-1)
         back = rank[:, None] < counts[:, None]
         distinct, asked = np.unique(back.reshape(-1, markers), axis=0, return_inverse=True)
-        told = [
+        answered = [
             answer_whole(predict, redraw(image, distinct[start : start + batch_size]), batch_size=batch_size)
             for start in range(0, len(distinct), batch_size)
         ]
-        answers[:, image] = np.concatenate(told)[asked].reshape(back.shape[:2])
+        answers[:, image] = np.concatenate(answered)[asked].reshape(back.shape[:2])
         if on_progress is not None:
             on_progress(image + 1, images)
     return RemovalCurves(areas=areas, answers=answers)
