@@ -21,8 +21,6 @@ def capture(model: nn.Module, names: Sequence[str], *, differentiable: bool = Fa
 
     Parameters
     ----------
-    model
-        Network to listen to.
     names
         Modules, by their names in `model.named_modules()`. Of a module called twice the last output is kept.
     differentiable

@@ -162,8 +162,6 @@ class GradCam(_Cam):
     contrast
         Take the reference's activations off. False gives the published map, which does not depend on the reference and
         has no completeness gap; the reference then only decides what `saliency` shows.
-    batch_size
-        Images in one pass.
     """
 
     method: ClassVar[str] = "grad-cam"

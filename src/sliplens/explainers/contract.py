@@ -39,8 +39,6 @@ class Explainer(Protocol):
         reference
             What the images are compared with, float in [0, 1], one for all (3, height, width) or one each
             (batch, 3, height, width); by default zeros, the untouched sensor of difference images.
-        on_progress
-            Called with the pieces of work done and their total.
 
         Raises
         ------

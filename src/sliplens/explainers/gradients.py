@@ -52,8 +52,6 @@ class IntegratedGradients(Method):
         line, as it was published.
     tolerance
         Completeness gap allowed, as a share of |f(x) - f(b)|.
-    batch_size
-        Steps in one pass.
 
     References
     ----------
@@ -257,8 +255,6 @@ class SmoothGrad(Method):
         Noisy copies of each image.
     noise
         Standard deviation of the noise, in units of the input's range [0, 1].
-    batch_size
-        Copies in one pass.
     seed
         Of the noise, the same for each image.
 

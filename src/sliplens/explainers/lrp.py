@@ -31,11 +31,6 @@ class Lrp(Method):
     branches, functions in TorchVision's networks, are made modules: zennit knows rules for modules only, and would
     hand relevance back from a mean in equal parts, and twice from a sum.
 
-    Parameters
-    ----------
-    batch_size
-        Images in one pass.
-
     References
     ----------
     Bach et al., *On pixel-wise explanations for non-linear classifier decisions by layer-wise relevance propagation*,

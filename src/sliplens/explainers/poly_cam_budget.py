@@ -193,8 +193,6 @@ def estimate_weights(
         Supports of channels, in rising order; see `Score.support`.
     to_map
         The map that weights of each layer give.
-    seed
-        Of the draws.
 
     Returns
     -------

@@ -62,8 +62,6 @@ def explain(
         Frame of the untouched sensor, T_0. A network on difference images needs none.
     method
         Row of `EXPLAINERS`, or an explainer.
-    on_progress
-        Called with the pieces of work done and their total.
     options
         Options of the method, such as `budget=0.25` of `poly-cam`: the fields of its class.
 
@@ -139,8 +137,6 @@ def network_images(
 
     Parameters
     ----------
-    trained
-        The network.
     frames, reference
         As `explain` takes them.
 

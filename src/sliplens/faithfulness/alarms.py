@@ -23,8 +23,6 @@ def fill_decides(whole: Float[np.ndarray, " images"], filled: Float[np.ndarray, 
     ----------
     whole, filled
         Answers on the images, and on images of nothing but fill, in margin units.
-    fill
-        Its name.
     """
     near = int(np.sum(np.abs(whole - filled) < FILL_DECIDES))
     if not near:

@@ -161,18 +161,12 @@ def deletion_curves(
         Inputs in [0, 1].
     orders
         Flat pixel indices for each image, first to be removed first (`deletion_order`, `random_order`).
-    fill
-        What removed pixels become (`get_fill`).
     references
         Inputs of the untouched sensor, for the fill that needs them.
     steps
         Number of steps; the image's height if None, as in the thesis.
-    seed
-        For the fill that adds noise.
     batch_size
         Masked images that are made and answered at a time: bounds the memory.
-    on_progress
-        Called with the number of images done and the number of all.
 
     Examples
     --------

@@ -35,8 +35,6 @@ def noisy_linear(
     ----------
     images
         Images in [0, 1].
-    gone
-        Pixels to fill.
     noise
         Standard normal numbers; scaled to ROAD's 0.01 and added where pixels were filled. None without noise.
     tolerance

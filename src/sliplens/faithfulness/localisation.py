@@ -16,8 +16,6 @@ def relevance_mass(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "
     ----------
     saliency
         Map of what matters, not negative.
-    truth
-        Where it ought to lie.
 
     Raises
     ------

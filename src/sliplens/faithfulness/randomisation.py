@@ -54,8 +54,6 @@ def cascade(
     ----------
     model
         Network; left as it is.
-    seed
-        Seed of the new weights.
     stages
         Number of steps, evenly spread, the last of which has all weights new; every layer if None.
     images
@@ -132,12 +130,8 @@ def randomisation_scores(
 
     Parameters
     ----------
-    explain
-        From a network and inputs to maps.
     model
         The trained network; left as it is.
-    images
-        Inputs to explain.
     seed, stages
         See `cascade`.
     before

@@ -38,14 +38,10 @@ def marker_curves(
     ----------
     predict
         As `removal_curves` takes it.
-    redraw
-        Draws the images.
     orders
         Places among an image's markers, first to be put back first.
     batch_size
         Images that are drawn and answered at a time: bounds the memory.
-    on_progress
-        Called with the number of images done and the number of all.
     """
     areas, (_, images, markers) = np.asarray(SHARES), orders.shape
     counts = np.round(areas * markers).astype(np.int64)
@@ -92,12 +88,8 @@ def marker_faithfulness(
     influence
         How much each marker matters, by method (`unit_means`): larger goes first. Of signed relevance give the part
         that works towards the target, `relevance * sign(target)`.
-    rng
-        Source of the random orders.
     towards
         As `faithfulness` takes it.
-    random_orders
-        How many of them.
 
     Raises
     ------

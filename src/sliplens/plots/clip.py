@@ -74,8 +74,6 @@ def write_clip(
         File to write, .mp4 (H.264).
     frames_per_s
         Frames a second of the clip; by default the recording's own if between 25 and 30, otherwise 30.
-    on_frames
-        Called with the frames done and the frames in all, after each.
 
     Raises
     ------
@@ -283,10 +281,6 @@ def draw_tracked(
 
     Parameters
     ----------
-    frame
-        RGB.
-    tracked
-        Its markers.
     rest_px
         Where those of the reference frame were.
     scale

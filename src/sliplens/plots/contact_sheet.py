@@ -96,8 +96,6 @@ def draw_contact_sheet(recordings: Sequence[Recording], *, title: str | None = N
     ----------
     recordings
         Trials, of any frame size.
-    title
-        Words above all bands.
 
     Raises
     ------
@@ -137,8 +135,6 @@ def write_contact_sheet(recordings: Sequence[Recording], path: Path, *, title: s
     ----------
     recordings, title
         As `draw_contact_sheet` takes them.
-    path
-        File to write.
 
     Raises
     ------

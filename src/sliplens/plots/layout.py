@@ -123,8 +123,6 @@ def draw_picture(plot: Callable[[Axes], object], *, alt: str, size_in: tuple[flo
         Draws on the axes it is given.
     alt
         What the picture shows, in words.
-    size_in
-        Width and height in inches.
     """
     with drawing_style():
         figure = Figure(figsize=size_in, layout="constrained")
@@ -137,8 +135,6 @@ def figure_picture(figure: Figure, *, alt: str, pixels: bool = False) -> Picture
 
     Parameters
     ----------
-    figure
-        What is shown.
     alt
         The same in words.
     pixels

@@ -58,8 +58,6 @@ def plot_arrows(
         x, y of the markers in T_0.
     displacement_px
         x, y of their displacements; markers where it is NaN have no arrow.
-    ax
-        To draw on.
     magnified
         Length of an arrow over the displacement.
     """
@@ -83,12 +81,8 @@ def plot_field(
 
     Parameters
     ----------
-    field
-        What to draw.
     size
         Height and width of the frame, in pixels.
-    ax
-        To draw on.
     longest_px
         Displacement that gets the lightest colour; the field's own longest if None.
 

@@ -23,11 +23,6 @@ def draw_strip(strip: Strip) -> Figure:
 
     Above, what the camera saw at a few moments with the map over it, on one scale for all: blue where a pixel raises
     the read margin, red where it lowers it. Below, the true and the read margin over time, with the 90 % interval.
-
-    Parameters
-    ----------
-    strip
-        What `explain_trial` gave.
     """
     count = len(strip.shown)
     cell = (_WIDTH_IN - _MARGIN_IN - 1.0 - _GAP_IN * (count - 1)) / count

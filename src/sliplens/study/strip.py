@@ -40,8 +40,6 @@ def explain_trial(
         Key of `EXPLAINERS`.
     levels
         Safety margins whose frames are explained, in [0, 1]; a frame that is nearest to two is shown once.
-    on_progress
-        Called with the frames explained and their number.
 
     Raises
     ------

@@ -27,8 +27,6 @@ def mean_force(
 
     Parameters
     ----------
-    time_s, force_n
-        The samples.
     at_s
         Where to have the force; beyond the samples it is that of the nearest.
     window_s
