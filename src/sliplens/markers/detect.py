@@ -15,7 +15,7 @@ Contrast: TypeAlias = Literal["dark", "light", "colour"]
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerKind:
-    """How the markers of a sensor differ from what they are printed on.
+    """Difference between the markers of a sensor and what they are printed on.
 
     Raises
     ------
@@ -25,7 +25,7 @@ class MarkerKind:
 
     name: str
     contrasts: tuple[Contrast, ...]
-    """How they may stand out; where there are several, the frame decides."""
+    """Ways in which they may stand out; where there are several, the frame decides."""
     radius_px: tuple[float, float] = (2.0, 40.0)
     """Smallest and largest radius that is looked for, in pixels."""
     channels: tuple[float, float, float] | None = None
@@ -42,10 +42,10 @@ class MarkerKind:
 
 @dataclass(frozen=True, kw_only=True)
 class Appearance:
-    """How the markers of one sensor look to its camera, as one frame showed it."""
+    """Look of one sensor's markers to its camera, as one frame showed it."""
 
     weights: Float32[np.ndarray, "3"]
-    """Of red, green and blue; their sum is high on a marker, whatever its colour, and in grey levels."""
+    """Weights of red, green and blue; their sum is high on a marker, whatever its colour, and in grey levels."""
     radius_px: float
     """Median over the markers."""
     contrast: float
@@ -96,7 +96,7 @@ class _Spots:
     """Components that are round."""
     radius_px: float
     score: float
-    """How well they agree with markers: many, alike, and little else."""
+    """Agreement with markers: many, alike, and little else."""
 
 
 def find_appearance(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind) -> Appearance:
@@ -105,13 +105,6 @@ def find_appearance(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind
     Spots are what passes Otsu's threshold over the local background; those that are round and of one size tell the
     colour in which markers differ from what surrounds them. Its direction is the weight of the channels, unless the
     kind names them.
-
-    Parameters
-    ----------
-    frame
-        Of the untouched sensor, or nearly so: RGB.
-    kind
-        What to look for.
 
     Raises
     ------
@@ -241,7 +234,7 @@ _SLOPE_SHARE = 0.5  # of the contrast that the background may change by across a
 
 @dataclass(frozen=True, kw_only=True)
 class Shapes:
-    """What was measured on spots."""
+    """Measurements on spots."""
 
     centre_px: Float[np.ndarray, "spots 2"]
     radius_px: Float[np.ndarray, " spots"]
@@ -254,7 +247,7 @@ class Shapes:
 
 @dataclass(frozen=True, kw_only=True)
 class _Window:
-    """What windows of one size share; pixels in one row."""
+    """Common part of windows of one size; pixels in one row."""
 
     half: int
     x: Float32[np.ndarray, " pixels"]
@@ -302,8 +295,6 @@ def measure_spots(
         High on markers.
     near_px
         x, y of each spot, to about a third of a radius.
-    radius_px
-        About how large they are.
     """
     window = _window(round(max(radius_px, 1.5), 1))
     height, width = signal.shape
@@ -363,15 +354,15 @@ class Markers:
 
     centre_px: Float[np.ndarray, "markers 2"]
     radius_px: Float[np.ndarray, " markers"]
-    """Of the disc of the same area."""
+    """Radius of the disc of the same area."""
     contrast: Float[np.ndarray, " markers"]
-    """Against the background around it, in weighted grey levels."""
+    """Contrast with the background around it, in weighted grey levels."""
     roundness: Float[np.ndarray, " markers"]
     """Shorter over longer axis, 1 for a disc."""
     whole: Bool[np.ndarray, " markers"]
     """False where the edge of the frame cuts a marker, so that its centre is not seen."""
     appearance: Appearance
-    """What they had in common."""
+    """Look that they have in common."""
 
     def __len__(self) -> int:
         """Count the markers."""
@@ -388,8 +379,6 @@ def detect_markers(
 
     Parameters
     ----------
-    frame
-        RGB.
     kind
         Row of `KINDS`, or a kind of one's own.
     appearance

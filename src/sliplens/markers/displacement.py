@@ -61,14 +61,10 @@ def interpolate_field(
 
     Parameters
     ----------
-    rest_px
-        x, y of each marker in T_0.
     displacement_px
         x, y of each marker's displacement; NaN where it is not known.
     size
         Height and width of the frame, in pixels.
-    step_px
-        Distance of two points of the grid.
     reach_px
         Standard deviation of the weights; if None, three quarters of the median distance to the third nearest marker.
 
@@ -131,17 +127,6 @@ def interpolate_field(
 
 def compute_field(tracks: Tracks, frame: int, *, size: tuple[int, int], step_px: float = 8.0) -> DisplacementField:
     """Field of one frame of a trial, from the markers that were followed.
-
-    Parameters
-    ----------
-    tracks
-        Markers of the trial.
-    frame
-        Number of the frame, from 0.
-    size
-        Height and width of the frames, in pixels.
-    step_px
-        Distance of two points of the grid.
 
     Raises
     ------

@@ -21,8 +21,6 @@ def resolve_signs(
 
     Parameters
     ----------
-    place_px
-        x, y of each marker.
     way_px
         Displacement of each, up to its sign.
     pressed
@@ -71,11 +69,11 @@ class Doublets:
     """Markers of a difference image; pixel coordinates are (x, y), pixel centres at whole numbers."""
 
     rest_px: Float[np.ndarray, "markers 2"]
-    """Where each was in T_0."""
+    """Place of each in T_0."""
     displacement_px: Float[np.ndarray, "markers 2"]
-    """To where it is in T_n."""
+    """Displacement to its place in T_n."""
     correlation: Float[np.ndarray, " markers"]
-    """Of the image with the fitted doublet: 1 is a perfect fit."""
+    """Correlation of the image with the fitted doublet: 1 is a perfect fit."""
     amplitude: Float[np.ndarray, " markers"]
     """Grey levels by which a marker differs from what it covers."""
     whole: Bool[np.ndarray, " markers"]
@@ -158,7 +156,7 @@ def fit_doublets(
 
 
 def _find_middles(signal: Float32[np.ndarray, "height width"], radius_px: float) -> Float[np.ndarray, "spots 2"]:
-    """Where both places of a marker together are brightest."""
+    """Places where both images of a marker together are brightest."""
     cv2 = import_cv2()
     smooth = cv2.GaussianBlur(signal - float(np.median(signal)), (0, 0), radius_px, borderType=cv2.BORDER_REFLECT)
     reach = 2 * int(1.5 * radius_px) + 1

@@ -30,7 +30,7 @@ class FieldTrial:
 
     rest_px: Float[np.ndarray, "_ 2"]
     displacement_px: Float[np.ndarray, "_ _ 2"]
-    """From T_0, by frame and marker; NaN where a marker was not followed."""
+    """Displacement from T_0, by frame and marker; NaN where a marker was not followed."""
     hold: int
     """Last frame before the pull: slip is told by what moves from there, not from T_0."""
 
@@ -122,7 +122,7 @@ def affine_parts(
 def pressed_centre(
     rest_px: Float[np.ndarray, "markers 2"], displacement_px: Float[np.ndarray, "markers 2"]
 ) -> Float[np.ndarray, "2"]:
-    """Where pressing moved nothing sideways, by the affine fit; the middle of the markers where it says nothing."""
+    """Point that pressing left where it was, by the affine fit; the middle of the markers where it says nothing."""
     middle = rest_px.mean(axis=0)
     mean_x, mean_y, divergence, *_ = affine_parts(rest_px, displacement_px[None])[0]
     if not np.isfinite(divergence) or abs(divergence) < 1e-3:
@@ -316,8 +316,6 @@ class MarginEstimator(ABC):
 
         Parameters
         ----------
-        trials
-            Fields of the trials.
         margins
             Safety margin of each frame of each trial, in [0, 1]; NaN where there is no label.
 
@@ -368,13 +366,7 @@ class Constant(MarginEstimator):
 
 @final
 class FeatureRegression(MarginEstimator):
-    """Ridge regression of the margin on a few numbers of the field, their squares and products.
-
-    Parameters
-    ----------
-    features
-        Gives (frames, features) of a trial.
-    """
+    """Ridge regression of the margin on a few numbers of the field, their squares and products."""
 
     def __init__(self, features: Callable[[FieldTrial], np.ndarray]) -> None:
         self._features = features

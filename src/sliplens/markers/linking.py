@@ -16,19 +16,13 @@ class Neighbours:
 
     index: Int[np.ndarray, "markers neighbours"]
     offset: Float[np.ndarray, "markers neighbours 2"]
-    """From the marker, over the pitch."""
+    """Way from the marker, over the pitch."""
     pitch_px: Float[np.ndarray, " markers"]
     """Distance of the nearest one."""
 
 
 def find_neighbours(place_px: Float[np.ndarray, "markers 2"]) -> Neighbours:
-    """Find the nearest eight markers of each, or all others where there are fewer.
-
-    Parameters
-    ----------
-    place_px
-        x, y of at least two markers.
-    """
+    """Find the nearest eight markers of each, or all others where there are fewer."""
     distance = np.linalg.norm(place_px[:, None] - place_px[None], axis=-1)
     np.fill_diagonal(distance, np.inf)
     count = min(_NEIGHBOURS, len(place_px) - 1)
@@ -48,12 +42,8 @@ def predict_from_neighbours(
 
     Parameters
     ----------
-    neighbours
-        Of the markers at rest.
     displacement_px
         x, y of each marker; what is not known may be NaN.
-    known
-        Which markers may be believed.
     """
     usable = known[neighbours.index]
     values = np.where(usable[..., None], displacement_px[neighbours.index], 0.0)
@@ -79,15 +69,15 @@ class Pairing:
     """Found spots for predicted markers."""
 
     spot: Int[np.ndarray, " markers"]
-    """Which spot each marker is; -1 for none."""
+    """Spot of each marker; -1 for none."""
     support: float
     """Share of the markers expected in view that have a spot."""
     spread_px: float
-    """How unlike steps are where they are most alike: a touch bends the skin in places, a wrong match spoils all. The
+    """Unlikeness of the steps where they are most alike: a touch bends some skin, a wrong match spoils all. The
     lower quartile of the steps' distances from what their neighbours' steps say, or the lower fifth of those from the
     commonest step, whichever is less."""
     step_px: Float[np.ndarray, "markers 2"]
-    """From where each was; NaN without a spot."""
+    """Step of each from where it was; NaN without a spot."""
 
     @property
     def paired(self) -> Bool[np.ndarray, " markers"]:
@@ -113,14 +103,8 @@ def pair(
     ----------
     predicted_px
         Where each marker is expected; NaN if nowhere.
-    found_px
-        What was found.
     from_px
         Where each marker was before; NaN where it was not seen.
-    neighbours
-        Of the markers at rest.
-    expected
-        Markers that should be in view.
     """
     spot = _mutual(predicted_px, found_px, reach_px=GATE * neighbours.pitch_px)
     step = np.full(predicted_px.shape, np.nan)
@@ -212,7 +196,7 @@ _SMALL_STEP, _SMALL_SUPPORT = 0.25, 0.8
 
 @dataclass(frozen=True, kw_only=True)
 class Usual:
-    """What steps of this trial look like."""
+    """Usual steps of this trial."""
 
     spread_px: float = np.inf
     support: float = 1.0
@@ -245,14 +229,6 @@ def link(
     ----------
     origins
         Places from which the markers may have come, the likeliest first; no NaN.
-    found_px
-        Spots of the frame.
-    neighbours
-        Of the markers at rest.
-    frame_size
-        Height and width, in pixels.
-    usual
-        What steps have looked like.
     lost
         Whether nothing was said of the frame before: then no step counts as small.
     """
@@ -344,15 +320,6 @@ def drop_strays(
 ) -> tuple[Bool[np.ndarray, " markers"], Float[np.ndarray, "markers 2"]]:
     """Drop markers that stray from their neighbours, worst first: one stray makes all round it look astray.
 
-    Parameters
-    ----------
-    neighbours
-        Of the markers at rest.
-    shift_px
-        Displacement of each; NaN where it has none.
-    sound
-        Which may be believed so far.
-
     Returns
     -------
     tuple
@@ -380,15 +347,6 @@ def drop_contradicting(
 
     A part of a grid that moved by most of a pitch is matched wrongly as a whole: no marker in it strays from the next.
     But where it meets the rest, the skin would have to be torn or folded.
-
-    Parameters
-    ----------
-    neighbours
-        Of the markers at rest.
-    shift_px
-        Displacement of each; NaN where it has none.
-    sound
-        Which may be believed so far.
     """
     both = sound[:, None] & sound[neighbours.index]
     apart = np.linalg.norm(neighbours.offset, axis=-1)
@@ -433,16 +391,10 @@ def match_left_over(
 
     Parameters
     ----------
-    neighbours
-        Of the markers at rest.
     spot
         Which spot each marker has; -1 for none.
-    sound
-        Which are believed.
     told_px
         Displacement of each as its sound neighbours tell it; NaN where they do not.
-    rest_px, found_px
-        x, y of the markers at rest, and of the spots.
 
     Returns
     -------

@@ -34,13 +34,7 @@ class NewPlaces:
 
 
 class Newcomers:
-    """Spots that no known marker accounts for, until they have stayed long enough to be markers.
-
-    Parameters
-    ----------
-    pitch_px
-        Typical distance of two markers.
-    """
+    """Spots that no known marker accounts for, until they have stayed long enough to be markers."""
 
     def __init__(self, *, pitch_px: float) -> None:
         self._pitch = pitch_px

@@ -16,7 +16,7 @@ from sliplens.errors import InputError
 
 
 class MarkerStatus(IntEnum):
-    """What is known of a marker in a frame; only what was followed has a displacement."""
+    """Knowledge of a marker in a frame; only what was followed has a displacement."""
 
     UNSEEN = 0
     """Not there yet: a marker that appears later."""
@@ -56,7 +56,7 @@ class Tracks:
     """Markers of a trial; pixel coordinates are (x, y), pixel centres at whole numbers."""
 
     rest_px: Float[np.ndarray, "markers 2"]
-    """In the reference frame T_0; NaN for markers that it does not show."""
+    """Places in the reference frame T_0; NaN for markers that it does not show."""
     rest_radius_px: Float[np.ndarray, " markers"]
     position_px: Float[np.ndarray, "frames markers 2"]
     """NaN where a marker was not seen whole."""
@@ -70,7 +70,7 @@ class Tracks:
 
     @property
     def followed(self) -> Bool[np.ndarray, "frames markers"]:
-        """Where a marker has a displacement."""
+        """Markers that have a displacement, frame by frame."""
         return self.status == MarkerStatus.FOLLOWED
 
     @property
@@ -143,10 +143,6 @@ class TrackWriter:
 
         Parameters
         ----------
-        trial, frame
-            Name of the trial, number of the frame in it.
-        tracked
-            What the tracker gave.
         rest_px
             Where the markers of the reference frame were; new markers have no place at rest.
         time_s
@@ -185,13 +181,6 @@ class TrackWriter:
 @contextmanager
 def track_writer(path: Path, *, metadata: Mapping[str, str]) -> Iterator[TrackWriter]:
     """Write a Parquet file of tracks; it appears when complete, and not at all when something fails.
-
-    Parameters
-    ----------
-    path
-        File to write; one that is there is replaced.
-    metadata
-        Kept in the file.
 
     Raises
     ------

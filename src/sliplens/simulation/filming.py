@@ -60,15 +60,7 @@ class Film:
         )[0]
 
     def draw(self, frames: slice, *, device: str | torch.device = "cpu") -> UInt8[Tensor, "frames height width 3"]:
-        """Draw some of the frames.
-
-        Parameters
-        ----------
-        frames
-            Which ones, from start to stop.
-        device
-            Where to draw; the frames stay there.
-        """
+        """Draw some of the frames."""
         motion = self.motion
         slope = None
         if self.relief is not None:
@@ -183,18 +175,10 @@ def prepare_film(
 
     Parameters
     ----------
-    sensor
-        The fingertip.
-    loading
-        Forces and margins of every frame.
-    grasp, day, unit
-        What stays the same in the trial, on its day and for the built sensor.
     rng
         Source of noise and of the focus' wander.
     noise
         The camera's noise; None films without it.
-    displacement
-        How the markers move; see `move_markers`.
 
     Raises
     ------

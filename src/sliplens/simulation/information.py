@@ -88,12 +88,6 @@ def marker_sensitivity(
     ----------
     margins
         Safety margins to look at, inside (0, 1).
-    sensor
-        The fingertip.
-    touch
-        Everything else that moves the markers.
-    displacement
-        As for `move_markers`.
 
     Raises
     ------
@@ -163,8 +157,6 @@ def margin_bound(
 
     Parameters
     ----------
-    sensitivity
-        From `marker_sensitivity`.
     noise_px
         Standard deviation of each coordinate, in pixels.
     prior
@@ -205,8 +197,6 @@ def sequence_bound(
     ----------
     sensitivity
         From `marker_sensitivity`; the last frame is the one asked for.
-    noise_px, prior
-        As for `margin_bound`.
     pull_known
         Whether it is known by how much the margin fell between the frames, from a clock and a steady pull; else every
         frame's margin is an unknown of its own.
@@ -254,8 +244,6 @@ def reading_gain(
     ----------
     jacobian, unknowns
         Derivatives of the coordinates, as in `Sensitivity`; the margin first.
-    noise_px, prior
-        As for `margin_bound`.
 
     Raises
     ------

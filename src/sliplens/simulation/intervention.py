@@ -102,10 +102,6 @@ def rebuild_trial(folder: Path, recording: Recording, *, recipe: SimulationRecip
 
     Parameters
     ----------
-    folder
-        Folder of its data set.
-    recording
-        The trial, with its truth.
     recipe
         What simulated it; read from the folder if None.
 
@@ -142,15 +138,6 @@ def put_markers_back(film: Film, frame: int, back: Bool[np.ndarray, "variants ma
 
     A marker that is put back lies where it lay untouched, as large as it was and pressed by nothing. The focus and the
     paleness that the touch gives to all markers stay: they are of the gel, not of the marker.
-
-    Parameters
-    ----------
-    film
-        The trial.
-    frame
-        The moment.
-    back
-        Which markers are put back, in each of the new film's frames.
     """
     count, motion = len(back), film.motion
     at, taken = np.full(count, frame), np.full(count, frame + 1)  # the untouched sensor's picks come first
@@ -225,15 +212,6 @@ def marker_readings(
     trial: FilmedTrial, frame: int, *, noise_px: float = NOISE_PX
 ) -> tuple[Int[np.ndarray, " markers"], Float[np.ndarray, " markers"]]:
     """Part of each marker that lies wholly in the image in the best reading of a frame's margin.
-
-    Parameters
-    ----------
-    trial
-        The trial.
-    frame
-        A frame in contact.
-    noise_px
-        Standard deviation of each coordinate, in pixels.
 
     Returns
     -------

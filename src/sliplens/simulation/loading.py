@@ -46,10 +46,6 @@ def slide(
     ----------
     since_slip_s
         Time since the first full slip, in seconds.
-    static_friction
-        Static coefficient of friction.
-    grasp
-        Kinetic ratio, and strength and rate of the stick-slip.
     stuck_until
         Frames after the first slip from which on the contact slips for good, at the level it then has: it is let go.
 
@@ -127,10 +123,6 @@ def load_grasp(grasp: Grasp, *, frames: int, rng: np.random.Generator, release: 
 
     Parameters
     ----------
-    grasp
-        The trial's draws.
-    frames
-        Frames in the trial.
     rng
         Source of the pull's small unevenness.
     release

@@ -82,10 +82,6 @@ def move_markers(
 
     Parameters
     ----------
-    sensor
-        The sensor.
-    loading
-        Forces and margins of every frame.
     grasp
         Contact offset, tilt, direction and exponent of the shear, creep.
     displacement

@@ -167,12 +167,8 @@ def draw_day(nuisances: Nuisances, *, quantile: float, rng: np.random.Generator)
 
     Parameters
     ----------
-    nuisances
-        The ranges.
     quantile
         Where in its range the day's dry friction lies, 0 to 1; the caller spreads the days.
-    rng
-        Source of everything else.
     """
     low, high = nuisances.dry_friction
     return Day(
@@ -201,19 +197,7 @@ def draw_unit(nuisances: Nuisances, *, markers: int, rng: np.random.Generator) -
 
 
 def draw_grasp(nuisances: Nuisances, *, day: Day, wet: bool, rng: np.random.Generator) -> Grasp:
-    """Draw a trial of a day.
-
-    Parameters
-    ----------
-    nuisances
-        The ranges.
-    day
-        The day, for its dry friction.
-    wet
-        Draw the friction of a wet object, with its drift.
-    rng
-        Source of the draws.
-    """
+    """Draw a trial of a day."""
     # every trial draws the same number of times, so that dry and wet twins differ in friction alone
     dry_factor, wet_friction = rng.uniform(*nuisances.dry_friction_factor), rng.uniform(*nuisances.wet_friction)
     drift = rng.uniform(*nuisances.wet_friction_drift)

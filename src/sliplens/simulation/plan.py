@@ -152,11 +152,6 @@ class TrialPlan:
 def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
     """Lay out the trials of a recipe: names, days, splits and seeds.
 
-    Parameters
-    ----------
-    recipe
-        What to simulate.
-
     Returns
     -------
     tuple of TrialPlan

@@ -79,12 +79,8 @@ def haze(
 
     Parameters
     ----------
-    sensor, grasp
-        The fingertip, and the strength of veil and glow.
     contact_px, radius_px
         Where the camera sees the contact's centre, and how large its radius in a nominal grasp.
-    rng
-        Source of the grain.
     """
     if not sensor.sees_contact:
         return np.zeros((3, sensor.image_size_px, sensor.image_size_px), dtype=np.float32)
@@ -149,17 +145,6 @@ def render(
 
     Each marker is drawn in a patch of its own and added to the frame, so that a frame costs little more than its noise.
     Devices agree within one grey level: they round sums of four terms in another order.
-
-    Parameters
-    ----------
-    scene
-        Markers, light, blur and noise picks.
-    sensor
-        Colours, marker sizes and image size.
-    noise
-        How strong the noise is; None for a clean image.
-    device
-        Where to compute; the frames stay there.
     """
     # one plane a channel: a channel's constant then meets whole rows of pixels, which vectorises
     shade = _shade(scene, size_px=sensor.image_size_px, noise=noise, device=device)

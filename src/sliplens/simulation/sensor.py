@@ -64,17 +64,6 @@ def mix_noise(
 
     The sum of two windows out of 32 fields repeats after some 10^10 frames, costs two reads and an addition, and is the
     same on every device.
-
-    Parameters
-    ----------
-    picks
-        From `pick_noise`.
-    noise
-        Its smoothness and the correlation of its channels.
-    image_size_px
-        Height and width of the frames.
-    device
-        Where to compute.
     """
     bank = _noise_bank(noise, image_size_px + _PLAY_PX, str(device))
     return sum(  # pyright: ignore[reportReturnType] - of two tensors, never of none
@@ -168,10 +157,6 @@ def draw_look(
 
     Parameters
     ----------
-    look, geometry
-        The sensor's.
-    unit
-        The built sensor's own sizes and contrasts.
     scale
         Size of each marker over its size at rest.
     pressure

@@ -17,13 +17,7 @@ from sliplens.simulation.plan import SimulationRecipe, TrialPlan, plan_trials
 
 
 def prepare_trial(plan: TrialPlan) -> tuple[Loading, Film]:
-    """Load a trial and make it ready to be drawn.
-
-    Parameters
-    ----------
-    plan
-        The trial, as `plan_trials` laid it out.
-    """
+    """Load a trial and make it ready to be drawn."""
     recipe = plan.recipe
     grasp_rng, load_rng, film_rng = np.random.default_rng(plan.seed).spawn(3)
     grasp = draw_grasp(recipe.nuisances, day=plan.day_draw, wet=plan.condition == "wet", rng=grasp_rng)
@@ -53,10 +47,6 @@ def simulate_trial(
 
     Parameters
     ----------
-    plan
-        The trial, as `plan_trials` laid it out.
-    device
-        Where to draw the frames.
     on_frames
         Called with the frames done and the frames in all, after each batch.
     """
@@ -109,10 +99,6 @@ def simulate_dataset(
     ----------
     folder
         Where to write `trials/*.parquet` and, last, `dataset.json`.
-    recipe
-        What to simulate.
-    device
-        Where to draw the frames.
     on_frames
         Called with the frames done and the frames in all, after each batch.
 
