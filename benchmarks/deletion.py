@@ -58,14 +58,14 @@ def main() -> None:
     told = {
         "speedup": slow_s / fast_s,
         "max_difference": float(np.abs(found.predictions[:LOOPED] - slow).max()),
-        "engine": ready.engine,
+        "engine": ready.name,
         "seconds_an_image": {"one by one": slow_s, "in batches": fast_s},
         "preparation_s": prepared_s,
     }
     if options.json:
         print(json.dumps(told))
         return
-    print(f"{told['speedup']:.1f} times as fast ({ready.engine}), largest difference {told['max_difference']:.1e}")
+    print(f"{told['speedup']:.1f} times as fast ({ready.name}), largest difference {told['max_difference']:.1e}")
 
 
 @torch.no_grad()

@@ -20,7 +20,7 @@ from sliplens.extras import missing_packages
 from sliplens.files import machine, versions
 
 STEPS = 50
-INSTALLED = [name for name in EXPLAINERS if name != "lrp" or not missing_packages("zennit")]
+INSTALLED = [name for name in EXPLAINERS if name != "lrp" or not missing_packages("zennit", extra="lrp")]
 
 
 def median_seconds(work: Callable[[], object], *, repeats: int, device: torch.device) -> float:

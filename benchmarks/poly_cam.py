@@ -90,7 +90,7 @@ def measure(
     """Times, errors and likeness on the frames of one network, frame by frame."""
     model, rows = trained.model, []
     # torch alone and in batches: the loop's own map where its passes are too many to make them all
-    plain = PolyCam(engine="plain")
+    plain = PolyCam(engine="eager")
     exact = PolyCam(levels=True)
     fast = PolyCam(budget=options.budget)
     with_engine = exact(model, images[:1], reference=references[:1])  # prepares the engine, as the first frame does

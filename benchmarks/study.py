@@ -21,7 +21,7 @@ import torch
 
 from sliplens.models import load_checkpoint
 from sliplens.models.checkpoint import find_run
-from sliplens.models.engines import WORTH_CONVERTING, prepare
+from sliplens.models.engines import prepare
 
 _INTERRUPTED = 130
 _LOOK_EVERY_S = 0.5
@@ -78,7 +78,7 @@ def measure_passes(count: int = 1000) -> float:
     size = trained.manifest.image_size
     images = torch.rand(16, 3, size, size, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        passes = prepare(trained.model, images, trained.model(images).reshape(-1), passes=WORTH_CONVERTING)
+        passes = prepare(trained.model, images, trained.model(images).reshape(-1), passes=10_000)
     batch = images[: passes.batch_size]
     for batches in (10, count // len(batch)):  # the first to warm up
         started = time.perf_counter()

@@ -10,16 +10,20 @@ if TYPE_CHECKING:
     from sliplens.explainers.table import explain
     from sliplens.faithfulness.scoring import score
     from sliplens.models.checkpoint import load
+    from sliplens.models.onnx import export_onnx
+    from sliplens.models.predictions import predict
 
 # where each name lives: importing sliplens alone imports neither torch nor NumPy
 _MODULES = {
-    "SliplensError": "sliplens.errors",
     "explain": "sliplens.explainers.table",
+    "export_onnx": "sliplens.models.onnx",
     "load": "sliplens.models.checkpoint",
+    "predict": "sliplens.models.predictions",
     "score": "sliplens.faithfulness.scoring",
+    "SliplensError": "sliplens.errors",
 }
 
-__all__ = ["SliplensError", "__version__", "explain", "load", "score"]
+__all__ = ["SliplensError", "__version__", "explain", "export_onnx", "load", "predict", "score"]
 
 
 def __getattr__(name: str) -> Any:

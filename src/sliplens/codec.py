@@ -5,7 +5,7 @@ not finite is told in one sentence with its place and its cure, by msgspec for J
 """
 
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
@@ -242,6 +242,46 @@ def load_columns(path: Path, kind: type[_Columns], *, command: str) -> _Columns:
     return kind(**values)
 
 
+def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schema) -> pa.Table | None:
+    """Write tables as row groups of one Parquet file, each as it comes; whole or not at all.
+
+    Parameters
+    ----------
+    tables
+        Rows, in their order.
+    path
+        File to write, one that is there is replaced; None to join the tables in memory.
+    schema
+        Columns and metadata.
+
+    Returns
+    -------
+    Table
+        All rows; None where they are in the file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    if path is None:
+        return pa.concat_tables([schema.empty_table(), *tables]).replace_schema_metadata(schema.metadata)
+    part = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        writer = pq.ParquetWriter(part, schema, compression="zstd")
+    except OSError as error:
+        raise InputError(f"cannot write {path} ({error.strerror or error}); choose another file") from None
+    try:
+        with writer:
+            for table in tables:
+                writer.write_table(table.replace_schema_metadata(schema.metadata))
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    return None
+
+
 def save_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> None:
     """Write arrays as a compressed NPZ file, whole or not at all."""
     part = path.with_name(path.name + ".part")
@@ -364,4 +404,5 @@ __all__ = [
     "save_record",
     "save_result",
     "to_builtins",
+    "write_tables",
 ]

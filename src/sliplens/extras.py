@@ -94,11 +94,27 @@ class Table(Mapping[str, Row]):
 
 ONNX_PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 """What the extra `onnx` installs."""
+_NAMES = {"cv2": "OpenCV", "av": "PyAV"}
+"""Packages that people know by another name than Python does."""
 
 
-def missing_packages(*names: str) -> tuple[str, ...]:
-    """Those of some packages that are not installed, told without importing any."""
-    return tuple(name for name in names if find_spec(name) is None)
+def missing_packages(*names: str, extra: str) -> str | None:
+    """What to say of packages that are not installed, with the command that installs them; None if all are there.
+
+    Nothing is imported.
+
+    Parameters
+    ----------
+    names
+        Packages, as they are imported.
+    extra
+        Extra of sliplens that installs them; several are divided by commas.
+    """
+    missing = [_NAMES.get(name, name) for name in names if find_spec(name) is None]
+    if not missing:
+        return None
+    verb = "is" if len(missing) == 1 else "are"
+    return f'{" and ".join(missing)}, which {verb} not installed; install with `pip install "sliplens[{extra}]"`'
 
 
 def require_packages(*names: str, extra: str, purpose: str) -> None:
@@ -106,10 +122,8 @@ def require_packages(*names: str, extra: str, purpose: str) -> None:
 
     Parameters
     ----------
-    names
-        Packages, as they are imported.
-    extra
-        Of sliplens, that installs them.
+    names, extra
+        As `missing_packages` takes them.
     purpose
         What needs them, as the message begins.
 
@@ -118,13 +132,8 @@ def require_packages(*names: str, extra: str, purpose: str) -> None:
     InputError
         Naming those that are missing, and how to install them.
     """
-    missing = missing_packages(*names)
-    if missing:
-        verb = "is" if len(missing) == 1 else "are"
-        raise InputError(
-            f"{purpose} needs {' and '.join(missing)}, which {verb} not installed; "
-            f'install with `pip install "sliplens[{extra}]"`'
-        )
+    if missing := missing_packages(*names, extra=extra):
+        raise InputError(f"{purpose} needs {missing}")
 
 
 def import_onnxruntime() -> ModuleType:
@@ -156,7 +165,7 @@ def import_openvino() -> ModuleType:
     InputError
         If it is not installed.
     """
-    require_packages("openvino", extra="onnx,openvino", purpose="OpenVINO")
+    require_packages("openvino", extra="openvino", purpose="OpenVINO")
     reporter = "openvino_telemetry"
     hide = "openvino" not in sys.modules and reporter not in sys.modules
     if hide:
@@ -177,10 +186,7 @@ def import_cv2() -> ModuleType:
     InputError
         If it is not installed.
     """
-    if find_spec("cv2") is None:
-        raise InputError(
-            'markers are found with OpenCV, which is not installed; install with `pip install "sliplens[markers]"`'
-        )
+    require_packages("cv2", extra="markers", purpose="finding markers")
     import cv2  # noqa: PLC0415 (an extra)
 
     return cv2

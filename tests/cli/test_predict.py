@@ -9,7 +9,7 @@ import tyro
 from sliplens import __version__
 from sliplens.cli.predict import Predict
 from sliplens.errors import InputError, SliplensError
-from sliplens.files import hash_file
+from sliplens.files import hash_file, hash_json, read_json
 from sliplens.recordings import Dataset
 
 
@@ -32,12 +32,12 @@ def test_a_data_set_is_predicted(
     told = {key.decode(): value.decode() for key, value in table.schema.metadata.items() if key.startswith(b"sliplens")}
     assert told == {
         "sliplens.version": __version__,
-        "sliplens.engine": "folded",  # for so few frames
+        "sliplens.engine": "eager",  # for so few frames
         "sliplens.source": str(small_dataset.folder),
-        "sliplens.manifest_sha256": hash_file(difference_run / "manifest.json"),
+        "sliplens.manifest_hash": hash_json(read_json(difference_run / "manifest.json")),
         "sliplens.weights_sha256": hash_file(difference_run / "model.safetensors"),
     }
-    assert "24 frames, by folded" in capsys.readouterr().out
+    assert "24 frames, by eager" in capsys.readouterr().out
     assert [path.name for path in output.parent.iterdir()] == ["a.parquet"]
 
 

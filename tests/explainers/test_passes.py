@@ -6,8 +6,7 @@ from torch import nn
 
 from sliplens.errors import InputError, ModelError
 from sliplens.explainers import PolyCam
-from sliplens.models import engines as passes
-from sliplens.models.engines import prepare
+from sliplens.models.engines import ENGINES, prepare
 
 
 class Branches(nn.Module):
@@ -33,7 +32,7 @@ def float_network(network):
     return network("small shufflenet").float().requires_grad_(requires_grad=False)
 
 
-@pytest.mark.parametrize("engine", ["plain", "folded", "openvino"])
+@pytest.mark.parametrize("engine", ["eager", "folded", "onnxruntime", "openvino"])
 def test_answers_in_order_and_as_the_network_does(engine, float_network, images):
     one = images.float()
     found, _ = ready(float_network, one[:2], engine=engine, batch_size=2)
@@ -47,17 +46,17 @@ def test_answers_in_order_and_as_the_network_does(engine, float_network, images)
 
 def test_the_exact_map_is_that_of_the_plain_loop(float_network, images):
     image = images[:1].float()
-    plain = PolyCam(engine="plain", batch_size=1)(float_network, image)
+    plain = PolyCam(engine="eager", batch_size=1)(float_network, image)
     quick = PolyCam(engine="openvino")(float_network, image)
-    assert (plain.engine, quick.engine) == ("plain", "openvino")
+    assert (plain.engine, quick.engine) == ("eager", "openvino")
     torch.testing.assert_close(quick.saliency, plain.saliency, atol=1e-4, rtol=0)
 
 
 def test_the_best_engine_that_pays_is_taken(float_network, images):
-    assert ready(float_network, images[:1].float(), count=1)[0].engine == "plain"
-    assert ready(float_network, images[:1].float(), count=passes.WORTH_FOLDING)[0].engine == "folded"
+    assert ready(float_network, images[:1].float(), count=1)[0].name == "eager"
     # earlier calls count: frames are explained one by one
-    assert ready(float_network, images[:1].float(), count=passes.WORTH_CONVERTING)[0].engine == "openvino"
+    for name in ("folded", "openvino"):
+        assert ready(float_network, images[:1].float(), count=ENGINES[name].pays_after or 0)[0].name == name
 
 
 def test_new_weights_are_converted_anew(float_network, images):
@@ -69,7 +68,7 @@ def test_new_weights_are_converted_anew(float_network, images):
 
 def test_an_engine_that_answers_otherwise_is_not_used(images):
     model, one = Branches(), images[:1].float()
-    assert ready(model, one)[0].engine != "openvino"
+    assert ready(model, one)[0].name != "openvino"
     with pytest.raises(ModelError, match=r"the engine openvino cannot run Branches \(its answers differ by .*; choose"):
         ready(model, one, engine="openvino")
 
@@ -87,25 +86,25 @@ def test_a_network_that_cannot_be_copied_runs_as_it_is(images):
             return self.maps(images).mean(dim=(1, 2, 3))
 
     found, predictions = ready(Uncopied(), images[:1].float())
-    assert found.engine == "plain"
+    assert found.name == "eager"
     torch.testing.assert_close(next(found.run([images[:1].float()])), predictions)
-    with pytest.raises(ModelError, match=r"the engine folded cannot run Uncopied \(holds a file\); choose auto"):
+    with pytest.raises(ModelError, match=r"the engine folded cannot run Uncopied \(holds a file\); choose another"):
         ready(Uncopied(), images[:1].float(), engine="folded")
 
 
 def test_a_network_with_hooks_runs_as_it_is(float_network, images):
     float_network.stage3.register_forward_hook(lambda _module, _arguments, output: 2 * output)
-    assert ready(float_network, images[:1].float())[0].engine == "plain"
+    assert ready(float_network, images[:1].float())[0].name == "eager"
     with pytest.raises(InputError, match="the engine openvino cannot be used: the model has hooks"):
         ready(float_network, images[:1].float(), engine="openvino")
 
 
 def test_what_an_engine_needs_is_told(float_network, images, monkeypatch):
-    with pytest.raises(InputError, match=r"cannot be used: it runs float32 on the processor, not torch\.float64"):
+    with pytest.raises(InputError, match=r"cannot be used: it runs float32, not torch\.float64"):
         ready(float_network.double(), images[:1], engine="openvino")
-    monkeypatch.setattr(passes, "missing_packages", lambda *names: names)
-    with pytest.raises(InputError, match="openvino is not installed; `pip install"):
+    monkeypatch.setattr("sliplens.extras.find_spec", lambda _: None)
+    with pytest.raises(InputError, match="it needs openvino, which is not installed; install with `pip install"):
         ready(float_network.float(), images[:1].float(), engine="openvino")
-    assert ready(float_network, images[:1].float())[0].engine == "folded"
-    with pytest.raises(InputError, match="there is no engine named 'tvm' for passes; choose auto, openvino, folded"):
+    assert ready(float_network, images[:1].float())[0].name == "folded"
+    with pytest.raises(InputError, match="there is no engine named 'tvm'; choose one of eager, folded, compiled"):
         ready(float_network, images[:1].float(), engine="tvm")

@@ -9,10 +9,11 @@ from torch.nn import functional
 
 from sliplens.models import Manifest, TrainedModel, build_model, load_checkpoint, save_checkpoint
 from sliplens.models.backbones import HistogramRegressor
+from sliplens.models.calibration import Calibration
 from sliplens.models.onnx import export_onnx
 
 FRAME_SIZE, IMAGE_SIZE = 48, 32
-CALIBRATION = {"temperature": 1.0, "offsets": {"0.68": 0.02, "0.9": 0.05}, "frames": 100, "mse": 0.01}
+CALIBRATION = Calibration(temperature=1.0, offsets={"0.68": 0.02, "0.9": 0.05}, frames=100, mse=0.01)
 
 
 def some_images(count: int, *, seed: int) -> Tensor:

@@ -71,7 +71,7 @@ def test_an_incomplete_manifest_is_refused(run: Path):
     manifest = json.loads((run / "manifest.json").read_text())
     del manifest["frame_size"]
     (run / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(CheckpointError, match=r"manifest\.json is incomplete .*frame_size"):
+    with pytest.raises(InputError, match=r"manifest\.json is not what was written: .*frame_size.*`sliplens train`"):
         load_checkpoint(run)
 
 

@@ -1,7 +1,7 @@
 """Predictions: those of the network, one frame at a time, from every kind of source."""
 
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
 
@@ -13,12 +13,11 @@ import pytest
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.images import absolute_difference, write_png
 from sliplens.models import TrainedModel, load_checkpoint
-from sliplens.models.engines import make_engine
-from sliplens.models.predict import write_predictions
-from sliplens.models.sources import FrameSource, FrameTrial, SourceOptions, open_source
+from sliplens.models.predictions import predict as predict_source
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.formats import ReadOptions
 from sliplens.recordings.formats.lerobot_export import write_lerobot
+from sliplens.recordings.source import TrialFrames
 
 TRIAL = "test-wet-7"
 
@@ -36,8 +35,7 @@ def wet(small_dataset: Dataset) -> Recording:
 def predict(
     source: Path, trained: TrainedModel, path: Path, *, batch_size: int = 5, **options: object
 ) -> dict[str, list]:
-    opened = open_source(source, trained, SourceOptions(**options))  # pyright: ignore[reportArgumentType]
-    write_predictions(make_engine("eager", trained), opened, path, metadata={"who": "a test"}, batch_size=batch_size)
+    predict_source(trained, source, out=path, batch_size=batch_size, engine="eager", **options)  # pyright: ignore
     return pq.read_table(path).to_pydict()
 
 
@@ -143,7 +141,7 @@ def test_a_folder_of_frames_and_its_differences_are_the_same(trained: TrainedMod
 
 def test_images_have_times_where_their_rate_is_told(trained: TrainedModel, wet: Recording, tmp_path: Path):
     frames = write_frames(tmp_path / "frames", wet.frames)
-    rows = predict(frames, trained, tmp_path / "a.parquet", reference_frame=0, read=ReadOptions(frame_rate=8.0))
+    rows = predict(frames, trained, tmp_path / "a.parquet", reference_frame=0, options=ReadOptions(frame_rate=8.0))
     assert rows["time_s"] == [index / 8 for index in range(12)]
 
 
@@ -170,13 +168,13 @@ def test_raw_frames_need_no_reference(raw_run: Path, wet: Recording, tmp_path: P
 
 def test_what_the_images_were_taken_for_is_noted(trained: TrainedModel, wet: Recording, tmp_path: Path):
     frames = write_frames(tmp_path / "frames", wet.frames)
-    assert "taken for difference images" in open_source(frames, trained, SourceOptions()).notes[0]
-    assert not open_source(frames, trained, SourceOptions(reference_frame=0)).notes
+    assert "taken for difference images" in predict_source(trained, frames).notes[0]
+    assert not predict_source(trained, frames, reference_frame=0).notes
 
 
 def refused(source: Path, trained: TrainedModel, kind: type[Exception], message: str, **options: object) -> None:
     with pytest.raises(kind, match=message):
-        open_source(source, trained, SourceOptions(**options))  # pyright: ignore[reportArgumentType]
+        predict_source(trained, source, **options)  # pyright: ignore[reportArgumentType]
 
 
 def test_what_is_missing_or_too_much_is_told(
@@ -191,17 +189,17 @@ def test_what_is_missing_or_too_much_is_told(
     refused(video, trained, InputError, "no frame 12; name one from 0 to 11", reference_frame=12)
     refused(tmp_path / "nothing", trained, InputError, "nothing does not exist")
     refused(small_dataset.folder, trained, InputError, "bring their reference frames", reference=image)
-    refused(small_dataset.folder, trained, InputError, "does not take frame_rate", read=ReadOptions(frame_rate=30.0))
+    refused(small_dataset.folder, trained, InputError, "does not take frame_rate", options=ReadOptions(frame_rate=30.0))
     refused(small_dataset.folder, trained, RecordingError, "no trial with split exam", split="exam")
     frames = write_frames(tmp_path / "frames", wet.frames)
     refused(frames, trained, InputError, "no frame 12; name one from 0 to 11", reference_frame=12)
-    refused(frames, trained, InputError, "does not take image_topic", read=ReadOptions(image_topic="/image"))
+    refused(frames, trained, InputError, "does not take image_topic", options=ReadOptions(image_topic="/image"))
 
 
 def test_frames_of_another_size_are_refused(trained: TrainedModel, wet: Recording, tmp_path: Path):
     cut = np.ascontiguousarray(wet.frames[:, :40])
     refused(write_video(tmp_path / "touch.mkv", cut), trained, ImageError, "40 x 48 pixels", reference_frame=0)
-    with pytest.raises(ImageError, match="40 x 48 pixels, 48 x 48 are needed"):
+    with pytest.raises(ImageError, match="frames are 40 x 48 pixels"):
         predict(write_frames(tmp_path / "frames", cut), trained, tmp_path / "a.parquet")
     assert not (tmp_path / "a.parquet").exists()
 
@@ -219,17 +217,27 @@ def test_signed_images_need_a_reference(wet: Recording, tmp_path: Path, networks
     np.testing.assert_allclose(rows["prediction"], expected, atol=1e-5, rtol=1e-5)
 
 
+def frames_of(recording: Recording, read_frames: Callable[[], Iterator[np.ndarray]], *, frames: int) -> TrialFrames:
+    size = recording.reference.shape[:2]
+    return TrialFrames(
+        name="trial",
+        frames=frames,
+        frame_size=(size[0], size[1]),
+        read_frames=read_frames,
+        read_reference=lambda: recording.reference,
+    )
+
+
 def test_a_source_that_fails_leaves_what_was_there(trained: TrainedModel, wet: Recording, tmp_path: Path):
     def broken() -> Iterator[np.ndarray]:
         yield from wet.frames[:6]
         raise RecordingError("the disk is gone")
 
-    trial = FrameTrial(name="broken", read_frames=broken, reference=wet.reference)
-    source = FrameSource(frames=12, labelled=False, files=False, open_trials=lambda: iter((trial,)))
+    trial = frames_of(wet, broken, frames=12)
     path = tmp_path / "a.parquet"
     path.write_text("the last good one")
     with pytest.raises(RecordingError, match="the disk is gone"):
-        write_predictions(make_engine("eager", trained), source, path, metadata={}, batch_size=4)
+        predict_source(trained, [trial], out=path, overwrite=True, engine="eager", batch_size=4)
     assert path.read_text() == "the last good one"
     assert len(list(tmp_path.iterdir())) == 1
 
@@ -250,25 +258,32 @@ def test_only_one_batch_of_frames_is_held(trained: TrainedModel, wet: Recording,
             most = max(most, alive)
             yield frame
 
-    trial = FrameTrial(name="long", read_frames=frames, reference=wet.reference)
-    source = FrameSource(frames=60, labelled=False, files=False, open_trials=lambda: iter((trial,)))
+    trial = frames_of(wet, frames, frames=60)
     seen = []
-    write_predictions(
-        make_engine("eager", trained),
-        source,
-        tmp_path / "a.parquet",
-        metadata={},
+    predict_source(
+        trained,
+        [trial],
+        out=tmp_path / "a.parquet",
+        engine="eager",
         batch_size=4,
-        on_frames=lambda done, total: seen.append((done, total)),
+        on_progress=lambda done, total: seen.append((done, total)),
     )
     # the next frame is read while the last batch still has its name
     assert most <= 2 * 4 + 1
     assert seen == [(done, 60) for done in range(4, 61, 4)]
 
 
-def test_the_file_keeps_where_it_comes_from(trained: TrainedModel, small_dataset: Dataset, tmp_path: Path):
-    predict(small_dataset.folder, trained, tmp_path / "a.parquet", split="test")
-    assert pq.read_schema(tmp_path / "a.parquet").metadata[b"who"] == b"a test"
+def test_rows_in_memory_are_those_of_the_file(trained: TrainedModel, small_dataset: Dataset, tmp_path: Path):
+    written = predict_source(trained, small_dataset, split="test", out=tmp_path / "a.parquet")
+    kept = predict_source(trained, small_dataset, split="test")
+    assert kept.frame().equals(written.frame(), check_metadata=True)
+    assert kept.frames == kept.frame().num_rows == 24
+
+
+def test_an_array_is_a_trial(trained: TrainedModel, wet: Recording):
+    rows = predict_source(trained, wet.frames, reference=wet.reference).frame().to_pydict()
+    np.testing.assert_allclose(rows["prediction"], one_by_one(trained, wet.frames, wet.reference), atol=1e-5)
+    assert "file" not in rows
 
 
 def test_a_recording_brings_its_own_reference_and_labels_unless_told_otherwise(

@@ -53,7 +53,7 @@ def test_it_reads_real_touch_it_was_never_trained_on(chromatouch_folder: Path):
 
 
 def test_a_network_that_is_not_there_is_refused():
-    with pytest.raises(InputError, match="no network named 'gelsight' comes with sliplens; choose"):
+    with pytest.raises(InputError, match="the run gelsight does not exist; check the path, or name chromatouch-diff"):
         sliplens.load("gelsight")
     with pytest.raises(InputError, match="the run nowhere does not exist; check the path"):
         find_run(Path("nowhere"))

@@ -103,3 +103,27 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
     for row in rows:
         table.add_row(*row)
     OUT.print(table)
+
+
+class Terminal:
+    """Progress of a command, as `sliplens.progress.Stages`: a bar a stage, what was written, notes."""
+
+    def __call__(self, done: int, total: int, /) -> None:
+        """Show nothing: each stage has a bar of its own."""
+
+    @contextmanager
+    def stage(self, title: str, /) -> Iterator[Callable[[int, int], None]]:
+        """Show a bar while the stage is open."""
+        with progress_bar(title) as count:
+            yield count
+
+    def wrote(self, path: Path, what: str, /, *, kept: bool = False) -> None:
+        """Say what was written where, or that it was there already."""
+        if kept:
+            unchanged(path)
+        else:
+            wrote(path, what)
+
+    def note(self, message: str, /) -> None:
+        """Print a sentence."""
+        say(f"  note: {message}")

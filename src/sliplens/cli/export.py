@@ -53,9 +53,7 @@ class Export:
             self._export_data(kinds[0])
 
     def _export_network(self) -> None:
-        from sliplens.extras import ONNX_PACKAGES, require_packages
-        from sliplens.models import load_checkpoint
-        from sliplens.models.checkpoint import find_run
+        from sliplens.models.checkpoint import load
         from sliplens.models.onnx import export_onnx
 
         if _is_data(self.source) and not _is_run(self.source):
@@ -65,15 +63,9 @@ class Export:
             )
         if self.trials:
             raise InputError("--trials chooses trials of a data set; leave it out with --onnx")
-        if self.output.suffix != ".onnx":
-            raise InputError(f"{self.output} does not end in .onnx; name the file to write so")
-        if self.output.exists() and not self.overwrite:
-            raise InputError(f"{self.output} exists; choose another file or pass --overwrite")
-        require_packages(*ONNX_PACKAGES, extra="onnx", purpose="an ONNX file")
-        trained = load_checkpoint(find_run(self.source))
-        self.output.parent.mkdir(parents=True, exist_ok=True)
+        trained = load(self.source)
         with OUT.status("Exporting and comparing"):
-            export_onnx(trained, self.output)
+            export_onnx(trained, self.output, overwrite=self.overwrite)
         manifest = trained.manifest
         wrote(
             self.output,

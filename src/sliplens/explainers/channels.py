@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from sliplens.explainers.activations import Layer, find_layers, find_published_layers
 from sliplens.explainers.maps import FLOOR, resize, to_masks
-from sliplens.models.engines import Passes
+from sliplens.models.engines import Engine
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,7 +210,7 @@ def measure(
     regions: Regions,
     channels: Int[Tensor, " some"],
     *,
-    passes: Passes,
+    passes: Engine,
     variant: Variant,
     on_channels: Callable[[int], None],
 ) -> Float[Tensor, "points some"]:

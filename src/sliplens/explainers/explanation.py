@@ -61,8 +61,8 @@ class Explanation:
     """The map layer by layer, fine to coarse, where the method has levels and was asked to keep them."""
     approximations: tuple[Approximation, ...] = ()
     """For each image what its map has in common with the exact one; empty where the map is exact."""
-    engine: str = "plain"
-    """What ran the network: as it is (`plain`), or an engine of `models.engines` that answers as it does."""
+    engine: str = "eager"
+    """What ran the network: as it is (`eager`), or a faster engine of `models.engines` that answers as it does."""
 
     @property
     def change(self) -> Float[Tensor, " batch"]:

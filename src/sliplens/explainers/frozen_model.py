@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from sliplens.errors import ImageError, ModelError
 from sliplens.explainers.explanation import Approximation, Explanation, Level, check_maps
-from sliplens.models.engines import Passes, prepare
+from sliplens.models.engines import Engine, prepare
 from sliplens.progress import OnProgress
 
 CHANNELS = 3
@@ -125,7 +125,7 @@ class Comparison(FrozenModel):
         """f(x) - f(b) in margin units."""
         return self.prediction - self.reference_prediction
 
-    def prepare(self, passes: int, *, engine: str = "auto", batch_size: int | None = None) -> Passes:
+    def prepare(self, passes: int, *, engine: str = "auto", batch_size: int | None = None) -> Engine:
         """Make an engine ready for so many passes of the network (`models.engines.prepare`)."""
         return prepare(
             self.model,
@@ -157,7 +157,7 @@ class Comparison(FrozenModel):
         warnings: Iterable[str] = (),
         levels: tuple[Level, ...] = (),
         approximations: tuple[Approximation, ...] = (),
-        engine: str = "plain",
+        engine: str = "eager",
     ) -> Explanation:
         """Record of an explanation, with its warnings.
 

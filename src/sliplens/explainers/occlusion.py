@@ -181,7 +181,7 @@ class Occlusion(Method):
             complete=False,
             target="f(x) - f(x with one region as in the reference), "
             + (f"tiles of {self.tile_px} px" if by_tile else "markers"),
-            engine=passes.engine,
+            engine=passes.name,
         )
 
     def _regions(self, image: Tensor, empty: Tensor) -> Tensor:

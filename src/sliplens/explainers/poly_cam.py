@@ -14,7 +14,7 @@ from sliplens.explainers.explanation import Approximation, Explanation, Level, c
 from sliplens.explainers.frozen_model import Comparison, FrozenModel
 from sliplens.explainers.maps import local_change, to_masks
 from sliplens.explainers.poly_cam_budget import Likeness, estimate_weights, mask_kernel
-from sliplens.models.engines import Passes
+from sliplens.models.engines import Engine
 from sliplens.progress import OnProgress
 
 
@@ -134,7 +134,7 @@ class PolyCam(Method):
             ),
             levels=levels if self.levels else (),
             approximations=tuple(approximations),
-            engine=passes.engine,
+            engine=passes.name,
         )
 
     @property
@@ -166,7 +166,7 @@ class PolyCam(Method):
         activations: list[Tensor],
         shown_at: Tensor,
         *,
-        passes: Passes,
+        passes: Engine,
         count: "_Count",
     ) -> tuple[list[Tensor], list[Approximation]]:
         """Weight >= 0 of each channel, layer by layer, and how far they are estimates."""

@@ -15,10 +15,10 @@ from sliplens.errors import InputError
 from sliplens.faithfulness.fills import Fill, Painter
 from sliplens.faithfulness.units import Units, random_unit_order, unit_order
 from sliplens.intervals import Difference, paired_difference
-from sliplens.models.engines import Passes
+from sliplens.models.engines import Engine
 from sliplens.progress import OnProgress
 
-Predict: TypeAlias = Callable[[Tensor], Tensor] | Passes
+Predict: TypeAlias = Callable[[Tensor], Tensor] | Engine
 """From inputs (batch, 3, height, width) to answers (batch,), in margin units; or an engine made ready for many passes,
 which keeps all cores busy (`sliplens.models.engines.prepare`)."""
 
@@ -97,7 +97,7 @@ def _paint(
 
 
 def _size(predict: Predict, batch_size: int) -> int:
-    return predict.batch_size if isinstance(predict, Passes) else batch_size
+    return predict.batch_size if isinstance(predict, Engine) else batch_size
 
 
 def _collect(
@@ -105,7 +105,7 @@ def _collect(
 ) -> Float64[np.ndarray, " images"]:
     answers = []
     with torch.no_grad():
-        for one in predict.run(batches) if isinstance(predict, Passes) else map(predict, batches):
+        for one in predict.run(batches) if isinstance(predict, Engine) else map(predict, batches):
             answers.append(one.double().cpu().numpy())
             on_batch(one)
     return np.concatenate(answers) if answers else np.empty(0)

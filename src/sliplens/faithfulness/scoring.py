@@ -26,7 +26,7 @@ from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import AREAS, RANDOM_ORDERS, Faithfulness, faithfulness
 from sliplens.faithfulness.units import pixel_units, tile_units
 from sliplens.models import TrainedModel
-from sliplens.models.engines import Passes, prepare
+from sliplens.models.engines import Engine, prepare
 from sliplens.progress import OnProgress
 
 Frames: TypeAlias = UInt8[np.ndarray, "images height width 3"]
@@ -183,7 +183,7 @@ def score_by_deletion(
     return replace(own, control=control)
 
 
-def prepare_passes(trained: TrainedModel, inputs: Float[Tensor, "images 3 size size"], passes: int) -> Passes:
+def prepare_passes(trained: TrainedModel, inputs: Float[Tensor, "images 3 size size"], passes: int) -> Engine:
     """Make an engine ready for so many passes of a network, checked on a few of its inputs, on the network's device."""
     some = inputs[:_CHECKED_IMAGES].to(trained.device)
     return prepare(trained.model, some, trained.predict(some).to(trained.device), passes=passes)

@@ -1,6 +1,24 @@
-"""Networks that read the safety margin, and their checkpoints."""
+"""Networks that read the safety margin, their checkpoints, and the engines that run them."""
 
 from sliplens.models.backbones import build_model
-from sliplens.models.checkpoint import Manifest, TrainedModel, load_checkpoint, save_checkpoint
+from sliplens.models.checkpoint import Estimate, Manifest, TrainedModel, load, load_checkpoint, save_checkpoint
+from sliplens.models.engines import ENGINES, Engine, make_engine, prepare
+from sliplens.models.onnx import export_onnx
+from sliplens.models.predictions import Predictions, predict
 
-__all__ = ["Manifest", "TrainedModel", "build_model", "load_checkpoint", "save_checkpoint"]
+__all__ = [
+    "ENGINES",
+    "Engine",
+    "Estimate",
+    "Manifest",
+    "Predictions",
+    "TrainedModel",
+    "build_model",
+    "export_onnx",
+    "load",
+    "load_checkpoint",
+    "make_engine",
+    "predict",
+    "prepare",
+    "save_checkpoint",
+]

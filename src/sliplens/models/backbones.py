@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 
+import numpy as np
 import torch
 import torchvision
 from jaxtyping import Float
@@ -14,7 +15,7 @@ from sliplens.extras import Table
 
 BINS = 60
 LOWEST, HIGHEST = -0.1, 1.1
-"""Of the histogram: beyond [0, 1] by what a label's own width needs, so that its mean is not pulled inwards."""
+"""Ends of the histogram, in margin units: a label's width beyond [0, 1], so that its mean is not pulled inwards."""
 _WIDTH_RATIO = 0.75
 """Standard deviation of a label over the width of a bin, as Farebrother et al. recommend."""
 
@@ -62,10 +63,43 @@ class HistogramRegressor(nn.Module):
     def loss(
         self, images: Float[Tensor, "batch 3 height width"], labels: Float[Tensor, " batch"]
     ) -> tuple[Float[Tensor, ""], Float[Tensor, " batch"]]:
-        """Cross-entropy against each label as a Gaussian of the bins' width, and the margins that were told."""
+        """Cross-entropy against each label as a Gaussian of the bins' width, and the predicted margins."""
         logits = self.backbone(images).float()
         loss = functional.cross_entropy(logits, histogram_targets(labels, self.edges))
         return loss, torch.softmax(logits / self.temperature, dim=-1) @ self.centres
+
+
+class Answers(nn.Module):
+    """A network that returns all it answers: margins, and the probabilities behind them where it has a histogram.
+
+    Parameters
+    ----------
+    model
+        Takes (batch, 3, height, width) and returns one number an image.
+    """
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(
+        self, image: Float[Tensor, "batch 3 height width"]
+    ) -> tuple[Float[Tensor, " batch"]] | tuple[Float[Tensor, " batch"], Float[Tensor, "batch bins"]]:
+        """Margins, and probabilities if any."""
+        if isinstance(self.model, HistogramRegressor):
+            probabilities = self.model.probabilities(image)
+            return probabilities @ self.model.centres, probabilities
+        return (self.model(image).flatten(),)
+
+
+def answer_names(model: nn.Module) -> tuple[str, ...]:
+    """Names of what `Answers` returns, in its order."""
+    return ("margin", "probabilities") if isinstance(model, HistogramRegressor) else ("margin",)
+
+
+def bin_edges(model: nn.Module) -> Float[np.ndarray, " edges"] | None:
+    """Edges of the bins of a histogram, in margin units; None for one number."""
+    return model.edges.double().cpu().numpy() if isinstance(model, HistogramRegressor) else None
 
 
 def histogram_targets(margins: Float[Tensor, " batch"], edges: Float[Tensor, " edges"]) -> Float[Tensor, "batch bins"]:
@@ -93,7 +127,7 @@ def histogram_targets(margins: Float[Tensor, " batch"], edges: Float[Tensor, " e
 def margin_loss(
     model: nn.Module, images: Float[Tensor, "batch 3 height width"], labels: Float[Tensor, " batch"]
 ) -> tuple[Float[Tensor, ""], Float[Tensor, " batch"]]:
-    """What a training makes small, cross-entropy for a histogram, else the mean squared error; and what was told."""
+    """Loss of training, cross-entropy for a histogram, else the mean squared error; and the predicted margins."""
     if isinstance(model, HistogramRegressor):
         return model.loss(images, labels)
     margins = model(images).reshape(len(images)).float()

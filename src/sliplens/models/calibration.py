@@ -1,7 +1,6 @@
 """How sure a network may be: the temperature of its distribution, and intervals that hold as often as they say."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +16,7 @@ _COLDEST, _HOTTEST = -3.0, 3.0  # natural logarithms of the temperature
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """What was found on validation frames.
+    """Temperature and intervals, fitted on validation frames.
 
     Of a distribution, the interval of a level lies between its quantiles, widened by an offset (conformalised quantile
     regression); of one number, it is that number plus and minus the offset (split conformal). Both hold for the level's
@@ -30,13 +29,18 @@ class Calibration:
     """
 
     temperature: float
-    """By which logits are divided; 1 for one number."""
+    """What logits are divided by; 1 for a network that answers with one number."""
     offsets: dict[str, float]
-    """By level, in margin units; negative where quantiles were too far apart."""
+    """Widening of each level's interval, in margin units; negative where quantiles were too far apart."""
     frames: int
     """Validation frames."""
     mse: float
-    """Of the answers to them, at this temperature, which moves the mean of a distribution a little."""
+    """Mean squared error of the answers to them, at this temperature (it moves the mean of a distribution a little)."""
+
+    def __post_init__(self) -> None:
+        """Check that logits can be divided by the temperature."""
+        if not self.temperature > 0:
+            raise ModelError(f"the temperature of a calibration must be positive, got {self.temperature:g}")
 
     def offset(self, level: float) -> float:
         """Offset of a level.
@@ -49,29 +53,6 @@ class Calibration:
         if str(level) not in self.offsets:
             raise ModelError(f"there is no interval of level {level:g}; choose {', '.join(self.offsets)}")
         return self.offsets[str(level)]
-
-    @classmethod
-    def from_json(cls, values: dict[str, Any]) -> "Calibration":
-        """Read what a manifest keeps.
-
-        Raises
-        ------
-        ModelError
-            If a number is missing or is none.
-        """
-        try:
-            offsets = {str(level): float(offset) for level, offset in values["offsets"].items()}
-            made = cls(
-                temperature=float(values["temperature"]),
-                offsets=offsets,
-                frames=int(values["frames"]),
-                mse=float(values["mse"]),
-            )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise ModelError(f"the calibration is damaged ({error}); train the network again") from None
-        if not (np.isfinite([made.temperature, made.mse, *offsets.values()]).all() and made.temperature > 0):
-            raise ModelError("the calibration holds no usable numbers; train the network again")
-        return made
 
 
 def fit_temperature(logits: Float[Tensor, "frames bins"], targets: Float[Tensor, "frames bins"]) -> float:

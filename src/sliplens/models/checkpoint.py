@@ -1,10 +1,9 @@
-"""Networks that come with the package, trained on simulated touch."""
+"""Trained networks: with their manifest, on disk, and those that come with the package."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,9 +12,10 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from sliplens.codec import load_record, save_record
 from sliplens.errors import CheckpointError, ImageError, InputError
-from sliplens.files import hash_file, read_json, require_folder, write_json
-from sliplens.models.backbones import HistogramRegressor, build_model
+from sliplens.files import hash_file, require_folder
+from sliplens.models.backbones import HistogramRegressor, bin_edges, build_model
 from sliplens.models.calibration import Calibration, quantiles
 from sliplens.models.encodings import Encoding, get_encoding
 
@@ -39,9 +39,8 @@ class Manifest:
     target: str = "safety_margin"
     weights_sha256: str = ""
     schema_version: int = SCHEMA_VERSION
-    metrics: dict[str, Any] = field(default_factory=dict)
-    calibration: dict[str, Any] | None = None
-    """See `Calibration`; None where none was found."""
+    metrics: dict[str, float] = field(default_factory=dict)
+    calibration: Calibration | None = None
     versions: dict[str, str] = field(default_factory=dict)
     trained_on: tuple[str, ...] = ()
     """First 12 hex digits of the hash of every trial that trained or validated it, or what it started from."""
@@ -67,9 +66,16 @@ class TrainedModel:
         return get_encoding(self.manifest.input)
 
     def encode(
-        self, frames: UInt8[np.ndarray, "batch height width 3"], reference: UInt8[np.ndarray, "_ _ 3"]
+        self, frames: UInt8[np.ndarray, "batch height width 3"], reference: UInt8[np.ndarray, "_ _ 3"] | None
     ) -> Float[Tensor, "batch 3 size size"]:
         """Encode frames as the network was trained on them.
+
+        Parameters
+        ----------
+        frames
+            RGB.
+        reference
+            The sensor untouched; None for frames that were compared before, or that need not be.
 
         Raises
         ------
@@ -77,7 +83,10 @@ class TrainedModel:
             If the frames are not of the size the network's sensor has.
         """
         self.require_frame_size(frames.shape[1:3])
-        return self.encoding.encode(frames, reference, image_size=self.manifest.image_size)
+        size = self.manifest.image_size
+        if reference is None:
+            return self.encoding.normalise(self.encoding.resize(frames, image_size=size))
+        return self.encoding.encode(frames, reference, image_size=size)
 
     def require_frame_size(self, size: tuple[int, ...]) -> None:
         """Refuse frames of another sensor.
@@ -102,24 +111,28 @@ class TrainedModel:
     @property
     def calibration(self) -> Calibration | None:
         """How sure the network may be; None for one that was never calibrated."""
-        found = self.manifest.calibration
-        return None if found is None else Calibration.from_json(found)
+        return self.manifest.calibration
 
     @torch.no_grad()
     def estimate(self, inputs: Float[Tensor, "batch 3 size size"], *, batch_size: int = 64) -> "Estimate":
         """Safety margin of encoded frames, with how sure it is."""
-        if isinstance(self.model, HistogramRegressor):
-            parts = [self.model.probabilities(batch.to(self.device)) for batch in inputs.split(batch_size)]
-            bins = len(self.model.edges) - 1
-            probabilities = torch.cat(parts) if parts else torch.empty((0, bins), device=self.device)
-            return Estimate(
-                margin=(probabilities @ self.model.centres).double().cpu().numpy(),
-                probabilities=probabilities.double().cpu().numpy(),
-                edges=self.model.edges.double().cpu().numpy(),
-                calibration=self.calibration,
-            )
-        margin = self.predict(inputs, batch_size=batch_size).double().cpu().numpy()
-        return Estimate(margin=margin, calibration=self.calibration)
+        if not isinstance(self.model, HistogramRegressor):
+            return self.to_estimate(self.predict(inputs, batch_size=batch_size))
+        parts = [self.model.probabilities(batch.to(self.device)) for batch in inputs.split(batch_size)]
+        bins = len(self.model.edges) - 1
+        probabilities = torch.cat(parts) if parts else torch.empty((0, bins), device=self.device)
+        return self.to_estimate(probabilities @ self.model.centres, probabilities)
+
+    def to_estimate(
+        self, margin: Float[Tensor, " batch"], probabilities: Float[Tensor, "batch bins"] | None = None
+    ) -> "Estimate":
+        """Estimate from what the network answered (`Answers`)."""
+        return Estimate(
+            margin=margin.double().cpu().numpy(),
+            probabilities=None if probabilities is None else probabilities.double().cpu().numpy(),
+            edges=bin_edges(self.model),
+            calibration=self.calibration,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,7 +192,7 @@ def save_checkpoint(folder: Path, model: nn.Module, manifest: Manifest) -> None:
     part = weights.with_name(weights.name + ".part")
     save_file({name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}, part)
     part.replace(weights)
-    write_json(folder / MANIFEST_FILE, asdict(manifest) | {"weights_sha256": hash_file(weights)})
+    save_record(replace(manifest, weights_sha256=hash_file(weights)), folder / MANIFEST_FILE)
 
 
 def load_checkpoint(folder: Path, *, device: str = "cpu") -> TrainedModel:
@@ -213,26 +226,10 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> TrainedModel:
 
 
 def _read_manifest(path: Path) -> Manifest:
-    values = read_json(path)
-    if not isinstance(values, dict) or values.get("schema_version") != SCHEMA_VERSION:
-        raise CheckpointError(f"{path} is not a sliplens manifest of schema {SCHEMA_VERSION}")
-    known = {item.name for item in fields(Manifest)}
-    missing = {"backbone", "input", "image_size", "frame_size", "weights_sha256"} - set(values)
-    if missing:
-        raise CheckpointError(f"{path} is incomplete (it lacks {', '.join(sorted(missing))}); train the network again")
-    size, frame = values["image_size"], values["frame_size"]
-    if not isinstance(size, int) or not isinstance(frame, list) or [type(side) for side in frame] != [int, int]:
-        raise CheckpointError(f"{path} gives no usable image_size or frame_size; train the network again")
-    given: dict[str, Any] = {name: value for name, value in values.items() if name in known}
-    given["frame_size"] = (frame[0], frame[1])
-    given["trained_on"] = tuple(str(one) for one in values.get("trained_on", ()))
-    try:
-        manifest = Manifest(**given)
-    except TypeError as error:
-        raise CheckpointError(f"{path} is incomplete ({error}); train the network again") from None
+    manifest = load_record(path, Manifest, command="sliplens train")
+    if manifest.schema_version != SCHEMA_VERSION:
+        raise CheckpointError(f"{path} is not a sliplens manifest of schema {SCHEMA_VERSION}; train the network again")
     get_encoding(manifest.input)
-    if manifest.calibration is not None:
-        Calibration.from_json(manifest.calibration)
     return manifest
 
 
@@ -241,24 +238,50 @@ def shipped_names() -> list[str]:
     return sorted(folder.name for folder in _weights().iterdir() if (folder / MANIFEST_FILE).is_file())
 
 
-def load(name: str, *, device: str = "cpu") -> TrainedModel:
-    """Load a network that comes with the package, by its name.
+def load(run: str | Path, *, device: str = "cpu") -> TrainedModel:
+    """Load a network: one that comes with the package by its name, or that of a run by its folder.
 
     Parameters
     ----------
-    name
-        One of `shipped_names`, such as `chromatouch-difference`.
+    run
+        One of `shipped_names`, such as `chromatouch-difference`, or a folder that training wrote.
     device
         Where to put it.
 
     Raises
     ------
     InputError
-        If there is none of that name; the message lists those there are.
+        If there is none, which lists the names there are, or the device is not known or not there.
+    CheckpointError
+        If the folder is damaged.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> network = sl.load("chromatouch-difference")
+    >>> network.manifest.input, network.manifest.image_size
+    ('difference', 224)
     """
-    if name not in shipped_names():
-        raise InputError(f"no network named {name!r} comes with sliplens; choose {_choices()}")
-    return load_checkpoint(_weights() / name, device=device)
+    require_device(device)
+    return load_checkpoint(find_run(Path(run)), device=device)
+
+
+def require_device(name: str) -> None:
+    """Refuse a device that is not known or not there.
+
+    Raises
+    ------
+    InputError
+        Naming those that can be used.
+    """
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise InputError(f"device {name!r} is not known; use cpu, cuda or cuda:1") from None
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise InputError(f"device {name} is not on this machine; use cpu")
+    if device.type not in {"cpu", "cuda"}:
+        raise InputError(f"device {name} cannot be used; use cpu or cuda")
 
 
 def find_run(run: Path) -> Path:

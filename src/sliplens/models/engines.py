@@ -1,31 +1,222 @@
-"""Many forward passes of one network, by the fastest engine at hand that answers as the network does."""
+"""Engines: ways to run a network many times, by the fastest at hand that answers as the network itself does."""
 
 import hashlib
 import os
 import shutil
-import tempfile
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 from weakref import WeakKeyDictionary
 
-import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.fx.experimental.optimization import fuse
 from torch.fx.proxy import TraceError
 
 from sliplens.errors import InputError, ModelError
-from sliplens.extras import ONNX_PACKAGES, import_onnxruntime, import_openvino, missing_packages
-from sliplens.models import TrainedModel
-from sliplens.models.backbones import HistogramRegressor
-from sliplens.models.checkpoint import Estimate
-from sliplens.models.onnx import INPUT, Answers, answer_names, export_onnx, require_file_of, run_network, to_estimate
+from sliplens.extras import ONNX_PACKAGES, Table, import_onnxruntime, import_openvino, missing_packages
+from sliplens.models.backbones import Answers, HistogramRegressor, answer_names
+from sliplens.models.checkpoint import Estimate, TrainedModel
+from sliplens.models.onnx import INPUT, TOLERANCE, convert_network, difference, require_file_of, trial_inputs
+
+RunBatches: TypeAlias = Callable[[Iterable[Tensor]], Iterator[tuple[Tensor, ...]]]
+"""Answers to batches of images, as `Answers` gives them, in the order of the batches."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Engine:
+    """A network ready to be run; valid while the network stays as it is."""
+
+    name: str
+    """Row of `ENGINES`."""
+    batch_size: int
+    """Images in a batch; the last one may be shorter."""
+    answers: RunBatches
+    """Margins and, of a histogram, probabilities, of batches of images; a few batches are under way at once."""
+
+    def run(self, batches: Iterable[Tensor]) -> Iterator[Float[Tensor, " batch"]]:
+        """Safety margins of batches of images, in their order; a few batches are under way at once."""
+        return (margins for margins, *_ in self.answers(batches))
+
+    def estimate(self, trained: TrainedModel, inputs: Float[Tensor, "batch 3 size size"]) -> Estimate:
+        """Safety margins of encoded images, with how sure the network is.
+
+        Parameters
+        ----------
+        trained
+            The network that the engine was made of.
+        inputs
+            As `TrainedModel.encode` makes them.
+        """
+        answers = zip(*self.answers(inputs.split(self.batch_size)), strict=True)
+        return trained.to_estimate(*(torch.cat(parts) for parts in answers))
+
+
+@dataclass(frozen=True, kw_only=True)
+class EngineJob:
+    """What an engine is made for."""
+
+    images: Float[Tensor, "batch 3 height width"]
+    """Images of the size to come, on the network's device."""
+    batch_size: int
+    streams: int
+    """Batches that are worked on at once, by one thread each; with 1, all threads work on one batch."""
+    onnx_file: Path | None = None
+    """The network as `export_onnx` wrote it, if there is such a file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EngineKind:
+    """Way to run a network."""
+
+    words: str
+    """What it does, for people."""
+    pays_after: int | None
+    """Passes of a network from which it pays to prepare the engine; None for one that is taken by name alone."""
+    batch_size: Callable[[Float[Tensor, "batch 3 height width"]], int]
+    """Images in a batch that suit it."""
+    obstacle: Callable[[torch.device], str | None]
+    """Why it cannot be used on a device, with the cure; None if it can."""
+    build: Callable[[nn.Module, EngineJob], RunBatches]
+    """Called with a network in evaluation mode, one number an image."""
+
+
+def prepare(
+    model: nn.Module,
+    images: Float[Tensor, "batch 3 height width"],
+    predictions: Float[Tensor, " batch"],
+    *,
+    passes: int,
+    engine: str = "auto",
+    batch_size: int | None = None,
+    streams: int | None = None,
+    onnx_file: Path | None = None,
+) -> Engine:
+    """Make a network ready for many passes without gradients, and check that it answers as before.
+
+    Parameters
+    ----------
+    model
+        Network in evaluation mode, one number an image.
+    images, predictions
+        Images of the size to come, and what the network says of them: an engine that says anything else is not used.
+    passes
+        How many there will be. `auto` takes no engine that would not pay for its preparation; passes of earlier calls
+        count, since frames are explained one by one.
+    engine
+        Row of `ENGINES`, or `auto` for the fastest that can be used.
+    batch_size
+        Images in a batch; None for what suits the engine.
+    streams
+        Batches that are worked on at once, by one thread each; None for one a thread, which is fastest for many
+        passes: threads that share a batch wait for each other in every layer, and long where another program takes
+        one of their cores. With 1 all threads work on one batch, which answers soonest.
+    onnx_file
+        The network as `export_onnx` wrote it, for `onnxruntime` and `openvino`; converted here if None.
+
+    Raises
+    ------
+    InputError
+        If there is no such engine, or it is asked for by name and cannot be used here.
+    ModelError
+        If an engine that is asked for by name cannot run the network, or answers otherwise.
+    """
+    _PASSES[model] = known = _PASSES.get(model, 0) + passes
+    pay = [name for name, row in ENGINES.items() if row.pays_after is not None and known >= row.pays_after]
+    names = [engine] if engine != "auto" else [*reversed(pay)]
+    for name in names:
+        kind = ENGINES.pick(name)
+        obstacle = _obstacle(name, kind, model, images)
+        if obstacle is not None:
+            if engine != "auto":
+                raise InputError(f"the engine {name} cannot be used: {obstacle}")
+            continue
+        job = EngineJob(
+            images=images,
+            batch_size=batch_size or kind.batch_size(images),
+            streams=streams or torch.get_num_threads(),
+            onnx_file=onnx_file,
+        )
+        try:
+            ready = Engine(name=name, batch_size=job.batch_size, answers=_build(name, kind, model, job))
+            if name == "eager":
+                return ready  # it is what the predictions came from
+            found = torch.cat(list(ready.run(images.split(ready.batch_size))))
+            off = difference(found.cpu().numpy(), predictions.cpu().numpy())
+            if off <= TOLERANCE:
+                return ready
+            reason = f"its answers differ by {off:.2g}, {TOLERANCE:g} is allowed"
+        except InputError:
+            raise
+        except Exception as error:
+            # whatever a converter cannot do, the network itself still can
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        if engine != "auto":
+            cure = "choose another engine" if onnx_file is None else f"export {onnx_file} again"
+            raise ModelError(f"the engine {name} cannot run {type(model).__name__} ({reason}); {cure}")
+    raise AssertionError  # eager has no obstacle
+
+
+def make_engine(
+    name: str,
+    trained: TrainedModel,
+    *,
+    frames: int = 1,
+    batch_size: int = 8,
+    streams: int | None = None,
+    onnx_file: Path | None = None,
+) -> Engine:
+    """Make a trained network ready to read frames, and check that it answers as before on black, white and noise.
+
+    Parameters
+    ----------
+    name
+        Row of `ENGINES`, or `auto` for the fastest that can be used.
+    trained
+        The network, on the device where it is to run.
+    frames
+        How many there will be, for `auto`: a few do not pay for a conversion.
+    batch_size, streams
+        As `prepare` takes them; a batch of 1 and a stream of 1 for a running camera.
+    onnx_file
+        The network as `export_onnx` wrote it, for `onnxruntime` and `openvino`; converted here if None.
+
+    Raises
+    ------
+    InputError
+        If there is no engine of that name, it cannot be used here, or the file is not of this network.
+    ModelError
+        If the engine cannot run the network, or answers otherwise.
+
+    Examples
+    --------
+    >>> import torch
+    >>> import sliplens as sl
+    >>> from sliplens.models.engines import make_engine
+    >>> network = sl.load("chromatouch-difference")
+    >>> engine = make_engine("folded", network, batch_size=2)
+    >>> engine.estimate(network, torch.zeros(3, 3, 224, 224)).margin.shape
+    (3,)
+    """
+    if onnx_file is not None:
+        require_file_of(onnx_file, trained)
+    *_, images = trial_inputs(trained.manifest.image_size)
+    return prepare(
+        trained.model,
+        images.to(trained.device),
+        trained.predict(images).to(trained.device),
+        passes=frames,
+        engine=name,
+        batch_size=batch_size,
+        streams=streams,
+        onnx_file=onnx_file,
+    )
 
 
 def fold_batch_norm(model: nn.Module) -> nn.Module:
@@ -60,90 +251,37 @@ def _fold(model: nn.Module) -> nn.Module:
     return folded.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
 
-Run = Callable[[Tensor], tuple[np.ndarray, ...]]
-EXPORT_PAYS_AFTER = 4000
-"""Frames: an export takes some 10 s of a processor, and ONNX Runtime then saves 2 to 9 ms a frame."""
+def _obstacle(name: str, kind: EngineKind, model: nn.Module, images: Tensor) -> str | None:
+    if name != "eager" and any(module._forward_hooks or module._forward_pre_hooks for module in model.modules()):
+        return "the model has hooks, which may change what it says; take them off"
+    if name in _CONVERTED and images.dtype != torch.float32:
+        return f"it runs float32, not {images.dtype}; choose folded"
+    return kind.obstacle(images.device)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Engine:
-    """A network ready to be run."""
-
-    name: str
-    """Row of `ENGINES`."""
-    trained: TrainedModel
-    run: Run
-    """Answers as `Answers` gives them."""
-
-    def __call__(self, inputs: Float32[Tensor, "batch 3 size size"]) -> Estimate:
-        """Safety margins of encoded frames.
-
-        Parameters
-        ----------
-        inputs
-            As `TrainedModel.encode` makes them, on the processor.
-        """
-        return to_estimate(self.trained, self.run(inputs))
+def _build(name: str, kind: EngineKind, model: nn.Module, job: EngineJob) -> RunBatches:
+    if name == "eager":
+        return kind.build(model, job)
+    shape, threads = tuple(job.images.shape[1:]), torch.get_num_threads()
+    key = (name, shape, job.images.device, job.batch_size, job.streams, threads, job.onnx_file, _hash_weights(model))
+    known = _BUILT.get(model)
+    if known is None or known[0] != key:
+        _BUILT[model] = known = (key, kind.build(model, job))
+    return known[1]
 
 
-@dataclass(frozen=True, kw_only=True)
-class EngineKind:
-    """How networks are run in one way."""
-
-    words: str
-    """What it does, for people."""
-    obstacle: Callable[[torch.device], str | None]
-    """Why it cannot be used for a network on a device, with the cure; None if it can."""
-    build: Callable[[TrainedModel, Path | None], Run]
-    """Called with the network, and an ONNX file of it if there is one."""
+def _hash_weights(model: nn.Module) -> str:
+    digest = hashlib.blake2b()
+    for name, tensor in model.state_dict().items():
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy())
+    return digest.hexdigest()
 
 
-def make_engine(name: str, trained: TrainedModel, *, onnx_file: Path | None = None) -> Engine:
-    """Make a network ready to be run by an engine.
-
-    Parameters
-    ----------
-    name
-        Row of `ENGINES`.
-    trained
-        The network, on the device where it is to run.
-    onnx_file
-        The network as `export_onnx` wrote it, for `onnxruntime` and `openvino`; exported on the fly if None.
-
-    Raises
-    ------
-    InputError
-        If there is no engine of that name, it cannot be used here, or the file is not of this network.
-    """
-    if name not in ENGINES:
-        raise InputError(f"there is no engine named {name!r}; choose one of {', '.join(ENGINES)}")
-    obstacle = ENGINES[name].obstacle(_device(trained.model))
-    if obstacle is not None:
-        raise InputError(f"the engine {name} cannot be used: {obstacle}")
-    return Engine(name=name, trained=trained, run=ENGINES[name].build(trained, onnx_file))
-
-
-def fastest_engine(trained: TrainedModel, *, onnx_file: Path | None = None, frames: int | None = None) -> str:
-    """Name of the engine to run a network by: the fastest that was measured and is at hand.
-
-    `compiled` is never chosen: it takes minutes to begin.
-
-    Parameters
-    ----------
-    trained
-        The network, on its device.
-    onnx_file
-        Its ONNX file, if there is one.
-    frames
-        How many there will be; many if None. For a few an export does not pay.
-    """
-    few = frames is not None and frames < EXPORT_PAYS_AFTER and onnx_file is None
-    order = ("folded",) if few else ("onnxruntime", "openvino", "folded")
-    return next(name for name in order if ENGINES[name].obstacle(_device(trained.model)) is None)
-
-
-def _device(model: nn.Module) -> torch.device:
-    return next(model.parameters()).device
+_PASSES: WeakKeyDictionary[nn.Module, int] = WeakKeyDictionary()
+"""Passes that each network was asked for so far."""
+_BUILT: WeakKeyDictionary[nn.Module, tuple[tuple[Any, ...], RunBatches]] = WeakKeyDictionary()
+"""What was built last of each network; it must not hold the network itself, which would never die."""
 
 
 def _no_obstacle(_: torch.device) -> None:
@@ -163,306 +301,154 @@ def _needs(*packages: str, extra: str) -> Callable[[torch.device], str | None]:
     def obstacle(device: torch.device) -> str | None:
         if device.type != "cpu":
             return f"it runs on the processor, not on {device.type}; leave the device out, or choose folded"
-        missing = missing_packages(*packages)
-        return f'{" and ".join(missing)} missing; `pip install "sliplens[{extra}]"`' if missing else None
+        missing = missing_packages(*packages, extra=extra)
+        return f"it needs {missing}" if missing else None
 
     return obstacle
 
 
-def _torch_run(network: nn.Module, device: torch.device) -> Run:
-    return lambda inputs: run_network(network, inputs.to(device))
-
-
-def _eager(trained: TrainedModel, _: Path | None) -> Run:
-    return _torch_run(Answers(trained.model).eval(), _device(trained.model))
-
-
-def _folded(trained: TrainedModel, _: Path | None) -> Run:
-    return _torch_run(Answers(fold_batch_norm(trained.model)).eval(), _device(trained.model))
-
-
-def _compiled(trained: TrainedModel, _: Path | None) -> Run:
-    from torch._dynamo.exc import TorchDynamoException  # noqa: PLC0415 (takes seconds)
-
-    compiled = torch.compile(Answers(fold_batch_norm(trained.model)).eval())
-    device = _device(trained.model)
-
-    @torch.no_grad()
-    def run(inputs: Tensor) -> tuple[np.ndarray, ...]:
-        try:
-            return tuple(answer.cpu().numpy() for answer in compiled(inputs.to(device)))
-        except TorchDynamoException as error:
-            reason = str(error).strip().splitlines()[0]
-            raise ModelError(f"torch cannot compile the network here ({reason}); choose another engine") from None
+def _run_torch(network: nn.Module, device: torch.device) -> RunBatches:
+    def run(batches: Iterable[Tensor]) -> Iterator[tuple[Tensor, ...]]:
+        for batch in batches:
+            with torch.no_grad():
+                # convolutions on a processor then need no reordering
+                answers = network(batch.to(device).contiguous(memory_format=torch.channels_last))
+            yield answers
 
     return run
 
 
-def _onnxruntime(trained: TrainedModel, onnx_file: Path | None) -> Run:
+def _eager(model: nn.Module, job: EngineJob) -> RunBatches:
+    return _run_torch(Answers(model), job.images.device)
+
+
+def _folded(model: nn.Module, job: EngineJob) -> RunBatches:
+    return _run_torch(Answers(fold_batch_norm(model)), job.images.device)
+
+
+def _compiled(model: nn.Module, job: EngineJob) -> RunBatches:
+    return _run_torch(torch.compile(Answers(fold_batch_norm(model))), job.images.device)  # pyright: ignore
+
+
+def _run_in_streams(submit: Callable[[Tensor], Callable[[], tuple[Tensor, ...]]], streams: int) -> RunBatches:
+    """Begin a few batches at once; `submit` begins one and gives what waits for its answers."""
+
+    def run(batches: Iterable[Tensor]) -> Iterator[tuple[Tensor, ...]]:
+        # more than can be worked on: the next ones are made while all cores are busy
+        waiting: deque[Callable[[], tuple[Tensor, ...]]] = deque()
+        for batch in batches:
+            waiting.append(submit(batch))
+            if len(waiting) > streams:
+                yield waiting.popleft()()
+        while waiting:
+            yield waiting.popleft()()
+
+    return run
+
+
+def _onnxruntime(model: nn.Module, job: EngineJob) -> RunBatches:
     runtime = import_onnxruntime()
     options = runtime.SessionOptions()
-    options.intra_op_num_threads = torch.get_num_threads()
+    options.intra_op_num_threads = torch.get_num_threads() if job.streams == 1 else 1
     # threads that spin while they wait take the cores from those that decode and encode
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    source = convert_network(model, job.images).SerializeToString() if job.onnx_file is None else str(job.onnx_file)
+    session = runtime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+    names, workers = list(answer_names(model)), ThreadPoolExecutor(job.streams, thread_name_prefix="onnxruntime")
 
-    def load(path: Path) -> Any:
-        return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    def answer(batch: Tensor) -> tuple[Tensor, ...]:
+        return tuple(map(torch.from_numpy, session.run(names, {INPUT: batch.contiguous().numpy()})))
 
-    session = _load("ONNX Runtime", load, trained, onnx_file)
-    names = list(answer_names(trained.model))
-    return lambda inputs: tuple(session.run(names, {INPUT: inputs.numpy()}))
+    return _run_in_streams(lambda batch: workers.submit(answer, batch).result, job.streams)
 
 
-def _openvino(trained: TrainedModel, onnx_file: Path | None) -> Run:
+def _openvino(model: nn.Module, job: EngineJob) -> RunBatches:
     openvino = import_openvino()
-    settings: dict[str, Any] = {
-        "PERFORMANCE_HINT": "LATENCY",
-        "INFERENCE_NUM_THREADS": torch.get_num_threads(),
-        "INFERENCE_PRECISION_HINT": "f32",  # where the processor knows bfloat16 that is the default, at 3 digits
-    }
-
-    def load(path: Path) -> Any:
-        return openvino.Core().compile_model(str(path), "CPU", settings)
-
-    network = _load("OpenVINO", load, trained, onnx_file)
-    names = answer_names(trained.model)
-
-    def run(inputs: Tensor) -> tuple[np.ndarray, ...]:
-        answers = network({INPUT: inputs.numpy()})
-        return tuple(np.array(answers[name]) for name in names)  # its own memory is written anew by the next call
-
-    return run
-
-
-def _load(words: str, load: Callable[[Path], Any], trained: TrainedModel, onnx_file: Path | None) -> Any:
-    with tempfile.TemporaryDirectory() as folder:
-        if onnx_file is None:
-            export_onnx(trained, path := Path(folder) / "network.onnx")
-        else:
-            require_file_of(path := onnx_file, trained)
-        try:
-            return load(path)
-        except Exception as error:  # the errors of ONNX Runtime have no other base
-            reason = str(error).strip().splitlines()[0]
-            raise ModelError(f"{words} cannot load {path} ({reason}); export the run again") from None
-
-
-ENGINES = {
-    "eager": EngineKind(words="torch as it is", obstacle=_no_obstacle, build=_eager),
-    "folded": EngineKind(
-        words="torch, batch normalisation folded into the convolutions", obstacle=_no_obstacle, build=_folded
-    ),
-    "compiled": EngineKind(words="torch.compile of the folded network", obstacle=_compiler_obstacle, build=_compiled),
-    "onnxruntime": EngineKind(words="ONNX Runtime", obstacle=_needs(*ONNX_PACKAGES, extra="onnx"), build=_onnxruntime),
-    "openvino": EngineKind(
-        words="OpenVINO, from the ONNX file",
-        obstacle=_needs(*ONNX_PACKAGES, "openvino", extra="onnx,openvino"),
-        build=_openvino,
-    ),
-}
-"""Ways to run a network; each answers within 1e-4 of `eager`."""
-
-
-PARITY = 1e-5
-"""How far an engine's answer may lie from the network's own, times its size where that is above 1: float32 sums in
-another order move an answer by a tenth of it, and channels of one layer differ by a hundred times as much."""
-WORTH_FOLDING, WORTH_CONVERTING = 100, 1500
-"""Passes of a network, those of earlier calls included, from which it pays to prepare an engine: folding takes as long
-as 20 passes, a conversion as 1000."""
-
-RunBatch = Callable[[Iterable[Tensor]], Iterator[Tensor]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Passes:
-    """A network ready for many passes; valid while the network is held still."""
-
-    engine: str
-    """`plain`, `folded` or `openvino`."""
-    batch_size: int
-    """Images in a batch; the last one may be shorter."""
-    run: RunBatch
-    """Predictions (batch,) of batches of images, in their order, a few of them under way at once."""
-
-
-def prepare(
-    model: nn.Module,
-    images: Float[Tensor, "batch 3 height width"],
-    predictions: Float[Tensor, " batch"],
-    *,
-    passes: int,
-    engine: str = "auto",
-    batch_size: int | None = None,
-) -> Passes:
-    """Make a network ready for many passes without gradients, and check that it answers as before.
-
-    Parameters
-    ----------
-    model
-        Network in evaluation mode, one number an image.
-    images, predictions
-        Images of the size to come, and what the network says of them: an engine that says anything else is not used.
-    passes
-        How many there will be: an engine that would not pay for its preparation is not used by `auto`.
-    engine
-        `plain`, the network as it is; `folded`, batch normalisation folded into the convolutions; `openvino`, that
-        converted to OpenVINO; `auto`, the last of them that can be used.
-    batch_size
-        Images in a batch; None for what suits the engine.
-
-    Raises
-    ------
-    InputError
-        If there is no such engine, or it is asked for by name and cannot be used here.
-    ModelError
-        If an engine that is asked for by name cannot run the network, or answers otherwise.
-    """
-    if engine not in {"auto", *_BUILDERS}:
-        raise InputError(f"there is no engine named {engine!r} for passes; choose auto, {', '.join(_BUILDERS)}")
-    _SPENT[model] = spent = _SPENT.get(model, 0) + passes
-    names = [engine] if engine != "auto" else [name for name in _BUILDERS if spent >= _WORTH[name]]
-    for name in names:
-        obstacle = _obstacle(name, model, images)
-        if obstacle is not None:
-            if engine != "auto":
-                raise InputError(f"the engine {name} cannot be used: {obstacle}")
-            continue
-        try:
-            ready = Passes(
-                engine=name,
-                batch_size=batch_size or _batch_size(name, images),
-                run=_BUILDERS[name](model, images, batch_size or _batch_size(name, images)),
+    shape = openvino.PartialShape((job.batch_size, *job.images.shape[1:]))
+    core = openvino.Core()
+    if job.onnx_file is not None:
+        converted = core.read_model(str(job.onnx_file))
+        converted.reshape(shape)
+    else:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of torch and OpenVINO about each other; the answers are checked
+            example = job.images.new_zeros(tuple(int(length) for length in shape.to_shape()))
+            converted = openvino.convert_model(
+                Answers(fold_batch_norm(model)).eval(), example_input=example, input=[shape]
             )
-            if name == "plain":
-                return ready  # it is what the predictions came from
-            found = torch.cat(list(ready.run(images.split(ready.batch_size))))
-            if agrees(found, predictions):
-                return ready
-            reason = f"its answers differ by {float((found - predictions).abs().max()):.2g}"
-        except Exception as error:
-            # whatever a converter cannot do, the network itself still can
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        if engine != "auto":
-            raise ModelError(f"the engine {name} cannot run {type(model).__name__} ({reason}); choose auto")
-    raise AssertionError  # plain has no obstacle
-
-
-def agrees(found: Float[Tensor, " batch"], expected: Float[Tensor, " batch"]) -> bool:
-    """Whether an engine's answers are the network's own, but for rounding."""
-    return bool(((found - expected).abs() <= PARITY * expected.abs().clamp_min(1)).all())
-
-
-def _batch_size(name: str, images: Tensor) -> int:
-    if images.device.type != "cpu":
-        return 256  # a graphics card wants to be filled
-    if name != "openvino":
-        return 64
-    # measured on two cores: 16 images of 112 px and 4 of 224 px are the fastest, more of them leave the caches
-    return min(16, max(4, 16 * 112**2 // (images.shape[-2] * images.shape[-1])))
-
-
-def _obstacle(name: str, model: nn.Module, images: Tensor) -> str | None:
-    if name == "plain":
-        return None
-    if any(_has_hooks(module) for module in model.modules()):
-        return "the model has hooks, which may change what it says; take them off"
-    if name == "openvino":
-        if images.device.type != "cpu" or images.dtype != torch.float32:
-            return f"it runs float32 on the processor, not {images.dtype} on {images.device.type}; choose folded"
-        if missing_packages("openvino"):
-            return 'openvino is not installed; `pip install "sliplens[openvino]"`'
-    return None
-
-
-def _has_hooks(module: nn.Module) -> bool:
-    return bool(module._forward_hooks or module._forward_pre_hooks)
-
-
-def _plain(model: nn.Module, _: Tensor, batch_size: int) -> RunBatch:  # noqa: ARG001 (a row of the table)
-    def run(batches: Iterable[Tensor]) -> Iterator[Tensor]:
-        for batch in batches:
-            # convolutions on a CPU then need no reordering
-            yield model(batch.contiguous(memory_format=torch.channels_last)).reshape(len(batch))
-
-    return run
-
-
-def _fold_for_passes(model: nn.Module, images: Tensor, batch_size: int) -> RunBatch:
-    return _plain(fold_batch_norm(model), images, batch_size)
-
-
-def _openvino_for_passes(model: nn.Module, images: Tensor, batch_size: int) -> RunBatch:
-    key = (tuple(images.shape[1:]), batch_size, torch.get_num_threads(), _hash_weights(model))
-    known = _CONVERTED.get(model)
-    if known is None or known[0] != key:
-        _CONVERTED[model] = known = (key, _convert(model, images, batch_size))
-    network = known[1]
-
-    def run(batches: Iterable[Tensor]) -> Iterator[Tensor]:
-        # one more than can be worked on: the next batch is made while all cores are busy
-        idle = [network.create_infer_request() for _ in range(torch.get_num_threads() + 1)]
-        busy: deque[tuple[Any, Tensor, int]] = deque()
-
-        def finish() -> Tensor:
-            request, _, length = busy.popleft()
-            request.wait()
-            idle.append(request)
-            # its own memory is written anew by the next call
-            return torch.from_numpy(request.get_output_tensor(0).data.copy()).flatten()[:length]
-
-        for batch in batches:
-            if not idle:
-                yield finish()
-            full = batch if len(batch) == batch_size else torch.cat([batch, batch.new_zeros(_rest(batch, batch_size))])
-            full = full.contiguous()
-            request = idle.pop()
-            request.start_async({0: full.numpy()}, share_inputs=True)
-            busy.append((request, full, len(batch)))  # the tensor too: the request reads its memory
-        while busy:
-            yield finish()
-
-    return run
-
-
-def _rest(batch: Tensor, batch_size: int) -> tuple[int, ...]:
-    return (batch_size - len(batch), *batch.shape[1:])
-
-
-def _convert(model: nn.Module, images: Tensor, batch_size: int) -> Any:
-    openvino = import_openvino()
-    shape = (batch_size, *images.shape[1:])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of torch and OpenVINO about each other; the answers are checked
-        converted = openvino.convert_model(
-            fold_batch_norm(model), example_input=images.new_zeros(shape), input=[openvino.PartialShape(shape)]
-        )
-    threads = torch.get_num_threads()
     settings = {
-        # one batch to a core: together they would wait for each other in every layer
-        "NUM_STREAMS": threads,
-        "INFERENCE_NUM_THREADS": threads,
+        "NUM_STREAMS": job.streams,
+        "INFERENCE_NUM_THREADS": torch.get_num_threads(),
         # pinned, the threads of two processes share the first core and leave the second idle
         "ENABLE_CPU_PINNING": False,
         "INFERENCE_PRECISION_HINT": "f32",  # where the processor knows bfloat16 that is the default, at 3 digits
     }
-    return openvino.Core().compile_model(converted, "CPU", settings)
+    network = core.compile_model(converted, "CPU", settings)
+    idle = [network.create_infer_request() for _ in range(job.streams + 1)]
+    outputs = len(answer_names(model))
+
+    def submit(batch: Tensor) -> Callable[[], tuple[Tensor, ...]]:
+        missing = job.batch_size - len(batch)
+        full = torch.cat([batch, batch.new_zeros(missing, *batch.shape[1:])]) if missing else batch
+        full = full.contiguous()
+        request = idle.pop() if idle else network.create_infer_request()
+        request.start_async({0: full.numpy()}, share_inputs=True)
+
+        def answers(_: Tensor = full) -> tuple[Tensor, ...]:  # the tensor too: the request reads its memory
+            request.wait()
+            # its own memory is written anew by the next call
+            copies = [torch.from_numpy(request.get_output_tensor(at).data.copy()) for at in range(outputs)]
+            idle.append(request)
+            return tuple(copy[: len(batch)] for copy in copies)
+
+        return answers
+
+    return _run_in_streams(submit, job.streams)
 
 
-def _hash_weights(model: nn.Module) -> str:
-    digest = hashlib.blake2b()
-    for name, tensor in model.state_dict().items():
-        digest.update(name.encode())
-        digest.update(tensor.detach().contiguous().flatten().view(torch.uint8).numpy())
-    return digest.hexdigest()
+def _batch_of_torch(images: Tensor) -> int:
+    return 64 if images.device.type == "cpu" else 256  # a graphics card wants to be filled
 
 
-_BUILDERS: dict[str, Callable[[nn.Module, Tensor, int], RunBatch]] = {
-    "openvino": _openvino_for_passes,
-    "folded": _fold_for_passes,
-    "plain": _plain,
+def _batch_in_cache(images: Tensor) -> int:
+    # measured on two cores: 16 images of 112 px and 4 of 224 px are the fastest, more of them leave the caches
+    return min(16, max(4, 16 * 112**2 // (images.shape[-2] * images.shape[-1])))
+
+
+_CONVERTED = ("onnxruntime", "openvino")
+_ROWS = {
+    "eager": EngineKind(
+        words="torch as it is", pays_after=0, batch_size=_batch_of_torch, obstacle=_no_obstacle, build=_eager
+    ),
+    "folded": EngineKind(
+        words="torch, batch normalisation folded into the convolutions",
+        pays_after=100,  # it takes as long as 20 passes
+        batch_size=_batch_of_torch,
+        obstacle=_no_obstacle,
+        build=_folded,
+    ),
+    "compiled": EngineKind(
+        words="torch.compile of the folded network",
+        pays_after=None,  # it takes minutes
+        batch_size=_batch_of_torch,
+        obstacle=_compiler_obstacle,
+        build=_compiled,
+    ),
+    "onnxruntime": EngineKind(
+        words="ONNX Runtime",
+        pays_after=4000,  # it takes some 10 s, and saves 2 to 9 ms a pass
+        batch_size=_batch_in_cache,
+        obstacle=_needs(*ONNX_PACKAGES, extra="onnx"),
+        build=_onnxruntime,
+    ),
+    "openvino": EngineKind(
+        words="OpenVINO",
+        pays_after=1500,  # it takes as long as 1000 passes
+        batch_size=_batch_in_cache,
+        obstacle=_needs("openvino", extra="openvino"),
+        build=_openvino,
+    ),
 }
-_WORTH = {"openvino": WORTH_CONVERTING, "folded": WORTH_FOLDING, "plain": 0}
-_SPENT: WeakKeyDictionary[nn.Module, int] = WeakKeyDictionary()
-"""Passes that each network was asked for so far: frames are explained one by one."""
-_CONVERTED: WeakKeyDictionary[nn.Module, tuple[tuple[Any, ...], Any]] = WeakKeyDictionary()
-"""The last conversion of each network."""
+ENGINES = Table("engine", "sliplens.engines", _ROWS)
+"""Ways to run a network, from the slowest to the fastest for many passes; each answers within `TOLERANCE` of the
+network itself."""

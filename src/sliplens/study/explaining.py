@@ -17,10 +17,10 @@ from sliplens.arrays import require_saliency
 from sliplens.errors import InputError, RecordingError
 from sliplens.explainers import EXPLAINERS, Explainer, Explanation
 from sliplens.files import RUN_FILE, read_json, require_folder, write_json
-from sliplens.images import list_images, read_image
 from sliplens.images.files import write_png
 from sliplens.models import TrainedModel
 from sliplens.recordings import Dataset
+from sliplens.recordings.source import open_source
 
 DEFAULT_LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 """Safety margins at which the thesis explains frames (section 4)."""
@@ -158,15 +158,15 @@ def nearest_frame(margin: Float[np.ndarray, " frames"], level: float) -> int:
 def frames_from_folder(
     trained: TrainedModel, folder: Path, *, reference: Path | None = None, labels_in_names: bool = False
 ) -> ChosenFrames:
-    """Images of a folder, in natural order.
+    """Images of a folder, in natural order, or the frames of whatever recording `open_source` opens.
 
     Parameters
     ----------
     trained
         The network.
     folder
-        8-bit RGB images of the size the network's sensor has: camera frames if `reference` is given, otherwise
-        absolute difference images |T_n - T_0|.
+        Frames of the size the network's sensor has: camera frames if `reference` is given or the source brings one,
+        otherwise absolute difference images |T_n - T_0|.
     reference
         Image of the untouched sensor.
     labels_in_names
@@ -180,30 +180,48 @@ def frames_from_folder(
     ImageError
         If an image cannot be read, or has another size or kind of pixels.
     """
-    size = (int(trained.manifest.frame_size[0]), int(trained.manifest.frame_size[1]))
-    paths = list_images(folder)
-    frames = np.stack([read_image(path, size=size) for path in paths])
-    labels = [_label(path) if labels_in_names else np.nan for path in paths]
-    image_size = trained.manifest.image_size
-    if reference is not None:
-        untouched = read_image(reference, size=size)
-        images = trained.encoding.resize(trained.encoding.compare(frames, untouched), image_size=image_size)
-        empty = trained.encoding.empty(untouched, image_size=image_size)
-    elif trained.encoding.empty_is_black:
-        images = trained.encoding.resize(frames, image_size=image_size)
-        empty = torch.zeros(3, image_size, image_size)
-    else:
-        raise InputError(
-            f"a network on {trained.encoding.name} images needs the untouched sensor; give it with --reference IMAGE"
+    image_size, parts = trained.manifest.image_size, []
+    for trial in open_source(folder, reference=reference):
+        trained.require_frame_size(trial.frame_size)
+        frames = np.stack(list(trial.read_frames()))
+        if trial.read_reference is not None:
+            untouched = trial.read_reference()
+            frames = trained.encoding.compare(frames, untouched)
+            empty = trained.encoding.empty(untouched, image_size=image_size)
+        elif trained.encoding.empty_is_black:
+            empty = torch.zeros(3, image_size, image_size)
+        else:
+            raise InputError(
+                f"a network on {trained.encoding.name} images needs the untouched sensor; give it with "
+                "--reference IMAGE"
+            )
+        names = trial.files or [f"{trial.name}-f{number:04d}" for number in range(trial.frames)]
+        labels = np.full(trial.frames, np.nan) if trial.safety_margin is None else trial.safety_margin
+        if labels_in_names:
+            labels = np.array([_label(folder / name) for name in names])
+        parts.append(
+            ChosenFrames(
+                ids=tuple(Path(name).stem for name in names),
+                trial=(folder.name if trial.files else trial.name,) * trial.frames,
+                condition=("unknown",) * trial.frames,
+                safety_margin=labels.astype(np.float32),
+                images=trained.encoding.resize(frames, image_size=image_size),
+                references=empty.expand(trial.frames, -1, -1, -1).clone(),
+                source="real",
+            )
         )
+    return _join(parts)
+
+
+def _join(parts: Sequence[ChosenFrames]) -> ChosenFrames:
     return ChosenFrames(
-        ids=tuple(path.stem for path in paths),
-        trial=(folder.name,) * len(paths),
-        condition=("unknown",) * len(paths),
-        safety_margin=np.array(labels, dtype=np.float32),
-        images=images,
-        references=empty.expand(len(paths), -1, -1, -1).clone(),
-        source="real",
+        ids=sum((part.ids for part in parts), ()),
+        trial=sum((part.trial for part in parts), ()),
+        condition=sum((part.condition for part in parts), ()),
+        safety_margin=np.concatenate([part.safety_margin for part in parts]),
+        images=torch.cat([part.images for part in parts]),
+        references=torch.cat([part.references for part in parts]),
+        source=parts[0].source,
     )
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from sliplens.explainers import EXPLAINERS, Explainer, Likeness, PolyCam
 from sliplens.faithfulness.units import Units, marker_units, pixel_units, tile_units
 from sliplens.models import TrainedModel
-from sliplens.models.engines import Passes, prepare
+from sliplens.models.engines import Engine, prepare
 from sliplens.recordings import Dataset
 from sliplens.study.choice import Pick
 from sliplens.study.explaining import Explained, frames_at, require_methods
@@ -107,7 +107,7 @@ class Material:
         """The part of a method's relevance that works towards each frame's target."""
         return self.explained.relevance[method] * self.towards[:, None, None]
 
-    def fast(self, passes: int) -> Passes:
+    def fast(self, passes: int) -> Engine:
         """Make an engine ready for so many passes of the network."""
         return make_fast(self.trained, self.inputs, passes=passes)
 
@@ -130,7 +130,7 @@ class Material:
         return network_places(self.markers[frame], frame_size=(size[0], size[1]), image_size=self.inputs.shape[-1])
 
 
-def make_fast(trained: TrainedModel, inputs: Float[Tensor, "frames 3 size size"], *, passes: int) -> Passes:
+def make_fast(trained: TrainedModel, inputs: Float[Tensor, "frames 3 size size"], *, passes: int) -> Engine:
     """Make an engine ready for so many passes of a network, checked on a few of its inputs, on the network's device."""
     some = inputs[:_PARITY_IMAGES].to(trained.device)
     return prepare(trained.model, some, trained.predict(some).to(trained.device), passes=passes)

@@ -8,7 +8,7 @@ import signal
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -396,7 +396,7 @@ def fit(
                 trained_on=(*trained_on, *(start.manifest.trained_on if start else ())),
                 started_from=start.manifest.weights_sha256 if start else "",
                 metrics={"validation_mse": calibration.mse},
-                calibration=asdict(calibration),
+                calibration=calibration,
                 versions=versions(),
             ),
         )

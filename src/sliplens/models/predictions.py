@@ -1,0 +1,255 @@
+"""Safety margins of any number of frames, from any source, in the memory of a few batches."""
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from torch import Tensor
+
+from sliplens._version import __version__
+from sliplens.codec import write_tables
+from sliplens.errors import InputError
+from sliplens.files import hash_json
+from sliplens.models.checkpoint import Estimate, TrainedModel, load
+from sliplens.models.engines import Engine, make_engine
+from sliplens.progress import OnProgress, note, stage
+from sliplens.recordings import Dataset
+from sliplens.recordings.formats import ReadOptions
+from sliplens.recordings.source import Frame, Frames, TrialFrames, describe_source, open_source
+
+LEVEL = 0.9
+"""Confidence of the intervals."""
+_ROW_GROUP = 8192
+_COLUMNS = {
+    "trial": pa.string(),
+    "frame": pa.int64(),
+    "file": pa.string(),
+    "time_s": pa.float64(),
+    "safety_margin": pa.float64(),
+    "prediction": pa.float64(),
+    "sigma": pa.float64(),
+    "low_90": pa.float64(),
+    "high_90": pa.float64(),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Predictions:
+    """Safety margins that a network reads, a row a frame."""
+
+    frames: int
+    engine: str
+    """Row of `ENGINES` that ran the network."""
+    path: Path | None
+    """Parquet file of the rows; None where they are kept in memory."""
+    rows: pa.Table | None
+    """The rows; None where they are in the file."""
+    notes: tuple[str, ...] = ()
+    """What was assumed, a sentence each, for people."""
+
+    def frame(self) -> pa.Table:
+        """Arrow table; `.to_pandas()` where pandas is installed.
+
+        Columns are `trial`, `frame`, `file` (of a folder of images), `time_s`, `safety_margin` (where the source has
+        labels), `prediction`, `sigma`, `low_90` and `high_90`. What is not known is null: the time of images without a
+        rate, sigma of a network that answers with one number, intervals of one that was never calibrated. Predictions
+        are not clipped to [0, 1].
+        """
+        return pq.read_table(self.path) if self.rows is None else self.rows
+
+
+def predict(
+    run: TrainedModel | Path | str,
+    source: Path | str | Frames | Dataset | Sequence[TrialFrames],
+    *,
+    reference: Path | str | Frame | None = None,
+    reference_frame: int | None = None,
+    split: str | None = None,
+    format: str | None = None,
+    options: ReadOptions | None = None,
+    engine: str = "auto",
+    onnx_file: Path | None = None,
+    batch_size: int = 8,
+    device: str = "cpu",
+    out: Path | str | None = None,
+    overwrite: bool = False,
+    on_progress: OnProgress | None = None,
+) -> Predictions:
+    """Read the safety margin of every frame; memory does not grow with the recording where `out` is named.
+
+    Parameters
+    ----------
+    run
+        Network, its folder, or the name of one that comes with sliplens.
+    source
+        Data set, folder of images, video, bag, uint8 RGB frames (frames, height, width, 3), or what `open_source` gave.
+        Images without a reference are taken for difference images, compared before.
+    reference, reference_frame
+        The sensor untouched: image, or number of the frame that shows it.
+    split, format, options
+        As `open_source` takes them.
+    engine
+        Row of `ENGINES`; `auto` for the fastest at hand that pays.
+    onnx_file
+        The network as `export_onnx` wrote it, for `onnxruntime` and `openvino`.
+    batch_size
+        Frames predicted together; on a processor more are slower, their layers no longer fit its cache.
+    device
+        Device of a network that is loaded here: cpu or cuda.
+    out
+        Parquet file to write, whole or not at all; rows are kept in memory if None.
+    overwrite
+        Write the file anew if it exists.
+    on_progress
+        Called with the frames done and the frames in all.
+
+    Raises
+    ------
+    InputError
+        If something named is missing or does not fit, or frames that need a reference have none.
+    ImageError
+        If frames are of another size than those of the network's sensor.
+    RecordingError
+        If the source cannot be read.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sliplens as sl
+    >>> touch = np.zeros((2, 224, 224, 3), dtype=np.uint8)  # difference images: nothing has moved
+    >>> predictions = sl.predict("chromatouch-difference", touch)
+    >>> predictions.frame().column_names
+    ['trial', 'frame', 'time_s', 'prediction', 'sigma', 'low_90', 'high_90']
+    """
+    path = None if out is None else Path(out)
+    _check_arguments(path, overwrite=overwrite, batch_size=batch_size, engine=engine, onnx_file=onnx_file)
+    trained = run if isinstance(run, TrainedModel) else load(run, device=device)
+    described = describe_source(source)
+    if isinstance(source, Path | str | np.ndarray | Dataset):
+        with stage(on_progress, "Opening the source"):
+            source = open_source(
+                source,
+                reference=reference,
+                reference_frame=reference_frame,
+                split=split,
+                format=format,
+                options=options,
+            )
+    notes = tuple(dict.fromkeys(words for one in source for words in (*one.notes, *_require_comparable(trained, one))))
+    for sentence in notes:
+        note(on_progress, sentence)
+    total = sum(trial.frames for trial in source)
+    with stage(on_progress, "Making the network ready"):
+        ready = make_engine(engine, trained, frames=total, batch_size=batch_size, onnx_file=onnx_file)
+    metadata = {
+        "sliplens.engine": ready.name,
+        "sliplens.source": described,
+        "sliplens.manifest_hash": hash_json(trained.manifest),
+        "sliplens.weights_sha256": trained.manifest.weights_sha256,
+    }
+    schema = _schema(source, metadata)
+    with stage(on_progress, f"Predicting frames ({trained.manifest.input}, {ready.name})") as count:
+        rows = write_tables(_tables(ready, trained, source, schema, count), path, schema)
+    return Predictions(frames=total, engine=ready.name, path=path, rows=rows, notes=notes)
+
+
+def _check_arguments(
+    path: Path | None, *, overwrite: bool, batch_size: int, engine: str, onnx_file: Path | None
+) -> None:
+    if path is not None and path.suffix != ".parquet":
+        raise InputError(f"{path} does not end in .parquet; name the file to write so")
+    if path is not None and path.exists() and not overwrite:
+        raise InputError(f"{path} exists; choose another file or pass --overwrite")
+    if batch_size < 1:
+        raise InputError(f"--batch-size must be at least 1, got {batch_size}")
+    if onnx_file is not None and engine not in {"auto", "onnxruntime", "openvino"}:
+        raise InputError(f"--onnx is for onnxruntime and openvino, not for {engine}; leave it out")
+
+
+def _require_comparable(trained: TrainedModel, trial: TrialFrames) -> Iterator[str]:
+    """Refuse a trial that the network cannot read; gives what is assumed of one that it can."""
+    trained.require_frame_size(trial.frame_size)
+    encoding = trained.encoding
+    if trial.read_reference is not None or encoding.name == "raw":
+        return
+    recorded = trial.files is None and trial.time_s is not None  # nobody compares frames before they are recorded
+    if recorded or not encoding.empty_is_black:
+        raise InputError(
+            f"a network on {encoding.name} images compares the frames of {trial.name} with the untouched sensor; "
+            "name its image with --reference IMAGE, or a frame of it with --reference-frame N"
+        )
+    yield f"{trial.name}: no reference was given, so its images were taken for difference images."
+
+
+def _schema(trials: Sequence[TrialFrames], metadata: dict[str, str]) -> pa.Schema:
+    absent = set()
+    if all(trial.files is None for trial in trials):
+        absent.add("file")
+    if all(trial.safety_margin is None for trial in trials):
+        absent.add("safety_margin")
+    columns = [pa.field(name, kind) for name, kind in _COLUMNS.items() if name not in absent]
+    return pa.schema(columns, metadata={"sliplens.version": __version__, **metadata})
+
+
+def _tables(
+    engine: Engine, trained: TrainedModel, trials: Sequence[TrialFrames], schema: pa.Schema, on_progress: OnProgress
+) -> Iterator[pa.Table]:
+    # plain numbers: small arrays kept between the large ones of each batch would leave holes in the memory
+    waiting: dict[str, list] = {name: [] for name in schema.names}
+    total, done = sum(trial.frames for trial in trials), 0
+    # batches are encoded while the ones before are under way
+    encoded: deque[tuple[TrialFrames, int]] = deque()
+    for answers in engine.answers(_encode(trained, trials, engine.batch_size, encoded)):
+        trial, first = encoded.popleft()
+        estimate = trained.to_estimate(*answers)
+        for name, values in _columns(estimate, trial, first).items():
+            if name in waiting:
+                waiting[name].extend(values.to_pylist())
+        if len(waiting["frame"]) >= _ROW_GROUP:
+            yield pa.Table.from_pydict(waiting, schema)
+            waiting = {name: [] for name in schema.names}
+        done += len(estimate.margin)
+        on_progress(done, total)
+    if waiting["frame"]:
+        yield pa.Table.from_pydict(waiting, schema)
+
+
+def _encode(
+    trained: TrainedModel, trials: Sequence[TrialFrames], batch_size: int, encoded: deque[tuple[TrialFrames, int]]
+) -> Iterator[Tensor]:
+    """Batches of encoded frames; trial and first frame of each are appended to `encoded`."""
+    for trial in trials:
+        reference = None if trial.read_reference is None else trial.read_reference()
+        first, frames = 0, trial.read_frames()
+        while batch := list(islice(frames, batch_size)):
+            encoded.append((trial, first))
+            first += len(batch)
+            yield trained.encode(np.stack(batch), reference)
+
+
+def _columns(estimate: Estimate, trial: TrialFrames, first: int) -> dict[str, pa.Array]:
+    count = len(estimate.margin)
+    here = slice(first, first + count)
+    low, high = estimate.interval(LEVEL) or (None, None)
+    return {
+        "trial": pa.array([trial.name] * count),
+        "frame": pa.array(np.arange(first, first + count)),
+        "file": pa.array(trial.files[here]) if trial.files else pa.nulls(count, pa.string()),
+        "time_s": _numbers(trial.time_s, here, count),
+        "safety_margin": _numbers(trial.safety_margin, here, count),
+        "prediction": pa.array(estimate.margin),
+        **{
+            name: _numbers(values, slice(None), count)
+            for name, values in (("sigma", estimate.sigma), ("low_90", low), ("high_90", high))
+        },
+    }
+
+
+def _numbers(values: np.ndarray | None, rows: slice, count: int) -> pa.Array:
+    """As Arrow keeps them, NaN as null: nothing is known."""
+    return pa.nulls(count, pa.float64()) if values is None else pa.array(values[rows], from_pandas=True)
