@@ -1,8 +1,12 @@
 """What the command line shows: progress bars, results, errors."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
+from threading import RLock
 
 from rich.console import Console
 from rich.markup import escape
@@ -17,8 +21,12 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from sliplens.progress import OnProgress
+
 OUT = Console()
 ERR = Console(stderr=True)
+
+_NAME_COLUMNS = 26
 
 
 def fail(message: str) -> None:
@@ -95,27 +103,46 @@ def _progress() -> Progress:
     )
 
 
-def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table, numbers to the right."""
-    table = Table(title=title, title_justify="left")
-    for index, name in enumerate(header):
-        table.add_column(name, justify="left" if index == 0 else "right")
-    for row in rows:
-        table.add_row(*row)
-    OUT.print(table)
-
-
 class Terminal:
-    """Progress of a command, as `sliplens.progress.Stages`: a bar a stage, what was written, notes."""
+    """Progress of a command on the terminal: a bar for each stage that is open, what was written, and notes.
+
+    Give it as `on_progress` to any call of the library. Notes that are told while a stage is open are shown when the
+    last one ends, equal ones once, with how often they were told.
+    """
+
+    def __init__(self) -> None:
+        self._bars = _progress()
+        self._open: list[TaskID] = []
+        self._notes: Counter[str] = Counter()
+        self._lock = RLock()
 
     def __call__(self, done: int, total: int, /) -> None:
-        """Show nothing: each stage has a bar of its own."""
+        """Show how far the newest open stage is; nothing where none is open."""
+        with self._lock:
+            if self._open:
+                self._bars.update(self._open[-1], completed=done, total=total)
 
     @contextmanager
-    def stage(self, title: str, /) -> Iterator[Callable[[int, int], None]]:
-        """Show a bar while the stage is open."""
-        with progress_bar(title) as count:
-            yield count
+    def stage(self, title: str, /) -> Iterator[OnProgress]:
+        """Show a bar while the stage is open; stages may be open side by side."""
+        with self._lock:
+            if not self._open:
+                self._bars.start()
+            task = self._bars.add_task(title, total=None)
+            self._open.append(task)
+        try:
+            yield lambda done, total: self._bars.update(task, completed=done, total=total)
+        finally:
+            with self._lock:
+                self._open.remove(task)
+                # the last frame of the screen keeps the bar of a stage that stands alone
+                if self._open:
+                    self._bars.remove_task(task)
+                else:
+                    self._bars.stop()
+                    for left in self._bars.task_ids:
+                        self._bars.remove_task(left)
+                    self._tell_notes()
 
     def wrote(self, path: Path, what: str, /, *, kept: bool = False) -> None:
         """Say what was written where, or that it was there already."""
@@ -125,5 +152,67 @@ class Terminal:
             wrote(path, what)
 
     def note(self, message: str, /) -> None:
-        """Print a sentence."""
-        say(f"  note: {message}")
+        """Say a sentence; one that is told again and again is shown once, with a count."""
+        with self._lock:
+            self._notes[message] += 1
+            if not self._open:
+                self._tell_notes()
+
+    def _tell_notes(self) -> None:
+        for message in fold_equal(self._notes.elements()):
+            say(f"  note: {message}")
+        self._notes.clear()
+
+
+def fold_equal(messages: Iterable[str]) -> list[str]:
+    """Keep each message once, in the order of the first, with how often it came where that is more than once."""
+    counts = Counter(messages)
+    return [message if count == 1 else f"{message} ({count} times)" for message, count in counts.items()]
+
+
+def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table, numbers to the right; columns that do not fit beside each other are printed below, names again."""
+    columns = [_Column.of(name, [row[place] for row in rows], names=place == 0) for place, name in enumerate(header)]
+    for number, shown in enumerate(_fitting(columns, OUT.width)):
+        table = Table(title=title if number == 0 else f"{title}, continued", title_justify="left")
+        for column in shown:
+            table.add_column(column.head, justify="left" if column is columns[0] else "right")
+        for cells in zip(*(column.cells for column in shown), strict=True):
+            table.add_row(*map(escape, cells))
+        OUT.print(table)
+
+
+@dataclass(frozen=True)
+class _Column:
+    """Column of a table, its head broken at spaces so that it is hardly wider than what stands below it."""
+
+    head: str
+    cells: tuple[str, ...]
+    width: int
+
+    @classmethod
+    def of(cls, name: str, cells: Sequence[str], *, names: bool) -> "_Column":
+        """Fit a column to its cells; a column of names may be broken at spaces, numbers may not."""
+        longest = max((len(word) for word in name.split()), default=0)
+        # names are as wide as they are up to a third of 80 columns
+        widest = max(map(len, cells), default=0)
+        width = max(longest, min(widest, _NAME_COLUMNS) if names else widest)
+        broken = tuple("\n".join(wrap(cell, width, break_long_words=False)) for cell in cells)
+        lines = [line for cell in broken for line in cell.split("\n")]
+        return cls(
+            head=escape("\n".join(wrap(name, width, break_long_words=False))),
+            cells=broken,
+            width=max([longest, *map(len, lines)]),
+        )
+
+
+def _fitting(columns: Sequence[_Column], width: int) -> Iterator[list[_Column]]:
+    """Deal columns out to tables no wider than the terminal, the column of names in each."""
+    shown = [columns[0]]
+    for column in columns[1:]:
+        # two blanks and a rule a column, and one rule more
+        if sum(one.width + 3 for one in (*shown, column)) + 1 > width and len(shown) > 1:
+            yield shown
+            shown = [columns[0]]
+        shown.append(column)
+    yield shown

@@ -1,0 +1,93 @@
+"""What the command line shows."""
+
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from sliplens.cli import console
+from sliplens.cli.console import Terminal, fold_equal, print_table
+from sliplens.progress import Stages, stage
+
+METHODS = ["Grad-CAM", "Integrated Gradients", "Poly-CAM (thesis)"]
+HEAD = ["Method", "Score D (lower is better)", "Standard deviation", "SRG, grey fill", "SRG, blurred fill", "Seconds"]
+
+
+@pytest.fixture
+def screen(monkeypatch: pytest.MonkeyPatch) -> Console:
+    narrow = Console(width=80, record=True)
+    monkeypatch.setattr(console, "OUT", narrow)
+    return narrow
+
+
+def test_wide_table_fits_80_columns_with_every_word_whole(screen: Console) -> None:
+    numbers = [[name, *(f"0.123 (0.045 to 0.{index}78)" for index in range(5))] for name in METHODS]
+
+    print_table("Scores of explanations", HEAD, numbers)
+
+    text = screen.export_text()
+    assert max(map(len, text.splitlines())) <= 80
+    for row in numbers:
+        for cell in row[1:]:
+            assert text.count(cell) == 3, "a number is broken or missing"
+    for word in " ".join((*METHODS, *HEAD)).split():
+        assert word in text
+
+
+def test_columns_below_have_their_rows_named_again(screen: Console) -> None:
+    print_table("Scores", ["Method", "A" * 40, "B" * 40], [["Grad-CAM", "1", "2"]])
+
+    assert screen.export_text().count("Grad-CAM") == 2
+
+
+def test_brackets_in_a_table_are_text(screen: Console) -> None:
+    print_table("Scores", ["Method", "D"], [["[red]", "1"]])
+
+    assert "[red]" in screen.export_text()
+
+
+def test_terminal_shows_stages(screen: Console) -> None:
+    terminal = Terminal()
+    assert isinstance(terminal, Stages)
+
+    with stage(terminal, "Explain") as count:
+        count(2, 2)
+        with terminal.stage("Score") as inner:
+            inner(1, 5)
+            terminal(3, 5)
+    terminal.wrote(Path("runs/explain"), "2 frames")
+
+    text = screen.export_text()
+    assert "Explain" in text
+    assert "2/2" in text
+    assert "wrote runs/explain" in text
+
+
+def test_notes_of_a_stage_are_shown_once_with_a_count(screen: Console) -> None:
+    terminal = Terminal()
+
+    with terminal.stage("Explain"):
+        for _ in range(3):
+            terminal.note("the map is flat")
+        terminal.note("one marker is lost")
+        terminal.note("the map is flat")
+
+    text = screen.export_text()
+    assert "the map is flat (4 times)" in text
+    assert text.count("flat") == 1
+    assert "one marker is lost\n" in text
+
+
+def test_a_stage_that_fails_closes_its_bar(screen: Console) -> None:
+    terminal = Terminal()
+
+    with pytest.raises(ValueError, match="no"), terminal.stage("Explain"):
+        raise ValueError("no")
+    with terminal.stage("Score") as count:
+        count(1, 1)
+
+    assert "1/1" in screen.export_text()
+
+
+def test_equal_messages_are_counted_in_order() -> None:
+    assert fold_equal(["b", "a", "b"]) == ["b (2 times)", "a"]
