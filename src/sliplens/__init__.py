@@ -12,18 +12,32 @@ if TYPE_CHECKING:
     from sliplens.models.checkpoint import load
     from sliplens.models.onnx import export_onnx
     from sliplens.models.predictions import predict
+    from sliplens.training.evaluate import evaluate
+    from sliplens.training.fit import train
 
 # where each name lives: importing sliplens alone imports neither torch nor NumPy
 _MODULES = {
+    "SliplensError": "sliplens.errors",
+    "evaluate": "sliplens.training.evaluate",
     "explain": "sliplens.explainers.table",
     "export_onnx": "sliplens.models.onnx",
     "load": "sliplens.models.checkpoint",
     "predict": "sliplens.models.predictions",
     "score": "sliplens.faithfulness.scoring",
-    "SliplensError": "sliplens.errors",
+    "train": "sliplens.training.fit",
 }
 
-__all__ = ["SliplensError", "__version__", "explain", "export_onnx", "load", "predict", "score"]
+__all__ = [
+    "SliplensError",
+    "__version__",
+    "evaluate",
+    "explain",
+    "export_onnx",
+    "load",
+    "predict",
+    "score",
+    "train",
+]
 
 
 def __getattr__(name: str) -> Any:

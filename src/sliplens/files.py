@@ -6,6 +6,7 @@ import os
 import platform
 import shutil
 import sys
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, is_dataclass
@@ -34,14 +35,51 @@ def versions() -> dict[str, str]:
     return found
 
 
-def machine() -> dict[str, Any]:
-    """Processor, cores and system of this machine, as far as the standard library can tell."""
-    return {
-        "system": platform.system(),
-        "processor": platform.machine(),
-        "cores": os.cpu_count(),
-        "implementation": sys.implementation.name,
-    }
+@dataclass(frozen=True, kw_only=True)
+class Machine:
+    """A machine, as far as the standard library can tell."""
+
+    system: str
+    processor: str
+    cores: int | None
+    implementation: str
+    """Of Python."""
+
+
+def machine() -> Machine:
+    """System, processor and cores of this machine."""
+    return Machine(
+        system=platform.system(),
+        processor=platform.machine(),
+        cores=os.cpu_count(),
+        implementation=sys.implementation.name,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """Where a folder comes from: what its `run.json` says."""
+
+    stage: str
+    config: Mapping[str, Any]
+    """All that shaped the result, as JSON."""
+    config_hash: str
+    versions: Mapping[str, str]
+    machine: Machine
+    finished: str
+    """Date and time in UTC, as ISO 8601."""
+
+
+def _write_provenance(path: Path, *, stage: str, recipe: Mapping[str, Any], config_hash: str) -> None:
+    provenance = Provenance(
+        stage=stage,
+        config=recipe,
+        config_hash=config_hash,
+        versions=versions(),
+        machine=machine(),
+        finished=datetime.now(UTC).isoformat(timespec="seconds"),
+    )
+    write_json(path, provenance)
 
 
 def to_jsonable(value: Any) -> Any:
@@ -109,6 +147,13 @@ def require_folder(path: Path, *, what: str) -> Path:
     return path
 
 
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Folder for what must lie on disk for a while; it is gone afterwards."""
+    with tempfile.TemporaryDirectory(prefix="sliplens-") as folder:
+        yield Path(folder)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Output:
     """A folder being written: `folder` lies beside the target until everything is in it."""
@@ -117,6 +162,11 @@ class Output:
     folder: Path
     complete: bool
     """True when the target was already made by the same recipe; then there is nothing to do."""
+
+
+def partial_folder(target: Path) -> Path:
+    """Folder in which `output_folder` makes a target."""
+    return target.with_name(f".{target.name}.partial")
 
 
 @contextmanager
@@ -173,7 +223,7 @@ def output_folder(target: Path, *, stage: str, config: Mapping[str, Any], overwr
         return
     if target.exists() and not (target / RUN_FILE).is_file() and (not target.is_dir() or any(target.iterdir())):
         raise InputError(f"{target} was not made by sliplens and will not be overwritten; choose another output folder")
-    partial = target.with_name(f".{target.name}.partial")
+    partial = partial_folder(target)
     state = partial / ".recipe"
     if partial.exists() and (not state.is_file() or state.read_text() != config_hash):
         shutil.rmtree(partial)
@@ -189,17 +239,7 @@ def output_folder(target: Path, *, stage: str, config: Mapping[str, Any], overwr
         if not any(path != state for path in partial.iterdir()):
             shutil.rmtree(partial)
         raise
-    write_json(
-        partial / RUN_FILE,
-        {
-            "stage": stage,
-            "config": recipe,
-            "config_hash": config_hash,
-            "versions": versions(),
-            "machine": machine(),
-            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-        },
-    )
+    _write_provenance(partial / RUN_FILE, stage=stage, recipe=recipe, config_hash=config_hash)
     state.unlink()
     if target.exists():
         shutil.rmtree(target)
@@ -243,7 +283,7 @@ def exported_folder(
             raise InputError(f"{target} holds a result of other settings; choose another folder or pass --overwrite")
         yield Output(target=target, folder=target, complete=True)
         return
-    partial = target.with_name(f".{target.name}.partial")
+    partial = partial_folder(target)
     if partial.exists():
         shutil.rmtree(partial)
     try:
@@ -254,17 +294,7 @@ def exported_folder(
         yield Output(target=target, folder=partial, complete=False)
         record = partial / run_file
         record.parent.mkdir(parents=True, exist_ok=True)
-        write_json(
-            record,
-            {
-                "stage": "export",
-                "config": recipe,
-                "config_hash": config_hash,
-                "versions": versions(),
-                "machine": machine(),
-                "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-            },
-        )
+        _write_provenance(record, stage="export", recipe=recipe, config_hash=config_hash)
     except BaseException:
         shutil.rmtree(partial)
         raise
