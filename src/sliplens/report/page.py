@@ -12,10 +12,10 @@ from sliplens.files import Provenance
 from sliplens.plots.layout import Picture, draw_picture, written_whole
 from sliplens.plots.saliency import plot_colour_bar
 from sliplens.plots.style import input_name, method_name, source_name
+from sliplens.report.believing import judge_study, tell_interval
+from sliplens.report.plates import FOLDER, Plate, write_plates
 from sliplens.report.results import READERS, RECORDS, load_results
 from sliplens.report.sections import Section, build_sections
-from sliplens.report.study.believing import judge_study, tell_interval
-from sliplens.report.study.plates import FOLDER, Plate, write_plates
 from sliplens.report.study.sections import build_study_page
 from sliplens.report.verdict import Statement, judge
 from sliplens.report.workspace import Results

@@ -29,7 +29,7 @@ from sliplens.plots.style import (
     source_name,
 )
 from sliplens.report.blocks import Notes
-from sliplens.report.study.claims import Claim
+from sliplens.report.claims import Claim
 from sliplens.report.tables import (
     Table,
     table_accuracy,
