@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from sliplens.codec import RESULT_FILE, load_record, load_result, save_record
+from sliplens.codec import load_record, load_result, save_record
 from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.extras import require_device
 from sliplens.files import hash_file, require_folder
@@ -226,8 +226,9 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> TrainedModel:
         ) from None
     # channels last: depthwise convolutions run up to half as fast again on a CPU
     model = model.to(device, memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
-    result = folder / RESULT_FILE
-    training = load_result(folder, Training, command="sliplens train") if result.is_file() else None
+    # the networks of the package come without their learning curve
+    told = (folder / "curve.parquet").is_file()
+    training = load_result(folder, Training, command="sliplens train") if told else None
     return TrainedModel(model=model, manifest=manifest, training=training)
 
 
