@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from sliplens.errors import SliplensError
     from sliplens.explainers.table import explain
     from sliplens.faithfulness.scoring import score
+    from sliplens.markers.tracking import track
     from sliplens.models.checkpoint import load
     from sliplens.models.onnx import export_onnx
     from sliplens.models.predictions import predict
@@ -17,13 +18,14 @@ if TYPE_CHECKING:
 
 # where each name lives: importing sliplens alone imports neither torch nor NumPy
 _MODULES = {
-    "SliplensError": "sliplens.errors",
     "evaluate": "sliplens.training.evaluate",
     "explain": "sliplens.explainers.table",
     "export_onnx": "sliplens.models.onnx",
     "load": "sliplens.models.checkpoint",
     "predict": "sliplens.models.predictions",
     "score": "sliplens.faithfulness.scoring",
+    "SliplensError": "sliplens.errors",
+    "track": "sliplens.markers.tracking",
     "train": "sliplens.training.fit",
 }
 
@@ -36,6 +38,7 @@ __all__ = [
     "load",
     "predict",
     "score",
+    "track",
     "train",
 ]
 

@@ -3,7 +3,8 @@
 from sliplens.markers.detect import KINDS, Appearance, MarkerKind, Markers, detect_markers
 from sliplens.markers.displacement import DisplacementField, compute_field, interpolate_field
 from sliplens.markers.doublets import Doublets, fit_doublets
-from sliplens.markers.track import Tracker, track_markers
+from sliplens.markers.tracker import Tracker, track_markers
+from sliplens.markers.tracking import Tracking, track
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame, Tracks
 
 __all__ = [
@@ -16,10 +17,12 @@ __all__ = [
     "Markers",
     "TrackedFrame",
     "Tracker",
+    "Tracking",
     "Tracks",
     "compute_field",
     "detect_markers",
     "fit_doublets",
     "interpolate_field",
+    "track",
     "track_markers",
 ]
