@@ -4,7 +4,6 @@ from sliplens.markers.detect import KINDS, Appearance, MarkerKind, Markers, dete
 from sliplens.markers.displacement import DisplacementField, compute_field, interpolate_field
 from sliplens.markers.doublets import Doublets, fit_doublets
 from sliplens.markers.tracker import Tracker, track_markers
-from sliplens.markers.tracking import Tracking, track
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame, Tracks
 
 __all__ = [
@@ -17,12 +16,10 @@ __all__ = [
     "Markers",
     "TrackedFrame",
     "Tracker",
-    "Tracking",
     "Tracks",
     "compute_field",
     "detect_markers",
     "fit_doublets",
     "interpolate_field",
-    "track",
     "track_markers",
 ]
