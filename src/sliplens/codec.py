@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from jaxtyping import AbstractArray, jaxtyped
 
 from sliplens.errors import InputError
-from sliplens.files import write_json
+from sliplens.files import to_builtins, write_json
 
 RESULT_FILE = "result.json"
 """Record of a folder."""
@@ -48,18 +48,6 @@ class Columns:
     def table(self) -> pa.Table:
         """Arrow table with a column a field; NaN stays NaN. `.to_pandas()` where pandas is installed."""
         return pa.table({field.name: getattr(self, field.name) for field in fields(self)})
-
-
-def to_builtins(value: object) -> Any:
-    """What JSON can hold of a record: mappings, lists, texts, numbers.
-
-    Parameters
-    ----------
-    value
-        Record, or anything made of records, mappings, sequences, paths, texts and numbers. Arrays have no
-        form in JSON: declare short ones as tuples, and long ones as fields of a result (`save_result`).
-    """
-    return msgspec.to_builtins(value, enc_hook=_encode, str_keys=True)
 
 
 def save_record(record: object, path: Path) -> None:
@@ -362,16 +350,6 @@ def _default(field: Field[Any]) -> Any:
     if field.default_factory is not MISSING:
         return msgspec.field(default_factory=field.default_factory)
     return msgspec.NODEFAULT if field.default is MISSING else field.default
-
-
-def _encode(value: object) -> object:
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, Mapping):
-        return dict(value)
-    raise NotImplementedError(f"{type(value).__name__} has no form in JSON")
 
 
 def _decode(kind: Any, value: object) -> object:
