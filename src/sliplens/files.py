@@ -188,8 +188,6 @@ def output_folder(
         Name of the command, kept in `run.json`.
     config
         All that shapes the result: the recipe that decides whether a partial or complete folder is the same.
-    overwrite
-        Replace a target made by another recipe, or by the same one.
     run_file
         Where `run.json` goes in a folder of another format, below it: where that format's readers do not look.
     resumable

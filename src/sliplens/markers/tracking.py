@@ -113,12 +113,6 @@ def track(
         As `open_source` takes them.
     out
         Parquet file to write, whole or not at all; rows are kept in memory if None.
-    overwrite
-        Write the file anew if it exists.
-    on_tracked
-        Called with each frame, to draw it.
-    on_progress
-        Called with the frames done and the frames in all.
 
     Raises
     ------

@@ -76,8 +76,6 @@ class TrainedModel:
 
         Parameters
         ----------
-        frames
-            RGB.
         reference
             The sensor untouched; None for frames that were compared before, or that need not be.
 

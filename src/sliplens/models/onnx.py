@@ -56,8 +56,6 @@ def export_onnx(run: TrainedModel | Path | str, out: Path | str, *, overwrite: b
         Network, its folder, or the name of one that comes with sliplens.
     out
         File to write, NAME.onnx.
-    overwrite
-        Write the file anew if it exists.
 
     Raises
     ------

@@ -188,13 +188,6 @@ def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
     intervals hold; uncertainty by condition; the trial of median error over time. Below, R2 and mean absolute error of
     the network beside those of model-based estimators, where there are any.
 
-    Parameters
-    ----------
-    path
-        File to write.
-    title
-        Head of the page.
-
     Raises
     ------
     InputError
@@ -373,8 +366,6 @@ def draw_learning_curve(training: Training, path: Path, *, title: str) -> None:
     ----------
     path
         File to write: .png, .pdf or .svg.
-    title
-        Head of the page.
 
     Raises
     ------

@@ -89,8 +89,6 @@ def evaluate_baselines(
         The network's, for the trial, condition, frame, time and label of each frame.
     folder
         Keeps the field of each trial: those that are there are not followed again.
-    on_progress
-        Called with the trials followed and the trials in all.
 
     Raises
     ------

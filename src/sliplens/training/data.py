@@ -166,8 +166,6 @@ def load_frames(
 
     Parameters
     ----------
-    data, trials
-        The data set and the trials of it to read.
     encoding, image_size
         Input of the network, and its height and width in pixels.
     untouched_share
@@ -178,8 +176,6 @@ def load_frames(
     scratch
         Folder for what does not fit into memory: frames that would take more than half of what is free go into a file
         there, which is read as needed and gone when the frames are. Always in memory if None.
-    on_progress
-        Called with the trials read and the trials in all.
 
     Raises
     ------
@@ -256,8 +252,6 @@ class EpochShuffle(Sampler[int]):
     ----------
     count
         Frames there are; those that do not divide among the processes are left out of this epoch.
-    seed
-        Of the orders.
     rank, processes
         Number of this process, from 0, and how many there are.
     """
@@ -293,8 +287,6 @@ class EvenShares(Sampler[list[int]]):
     ----------
     count
         Frames there are, at least one for each process.
-    batch_size
-        Most frames of a batch.
     rank, processes
         Number of this process, from 0, and how many there are.
     """

@@ -56,8 +56,6 @@ def evaluate(
         How many training trials they are fitted on, spread evenly over those of the data set.
     markers
         What markers look like, a row of `markers.KINDS`; by the sensor's name if None.
-    overwrite
-        Replace the folder if it exists.
 
     Raises
     ------
@@ -161,8 +159,6 @@ def evaluate_frames(
         The network; `frames` must be in its encoding and size.
     split
         What the frames are called in the result.
-    on_progress
-        Called with the frames done and the frames in all.
 
     Raises
     ------

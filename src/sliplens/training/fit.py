@@ -73,8 +73,6 @@ def train(
         and the logger are no part of what makes the result. All processes but the first end here.
     logger
         Where the numbers go besides `metrics.csv`: `csv` for nowhere, or a row of `LOGGERS`.
-    overwrite
-        Replace the folder if it exists.
     changes
         Fields of `TrainConfig` that are to differ from the recipe's, such as `epochs`, `image_size`, `batch_size`,
         `max_minutes` or `seed`; None leaves one as it is.
@@ -226,8 +224,6 @@ def calibrate(model: nn.Module, validation: FrameSet, *, batch_size: int) -> Cal
         Trained.
     validation
         Labelled frames of trials that did not train it.
-    batch_size
-        Images at a time.
     """
     was_training, device = model.training, next(model.parameters()).device
     model.eval()
@@ -284,8 +280,6 @@ def fit(
 
     Parameters
     ----------
-    config
-        The recipe.
     train, validation
         Encoded frames, of trials that do not overlap.
     folder
@@ -299,8 +293,6 @@ def fit(
         network a sensor that is like the one it knows. It is left as it is.
     trainer
         As `make_trainer` makes it, used once; one device, a GPU if there is one, if None.
-    logger
-        Gets the errors and the learning rate too.
     on_progress
         Called after every step with the steps done and the steps in all, in the first process; under a time limit the
         share of the time counts where it is further.

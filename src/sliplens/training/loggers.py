@@ -62,8 +62,6 @@ def open_logger(name: str, folder: Path, *, run_name: str, recipe: Mapping[str, 
     ----------
     name
         `csv` for none besides `metrics.csv`, or one of `LOGGERS`.
-    folder
-        Of the run.
     run_name
         What the logger calls the run.
     recipe
