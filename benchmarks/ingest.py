@@ -17,9 +17,8 @@ from pathlib import Path
 import av
 import numpy as np
 
-from sliplens.cli.labelling import LabelOptions, write_trials
-from sliplens.recordings.formats.video import read_video
-from sliplens.recordings.importing import About
+from sliplens.plots.audit import write_audits
+from sliplens.recordings import import_recordings
 
 HEIGHT, WIDTH, FRAMES_PER_S, FORCES_PER_S = 480, 640, 30, 500
 
@@ -68,10 +67,11 @@ def measure(video: Path, table: Path, *, audit: bool = True) -> Cost:
 
 
 def _import(video: Path, table: Path, audit: bool) -> Cost:
-    about = About(sensor="bench", day=1, condition="dry")
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        write_trials(Path(folder), [read_video(video, forces=table)], [about], ["train"], LabelOptions(audit=audit))
+        data = import_recordings(video, forces=table, sensor="bench", out=Path(folder) / "data")
+        if audit:
+            write_audits(data, data.folder / "audit")
     seconds = time.perf_counter() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return Cost(seconds=seconds, peak_rss_mb=peak / (2**20 if sys.platform == "darwin" else 2**10))

@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labels import Labels, LabelSettings, estimate_lag, label_trial, measure_motion
+from sliplens.recordings.labels import FoundLabels, LabelSettings, estimate_lag, label_trial, measure_motion
 from sliplens.simulation import SimulationRecipe, TrialPlan, plan_trials
 from sliplens.simulation.filming import Film
 from sliplens.simulation.loading import TRIAL_S, Loading
@@ -102,15 +102,15 @@ def score_trial(seen: Seen, *, noise_n: float, know_drift: bool, rng: np.random.
     time_s = seen.loading.time_s[seen.frames] + lag_s
     lag = estimate_lag(time_s, seen.motion, forces, rng=rng)
     settings = LabelSettings(
-        lag=lag, apply_lag=not lag.doubt, friction_change=_friction_change(seen.plan) if wet and know_drift else 0.0
+        apply_lag=not lag.doubt, friction_change=_friction_change(seen.plan) if wet and know_drift else 0.0
     )
     try:
-        labels = label_trial(time_s, seen.motion, forces, settings=settings, rng=rng)
+        labels = label_trial(time_s, seen.motion, forces, settings=settings, rng=rng, lag=lag)
     except RecordingError as refusal:
         print(f"{seen.plan.trial}: {refusal}")
         return None
     return _compare(
-        labels, seen, lag_s=lag_s, axes_right=(labels.axes.normal_index, labels.axes.sign) == (normal, sign)
+        labels, seen, lag_s=lag_s, axes_right=(labels.basis.axes.normal_index, labels.basis.axes.sign) == (normal, sign)
     )
 
 
@@ -121,18 +121,18 @@ def _friction_change(plan: TrialPlan) -> float:
     return 2 * (high - low) / np.sqrt(12)
 
 
-def _compare(labels: Labels, seen: Seen, *, lag_s: float, axes_right: bool) -> Score:
+def _compare(labels: FoundLabels, seen: Seen, *, lag_s: float, axes_right: bool) -> Score:
     loading, valid = seen.loading, labels.valid
     slip = int(np.argmax(loading.safety_margin == 0))
     mu, truth = float(loading.static_friction[slip]), loading.safety_margin[seen.frames]
-    error, lag = (labels.safety_margin - truth)[valid], labels.lag
+    error, lag = (labels.safety_margin - truth)[valid], labels.basis.lag
     assert lag is not None
     known = np.isfinite(error)
     return Score(
         trial=f"seed{seen.plan.recipe.seed}-{seen.plan.trial}",
         wet=seen.plan.condition == "wet",
-        mu_error=labels.friction.mu / mu - 1,
-        mu_covered=labels.friction.low <= mu <= labels.friction.high,
+        mu_error=labels.basis.friction.mu / mu - 1,
+        mu_covered=labels.basis.friction.low <= mu <= labels.basis.friction.high,
         lag_error_s=lag.lag_s - lag_s,
         lag_covered=abs(lag.lag_s - lag_s) <= lag.sigma_s,
         lag_doubtful=bool(lag.doubt),

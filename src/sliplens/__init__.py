@@ -9,37 +9,44 @@ if TYPE_CHECKING:
     from sliplens.errors import SliplensError
     from sliplens.explainers.table import explain
     from sliplens.faithfulness.scoring import score
-    from sliplens.markers.tracking import track
     from sliplens.models.checkpoint import load
     from sliplens.models.onnx import export_onnx
     from sliplens.models.predictions import predict
-    from sliplens.training.evaluate import evaluate
-    from sliplens.training.fit import train
+    from sliplens.recordings.check import check_dataset
+    from sliplens.recordings.dataset import load_dataset
+    from sliplens.recordings.exporting import export_lerobot, export_mcap
+    from sliplens.recordings.importing import import_recordings, label_dataset
 
 # where each name lives: importing sliplens alone imports neither torch nor NumPy
 _MODULES = {
-    "evaluate": "sliplens.training.evaluate",
+    "SliplensError": "sliplens.errors",
+    "check_dataset": "sliplens.recordings.check",
     "explain": "sliplens.explainers.table",
+    "export_lerobot": "sliplens.recordings.exporting",
+    "export_mcap": "sliplens.recordings.exporting",
     "export_onnx": "sliplens.models.onnx",
+    "import_recordings": "sliplens.recordings.importing",
+    "label_dataset": "sliplens.recordings.importing",
     "load": "sliplens.models.checkpoint",
+    "load_dataset": "sliplens.recordings.dataset",
     "predict": "sliplens.models.predictions",
     "score": "sliplens.faithfulness.scoring",
-    "SliplensError": "sliplens.errors",
-    "track": "sliplens.markers.tracking",
-    "train": "sliplens.training.fit",
 }
 
 __all__ = [
     "SliplensError",
     "__version__",
-    "evaluate",
+    "check_dataset",
     "explain",
+    "export_lerobot",
+    "export_mcap",
     "export_onnx",
+    "import_recordings",
+    "label_dataset",
     "load",
+    "load_dataset",
     "predict",
     "score",
-    "track",
-    "train",
 ]
 
 

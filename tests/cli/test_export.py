@@ -11,7 +11,8 @@ from sliplens.errors import InputError
 from sliplens.extras import import_onnxruntime
 from sliplens.files import RUN_FILE
 from sliplens.recordings import Dataset
-from sliplens.recordings.formats import ReadOptions, open_captures
+from sliplens.recordings.formats import open_captures
+from sliplens.recordings.options import ReadOptions
 
 
 def refused(message: str, *words: object) -> None:
@@ -52,7 +53,7 @@ def test_a_data_set_comes_back_from_other_formats(
     chosen = ("--trials", "test-wet-7", "train-dry-1")
     run(small_dataset.folder, "-o", output, f"--{kind}", *chosen)
     sources = [output] if kind == "lerobot" else [path for path in sorted(output.iterdir()) if path.suffix == ".mcap"]
-    found = {capture.name for path in sources for capture in open_captures(path, options=ReadOptions())}
+    found = {capture.trial for path in sources for capture in open_captures(path, options=ReadOptions())}
     assert found == {"test-wet-7", "train-dry-1"}
     # nothing of ours where their readers look
     assert names(output) == (
@@ -82,7 +83,7 @@ def test_a_failure_leaves_nothing_behind(small_dataset: Dataset, tmp_path: Path,
 
 def test_what_others_made_is_never_replaced(small_dataset: Dataset, tmp_path: Path):
     (tmp_path / "mine").write_text("")
-    refused("was not made by sliplens", small_dataset.folder, "-o", tmp_path, "--lerobot", "--overwrite")
+    refused("was not made by this export", small_dataset.folder, "-o", tmp_path, "--lerobot", "--overwrite")
     assert names(tmp_path) == ["mine"]
 
 

@@ -12,9 +12,8 @@ import pytest
 from command_line import refused, run
 
 from sliplens.images import write_png
-from sliplens.recordings import Dataset, Recording
-from sliplens.recordings.formats import ReadOptions
-from sliplens.recordings.store import read_labelling, write_trial
+from sliplens.recordings import Dataset, ReadOptions, Recording
+from sliplens.recordings.store import read_header, write_trial
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 FORCE_RATE = 500
@@ -80,16 +79,18 @@ def test_labels_of_an_imported_video_are_those_of_the_simulator(
     assert back.valid.sum() > 180
     error = (back.safety_margin - trial.safety_margin)[back.valid]
     assert np.sqrt(np.mean(error**2)) < 0.03
-    told = read_labelling(tmp_path / "data" / "trials" / "cup.parquet")
-    assert told is not None
+    labelling = read_header(tmp_path / "data" / "trials" / "cup.parquet").labelling
+    assert labelling is not None
+    assert labelling.basis is not None
+    basis = labelling.basis
     assert trial.truth is not None
     slip = int(np.argmax(trial.safety_margin == 0))
-    assert told["friction"]["mu"] == pytest.approx(trial.truth.static_friction[slip], rel=0.05)
-    assert (told["axes"]["normal"], told["axes"]["sign"]) == ("z", -1)
-    np.testing.assert_allclose(told["axes"]["tare_n"], TARE, atol=0.01)
+    assert basis.friction.mu == pytest.approx(trial.truth.static_friction[slip], rel=0.05)
+    assert (basis.axes.normal, basis.axes.sign) == ("z", -1)
+    np.testing.assert_allclose(basis.axes.tare_n, TARE, atol=0.01)
     # the reference was taken before the contact
-    np.testing.assert_array_equal(back.reference, trial.frames[told["reference"]["index"]])
-    assert np.isnan(trial.safety_margin[told["reference"]["index"]])
+    np.testing.assert_array_equal(back.reference, trial.frames[labelling.reference.index])
+    assert np.isnan(trial.safety_margin[labelling.reference.index])
     assert run(*command) == 0
     assert "kept" in capsys.readouterr().out
 
@@ -120,9 +121,12 @@ def test_lag_and_tare_by_hand_are_taken(tmp_path: Path, table: Path, video: Path
     # the same samples at the same times, but for the rounding of their stamps to 10 us, of forces that change by some
     # 50 N/s at most
     np.testing.assert_allclose(first.normal_force_n, second.normal_force_n, atol=1e-3)
-    told = read_labelling(tmp_path / "b" / "trials" / "cup.parquet")
-    assert told is not None
-    assert (told["lag"]["lag_s"], told["lag_applied"], told["axes"]["tare_found"]) == (0.05, True, "declared")
+    labelling = read_header(tmp_path / "b" / "trials" / "cup.parquet").labelling
+    assert labelling is not None
+    assert labelling.basis is not None
+    basis = labelling.basis
+    assert basis.lag is not None
+    assert (basis.lag.lag_s, basis.lag_applied, basis.axes.tare_found) == (0.05, True, "declared")
 
 
 def test_times_of_images_come_from_a_table_or_from_their_names(
@@ -150,9 +154,11 @@ def test_times_of_images_come_from_a_table_or_from_their_names(
 def test_friction_by_hand_is_taken(tmp_path: Path, table: Path, video: Path):
     assert run("import", video, "-o", tmp_path / "data", "--sensor", "mine", "--forces", table, "--mu", 1.4) == 0
     data = Dataset.open(tmp_path / "data")
-    told = read_labelling(tmp_path / "data" / "trials" / "cup.parquet")
-    assert told is not None
-    assert (told["friction"]["mu"], told["friction"]["found"]) == (1.4, "declared")
+    labelling = read_header(tmp_path / "data" / "trials" / "cup.parquet").labelling
+    assert labelling is not None
+    assert labelling.basis is not None
+    basis = labelling.basis
+    assert (basis.friction.mu, basis.friction.found) == (1.4, "declared")
     # with more friction than there was the trial never comes near slip
     assert np.nanmin(data.load(data.trials[0]).safety_margin) > 0.2
 
@@ -191,7 +197,10 @@ def test_an_interrupted_import_goes_on_where_it_stopped(
     [
         ((), "has no forces, and without them there is no label; give the table of the force sensor"),
         (("--forces", "MISSING.csv"), "MISSING.csv does not exist"),
-        (("--format", "papyrus"), "format 'papyrus' is not known; choose sliplens, rosbag, lerobot, thesis, gelsight"),
+        (
+            ("--format", "papyrus"),
+            "there is no format named 'papyrus'; choose one of sliplens, rosbag, lerobot",
+        ),
         (("--image-topic", "/camera"), "is read as video, which does not take image_topic"),
         (("--forces", "TABLE", "--test-trials", "2"), "2 to test are more than the 1 there are; give fewer"),
         (("--forces", "TABLE", "--test-trials", "-1"), "numbers of trials are not negative"),

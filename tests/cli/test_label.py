@@ -10,9 +10,8 @@ from command_line import refused, run
 
 from sliplens.images import write_png
 from sliplens.recordings import ContactState, Dataset, Recording
-from sliplens.recordings.capture import forces_path, load_forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.store import load_recording, read_labelling, save_recording
+from sliplens.recordings.store import forces_path, load_forces, load_recording, read_header, save_recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 
@@ -68,13 +67,14 @@ def test_what_is_said_on_the_command_line_counts_before_what_the_source_tells(tm
 
 def test_the_labels_of_a_simulated_trial_come_back_from_its_forces(trial: Recording, relabelled: Path):
     back = load_recording(trial_path(relabelled, trial.trial))
-    told = read_labelling(trial_path(relabelled, trial.trial))
-    assert told is not None
+    labelling = back.labelling
+    assert labelling is not None
+    assert labelling.basis is not None
     assert trial.truth is not None
     assert back.valid is not None
     slip = int(np.argmax(trial.safety_margin == 0))
     # forces without noise: what is left is the time of a frame over which they are averaged
-    assert told["friction"]["mu"] == pytest.approx(trial.truth.static_friction[slip], rel=0.02)
+    assert labelling.basis.friction.mu == pytest.approx(trial.truth.static_friction[slip], rel=0.02)
     error = (back.safety_margin - trial.safety_margin)[back.valid]
     assert np.sqrt(np.mean(error**2)) < 0.02
     np.testing.assert_array_equal(back.reference, trial.reference)
@@ -105,10 +105,10 @@ def test_force_samples_are_kept_and_labels_made_anew_from_them_are_the_same(
     assert Dataset.open(tmp_path / "data").trials[0].split == "validation"
     # what the trial came from, what was noted then, and how it was divided stay
     assert (tmp_path / "data" / "splits.json").read_text() == '{"rules": "of somebody"}'
-    first, last = (read_labelling(trial_path(folder, trial.trial)) for folder in (relabelled, tmp_path / "data"))
+    first, last = (read_header(trial_path(folder, trial.trial)).labelling for folder in (relabelled, tmp_path / "data"))
     assert first is not None
     assert last is not None
-    assert (last["source"], last["notes"]) == (first["source"], first["notes"])
+    assert (last.source, last.notes) == (first.source, first.notes)
 
 
 def test_labels_that_were_not_found_are_not_overwritten(simulated: Path, capsys: pytest.CaptureFixture[str]):
@@ -197,10 +197,10 @@ def test_real_clips_come_with_what_is_known_of_them_and_no_label(tmp_path: Path,
     assert {info.sensor for info in data.trials} == {"gelsight-mini"}
     for info in data.trials:
         back = data.load(info)
-        told = read_labelling(trial_path(tmp_path / "data", info.trial))
-        assert told is not None
-        assert told["clip"]["slips"] is True
+        assert back.labelling is not None
+        assert back.labelling.clip is not None
+        assert back.labelling.clip.slips
         assert not back.labelled.any()
         assert set(back.contact_state) == {ContactState.UNKNOWN}
-        np.testing.assert_array_equal(back.reference, back.frames[told["reference"]["index"]])
+        np.testing.assert_array_equal(back.reference, back.frames[back.labelling.reference.index])
     assert len(list((tmp_path / "data" / "audit").glob("*.png"))) == 2

@@ -15,8 +15,8 @@ from sliplens.images import absolute_difference, write_png
 from sliplens.models import TrainedModel, load_checkpoint
 from sliplens.models.predictions import predict as predict_source
 from sliplens.recordings import Dataset, Recording
-from sliplens.recordings.formats import ReadOptions
 from sliplens.recordings.formats.lerobot_export import write_lerobot
+from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.source import TrialFrames
 
 TRIAL = "test-wet-7"

@@ -1,5 +1,4 @@
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import replace
 from itertools import combinations, pairwise
 from typing import Any
@@ -19,6 +18,15 @@ from sliplens.errors import InputError
 from sliplens.plots.audit import choose_along, draw_audit, write_audit
 from sliplens.plots.contact_sheet import STATE_COLOURS
 from sliplens.recordings import ContactState, Recording
+from sliplens.recordings.labelling import (
+    ForceAxes,
+    Found,
+    FrictionEstimate,
+    LabelBasis,
+    Labelling,
+    Lag,
+    ReferenceChoice,
+)
 
 NO_CONTACT, CONTACT, INCIPIENT_SLIP, FULL_SLIP, _ = ContactState
 MU = 0.53
@@ -57,53 +65,53 @@ def make_trial(
     )
 
 
-def make_labelling(**changes: Any) -> dict[str, Any]:
+AXES = ForceAxes(
+    normal="z",
+    sign=-1,
+    tare_n=(0.211, -0.322, 1.433),
+    noise_n=(0.021, 0.022, 0.023),
+    tare_sigma_n=(0.001, 0.002, 0.003),
+    still_until_s=0.12,
+    normal_found=Found.INFERRED,
+    sign_found=Found.DECLARED,
+    tare_found=Found.INFERRED,
+)
+FRICTION = FrictionEstimate(
+    mu=MU,
+    low=0.517,
+    high=0.546,
+    onset_s=1.97,
+    found=Found.INFERRED,
+    method="break of F_t / F_n, seen in the image",
+    image_sigmas=12.3,
+)
+LAG = Lag(lag_s=0.015, sigma_s=0.009, correlation=0.87)
+REFERENCE = ReferenceChoice(index=2, method="least contact energy", contact_energy=0.42, drift=0.37)
+
+
+def make_labelling(
+    *, reference: ReferenceChoice = REFERENCE, source: str = "/data/one.mkv", **changes: Any
+) -> Labelling:
     """Everything found, nothing doubtful; the trial slips at 1.97 s."""
-    told = {
-        "source": "/data/one.mkv",
-        "forces": "/data/one.csv",
-        "notes": ["one.csv: times are those of column 't'."],
-        "axes": {
-            "normal": "z",
-            "sign": -1,
-            "tare_n": [0.211, -0.322, 1.433],
-            "noise_n": [0.021, 0.022, 0.023],
-            "tare_sigma_n": [0.001, 0.002, 0.003],
-            "still_until_s": 0.12,
-            "normal_found": "inferred",
-            "sign_found": "declared",
-            "tare_found": "inferred",
-            "notes": [],
-        },
-        "friction": {
-            "mu": MU,
-            "low": 0.517,
-            "high": 0.546,
-            "onset_s": 1.97,
-            "found": "inferred",
-            "method": "break of F_t / F_n, seen in the image",
-            "image_sigmas": 12.3,
-        },
-        "slip_s": 1.97,
-        "lag": {"lag_s": 0.015, "sigma_s": 0.009, "correlation": 0.87, "doubt": ""},
-        "lag_applied": False,
-        "contact_threshold_n": 0.061,
-        "window_s": 0.04,
-        "gap_s": 0.008,
-        "force_range_n": 17.5,
-        "reference": {"index": 2, "method": "least contact energy", "contact_energy": 0.42, "drift": 0.37},
-    }
-    return {**deepcopy(told), **changes}
-
-
-def forget(value: Any) -> Any:
-    """The same, every number that may be unknown gone."""
-    if isinstance(value, dict):
-        kept = {"sign", "index", "lag_applied"}
-        return {name: item if name in kept else forget(item) for name, item in value.items()}
-    if isinstance(value, list):
-        return [forget(item) for item in value]
-    return None if isinstance(value, float) else value
+    basis = LabelBasis(
+        axes=AXES,
+        friction=FRICTION,
+        friction_change=0.0,
+        slip_s=1.97,
+        lag=LAG,
+        lag_applied=False,
+        contact_threshold_n=0.061,
+        window_s=0.04,
+        gap_s=0.008,
+        force_range_n=17.5,
+    )
+    return Labelling(
+        source=source,
+        forces=changes.pop("forces", "/data/one.csv"),
+        notes=tuple(changes.pop("notes", ["one.csv: times are those of column 't'."])),
+        reference=reference,
+        basis=replace(basis, **changes),
+    )
 
 
 def slice_trial(trial: Recording, kept: slice) -> Recording:
@@ -213,15 +221,15 @@ def test_frames_without_a_valid_label_are_counted_by_what_they_lack():
     [
         ({}, None),
         ({"lag": None}, "Lag not applied"),
-        ({"lag": {"lag_s": 0.1, "sigma_s": 0.1, "correlation": 0.2, "doubt": "they correlate too little"}}, "Lag not"),
-        ({"lag": {"lag_s": 0.1, "sigma_s": 0.01, "correlation": 0.9, "doubt": ""}}, "Lag not applied"),
+        ({"lag": Lag(lag_s=0.1, sigma_s=0.1, correlation=0.2, doubt="they correlate too little")}, "Lag not"),
+        ({"lag": Lag(lag_s=0.1, sigma_s=0.01, correlation=0.9)}, "Lag not applied"),
         (
-            {"friction": {**make_labelling()["friction"], "low": MU, "high": MU, "found": "declared"}},
+            {"friction": replace(FRICTION, low=MU, high=MU, found=Found.DECLARED)},
             "Friction declared",
         ),
-        ({"friction": {**make_labelling()["friction"], "image_sigmas": 1.2}}, "Friction found"),
-        ({"axes": {**make_labelling()["axes"], "tare_found": "assumed"}}, "Tare assumed"),
-        ({"axes": {**make_labelling()["axes"], "notes": ["the normal axis is doubtful"]}}, "Axes"),
+        ({"friction": replace(FRICTION, image_sigmas=1.2)}, "Friction found"),
+        ({"axes": replace(AXES, tare_found=Found.ASSUMED)}, "Tare assumed"),
+        ({"axes": replace(AXES, notes=("the normal axis is doubtful",))}, "Axes"),
     ],
 )
 def test_what_may_put_the_labels_in_doubt_is_marked(changes, head):
@@ -232,7 +240,7 @@ def test_what_may_put_the_labels_in_doubt_is_marked(changes, head):
 
 
 def test_reason_why_a_lag_cannot_be_told_is_given():
-    lag = {"lag_s": 0.1, "sigma_s": 0.1, "correlation": 0.2, "doubt": "they correlate by 0.20 only"}
+    lag = Lag(lag_s=0.1, sigma_s=0.1, correlation=0.2, doubt="they correlate by 0.20 only")
 
     assert "cannot be told: they correlate by 0.20 only" in told(draw_audit(make_trial(), make_labelling(lag=lag)))
 
@@ -298,7 +306,7 @@ def test_trial_that_never_slips_has_no_onset():
 
 @pytest.mark.parametrize(("low", "high", "ends"), [(0.517, 0.546, [0.517, 0.546]), (MU, MU, [])])
 def test_interval_of_friction_is_a_band_unless_it_is_exact(low, high, ends):
-    friction = {**make_labelling()["friction"], "low": low, "high": high}
+    friction = replace(FRICTION, low=low, high=high)
     ratio = charts(draw_audit(make_trial(), make_labelling(friction=friction)))[1]
 
     found = [one for one in ratio.patches if one.get_label() == "its 68 % interval" and isinstance(one, Rectangle)]
@@ -406,12 +414,19 @@ def test_no_words_lie_over_others_or_leave_the_page(size):
         sensor="Some Sensor Mini 2 no 31 of the second batch, glued anew",
         condition="rubbed with oil and then with water",
     )
-    told = make_labelling(notes=["a note that tells of a doubt at some length, and of its cure"] * 30, slip_s=1970.1)
-    told["source"] = "/a/very/long/path" * 9
-    told["forces"] = "/another/of/these" * 9
-    told["lag"] = {"lag_s": -0.1, "sigma_s": 0.1, "correlation": 0.2, "doubt": "several lags fit alike " * 4}
-    told["friction"].update(low=MU, high=MU, found="declared", method="given by hand, after three trials by eye")
-    told["axes"].update(tare_n=[-1234.5, 2345.6, -3456.7], tare_found="assumed", notes=["the normal axis is doubtful"])
+    told = make_labelling(
+        source="/a/very/long/path" * 9,
+        forces="/another/of/these" * 9,
+        notes=["a note that tells of a doubt at some length, and of its cure"] * 30,
+        slip_s=1970.1,
+        lag=Lag(lag_s=-0.1, sigma_s=0.1, correlation=0.2, doubt="several lags fit alike " * 4),
+        friction=replace(
+            FRICTION, low=MU, high=MU, found=Found.DECLARED, method="given by hand, after three trials by eye"
+        ),
+        axes=replace(
+            AXES, tare_n=(-1234.5, 2345.6, -3456.7), tare_found=Found.ASSUMED, notes=("the normal axis is doubtful",)
+        ),
+    )
 
     outside, pairs = misplaced(draw_audit(trial, told))
 
@@ -421,10 +436,15 @@ def test_no_words_lie_over_others_or_leave_the_page(size):
 
 def test_numbers_that_are_not_known_are_dashes():
     trial = replace(make_trial(), valid=None, safety_margin_sigma=None)
-    figure = draw_audit(trial, forget(make_labelling()))
+    unknown = make_labelling(
+        reference=ReferenceChoice(index=2, method="named"),
+        axes=replace(AXES, still_until_s=None),
+        lag=replace(LAG, correlation=None),
+    )
+    figure = draw_audit(trial, unknown)
 
     assert misplaced(figure) == ([], [])
-    assert "68 % interval –" in told(figure)  # noqa: RUF001 (an en dash is meant)
+    assert "correlation –" in told(figure)  # noqa: RUF001 (an en dash is meant)
     assert "drift – grey levels" in told(figure)  # noqa: RUF001 (the same)
     assert len(pictures(figure)[0]) == 6
 
@@ -432,7 +452,7 @@ def test_numbers_that_are_not_known_are_dashes():
 @pytest.mark.parametrize("kept", [slice(0, 1), slice(0, 4), slice(6, 8)])
 def test_few_frames_are_all_shown(kept):
     trial = slice_trial(make_trial(), kept)
-    told = make_labelling(reference={**make_labelling()["reference"], "index": 0}, slip_s=None)
+    told = make_labelling(reference=replace(REFERENCE, index=0), slip_s=None)
     figure = draw_audit(trial, told)
     figure.draw_without_rendering()
 

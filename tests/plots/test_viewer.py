@@ -17,11 +17,11 @@ from sliplens.images.files import decode_png
 from sliplens.plots import viewer as viewer_process
 from sliplens.plots.viewer import open_viewer, write_rrd
 from sliplens.recordings import ContactState, Dataset, Recording
-from sliplens.recordings.capture import Capture, Forces, forces_path
+from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.importing import About, import_trial
+from sliplens.recordings.importing import import_trial
 from sliplens.recordings.labels import LabelSettings
-from sliplens.recordings.store import read_labelling, save_recording
+from sliplens.recordings.store import forces_path, read_header, save_recording
 from sliplens.recordings.trial import SIGNALS
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
@@ -270,7 +270,9 @@ def test_samples_of_the_force_sensor_stand_on_the_clock_of_the_camera(
     pull, press = (np.interp(time, long.time_s, one) for one in (long.tangential_force_n, long.normal_force_n))
     force = np.stack([pull, np.zeros_like(pull), press], axis=-1) + rng.normal(0, 0.02, (len(time), 3))
     capture = Capture(
-        name="cup_1",
+        trial="cup_1",
+        sensor="mine",
+        object="paper_cup*",
         source="cup",
         frame_time_s=long.time_s + LAG_S,
         frame_size=(224, 224),
@@ -281,25 +283,26 @@ def test_samples_of_the_force_sensor_stand_on_the_clock_of_the_camera(
     import_trial(
         capture,
         path,
-        about=About(sensor="mine", day=1, condition="dry", object="paper_cup*"),
         settings=LabelSettings(apply_lag=applied),
         rng=rng,
-        forces_path=forces_path(tmp_path, "cup_1"),
+        forces_file=forces_path(tmp_path, "cup_1"),
     )
     write_dataset_table(tmp_path, [trial_info(path, split="test")])
     data = Dataset.open(tmp_path)
     write_rrd(data, data.trials[0], tmp_path / "a.rrd")
-    labelling, found = read_labelling(path), read_rrd(tmp_path / "a.rrd")
+    labelling, found = read_header(path).labelling, read_rrd(tmp_path / "a.rrd")
     assert labelling is not None
+    assert labelling.basis is not None
+    assert labelling.basis.lag is not None
     late = rows(found, "sensor/force", "Scalars:scalars")
     assert late.frame is None
     assert late.time_ns is not None
-    shift = labelling["lag"]["lag_s"] if applied else 0.0
+    shift = labelling.basis.lag.lag_s if applied else 0.0
     np.testing.assert_allclose(late.time_ns / 1e9, time + shift, rtol=0, atol=0.6e-9)
     np.testing.assert_array_equal(np.array(late.values), force)
     if applied:  # half a frame at 15 a second
         assert shift == pytest.approx(LAG_S, abs=1 / 30)
-    np.testing.assert_array_equal(numbers(found, "ratio/static_friction"), labelling["friction"]["mu"])
+    np.testing.assert_array_equal(numbers(found, "ratio/static_friction"), labelling.basis.friction.mu)
     (text,) = rows(found, "about", "TextDocument:text").values[0]
     # as it was typed, not as Markdown reads it
     assert r"- object: paper\_cup\*" in text

@@ -157,5 +157,5 @@ def test_a_data_set_without_trials_is_refused(tmp_path: Path):
 
 def test_a_data_set_of_another_schema_is_refused(tmp_path: Path):
     (tmp_path / "dataset.json").write_text(json.dumps({"schema_version": 99}))
-    with pytest.raises(RecordingError, match="is not a sliplens data set of schema 1"):
+    with pytest.raises(RecordingError, match="is not a sliplens data set of schema 2; make it again"):
         Dataset.open(tmp_path)

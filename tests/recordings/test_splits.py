@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sliplens.errors import InputError
-from sliplens.recordings import Dataset
+from sliplens.recordings import Dataset, TrialFacts
 from sliplens.recordings.check import check_dataset
 from sliplens.recordings.dataset import DATASET_FILE
 from sliplens.recordings.splits import (
@@ -21,7 +21,6 @@ from sliplens.recordings.splits import (
     SPLITS_FILE,
     SplitPlan,
     SplitRule,
-    TrialFacts,
     assign_splits,
     read_splits,
     store_splits,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from sliplens.cli.console import print_table, progress_bar, say
+from sliplens.cli.console import Terminal, print_table, say
 from sliplens.errors import RecordingError
 
 
@@ -22,17 +22,15 @@ class Check:
 
     def run(self) -> None:
         """Check and say what is wrong, and where."""
-        from sliplens.recordings import Dataset
         from sliplens.recordings.check import check_dataset
+        from sliplens.recordings.dataset import load_dataset
 
-        data = Dataset.open(self.data)
-        with progress_bar("Checking trials") as bar:
-            findings = check_dataset(self.data, on_trial=bar)
+        data = load_dataset(self.data)
+        findings = check_dataset(data, on_progress=Terminal())
         if findings:
             print_table("Found", ("where", "what"), [(one.where, one.what) for one in findings])
             raise RecordingError(
                 f"{self.data} has {len(findings)} thing{'s' if len(findings) > 1 else ''} wrong, listed above; "
                 "mend or make these trials again"
             )
-        frames = sum(info.frames for info in data.trials)
-        say(f"{self.data} is sound: {len(data.trials)} trials, {frames:,} frames, every hash and law holds")
+        say(f"{self.data} is sound: {len(data.trials)} trials, {data.frames:,} frames, every hash and law holds")

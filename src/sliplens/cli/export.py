@@ -1,21 +1,13 @@
 """`sliplens export`."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
-from sliplens.cli.console import OUT, progress_bar, unchanged, wrote
+from sliplens.cli.console import OUT, Terminal, wrote
 from sliplens.errors import InputError
-
-if TYPE_CHECKING:
-    from sliplens.recordings import Dataset, TrialInfo
-
-_RUN_FILES = {"lerobot": "meta/sliplens/run.json", "mcap": "run.json"}
-"""Where our record goes: LeRobot reads what `meta` holds by name, and tools for MCAP open single files."""
-_NAMED = 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,44 +66,14 @@ class Export:
         )
 
     def _export_data(self, kind: str) -> None:
-        from sliplens.files import exported_folder
-        from sliplens.recordings import Dataset
+        from sliplens.recordings.exporting import export_lerobot, export_mcap
 
         if _is_run(self.source) and not _is_data(self.source):
             raise InputError(
                 f"{self.source} is a run, and --{kind} writes a data set; name a data set, or choose --onnx"
             )
-        data = Dataset.open(self.source)
-        chosen = self._choose(data)
-        config = {"format": kind, "data_hash": data.hash, "trials": [info.trial for info in chosen]}
-        with exported_folder(self.output, run_file=_RUN_FILES[kind], config=config, overwrite=self.overwrite) as out:
-            if out.complete:
-                unchanged(self.output)
-                return
-            with progress_bar("Writing frames") as bar:
-                _writer(kind)(data, out.folder, trials=chosen, on_frames=bar)
-        frames = sum(info.frames for info in chosen)
-        wrote(self.output, f"{len(chosen)} trials, {frames:,} frames")
-
-    def _choose(self, data: "Dataset") -> "tuple[TrialInfo, ...]":
-        if not self.trials:
-            return data.trials
-        by_name = {info.trial: info for info in data.trials}
-        for name in self.trials:
-            if name not in by_name:
-                more = f" and {len(by_name) - _NAMED} more" if len(by_name) > _NAMED else ""
-                raise InputError(f"{self.source} has no trial {name}; it has {', '.join(list(by_name)[:_NAMED])}{more}")
-        return tuple(by_name[name] for name in dict.fromkeys(self.trials))
-
-
-def _writer(kind: str) -> Callable[..., None]:
-    if kind == "mcap":
-        from sliplens.recordings.formats.mcap import write_mcap
-
-        return write_mcap
-    from sliplens.recordings.formats.lerobot_export import write_lerobot
-
-    return write_lerobot
+        export = export_mcap if kind == "mcap" else export_lerobot
+        export(self.source, self.output, trials=self.trials, overwrite=self.overwrite, on_progress=Terminal())
 
 
 def _is_run(source: Path) -> bool:

@@ -1,21 +1,18 @@
 """`sliplens import`."""
 
-from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from sliplens.cli.console import OUT, say, unchanged, wrote
-from sliplens.cli.labelling import LabelOptions, show_found, summary, write_trials
-from sliplens.errors import InputError
-from sliplens.files import output_folder, write_json
+from sliplens.cli.console import Terminal, print_table, say, wrote
+from sliplens.recordings.options import LabelSettings, ReadOptions
 
 if TYPE_CHECKING:
-    from sliplens.recordings.capture import Capture
-    from sliplens.recordings.importing import About
-    from sliplens.recordings.splits import SplitPlan
+    from sliplens.recordings import Dataset
+    from sliplens.recordings.labelling import Labelling
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,166 +45,75 @@ class Import:
     """File of rules that deal the trials to splits (TOML; see docs/splits.md), in place of the two numbers above."""
     format: str | None = None
     """rosbag, lerobot, sliplens, thesis, gelsight, images or video; recognised if not given."""
-    forces: Path | None = None
-    """Table of forces beside a video or folder of images (CSV)."""
-    time_column: str | None = None
-    """Column of the table with the times; guessed if not given."""
-    force_columns: tuple[str, ...] | None = None
-    """Columns with the forces, three (x y z) or two (tangential and normal); guessed if not given."""
-    time_unit: str | None = None
-    """s, ms, us or ns; guessed if not given."""
-    force_unit: str | None = None
-    """N, mN, gf or kgf; guessed if not given."""
-    frame_rate: float | None = None
-    """Frames a second, where a video's stamps are missing or wrong."""
-    times: Path | None = None
-    """Table with the name and the time of every image of a folder (CSV)."""
-    name_unit: str | None = None
-    """Unit (s, ms, us, ns) of the last number in the names of images, which is then their time."""
-    skip_frames: int | None = None
-    """So many frames at the start of a video are left out."""
-    skip_stale: bool = False
-    """Leave out the dark or frozen frames that a camera hands out when it was just started."""
-    start_s: float | None = None
-    """When the first frame was taken, on the clock of the forces."""
-    image_topic: str | None = None
-    """Topic of the images; the only one if not given."""
-    wrench_topic: str | None = None
-    """Topic of the forces; the only one if not given."""
-    camera_key: str | None = None
-    """Feature of a LeRobot data set with the images."""
-    force_key: str | None = None
-    """Feature of a LeRobot data set with the forces."""
-    image_root: Path | None = None
-    """Folder under which the images that a list names lie now."""
-    margin_unit: Literal["fraction", "percent"] | None = None
-    """Unit of a list's safety margins; told by their size if not given."""
-    labels: Annotated[LabelOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=LabelOptions)
+    reading: Annotated[ReadOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ReadOptions)
+    labelling: Annotated[LabelSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=LabelSettings)
+    audit: bool = True
+    """Draw a page for each trial, in `audit/` of the folder, from which to judge its labels."""
     overwrite: bool = False
     """Replace the folder if it exists."""
 
     def run(self) -> None:
         """Read, label, write, and show what was found."""
-        from sliplens.recordings.splits import TrialFacts, assign_splits, write_split_record
+        from sliplens.recordings.importing import import_recordings
 
-        captures = self._open()
-        abouts = [self._about(capture) for capture in captures]
-        plan = self._plan()
-        facts = [
-            TrialFacts(
-                trial=one.name, sensor=about.sensor, day=about.day, condition=about.condition, object=about.object
-            )
-            for one, about in zip(captures, abouts, strict=True)
-        ]
-        dealt = None if plan is None else assign_splits(plan, facts)
-        splits = self._deal(captures) if dealt is None else dealt.splits
-        own = {"output", "overwrite", "sources", "labels", "forces", "times"}
-        config = {
-            **{name: value for name, value in vars(self).items() if name not in own},
-            **vars(self.labels),
-            "sources": [_fingerprint(path) for path in self.sources],
-            **{
-                name: None if path is None else _fingerprint(path)
-                for name, path in (("forces", self.forces), ("times", self.times))
-            },
-            "splits": None if plan is None else [rule.as_table() for rule in plan.rules],
-        }
-        with output_folder(self.output, stage="import", config=config, overwrite=self.overwrite) as out:
-            if out.complete:
-                unchanged(self.output)
-                return
-            found = write_trials(out.folder, captures, abouts, splits, self.labels)
-            write_json(out.folder / "result.json", {"trials": summary(found)})
-            if plan is not None and dealt is not None:
-                write_split_record(out.folder, plan, facts, dealt)
-        show_found("Imported", found)
-        for note in dealt.notes if dealt else ():
-            say(f"  note: {note}")
-        frames = sum(len(capture.frame_time_s) for capture in captures)
-        wrote(self.output, f"{len(captures)} trials, {frames:,} frames")
-        if self.labels.audit:
-            wrote(self.output / "audit", "a page a trial: look at them before you train")
-
-    def _open(self) -> "list[Capture]":
-        from sliplens.recordings.formats import ReadOptions, open_captures
-
-        options = ReadOptions(
-            forces=self.forces,
-            frame_rate=self.frame_rate,
-            times=self.times,
-            name_unit=self.name_unit,
-            skip_frames=self.skip_frames,
-            skip_stale=self.skip_stale or None,
-            start_s=self.start_s,
-            time_column=self.time_column,
-            force_columns=self.force_columns,
-            time_unit=self.time_unit,
-            force_unit=self.force_unit,
-            image_topic=self.image_topic,
-            wrench_topic=self.wrench_topic,
-            camera_key=self.camera_key,
-            force_key=self.force_key,
-            image_root=self.image_root,
-            margin_unit=self.margin_unit,
+        terminal = Terminal()
+        data = import_recordings(
+            self.sources,
+            out=self.output,
+            sensor=self.sensor,
+            day=self.day,
+            condition=self.condition,
+            object=self.object,
+            format=self.format,
+            splits=self.splits,
+            validation_trials=self.validation_trials,
+            test_trials=self.test_trials,
+            reading=self.reading,
+            labelling=self.labelling,
+            overwrite=self.overwrite,
+            on_progress=terminal,
         )
-        if self.forces is not None and len(self.sources) > 1:
-            raise InputError("one table of forces goes with one recording; import the trials one by one")
-        with OUT.status("Opening the recordings"):
-            captures = [
-                one for path in self.sources for one in open_captures(path, format=self.format, options=options)
-            ]
-        twice = [name for name, count in Counter(one.name for one in captures).items() if count > 1]
-        if twice:
-            raise InputError(f"several recordings are named {', '.join(twice)}; rename their files")
-        return captures
-
-    def _about(self, capture: "Capture") -> "About":
-        """What a trial is: as said on the command line, else as its source tells."""
-        from sliplens.recordings.importing import About
-
-        told = capture.told
-        sensor = self.sensor or told.sensor
-        if not sensor:
-            raise InputError(f"{capture.source} does not tell its sensor, and a network is of one; add --sensor")
-        return About(
-            sensor=sensor,
-            day=self.day if self.day is not None else told.day if told.day is not None else 1,
-            condition=self.condition or told.condition or "dry",
-            object=self.object or told.object or "",
-        )
-
-    def _plan(self) -> "SplitPlan | None":
-        from sliplens.recordings.splits import read_splits
-
-        if self.splits is None:
-            return None
-        if self.validation_trials is not None or self.test_trials is not None:
-            raise InputError("splits come from a file or from numbers of trials, not from both; leave one out")
-        return read_splits(self.splits)
-
-    def _deal(self, captures: "list[Capture]") -> list[str]:
-        count = len(captures)
-        if self.validation_trials is None and self.test_trials is None:
-            return [capture.told.split or "train" for capture in captures]
-        validation, test = self.validation_trials or 0, self.test_trials or 0
-        if validation < 0 or test < 0:
-            raise InputError("numbers of trials are not negative; give 0 or more")
-        training = count - validation - test
-        if training < 0:
-            raise InputError(
-                f"{validation} trials to validate and {test} to test are more than the {count} there are; give fewer"
-            )
-        return ["train"] * training + ["validation"] * validation + ["test"] * test
+        if self.audit:
+            draw_audits(data, data.folder / "audit", terminal)
+        show_labelling("Imported", data)
 
 
-def _fingerprint(path: Path) -> list[object]:
-    """What tells a file that changed from one that did not, without reading all of it."""
-    if not path.exists():
-        raise InputError(f"{path} does not exist; check the path")
-    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-    stats = [file.stat() for file in files]
-    return [
-        str(path.resolve()),
-        sum(stat.st_size for stat in stats),
-        max((stat.st_mtime_ns for stat in stats), default=0),
-    ]
+def draw_audits(data: "Dataset", folder: Path, terminal: Terminal) -> None:
+    """Draw the pages that are not there yet."""
+    from sliplens.plots.audit import write_audits
+
+    if write_audits(data, folder, on_progress=terminal):
+        wrote(folder, "a page a trial: look at them before you train")
+
+
+def show_labelling(title: str, data: "Dataset") -> None:
+    """Show what the labels of each trial rest on, what was assumed, and which frames have none."""
+    rows, notes, lost = [], [], []
+    for info in data.trials:
+        labels = data.read_labels(info)
+        counts = labels.count()
+        kept = labels.labelling
+        rows.append((info.trial, str(info.frames), str(counts.get("valid", 0)), *_basis(kept, counts)))
+        if kept is not None:
+            notes += [*kept.notes, *(kept.basis.axes.notes if kept.basis else ())]
+        why = ", ".join(f"{count} {reason}" for reason, count in counts.items() if reason != "valid")
+        lost.append(f"  {info.trial}: frames without a valid label: {why or 'none'}")
+    print_table(title, ("trial", "frames", "valid", "mu", "lag, ms", "reference"), rows)
+    for line in (*(f"  note: {note}" for note in dict.fromkeys(notes)), *lost):
+        say(line)
+
+
+def _basis(labelling: "Labelling | None", counts: dict[str, int]) -> Sequence[str]:
+    """Friction, lag and reference, for people."""
+    friction, lag, reference = "came with it" if counts.get("valid") else "-", "-", "its own"
+    if labelling is not None and labelling.basis is not None:
+        basis = labelling.basis
+        estimate = basis.friction
+        friction = f"{estimate.mu:.3f} [{estimate.low:.3f}, {estimate.high:.3f}] {estimate.found}"
+        if basis.lag is not None:
+            sure = f"{1e3 * basis.lag.lag_s:+.1f} +- {1e3 * basis.lag.sigma_s:.1f}"
+            lag = ("not told" if basis.lag.doubt else sure) + (" (applied)" if basis.lag_applied else "")
+    if labelling is not None and labelling.reference.index is not None:
+        drift = "not told" if labelling.reference.drift is None else f"{labelling.reference.drift:.1f}"
+        reference = f"frame {labelling.reference.index}, drift {drift}"
+    return friction, lag, reference

@@ -51,7 +51,7 @@ class Predict:
     def run(self) -> None:
         """Predict and write."""
         from sliplens.models.predictions import predict
-        from sliplens.recordings.formats import ReadOptions
+        from sliplens.recordings.options import ReadOptions
 
         predictions = predict(
             self.model,

@@ -2,17 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
 from sliplens.cli.console import progress_bar, say, wrote
 from sliplens.errors import InputError
-
-if TYPE_CHECKING:
-    from sliplens.recordings import Dataset, TrialInfo
-
-_NAMED = 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +38,7 @@ class View:
             if self.output.exists() and not self.overwrite:
                 raise InputError(f"{self.output} exists; choose another file or pass --overwrite")
         data = Dataset.open(self.data)
-        info = self._find(data)
+        info = data.trials[0] if self.trial is None else data.find(self.trial)
         with progress_bar(f"Reading {info.trial}") as bar:
             if self.output is None:
                 open_viewer(data, info, on_frames=bar)
@@ -54,13 +49,3 @@ class View:
             say("the viewer tells its makers that it is used, not what is seen; `rerun analytics disable` ends that")
         else:
             wrote(self.output, f"{info.trial}, {info.frames:,} frames; open it with `rerun {self.output}`")
-
-    def _find(self, data: "Dataset") -> "TrialInfo":
-        if self.trial is None:
-            return data.trials[0]
-        for info in data.trials:
-            if info.trial == self.trial:
-                return info
-        names = [info.trial for info in data.trials]
-        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-        raise InputError(f"{self.data} has no trial {self.trial}; it has {', '.join(names[:_NAMED])}{more}")

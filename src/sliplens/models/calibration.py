@@ -119,6 +119,8 @@ def conformal_offset(
     ----------
     low, high
         Intervals of validation frames; equal for one number.
+    margins
+        Their labels.
     level
         Share that is to hold.
 

@@ -19,8 +19,8 @@ from sliplens.models.checkpoint import Estimate, TrainedModel, load
 from sliplens.models.engines import Engine, make_engine
 from sliplens.progress import OnProgress, note, stage
 from sliplens.recordings import Dataset
-from sliplens.recordings.formats import ReadOptions
-from sliplens.recordings.source import Frame, Frames, TrialFrames, open_source
+from sliplens.recordings.options import ReadOptions
+from sliplens.recordings.source import Frame, Frames, TrialFrames, describe_source, open_source
 
 LEVEL = 0.9
 """Confidence of the intervals."""
@@ -129,6 +129,7 @@ def predict(
     path = None if out is None else Path(out)
     _check_arguments(path, overwrite=overwrite, batch_size=batch_size, engine=engine, onnx_file=onnx_file)
     trained = run if isinstance(run, TrainedModel) else load(run, device=device)
+    described = describe_source(source)
     if isinstance(source, Path | str | np.ndarray | Dataset):
         with stage(on_progress, "Opening the source"):
             source = open_source(
@@ -147,7 +148,7 @@ def predict(
         ready = make_engine(engine, trained, frames=total, batch_size=batch_size, onnx_file=onnx_file)
     metadata = {
         "sliplens.engine": ready.name,
-        "sliplens.source": source[0].source,
+        "sliplens.source": described,
         "sliplens.manifest_hash": hash_json(trained.manifest),
         "sliplens.weights_sha256": trained.manifest.weights_sha256,
     }

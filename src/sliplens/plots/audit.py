@@ -1,9 +1,11 @@
 """Audit of an imported trial: one page that shows what its labels rest on."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from textwrap import wrap
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
@@ -12,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from sliplens.errors import InputError
 from sliplens.images import absolute_difference
 from sliplens.plots.contact_sheet import (
     NAMED_STATES,
@@ -25,7 +28,11 @@ from sliplens.plots.contact_sheet import (
 )
 from sliplens.plots.layout import place_axes, place_text, require_picture_path, save_page
 from sliplens.plots.style import BLACK, BLUE, GREEN, GREY, PURPLE, SKY, VERMILLION, decimals, drawing_style, signed
-from sliplens.recordings import ContactState, Recording
+from sliplens.progress import OnProgress, stage
+from sliplens.recordings import ContactState, Dataset, Recording
+from sliplens.recordings.dataset import trial_path
+from sliplens.recordings.labelling import Found, FrictionEstimate, Labelling, Lag
+from sliplens.recordings.store import load_recording, read_frames, read_header
 
 _MINUS = "\N{MINUS SIGN}"
 _LOOSE = 10.0  # percentage points: beyond, margins 20 points apart are hard to tell apart
@@ -42,50 +49,49 @@ class Fact(NamedTuple):
     indent: str = ""
 
 
-def audit_facts(recording: Recording, labelling: Mapping[str, Any]) -> list[Fact]:
+def audit_facts(recording: Recording, labelling: Labelling) -> list[Fact]:
     """Tell what the labels rest on: what was declared, found and assumed, and what of it is doubtful."""
-    if labelling["friction"] is None:
+    basis, reference = labelling.basis, labelling.reference
+    if basis is None:
         return _tell_given(recording, labelling)
-    axes, notes = labelling["axes"], [*labelling["axes"]["notes"], *labelling["notes"]]
-    found = {name: _found(axes[f"{name}_found"]) for name in ("normal", "sign", "tare")}
-    pressing = f"normal force is {'+' if axes['sign'] > 0 else _MINUS}{axes['normal']}"
-    still = f"untouched until {decimals(axes['still_until_s'], 2)} s"
-    reference, limit = labelling["reference"], labelling["force_range_n"]
-    energy, drift = (decimals(reference[name], 2) for name in ("contact_energy", "drift"))
-    means = f"means over {_milli(labelling['window_s'])} ms; gaps over {_milli(labelling['gap_s'])} ms count as missing"
+    axes, limit, notes = basis.axes, basis.force_range_n, [*basis.axes.notes, *labelling.notes]
+    pressing = f"normal force is {'+' if axes.sign > 0 else _MINUS}{axes.normal}"
+    still = f"untouched until {decimals(axes.still_until_s, 2)} s"
+    energy, drift = decimals(reference.contact_energy, 2), decimals(reference.drift, 2)
+    means = f"means over {_milli(basis.window_s)} ms; gaps over {_milli(basis.gap_s)} ms count as missing"
     return [
         _tell_frames(recording),
         Fact(
             "Axes",
-            [f"{pressing} (axis {found['normal']}, sign {found['sign']})"],
-            any("axis" in note for note in axes["notes"]),
+            [f"{pressing} (axis {_found(axes.normal_found)}, sign {_found(axes.sign_found)})"],
+            any("axis" in note for note in axes.notes),
         ),
         Fact(
-            f"Tare {found['tare']}",
+            f"Tare {_found(axes.tare_found)}",
             [
-                f"x, y, z: {_three(axes['tare_n'], signed)} N",
-                f"± {_three(axes['tare_sigma_n'])} N",
-                f"noise of a sample {_three(axes['noise_n'])} N",
+                f"x, y, z: {_three(axes.tare_n, signed)} N",
+                f"± {_three(axes.tare_sigma_n)} N",
+                f"noise of a sample {_three(axes.noise_n)} N",
                 still,
             ],
-            axes["tare_found"] == "assumed",
+            axes.tare_found == Found.ASSUMED,
         ),
-        _tell_friction(labelling["friction"], labelling["slip_s"]),
-        _tell_lag(recording, labelling["lag"], applied=labelling["lag_applied"]),
+        _tell_friction(basis.friction, basis.slip_s),
+        _tell_lag(recording, basis.lag, applied=basis.lag_applied),
         Fact(
             "Forces",
             [
-                f"contact from {decimals(labelling['contact_threshold_n'], 3)} N",
+                f"contact from {decimals(basis.contact_threshold_n, 3)} N",
                 means,
                 "range of the sensor not told" if limit is None else f"range of the sensor ± {limit:g} N",
             ],
         ),
         Fact(
             "Reference",
-            [str(reference["method"])]
-            if reference["index"] is None
+            [reference.method]
+            if reference.index is None
             else [
-                f"frame {reference['index']}, {reference['method']}",
+                f"frame {reference.index}, {reference.method}",
                 f"contact energy {energy}, drift {drift} grey levels",
             ],
         ),
@@ -93,15 +99,15 @@ def audit_facts(recording: Recording, labelling: Mapping[str, Any]) -> list[Fact
     ]
 
 
-def _tell_given(recording: Recording, labelling: Mapping[str, Any]) -> list[Fact]:
+def _tell_given(recording: Recording, labelling: Labelling) -> list[Fact]:
     """Tell of labels that came with the frames, and were not found from forces."""
-    reference, clip = labelling["reference"], labelling.get("clip") or {}
-    which = "recorded apart from the frames" if reference["index"] is None else f"frame {reference['index']}"
+    index, clip = labelling.reference.index, asdict(labelling.clip) if labelling.clip else {}
+    which = "recorded apart from the frames" if index is None else f"frame {index}"
     labelled = bool(recording.labelled.any())
     words = ["They came with the recording; nothing was found from forces."] if labelled else ["No frame has one."]
     known = [f"{name.replace('_', ' ')}: {_plainly(value)}" for name, value in clip.items()]
-    notes = [f"• {note}" for note in labelling["notes"]]
-    counts = labelling["frames_by_reason"]
+    notes = [f"• {note}" for note in labelling.notes]
+    counts = recording.count()
     lost = [", ".join(f"{count} {reason}" for reason, count in counts.items() if reason != "valid")]
     return [
         Fact(f"Frames: {counts.get('valid', 0)} of {sum(counts.values())} valid", lost),
@@ -136,38 +142,39 @@ def _tell_frames(recording: Recording) -> Fact:
     return Fact(f"Frames: {counts['valid']} of {len(states)} valid", words, lost > 0 or middle > _LOOSE)
 
 
-def _tell_friction(friction: Mapping[str, Any], slip_s: float | None) -> Fact:
-    low, high, moved = friction["low"], friction["high"], friction["image_sigmas"]
-    exact = low is not None and low == high
-    interval = "taken as exact" if exact else f"68 % interval {decimals(low, 3)} to {decimals(high, 3)}"
+def _tell_friction(friction: FrictionEstimate, slip_s: float | None) -> Fact:
+    exact, moved = friction.low == friction.high, friction.image_sigmas
+    interval = (
+        "taken as exact" if exact else f"68 % interval {decimals(friction.low, 3)} to {decimals(friction.high, 3)}"
+    )
     image = [] if moved is None else [f"image moves {moved:.1f} σ more at the slip"]  # noqa: RUF001 (sigma is meant)
     slip = "never slips" if slip_s is None else f"slips at {slip_s:.3f} s on the clock of the forces"
-    unseen = friction["found"] == "inferred" and (moved is None or moved < _SEEN_SIGMAS)
-    words = [f"μ {decimals(friction['mu'], 3)}, {interval}", friction["method"], *image, slip]
-    return Fact(f"Friction {_found(friction['found'])}", words, exact or unseen)
+    unseen = friction.found == Found.INFERRED and (moved is None or moved < _SEEN_SIGMAS)
+    words = [f"μ {decimals(friction.mu, 3)}, {interval}", friction.method, *image, slip]
+    return Fact(f"Friction {_found(friction.found)}", words, exact or unseen)
 
 
-def _tell_lag(recording: Recording, lag: Mapping[str, Any] | None, *, applied: bool) -> Fact:
+def _tell_lag(recording: Recording, lag: Lag | None, *, applied: bool) -> Fact:
     head = f"Lag {'applied' if applied else 'not applied'}"
-    if lag is None or lag["doubt"]:
-        return Fact(head, [f"cannot be told: {lag['doubt']}" if lag else "not estimated"], doubtful=True)
-    late = f"camera late by {_milli(lag['lag_s'])} ± {_milli(lag['sigma_s'])} ms"
+    if lag is None or lag.doubt:
+        return Fact(head, [f"cannot be told: {lag.doubt}" if lag else "not estimated"], doubtful=True)
+    late = f"camera late by {_milli(lag.lag_s)} ± {_milli(lag.sigma_s)} ms"
     # beyond chance, and as much as half a frame: the labels are those of another frame
-    least = max(2 * (lag["sigma_s"] or 0), np.ptp(recording.time_s) / (2 * len(recording)))
-    ignored = not applied and abs(lag["lag_s"] or 0) > least
-    return Fact(head, [late, f"correlation {decimals(lag['correlation'], 2)}"], bool(ignored))
+    least = max(2 * lag.sigma_s, np.ptp(recording.time_s) / (2 * len(recording)))
+    ignored = not applied and abs(lag.lag_s) > least
+    return Fact(head, [late, f"correlation {decimals(lag.correlation, 2)}"], bool(ignored))
 
 
-def _found(how: str) -> str:
-    return "found" if how == "inferred" else how
+def _found(how: Found) -> str:
+    return "found" if how is Found.INFERRED else str(how)
 
 
-def _milli(value: float | None) -> str:
-    return decimals(None if value is None else 1000 * value, 1).replace("-", _MINUS)
+def _milli(value: float) -> str:
+    return decimals(1000 * value, 1).replace("-", _MINUS)
 
 
-def _three(values: Sequence[float | None], write: Callable[..., str] = decimals) -> str:
-    return ", ".join(decimals(None, 0) if one is None else write(one, 3) for one in values)
+def _three(values: Sequence[float], write: Callable[..., str] = decimals) -> str:
+    return ", ".join(write(one, 3) for one in values)
 
 
 _HIGHEST = 2.5  # times mu_s: where hardly anything presses, F_t / F_n goes anywhere
@@ -187,7 +194,7 @@ def plot_contact_forces(recording: Recording, threshold_n: float | None, *, ax: 
         _say(ax, "no forces were recorded")
 
 
-def plot_force_ratio(recording: Recording, friction: Mapping[str, Any] | None, *, ax: Axes) -> None:
+def plot_force_ratio(recording: Recording, friction: FrictionEstimate | None, *, ax: Axes) -> None:
     """Draw F_t / F_n of the frames in contact, and the static friction with its interval.
 
     Where friction came with the frames (None), that of each frame is drawn.
@@ -197,7 +204,7 @@ def plot_force_ratio(recording: Recording, friction: Mapping[str, Any] | None, *
         ratio = np.where(touches, recording.tangential_force_n / recording.normal_force_n, np.nan)
     drawn = {"color": BLUE, "linewidth": _width(recording), "marker": _marker(recording)}
     ax.plot(recording.time_s, ratio, label="$F_t/F_n$ in contact" if np.isfinite(ratio).any() else "_", **drawn)
-    mu, low, high = (friction or {}).get("mu"), (friction or {}).get("low"), (friction or {}).get("high")
+    mu, low, high = (friction.mu, friction.low, friction.high) if friction else (None, None, None)
     own = np.where(touches, recording.friction_coefficient, np.nan)
     if friction is None and np.isfinite(own).any():
         ax.plot(recording.time_s, own, color=GREEN, linewidth=1.1, label=r"$\mu$ that came with the frames")
@@ -264,7 +271,7 @@ ReadFrames = Callable[[Sequence[int]], UInt8[np.ndarray, "frames height width 3"
 """Gives the frames of these numbers, in their order."""
 
 
-def draw_audit(recording: Recording, labelling: Mapping[str, Any], *, read_frames: ReadFrames | None = None) -> Figure:
+def draw_audit(recording: Recording, labelling: Labelling, *, read_frames: ReadFrames | None = None) -> Figure:
     """Draw a page from which to judge whether the labels of an imported trial can be defended.
 
     Forces, their ratio beside the static friction, and the safety margin with its uncertainty, on the camera's clock;
@@ -276,7 +283,7 @@ def draw_audit(recording: Recording, labelling: Mapping[str, Any], *, read_frame
     recording
         The trial.
     labelling
-        What its labels rest on, as `import_trial` keeps it; what is not known is None.
+        How its labels were made.
     read_frames
         Gives the frames of these numbers, for a trial that was loaded without its pixels; its own if None.
     """
@@ -285,7 +292,7 @@ def draw_audit(recording: Recording, labelling: Mapping[str, Any], *, read_frame
     with drawing_style():
         figure = Figure(figsize=(_WIDTH, _HEIGHT))
         charts = _draw_charts(figure, recording, labelling, bottom=top - _HEAD - _LEADER - _TICKS)
-        index, along = labelling["reference"]["index"], choose_along(recording)
+        index, along = labelling.reference.index, choose_along(recording)
         read = recording.frames.__getitem__ if read_frames is None else read_frames
         _draw_pictures(figure, recording, index, along, read, top=top, height=height)
         for column, at in enumerate([index, *along]):
@@ -299,7 +306,7 @@ def draw_audit(recording: Recording, labelling: Mapping[str, Any], *, read_frame
 
 
 def write_audit(
-    recording: Recording, labelling: Mapping[str, Any], path: Path, *, read_frames: ReadFrames | None = None
+    recording: Recording, labelling: Labelling, path: Path, *, read_frames: ReadFrames | None = None
 ) -> None:
     """Save the audit of a trial as .png, .pdf or .svg; it appears when complete.
 
@@ -319,6 +326,49 @@ def write_audit(
     """
     require_picture_path(path, example="audit.png")
     save_page(draw_audit(recording, labelling, read_frames=read_frames), path)
+
+
+def write_audits(data: Dataset, folder: Path, *, on_progress: OnProgress | None = None) -> int:
+    """Draw the audit of every trial of a data set, `TRIAL.png`; pages newer than their trial stay.
+
+    Parameters
+    ----------
+    data
+        Data set whose trials were imported or labelled.
+    folder
+        Where to write, made if it is missing.
+    on_progress
+        Called with the pages done and the pages in all.
+
+    Returns
+    -------
+    int
+        Number of pages drawn.
+
+    Raises
+    ------
+    InputError
+        If nothing tells how the labels of a trial were made.
+    """
+    for info in data.trials:
+        if read_header(trial_path(data.folder, info.trial)).labelling is None:
+            raise InputError(
+                f"{info.trial} of {data.folder} was not imported, and nothing tells what its labels rest on; "
+                "label it into a new folder with --output"
+            )
+    drawn = 0
+    folder.mkdir(parents=True, exist_ok=True)
+    with stage(on_progress, "Drawing pages") as count:
+        for done, info in enumerate(data.trials, start=1):
+            path, page = trial_path(data.folder, info.trial), folder / f"{info.trial}.png"
+            if not page.is_file() or page.stat().st_mtime_ns < path.stat().st_mtime_ns:
+                # all numbers, but only the pixels that the page shows: memory stays small however long the trial
+                recording = load_recording(path, pixels=False)
+                assert recording.labelling is not None
+                write_audit(recording, recording.labelling, page, read_frames=partial(read_frames, path))
+                drawn += 1
+            count(done, len(data.trials))
+    return drawn
 
 
 def choose_along(recording: Recording) -> list[int]:
@@ -344,23 +394,24 @@ def choose_along(recording: Recording) -> list[int]:
     return [int(at) for at in np.flatnonzero(~free)]
 
 
-def _draw_charts(figure: Figure, recording: Recording, labelling: Mapping[str, Any], *, bottom: float) -> list[Axes]:
+def _draw_charts(figure: Figure, recording: Recording, labelling: Labelling, *, bottom: float) -> list[Axes]:
     height = (bottom - _TOP) / 3 - _LEGEND
     tops = [_TOP + row * (height + _LEGEND) + _LEGEND for row in range(3)]
     charts = [place_axes(figure, _LEFT, top, _SPAN, height) for top in tops]
-    plot_contact_forces(recording, labelling["contact_threshold_n"], ax=charts[0])
-    plot_force_ratio(recording, labelling["friction"], ax=charts[1])
+    basis = labelling.basis
+    plot_contact_forces(recording, basis and basis.contact_threshold_n, ax=charts[0])
+    plot_force_ratio(recording, basis and basis.friction, ax=charts[1])
     plot_labels(recording, ax=charts[2])
-    lag = labelling["lag"]
-    shift = (lag["lag_s"] or 0.0) if lag and labelling["lag_applied"] else 0.0
+    lag = basis.lag if basis else None
+    shift = lag.lag_s if basis and lag and basis.lag_applied else 0.0
     shades = [(str(state), STATE_COLOURS[state], STATE_TINTS[state]) for state in NAMED_STATES]
     tints = [Patch(color=colour, alpha=tint, linewidth=0, label=name) for name, colour, tint in shades]
     for ax in charts:
-        if labelling["slip_s"] is not None:
-            slip_s = labelling["slip_s"] + shift
+        if basis is not None and basis.slip_s is not None:
+            slip_s = basis.slip_s + shift
             ax.axvline(slip_s, color=BLACK, linestyle="-.", linewidth=1.3, label=f"{_ONSET[0]} at {slip_s:.2f} s")
-            if lag is not None and not lag["doubt"] and None not in (lag["lag_s"], lag["sigma_s"]):
-                seen = labelling["slip_s"] + lag["lag_s"] + np.array([-1, 1]) * lag["sigma_s"]
+            if lag is not None and not lag.doubt:
+                seen = basis.slip_s + lag.lag_s + np.array([-1, 1]) * lag.sigma_s
                 ax.axvspan(*seen, color=SKY, alpha=0.6, linewidth=0, label=_ONSET[1], zorder=0)
         place = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.1, "borderpad": 0}
         handles, names = ax.get_legend_handles_labels()
@@ -441,12 +492,12 @@ def _margin(recording: Recording, at: int) -> str:
     return f"Γ {100 * margin:.0f}{band} %"
 
 
-def _tell(figure: Figure, recording: Recording, labelling: Mapping[str, Any]) -> None:
+def _tell(figure: Figure, recording: Recording, labelling: Labelling) -> None:
     # whoever names a trial may write a dollar sign, which begins no formula here
     plain = {"parse_math": False}
     place_text(figure, _EDGE, 0.17, _cut(recording.trial, 75), fontsize=14, fontweight="bold", **plain)
     about = f"{_cut(recording.sensor, 30)}, day {recording.day}, {_cut(recording.condition, 20)}"
-    sources = [_cut(str(labelling[name]), 50) for name in ("source", "forces") if labelling[name]]
+    sources = [_cut(words, 50) for words in (labelling.source, labelling.forces) if words]
     place_text(figure, _EDGE, 0.47, "   ·   ".join([about, *sources]), fontsize=9, color=GREY, **plain)
     top = _TOP + 0.05
     facts = audit_facts(recording, labelling)

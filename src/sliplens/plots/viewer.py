@@ -1,6 +1,5 @@
 """A trial in the Rerun viewer: frames, differences, forces and labels on one clock, streamed from its file."""
 
-import json
 import os
 import re
 import signal
@@ -9,13 +8,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -31,14 +30,16 @@ from sliplens.plots.contact_sheet import STATE_COLOURS, TIMES, brighten, brighte
 from sliplens.plots.layout import written_whole
 from sliplens.plots.style import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
 from sliplens.recordings import ContactState, Dataset, Recording, TrialInfo
-from sliplens.recordings.capture import Forces, forces_path, load_forces
+from sliplens.recordings.capture import Forces
 from sliplens.recordings.dataset import trial_path
+from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.store import (
     decode_pixels,
+    forces_path,
+    load_forces,
     load_recording,
     read_frames,
     read_header,
-    read_labelling,
     reading,
     stream_frames,
 )
@@ -221,7 +222,7 @@ def _chart(origin: str, name: str, legend: str, span: tuple[float, float] | None
 _MARKS = re.compile(r"([\\`*_{}\[\]<>#|~])")
 
 
-def describe_trial(trial: Recording, info: TrialInfo, labelling: Mapping[str, Any] | None, *, truth: str | None) -> str:
+def describe_trial(trial: Recording, info: TrialInfo, labelling: Labelling | None, *, truth: str | None) -> str:
     """Tell in Markdown what a trial is, and what its labels rest on.
 
     Parameters
@@ -231,7 +232,7 @@ def describe_trial(trial: Recording, info: TrialInfo, labelling: Mapping[str, An
     info
         What the data set says of it.
     labelling
-        What `import_trial` kept of its labels; None where nothing is kept.
+        How its labels were made; None where that is not told.
     truth
         Which model moved the markers of a simulated trial; None of any other.
     """
@@ -249,7 +250,7 @@ def describe_trial(trial: Recording, info: TrialInfo, labelling: Mapping[str, An
     return "\n".join([f"# {_plain(info.trial)}", *about, "", "## What its labels rest on", *map(_paragraph, facts)])
 
 
-def _facts(trial: Recording, labelling: Mapping[str, Any] | None, *, truth: str | None) -> list[Fact]:
+def _facts(trial: Recording, labelling: Labelling | None, *, truth: str | None) -> list[Fact]:
     if truth is not None:
         nominal = "nominal" if truth == "calibrated" else "exact"
         words = [
@@ -259,7 +260,7 @@ def _facts(trial: Recording, labelling: Mapping[str, Any] | None, *, truth: str 
         return [Fact("Simulated", words)]
     if labelling is None:
         return [Fact("Not told", ["nothing is kept of where they come from"], doubtful=True)]
-    sources = [str(labelling[name]) for name in ("source", "forces") if labelling[name]]
+    sources = [words for words in (labelling.source, labelling.forces) if words]
     recorded = [Fact("Recorded", sources)]
     return [*recorded, *audit_facts(trial, labelling)]
 
@@ -338,11 +339,10 @@ def log_states(stream: "RecordingStream", trial: Recording) -> None:
         stream.send_columns(entity, clock(trial.time_s[begins], begins), columns)
 
 
-def log_samples(stream: "RecordingStream", forces: Forces, labelling: Mapping[str, Any] | None) -> None:
+def log_samples(stream: "RecordingStream", forces: Forces, labelling: Labelling | None) -> None:
     """Log what the force sensor recorded, on the clock of the camera if its lag was applied to the labels."""
-    rerun = require_rerun()
-    told = labelling or {}
-    late_s = (told["lag"]["lag_s"] or 0.0) if told.get("lag_applied") and told.get("lag") else 0.0
+    rerun, basis = require_rerun(), labelling.basis if labelling else None
+    late_s = basis.lag.lag_s if basis and basis.lag and basis.lag_applied else 0.0
     names, colours = list(SAMPLE_LINES), [rgba(colour) for colour in SAMPLE_LINES.values()]
     stream.log("sensor/force", rerun.SeriesLines(names=names, colors=colours, widths=[1.0] * len(names)), static=True)
     for begin in range(0, len(forces.time_s), _SAMPLES_TOGETHER):
@@ -403,15 +403,14 @@ class StoredTruth:
 
 def read_truth(path: Path) -> StoredTruth | None:
     """Read the truth of a trial without its markers and maps; None where there is none."""
+    header = read_header(path).truth
+    if header is None:
+        return None
     with reading(path):
-        metadata = pq.read_schema(path).metadata or {}
-        if b"truth" not in metadata:
-            return None
-        told = json.loads(metadata[b"truth"])
         friction = pq.read_table(path, columns=["static_friction"]).column("static_friction")
     return StoredTruth(
-        displacement=told["displacement"],
-        marker_rest_px=np.array(told["marker_rest_px"], dtype=np.float32).reshape(-1, 2),
+        displacement=header.displacement,
+        marker_rest_px=np.array(header.marker_rest_px, dtype=np.float32).reshape(-1, 2),
         static_friction=friction.to_numpy().astype(np.float64),
     )
 
@@ -533,7 +532,8 @@ def log_trial(
     """
     rerun = require_rerun()
     path, samples = trial_path(data.folder, info.trial), forces_path(data.folder, info.trial)
-    trial, labelling, truth = load_recording(path, pixels=False), read_labelling(path), read_truth(path)
+    trial, truth = load_recording(path, pixels=False), read_truth(path)
+    labelling = trial.labelling
     friction = _static_friction(trial, labelling, truth)
     some = read_frames(path, range(0, len(trial), -(-len(trial) // _SAMPLED)))
     shown = Shown(
@@ -574,13 +574,13 @@ def _log_whole(
 
 
 def _static_friction(
-    trial: Recording, labelling: Mapping[str, Any] | None, truth: StoredTruth | None
+    trial: Recording, labelling: Labelling | None, truth: StoredTruth | None
 ) -> Float[np.ndarray, " frames"] | None:
     """mu_s of each frame: that of the simulator, or what was estimated; None where neither is told."""
     if truth is not None:
         return truth.static_friction
-    told = (labelling or {}).get("friction")
-    return None if told is None or told["mu"] is None else np.full(len(trial), float(told["mu"]))
+    basis = labelling.basis if labelling else None
+    return None if basis is None else np.full(len(trial), basis.friction.mu)
 
 
 def _highest_ratio(trial: Recording, static_friction: Float[np.ndarray, " frames"] | None) -> float:

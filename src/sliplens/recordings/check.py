@@ -1,17 +1,17 @@
 """Does a data set hold what it says: hashes, laws of the labels, splits."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from sliplens.errors import SliplensError
 from sliplens.files import hash_file
-from sliplens.recordings.capture import forces_path
-from sliplens.recordings.dataset import Dataset, TrialInfo, trial_path
-from sliplens.recordings.store import load_recording, read_header
+from sliplens.progress import OnProgress
+from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_path
+from sliplens.recordings.store import forces_path, load_recording, read_header
 from sliplens.recordings.trial import SIGNALS, ContactState, Recording
 
 _ROUNDING = 1e-6
@@ -28,7 +28,7 @@ class Finding:
     """What is wrong, and at which frame."""
 
 
-def check_dataset(folder: Path, *, on_trial: Callable[[int, int], None] | None = None) -> tuple[Finding, ...]:
+def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None = None) -> tuple[Finding, ...]:
     """Read every trial of a data set and list what is wrong with it.
 
     Checked are, for each trial: that its file is there, has the hash of the table and is what the table says; that
@@ -38,10 +38,10 @@ def check_dataset(folder: Path, *, on_trial: Callable[[int, int], None] | None =
 
     Parameters
     ----------
-    folder
-        The data set.
-    on_trial
-        Called with the trials done and the trials in all, after each.
+    data
+        Data set, or its folder.
+    on_progress
+        Called with the trials done and the trials in all.
 
     Returns
     -------
@@ -53,8 +53,8 @@ def check_dataset(folder: Path, *, on_trial: Callable[[int, int], None] | None =
     SliplensError
         If the folder is no data set at all.
     """
-    data = Dataset.open(folder)
-    findings = []
+    data = data if isinstance(data, Dataset) else load_dataset(data)
+    folder, findings = data.folder, []
     for trial, count in Counter(info.trial for info in data.trials).items():
         if count > 1:
             splits = sorted({info.split for info in data.trials if info.trial == trial})
@@ -68,8 +68,8 @@ def check_dataset(folder: Path, *, on_trial: Callable[[int, int], None] | None =
     ]
     for done, info in enumerate(data.trials, start=1):
         findings += [Finding(where=info.trial, what=what) for what in _check_trial(folder, info)]
-        if on_trial is not None:
-            on_trial(done, len(data.trials))
+        if on_progress is not None:
+            on_progress(done, len(data.trials))
     return tuple(findings)
 
 
@@ -84,13 +84,13 @@ def _check_trial(folder: Path, info: TrialInfo) -> Iterator[str]:
     if info.forces_sha256 and (not samples.is_file() or hash_file(samples) != info.forces_sha256):
         yield "has samples of forces that are missing or changed since the table was made"
     try:
-        stored, recording = asdict(read_header(path)), load_recording(path)
+        header, recording = read_header(path), load_recording(path)
     except SliplensError as error:
         yield f"cannot be read: {error}"
         return
-    for name, value in asdict(info).items():
-        if name in stored and value != stored[name]:
-            yield f"has {name} {stored[name]}, the table says {value}"
+    for name, value in vars(info).items():
+        if hasattr(header, name) and value != getattr(header, name):
+            yield f"has {name} {getattr(header, name)}, the table says {value}"
     yield from _check_laws(recording)
 
 

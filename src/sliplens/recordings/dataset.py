@@ -1,38 +1,45 @@
-"""A data set on disk: one Parquet file a trial, frames as lossless PNG beside their labels."""
+"""A data set on disk: one Parquet file a trial, frames without loss beside their labels."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 
+from sliplens.codec import from_builtins, save_record
 from sliplens.errors import RecordingError
-from sliplens.files import hash_file, hash_json, read_json, require_folder, write_json
-from sliplens.recordings.capture import forces_path
-from sliplens.recordings.store import SCHEMA_VERSION, load_recording, read_header, reading
-from sliplens.recordings.trial import Recording
+from sliplens.files import hash_file, hash_json, read_json, require_folder
+from sliplens.recordings.store import SCHEMA_VERSION, forces_path, load_labels, load_recording, read_header, reading
+from sliplens.recordings.trial import Labels, Recording, TrialFacts
 
 DATASET_FILE = "dataset.json"
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrialInfo:
-    """What the data set's table says of one trial."""
+class TrialInfo(TrialFacts):
+    """Row of a data set's table: a trial, its split, and the hashes of its files."""
 
-    trial: str
-    sensor: str
-    day: int
-    condition: str
     split: str
     frames: int
     height: int
+    """Rows of its frames, in pixels."""
     width: int
     sha256: str
-    object: str = ""
-    """What was held; empty where it is not told."""
     forces_sha256: str = ""
     """Hash of the samples of the force sensor; empty where none are kept."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Table:
+    """What `dataset.json` holds."""
+
+    schema_version: int = SCHEMA_VERSION
+    simulated: bool = False
+    units: dict[str, str] = field(
+        default_factory=lambda: {"time_s": "s", "normal_force_n": "N", "tangential_force_n": "N"}
+    )
+    trials: tuple[TrialInfo, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,26 +52,8 @@ class Dataset:
 
     @classmethod
     def open(cls, folder: Path) -> "Dataset":
-        """Open a data set that `save_recording` and `write_dataset_table` made.
-
-        Raises
-        ------
-        InputError
-            If the folder or its table is missing.
-        RecordingError
-            If the table is of another schema, or lists no trial.
-        """
-        require_folder(folder, what="the data set")
-        table = read_json(folder / DATASET_FILE)
-        if not isinstance(table, dict) or table.get("schema_version") != SCHEMA_VERSION:
-            raise RecordingError(f"{folder / DATASET_FILE} is not a sliplens data set of schema {SCHEMA_VERSION}")
-        if not table.get("trials"):
-            raise RecordingError(f"{folder} lists no trials; make or import a data set first")
-        try:
-            trials = tuple(TrialInfo(**row) for row in table["trials"])
-        except TypeError as error:
-            raise RecordingError(f"{folder / DATASET_FILE} has a malformed trial ({error})") from None
-        return cls(folder=folder, trials=trials, simulated=bool(table.get("simulated")))
+        """Open a data set, as `load_dataset` does."""
+        return load_dataset(folder)
 
     @property
     def source(self) -> str:
@@ -75,6 +64,26 @@ class Dataset:
     def hash(self) -> str:
         """Hash of the table, which holds the hash of every trial: the same data, the same hash."""
         return hash_json([asdict(trial) for trial in self.trials])
+
+    @property
+    def frames(self) -> int:
+        """Number of frames of all trials."""
+        return sum(trial.frames for trial in self.trials)
+
+    def find(self, trial: str) -> TrialInfo:
+        """Trial of a name.
+
+        Raises
+        ------
+        RecordingError
+            If there is none; the message lists what there is.
+        """
+        for info in self.trials:
+            if info.trial == trial:
+                return info
+        names = [info.trial for info in self.trials]
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        raise RecordingError(f"{self.folder} has no trial {trial}; it has {', '.join(names[:_NAMED])}{more}")
 
     def select(self, *, split: str | None = None, condition: str | None = None) -> tuple[TrialInfo, ...]:
         """Trials of a split and a condition.
@@ -101,9 +110,44 @@ class Dataset:
         """Read one trial, frames included; without the ground truth of a simulated one where that is not needed."""
         return load_recording(trial_path(self.folder, info.trial), truth=truth)
 
+    def read_labels(self, info: TrialInfo) -> Labels:
+        """Labels of one trial, without its frames."""
+        return load_labels(trial_path(self.folder, info.trial)).labels
+
     def load_all(self, trials: Sequence[TrialInfo], *, truth: bool = True) -> Iterator[Recording]:
         """Read trials one after another."""
         return (self.load(info, truth=truth) for info in trials)
+
+
+_NAMED = 10
+"""Trials named in a message before the rest is counted."""
+
+
+def load_dataset(folder: Path | str) -> Dataset:
+    """Open a data set that `import_recordings` or `simulate` made; its trials are read when they are asked for.
+
+    Parameters
+    ----------
+    folder
+        Folder with `dataset.json`.
+
+    Raises
+    ------
+    InputError
+        If the folder or its table is missing, damaged or of another schema, or lists no trial.
+    """
+    folder = Path(folder)
+    require_folder(folder, what="the data set")
+    path = folder / DATASET_FILE
+    values = read_json(path)
+    if not isinstance(values, dict) or values.get("schema_version") != SCHEMA_VERSION:
+        raise RecordingError(
+            f"{path} is not a sliplens data set of schema {SCHEMA_VERSION}; make it again with this version"
+        )
+    table = from_builtins(values, _Table, where=path, command="sliplens import")
+    if not table.trials:
+        raise RecordingError(f"{folder} lists no trials; make or import a data set first")
+    return Dataset(folder=folder, trials=table.trials, simulated=table.simulated)
 
 
 def trial_path(folder: Path, trial: str) -> Path:
@@ -132,14 +176,14 @@ def trial_info(path: Path, *, split: str) -> TrialInfo:
 
     Raises
     ------
-    RecordingError
+    InputError
         If the file is missing or damaged, or no trial.
     """
-    header = asdict(read_header(path))
-    del header["recipe"]
+    header = read_header(path)
     samples = forces_path(path.parent.parent, path.stem)
+    shared = {one.name: getattr(header, one.name) for one in fields(TrialInfo) if hasattr(header, one.name)}
     return TrialInfo(
-        **header,
+        **shared,
         split=split,
         sha256=hash_file(path),
         forces_sha256=hash_file(samples) if samples.is_file() else "",
@@ -148,13 +192,4 @@ def trial_info(path: Path, *, split: str) -> TrialInfo:
 
 def write_dataset_table(folder: Path, trials: Sequence[TrialInfo], *, simulated: bool = False) -> None:
     """Write `dataset.json`, the last file of a data set."""
-    units = {"time_s": "s", "normal_force_n": "N", "tangential_force_n": "N"}
-    write_json(
-        folder / DATASET_FILE,
-        {
-            "schema_version": SCHEMA_VERSION,
-            "simulated": simulated,
-            "units": units,
-            "trials": [asdict(trial) for trial in trials],
-        },
-    )
+    save_record(_Table(trials=tuple(trials), simulated=simulated), folder / DATASET_FILE)

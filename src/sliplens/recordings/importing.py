@@ -1,68 +1,270 @@
-"""From what was recorded to a labelled trial on disk, one frame at a time."""
+"""From recordings to a labelled data set on disk, one frame at a time; and its labels made anew."""
 
-import json
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, is_dataclass
+import shutil
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
-from sliplens.errors import RecordingError
-from sliplens.recordings.capture import GIVEN_SIGNALS, Capture, Forces, GivenLabels, save_forces
-from sliplens.recordings.labels import (
-    Labels,
-    LabelSettings,
-    Reason,
-    choose_reference,
-    label_trial,
-    measure_motion,
-)
-from sliplens.recordings.store import OBJECT, encode_frames, require_labelling, write_trial
+from sliplens.errors import InputError, RecordingError
+from sliplens.files import output_folder
+from sliplens.progress import OnProgress, note, stage, wrote
+from sliplens.recordings.capture import Capture, Forces
+from sliplens.recordings.dataset import Dataset, load_dataset, trial_info, trial_path, write_dataset_table
+from sliplens.recordings.formats import open_captures
+from sliplens.recordings.formats.stored import read_stored
+from sliplens.recordings.labelling import Labelling, ReferenceChoice
+from sliplens.recordings.labels import Reason, choose_reference, label_trial, measure_motion
+from sliplens.recordings.options import LabelSettings, ReadOptions
+from sliplens.recordings.splits import SPLITS_FILE, SplitPlan, assign_splits, read_splits, write_split_record
+from sliplens.recordings.store import encode_frames, forces_path, save_forces, write_trial
+from sliplens.recordings.trial import Labels
 
 
-@dataclass(frozen=True, kw_only=True)
-class About:
-    """What a trial is."""
+def import_recordings(
+    sources: Path | str | Sequence[Path | str],
+    *,
+    out: Path | str,
+    forces: Path | str | None = None,
+    sensor: str | None = None,
+    day: int | None = None,
+    condition: str | None = None,
+    object: str | None = None,
+    format: str | None = None,
+    splits: SplitPlan | Path | str | None = None,
+    validation_trials: int | None = None,
+    test_trials: int | None = None,
+    reading: ReadOptions | None = None,
+    labelling: LabelSettings | None = None,
+    overwrite: bool = False,
+    on_progress: OnProgress | None = None,
+) -> Dataset:
+    """Import recordings and label every frame with its safety margin.
 
-    sensor: str
-    day: int
-    condition: str
-    """dry or wet, or any other word for the state of the surface."""
-    object: str = ""
-    """What was held; empty where it is not told."""
+    Tare, axes, sign, lag and friction are found from each trial itself unless `labelling` gives them. What brings its
+    own labels keeps them. An import that was interrupted goes on where it stopped.
+
+    Parameters
+    ----------
+    sources
+        Bags, videos, folders of images, LeRobot data sets, lists of the thesis or data sets of sliplens.
+    out
+        Folder to make.
+    forces
+        Table of forces beside a video or folder of images (CSV); short for `reading.forces`.
+    sensor, day, condition, object
+        What the trials are; as the source tells where None.
+    format
+        Row of `FORMATS`; recognised by names if None.
+    splits
+        Rules that deal the trials to splits, or their file (TOML).
+    validation_trials, test_trials
+        So many of the last trials test, and so many before them validate, in place of rules.
+    reading
+        What is known of the sources.
+    labelling
+        What is known of forces and friction.
+    overwrite
+        Replace the folder if it exists.
+    on_progress
+        Called with the frames written and the frames in all.
+
+    Raises
+    ------
+    InputError
+        If a source is missing, damaged or of no known format, or `out` holds something else.
+    RecordingError
+        If a trial has neither labels nor forces, nothing touches, or it never slips and no friction is given.
+    """
+    reading, labelling = reading or ReadOptions(), labelling or LabelSettings()
+    paths = [Path(source) for source in ([sources] if isinstance(sources, Path | str) else sources)]
+    if forces is not None:
+        reading = replace(reading, forces=Path(forces))
+    if reading.forces is not None and len(paths) > 1:
+        raise InputError("one table of forces goes with one recording; import the trials one by one")
+    facts = {"sensor": sensor, "day": day, "condition": condition, "object": object}
+    with stage(on_progress, "Opening the recordings"):
+        found = [one for path in paths for one in open_captures(path, format=format, options=reading)]
+    captures = [replace(one, **{name: fact for name, fact in facts.items() if fact is not None}) for one in found]
+    _require_names(captures)
+    if splits is not None and (validation_trials is not None or test_trials is not None):
+        raise InputError("splits come from a file or from numbers of trials, not from both; leave one out")
+    plan = splits if splits is None or isinstance(splits, SplitPlan) else read_splits(Path(splits))
+    dealt = None if plan is None else assign_splits(plan, captures)
+    names = _deal(captures, validation_trials, test_trials) if dealt is None else dealt.splits
+    config = {
+        **facts,
+        "format": format,
+        "validation_trials": validation_trials,
+        "test_trials": test_trials,
+        "sources": [_fingerprint(path) for path in paths],
+        "reading": {
+            name: _fingerprint(value) if isinstance(value, Path) else value for name, value in reading.given().items()
+        },
+        "labelling": labelling,
+        "splits": None if plan is None else [rule.as_table() for rule in plan.rules],
+    }
+    with output_folder(Path(out), stage="import", config=config, overwrite=overwrite) as output:
+        if not output.complete:
+            _write_trials(output.folder, captures, names, labelling, on_progress, title="Importing frames")
+            if plan is not None and dealt is not None:
+                write_split_record(output.folder, plan, captures, dealt)
+    for message in dealt.notes if dealt else ():
+        note(on_progress, message)
+    return _tell(load_dataset(out), on_progress, kept=output.complete)
 
 
-_NO_CHOICE = dict.fromkeys(("index", "method", "contact_energy", "drift"))
-"""What is told of a reference frame."""
-_RESTS_ON = (
-    "axes",
-    "friction",
-    "friction_change",
-    "slip_s",
-    "lag",
-    "contact_threshold_n",
-    "window_s",
-    "gap_s",
-    "force_range_n",
-)
-"""What is told of labels that were found; None of labels that came with the frames."""
+def label_dataset(
+    data: Dataset | Path | str,
+    *,
+    out: Path | str,
+    labelling: LabelSettings | None = None,
+    overwrite: bool = False,
+    on_progress: OnProgress | None = None,
+) -> Dataset:
+    """Label the trials of a data set anew, from the frames and the force samples that it keeps; splits stay.
+
+    Parameters
+    ----------
+    data
+        Data set, imported or simulated.
+    out
+        Folder to make. The data set's own gets the new labels once all of them are there.
+    labelling
+        What is known of forces and friction.
+    overwrite
+        Replace another folder if it exists.
+    on_progress
+        Called with the frames written and the frames in all.
+
+    Raises
+    ------
+    InputError
+        If a trial has no forces, or its labels did not come from them and would be overwritten.
+    RecordingError
+        If nothing touches, or a trial never slips and no friction is given.
+    """
+    data = data if isinstance(data, Dataset) else load_dataset(data)
+    labelling, out = labelling or LabelSettings(), Path(out)
+    captures = read_stored(data.folder)
+    in_place = out.resolve() == data.folder.resolve()
+    for capture in captures:
+        kept = capture.labels.labelling if capture.labels else None
+        if capture.forces is None:
+            raise InputError(
+                f"{capture.trial} of {data.folder} has no forces, and without them there is no label; "
+                "import it again with its table of forces"
+            )
+        if in_place and (kept is None or kept.basis is None):
+            raise InputError(
+                f"the labels of {capture.trial} did not come from its forces and would be lost; "
+                "name a new folder with --output"
+            )
+    config = {"labelling": labelling, "data_hash": data.hash}
+    with output_folder(out, stage="label", config=config, overwrite=overwrite or in_place) as output:
+        if not output.complete:
+            bare, names = [_without_labels(one) for one in captures], [info.split for info in data.trials]
+            _write_trials(output.folder, bare, names, labelling, on_progress, title="Labelling frames")
+            if (data.folder / SPLITS_FILE).is_file():
+                shutil.copyfile(data.folder / SPLITS_FILE, output.folder / SPLITS_FILE)
+    return _tell(load_dataset(out), on_progress, kept=output.complete)
+
+
+def _tell(data: Dataset, on_progress: OnProgress | None, *, kept: bool) -> Dataset:
+    wrote(on_progress, data.folder, f"{len(data.trials)} trials, {data.frames:,} frames", kept=kept)
+    return data
+
+
+def _require_names(captures: Sequence[Capture]) -> None:
+    if not captures:
+        raise RecordingError("there is no trial to import; name a recording")
+    twice = [name for name, count in Counter(one.trial for one in captures).items() if count > 1]
+    if twice:
+        raise InputError(f"several recordings are named {', '.join(twice)}; rename their files")
+    for capture in captures:
+        if not capture.sensor:
+            raise InputError(f"{capture.source} does not tell its sensor, and a network is of one; add --sensor")
+
+
+def _deal(captures: Sequence[Capture], validation_trials: int | None, test_trials: int | None) -> list[str]:
+    count = len(captures)
+    if validation_trials is None and test_trials is None:
+        return [capture.split or "train" for capture in captures]
+    validation, test = validation_trials or 0, test_trials or 0
+    if validation < 0 or test < 0:
+        raise InputError("numbers of trials are not negative; give 0 or more")
+    training = count - validation - test
+    if training < 0:
+        raise InputError(
+            f"{validation} trials to validate and {test} to test are more than the {count} there are; give fewer"
+        )
+    return ["train"] * training + ["validation"] * validation + ["test"] * test
+
+
+def _fingerprint(path: Path) -> list[object]:
+    """What tells a file that changed from one that did not, without reading all of it."""
+    if not path.exists():
+        raise InputError(f"{path} does not exist; check the path")
+    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+    stats = [file.stat() for file in files]
+    return [
+        str(path.resolve()),
+        sum(stat.st_size for stat in stats),
+        max((stat.st_mtime_ns for stat in stats), default=0),
+    ]
+
+
+def _without_labels(capture: Capture) -> Capture:
+    """A stored trial as if it came from where it was recorded, with what was noted then."""
+    kept = capture.labels.labelling if capture.labels else None
+    if kept is None:
+        return replace(capture, labels=None)
+    return replace(capture, labels=None, source=kept.source, notes=kept.notes)
+
+
+def _write_trials(
+    folder: Path,
+    captures: Sequence[Capture],
+    splits: Iterable[str],
+    settings: LabelSettings,
+    on_progress: OnProgress | None,
+    *,
+    title: str,
+) -> None:
+    """Write the trials of a data set that are not there yet, and its table."""
+    table, done, total = [], 0, sum(map(len, captures))
+    with stage(on_progress, title) as count:
+        for number, (capture, split) in enumerate(zip(captures, splits, strict=True)):
+            path = trial_path(folder, capture.trial)
+            # a trial is there whole or not at all, and the folder is of this very command
+            if not path.is_file():
+                import_trial(
+                    capture,
+                    path,
+                    settings=settings,
+                    rng=np.random.default_rng((settings.seed, number)),
+                    forces_file=forces_path(folder, capture.trial),
+                    on_progress=lambda written, _, before=done: count(before + written, total),
+                )
+            done += len(capture)
+            count(done, total)
+            table.append(trial_info(path, split=split))
+    write_dataset_table(folder, table, simulated=all(capture.simulated for capture in captures))
 
 
 def import_trial(
     capture: Capture,
     path: Path,
     *,
-    about: About,
-    settings: LabelSettings,
+    settings: LabelSettings | None = None,
     rng: np.random.Generator,
-    forces_path: Path | None = None,
-    reference_index: int | None = None,
-    reference_method: str = "least contact energy",
-    on_frames: Callable[[int, int], None] | None = None,
-) -> dict[str, Any]:
+    forces_file: Path | None = None,
+    on_progress: OnProgress | None = None,
+) -> None:
     """Write a recording as a trial of a data set, with the labels that came with it, or found; whole or not at all.
 
     The frames are read several times, never all at once: to see the image move, to find the untouched sensor, and to
@@ -71,26 +273,17 @@ def import_trial(
     Parameters
     ----------
     capture
-        What a reader found; it must have labels or forces.
+        Recording, which must have labels or forces.
     path
         Parquet file to write.
-    about
-        What the trial is.
     settings
         What is known of axes, friction and lag, where labels are to be found.
     rng
         Source of the bootstraps.
-    forces_path
+    forces_file
         Where to keep the samples of the force sensor, from which labels can be made anew; not kept if None.
-    reference_index, reference_method
-        The untouched frame by hand, or how to choose it where the source does not tell it.
-    on_frames
+    on_progress
         Called with the frames written and the frames in all.
-
-    Returns
-    -------
-    dict
-        What the labels rest on, as `read_labelling` gives it back.
 
     Raises
     ------
@@ -98,108 +291,65 @@ def import_trial(
         If there are neither labels nor forces, nothing touches, the trial never slips and no friction is given, or no
         frame is untouched and none is named.
     """
+    settings = settings or LabelSettings()
     if capture.labels is None and capture.forces is None:
         raise RecordingError(
             f"{capture.source} has no forces, and without them there is no label; give the table of the force sensor"
         )
+    index = capture.reference_index if settings.reference_frame is None else settings.reference_frame
     try:
         if capture.labels is not None:
-            made = _given(capture, capture.labels, index=reference_index)
+            reference, labels = _given_labels(capture, capture.labels, index)
         else:
             assert capture.forces is not None
-            made = _found(capture, capture.forces, settings, rng, index=reference_index, method=reference_method)
+            reference, labels = _find_labels(capture, capture.forces, settings, rng, index)
     except RecordingError as error:
         raise RecordingError(f"{capture.source}: {error}") from None
-    description = {
-        **{name: str(getattr(about, name)) for name in ("sensor", "day", "condition")},
-        "trial": capture.name,
-        "labelling": json.dumps(made.labelling, allow_nan=False),
-    }
-    if about.object:
-        description[OBJECT] = about.object
     # before the trial, whose file tells that all of it is there
-    if forces_path is not None and capture.forces is not None:
-        save_forces(capture.forces, forces_path)
-    count = len(capture.frame_time_s)
-    images = _counted(encode_frames(_exactly(capture, count)), count, on_frames)
-    write_trial(path, images, {"time_s": capture.frame_time_s, **made.columns}, description, reference=made.reference)
-    return made.labelling
+    if forces_file is not None and capture.forces is not None:
+        save_forces(capture.forces, forces_file)
+    images = _counted(encode_frames(_frames(capture)), len(capture), on_progress)
+    write_trial(path, images, facts=capture, time_s=capture.frame_time_s, labels=labels, reference=reference)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Made:
-    """What is written besides frames and times."""
-
-    columns: dict[str, Any]
-    labelling: dict[str, Any]
-    reference: UInt8[np.ndarray, "height width 3"]
-
-
-def _found(
-    capture: Capture,
-    forces: Forces,
-    settings: LabelSettings,
-    rng: np.random.Generator,
-    *,
-    index: int | None,
-    method: str,
-) -> _Made:
-    motion = measure_motion(_exactly(capture, len(capture.frame_time_s)))
-    labels = label_trial(capture.frame_time_s, motion, forces, settings=settings, rng=rng)
-    index = capture.reference_index if index is None else index
+def _find_labels(
+    capture: Capture, forces: Forces, settings: LabelSettings, rng: np.random.Generator, index: int | None
+) -> tuple[UInt8[np.ndarray, "height width 3"], Labels]:
+    labels = label_trial(capture.frame_time_s, measure_motion(_frames(capture)), forces, settings=settings, rng=rng)
     if capture.reference is not None and index is None:
-        image, told = capture.reference, {**_NO_CHOICE, "method": "recorded apart from the frames"}
+        image, choice = capture.reference, ReferenceChoice(method="recorded apart from the frames")
     else:
         untouched = np.array([reason is Reason.NO_CONTACT for reason in labels.reason])
-        chosen = choose_reference(capture.read_frames, untouched, index=index, method=method)
-        image, told = chosen.image, {name: getattr(chosen, name) for name in _NO_CHOICE}
-    columns = {
-        **{name: getattr(labels, name) for name in GIVEN_SIGNALS},
-        "contact_state": [str(state) for state in labels.contact_state],
-        "safety_margin_sigma": labels.safety_margin_sigma,
-        "valid": labels.valid,
-        "invalid_reason": [str(reason) for reason in labels.reason],
-        "force_time_s": labels.force_time_s,
-    }
-    return _Made(columns=columns, labelling=_told(capture, labels, told, settings), reference=image)
+        choice = choose_reference(capture.read_frames, untouched, index=index, method=settings.reference)
+        image = next(islice(capture.read_frames(), choice.index, None))
+    return image, replace(labels, labelling=replace(_tell_source(capture, choice), basis=labels.basis))
 
 
-def _given(capture: Capture, labels: GivenLabels, *, index: int | None) -> _Made:
-    index = capture.reference_index if index is None else index
-    told: dict[str, Any] = {**_NO_CHOICE, "method": "came with the recording"}
+def _given_labels(
+    capture: Capture, labels: Labels, index: int | None
+) -> tuple[UInt8[np.ndarray, "height width 3"], Labels]:
     if index is not None:
-        if not 0 <= index < len(labels):
-            raise RecordingError(f"the reference is frame {index} of {len(labels)}; name one from 0 on that is there")
-        image = next(islice(capture.read_frames(), index, None))
-        told |= {"index": index, "method": "named"}
+        if not 0 <= index < len(capture):
+            raise RecordingError(f"the reference is frame {index} of {len(capture)}; name one from 0 on that is there")
+        image, choice = next(islice(capture.read_frames(), index, None)), ReferenceChoice(index=index, method="named")
     elif capture.reference is not None:
-        image = capture.reference
+        image, choice = capture.reference, ReferenceChoice(method="came with the recording")
     else:
         raise RecordingError("no frame is known to be untouched; name one with --reference-frame")
-    columns: dict[str, Any] = {name: getattr(labels, name) for name in GIVEN_SIGNALS}
-    columns["contact_state"] = [str(state) for state in labels.contact_state]
-    for name, column in (("safety_margin_sigma",) * 2, ("valid",) * 2, ("reason", "invalid_reason")):
-        values = getattr(labels, name)
-        if values is not None:
-            columns[column] = list(values) if name == "reason" else values
-    labelling = labels.labelling
-    if labelling is not None:
-        require_labelling(labelling, where="what came with the frames")
-    else:
-        labelling = {
-            **dict.fromkeys(_RESTS_ON),
-            "source": capture.source,
-            "frames_by_reason": labels.count(),
-            "forces": capture.forces.source if capture.forces else None,
-            "notes": list(capture.notes),
-            "lag_applied": False,
-            "reference": told,
-            "clip": labels.clip,
-        }
-    return _Made(columns=columns, labelling=labelling, reference=image)
+    return image, replace(labels, labelling=labels.labelling or _tell_source(capture, choice))
 
 
-def _exactly(capture: Capture, count: int) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+def _tell_source(capture: Capture, reference: ReferenceChoice) -> Labelling:
+    return Labelling(
+        source=capture.source,
+        forces=capture.forces.source if capture.forces else None,
+        notes=capture.notes,
+        reference=reference,
+        clip=capture.clip,
+    )
+
+
+def _frames(capture: Capture) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Frames of a capture, which must be as many as it promised and of one size."""
     read = 0
     for frame in capture.read_frames():
@@ -210,52 +360,17 @@ def _exactly(capture: Capture, count: int) -> Iterator[UInt8[np.ndarray, "height
             )
         read += 1
         yield frame
-    if read != count:
-        raise RecordingError(f"{capture.source} promised {count} frames but gave {read}; copy or export it again")
+    if read != len(capture):
+        raise RecordingError(
+            f"{capture.source} promised {len(capture)} frames but gave {read}; copy or export it again"
+        )
 
 
-def _counted(
-    chunks: Iterator[list[bytes]], count: int, on_frames: Callable[[int, int], None] | None
-) -> Iterator[list[bytes]]:
+def _counted(chunks: Iterator[list[bytes]], total: int, on_progress: OnProgress | None) -> Iterator[list[bytes]]:
     done = 0
     for chunk in chunks:
         done += len(chunk)
         yield chunk
         del chunk  # before the next is made
-        if on_frames is not None:
-            on_frames(done, count)
-
-
-def _told(capture: Capture, labels: Labels, reference: dict[str, Any], settings: LabelSettings) -> dict[str, Any]:
-    """All that the labels rest on, as JSON can hold it."""
-    told = {
-        "source": capture.source,
-        "frames_by_reason": labels.count(),
-        "forces": capture.forces.source if capture.forces else None,
-        "notes": capture.notes,
-        "axes": labels.axes,
-        "friction": labels.friction,
-        "friction_change": settings.friction_change,
-        "slip_s": labels.slip_s,
-        "lag": labels.lag,
-        "lag_applied": labels.lag_applied,
-        "contact_threshold_n": labels.contact_threshold_n,
-        "window_s": labels.window_s,
-        "gap_s": labels.gap_s,
-        "force_range_n": labels.force_range_n,
-        "reference": reference,
-        "clip": None,
-    }
-    return _plain(told)
-
-
-def _plain(value: Any) -> Any:
-    if is_dataclass(value) and not isinstance(value, type):
-        return _plain(asdict(value))
-    if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(item) for item in value]
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    return value.item() if isinstance(value, np.generic) else value
+        if on_progress is not None:
+            on_progress(done, total)

@@ -14,9 +14,10 @@ from sliplens.errors import ImageError, InputError
 from sliplens.images import list_images, read_image
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import DATASET_FILE, Dataset, TrialInfo, trial_path
-from sliplens.recordings.formats import ReadOptions, all_readers, open_captures
+from sliplens.recordings.formats import open_captures, recognise
 from sliplens.recordings.formats.images import frame_size, read_frame
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
+from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.store import load_recording, read_reference, stream_frames
 
 Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
@@ -44,15 +45,6 @@ class TrialFrames:
     """Names of the images of a folder."""
     notes: tuple[str, ...] = ()
     """What was assumed, a sentence each, for people."""
-    source: str = "frames in memory"
-    """Path that was opened, for people and metadata."""
-
-    @property
-    def frame_rate_hz(self) -> float:
-        """Frames a second at which it can be watched, 1 to 120; 25 where times are not known."""
-        if self.time_s is None or len(self.time_s) < 2:
-            return 25.0
-        return float(np.clip(1 / np.median(np.diff(self.time_s)), 1, 120))
 
 
 def open_source(
@@ -78,7 +70,7 @@ def open_source(
     trial
         Name of one trial; all if None.
     format
-        Row of `all_readers`; recognised if None.
+        Row of `FORMATS`; recognised if None.
     options
         For the reader.
 
@@ -111,11 +103,8 @@ def open_source(
         names = [info.trial for info in source.select(split=split)]
         return tuple(open_trial() for open_trial in _chosen(trials, names, trial, source.folder))
     if split is not None:
-        raise InputError(f"{_words(source)} is no data set of sliplens and has no splits; leave out --split")
-    opened = [
-        replace(_with_reference(one, reference, reference_frame), source=_words(source))
-        for one in _open(source, format, options)
-    ]
+        raise InputError(f"{describe_source(source)} is no data set of sliplens and has no splits; leave out --split")
+    opened = [_with_reference(one, reference, reference_frame) for one in _open(source, format, options)]
     return tuple(_chosen(opened, [one.name for one in opened], trial, source))
 
 
@@ -140,12 +129,15 @@ def _chosen(trials: list, names: list[str], trial: str | None, source: Path | Fr
     if trial is None:
         return trials
     if trial not in names:
-        raise InputError(f"{_words(source)} has no trial {trial}; choose one such as {names[0]}")
+        raise InputError(f"{describe_source(source)} has no trial {trial}; choose one such as {names[0]}")
     return [trials[names.index(trial)]]
 
 
-def _words(source: Path | Frames) -> str:
-    return str(source) if isinstance(source, Path) else TrialFrames.source
+def describe_source(source: Path | str | Frames | Dataset | Sequence[TrialFrames]) -> str:
+    """Where frames come from, for people and metadata: a path, or what else they are."""
+    if isinstance(source, Dataset):
+        return str(source.folder)
+    return str(source) if isinstance(source, str | Path) else "frames in memory"
 
 
 def _stored(folder: Path, info: TrialInfo) -> TrialFrames:
@@ -155,7 +147,6 @@ def _stored(folder: Path, info: TrialInfo) -> TrialFrames:
         name=info.trial,
         frames=info.frames,
         frame_size=(info.height, info.width),
-        source=str(folder),
         read_frames=partial(stream_frames, path),
         read_reference=partial(read_reference, path),
         time_s=recording.time_s,
@@ -174,7 +165,7 @@ def _array(frames: Frames) -> TrialFrames:
 def _is_image_folder(path: Path, format: str | None) -> bool:
     if format is not None:
         return format == "images"
-    return next((name for name, reader in all_readers().items() if reader.recognises(path)), None) == "images"
+    return recognise(path) == "images"
 
 
 def _images(folder: Path, frame_rate: float | None) -> TrialFrames:
@@ -200,7 +191,7 @@ def _recorded(capture: Capture) -> TrialFrames:
         margin, valid = capture.labels.safety_margin, capture.labels.valid
         margin = margin if valid is None else np.where(valid, margin, np.nan)
     opened = TrialFrames(
-        name=capture.name,
+        name=capture.trial,
         frames=len(capture.frame_time_s),
         frame_size=capture.frame_size,
         read_frames=capture.read_frames,

@@ -11,13 +11,14 @@ from fnmatch import fnmatchcase
 from fractions import Fraction
 from glob import escape
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from sliplens._version import __version__
 from sliplens.errors import InputError
 from sliplens.files import read_json, write_json
 from sliplens.images.files import natural_key
 from sliplens.recordings.dataset import DATASET_FILE, Dataset
+from sliplens.recordings.trial import TrialFacts
 
 FACTS = ("trial", "day", "object", "condition", "sensor")
 """What is known of a trial before it is looked at: what rules ask for, and trials are grouped by."""
@@ -26,47 +27,6 @@ _DEALING = ("share", "by", "seed")
 _SPLIT_NAME = re.compile(r"[a-z][a-z0-9_-]*")
 # shares are written with few digits: thirds as 0.3333 are to be mended by the one who wrote them
 _SUM_TOLERANCE = 1e-6
-
-
-@runtime_checkable
-class TrialLike(Protocol):
-    """What is known of a trial, whether it is stored (`TrialInfo`) or not yet (`TrialFacts`)."""
-
-    @property
-    def trial(self) -> str:
-        """Its name."""
-        ...
-
-    @property
-    def sensor(self) -> str:
-        """Name of the sensor."""
-        ...
-
-    @property
-    def day(self) -> int:
-        """Day of the recording."""
-        ...
-
-    @property
-    def condition(self) -> str:
-        """State of the surface."""
-        ...
-
-    @property
-    def object(self) -> str:
-        """What was held; empty where it is not told."""
-        ...
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrialFacts:
-    """What is known of a trial that is not stored yet."""
-
-    trial: str
-    sensor: str
-    day: int
-    condition: str
-    object: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +80,7 @@ class SplitRule:
         if abs(total - 1) > _SUM_TOLERANCE:
             raise InputError(f"the shares sum to {total:.6g}; change them so that they sum to 1")
 
-    def fits(self, trial: TrialLike) -> bool:
+    def fits(self, trial: TrialFacts) -> bool:
         """Tell whether all that the rule asks for is so of a trial."""
         if self.day and trial.day not in self.day:
             return False
@@ -255,7 +215,7 @@ def _is_integer(value: Any) -> bool:
 _VALIDATION_SHARE = 0.25
 
 
-def thesis_plan(trials: Sequence[TrialLike]) -> SplitPlan:
+def thesis_plan(trials: Sequence[TrialFacts]) -> SplitPlan:
     """Lay out the splits of the thesis for the days there are, as the simulator does.
 
     The first day trains and the last day tests. Of the dry trials of the days between a quarter validates, evenly
@@ -294,20 +254,20 @@ def thesis_plan(trials: Sequence[TrialLike]) -> SplitPlan:
     return SplitPlan(rules=tuple(rules), source="preset thesis")
 
 
-def _dry_of(trials: Sequence[TrialLike], day: int) -> list[tuple[int, int, str]]:
+def _dry_of(trials: Sequence[TrialFacts], day: int) -> list[tuple[int, int, str]]:
     """Dry trials of a day: place within the day, day, name."""
     names = [one.trial for one in trials if (one.day, one.condition) == (day, "dry")]
     # a01 and a1 are alike to the natural order
     return [(place, day, name) for place, name in enumerate(sorted(names, key=lambda name: (natural_key(name), name)))]
 
 
-def _dealt(by: str, *, source: str) -> Callable[[Sequence[TrialLike]], SplitPlan]:
+def _dealt(by: str, *, source: str) -> Callable[[Sequence[TrialFacts]], SplitPlan]:
     share = {"train": 0.7, "validation": 0.15, "test": 0.15}
     plan = SplitPlan(rules=(SplitRule(share=share, by=by),), source=source)
     return lambda _: plan
 
 
-PRESETS: dict[str, Callable[[Sequence[TrialLike]], SplitPlan]] = {
+PRESETS: dict[str, Callable[[Sequence[TrialFacts]], SplitPlan]] = {
     "thesis": thesis_plan,
     "objects": _dealt("object", source="preset objects"),
     "trials": _dealt("trial", source="preset trials"),
@@ -322,8 +282,6 @@ __all__ = [
     "SplitPlan",
     "SplitResult",
     "SplitRule",
-    "TrialFacts",
-    "TrialLike",
     "assign_splits",
     "read_splits",
     "store_splits",
@@ -348,7 +306,7 @@ class SplitResult:
     """Sentences for a person: rules that decide nothing, splits without trials, objects or days in train and test."""
 
 
-def assign_splits(plan: SplitPlan, trials: Sequence[TrialLike]) -> SplitResult:
+def assign_splits(plan: SplitPlan, trials: Sequence[TrialFacts]) -> SplitResult:
     """Give every trial the split that the first rule that fits it says.
 
     A rule with shares deals whole groups of those trials that no rule before it took. How many groups a split gets is
@@ -391,7 +349,7 @@ def assign_splits(plan: SplitPlan, trials: Sequence[TrialLike]) -> SplitResult:
         raise InputError(
             f"{_names(twice)} {_are(twice)} listed more than once; a trial belongs to one split, list it once"
         )
-    taken: dict[int, list[TrialLike]] = {index: [] for index in range(len(plan.rules))}
+    taken: dict[int, list[TrialFacts]] = {index: [] for index in range(len(plan.rules))}
     left = []
     for trial in trials:
         fitting = next((index for index, rule in enumerate(plan.rules) if rule.fits(trial)), None)
@@ -440,7 +398,7 @@ def store_splits(data: Dataset, plan: SplitPlan, result: SplitResult) -> None:
     write_json(data.folder / DATASET_FILE, table)
 
 
-def write_split_record(folder: Path, plan: SplitPlan, trials: Sequence[TrialLike], result: SplitResult) -> None:
+def write_split_record(folder: Path, plan: SplitPlan, trials: Sequence[TrialFacts], result: SplitResult) -> None:
     """Write `splits.json`: the rules, where they come from, and what they made of which trial.
 
     Parameters
@@ -473,7 +431,7 @@ def _recount(data: Dataset, splits: Sequence[str]) -> None:
         write_json(path, counted)
 
 
-def _deal(rule: SplitRule, trials: Sequence[TrialLike], *, where: str) -> tuple[dict[str, str], list[str]]:
+def _deal(rule: SplitRule, trials: Sequence[TrialFacts], *, where: str) -> tuple[dict[str, str], list[str]]:
     """Deal trials by whole groups; gives the split of each trial, and notes."""
     assert rule.by is not None
     group_of = {trial.trial: str(getattr(trial, rule.by)) for trial in trials}
@@ -525,7 +483,7 @@ def _missing(splits: Sequence[str]) -> list[str]:
     return [f"no trial is in {' or '.join(missing)}: to train takes train and validation, to evaluate test"]
 
 
-def _shared(trials: Sequence[TrialLike], splits: Sequence[str]) -> list[str]:
+def _shared(trials: Sequence[TrialFacts], splits: Sequence[str]) -> list[str]:
     """Objects and days that lie in both train and test."""
     notes = []
     for fact in ("object", "day"):

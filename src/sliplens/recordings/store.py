@@ -1,30 +1,47 @@
-"""One trial on disk: a Parquet file, a row a frame."""
+"""One trial on disk: a Parquet file, a row a frame, with its header and reference frame beside the rows."""
 
-import json
 import os
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
+from sliplens.codec import from_builtins, to_builtins
 from sliplens.errors import RecordingError
 from sliplens.images.files import decode_png, encode_png
-from sliplens.recordings.trial import SIGNALS, ContactState, GroundTruth, Recording
+from sliplens.recordings.capture import Forces
+from sliplens.recordings.labelling import Labelling
+from sliplens.recordings.trial import (
+    OPTIONAL_LABELS,
+    SIGNALS,
+    ContactState,
+    GroundTruth,
+    Labels,
+    Recording,
+    TrialFacts,
+)
 
+SCHEMA_VERSION = 2
+CODEC = "rows+zstd"
+"""Coding of the images, named in the metadata of a trial."""
+ROW_GROUP = 64
+"""Frames that are written, and can be read, together."""
 DAMAGED_PARQUET = (pa.ArrowException, OSError, ValueError, LookupError)
-"""What Arrow raises of a damaged file: names, too, may be no text."""
+"""Errors that Arrow raises of a damaged file: names, too, may be no text."""
+_COMMAND = "sliplens import"
 
 
 def one_line(error: Exception) -> str:
-    """What an error says, without the line breaks and stacks of Arrow."""
+    """Text of an error, without the line breaks and stacks of Arrow."""
     return " ".join(str(error).split())[:200]
 
 
@@ -45,12 +62,6 @@ def reading(path: Path) -> Iterator[None]:
         raise RecordingError(
             f"{path} is not a readable Parquet file ({one_line(error)}); make the data set again"
         ) from None
-
-
-CODEC = "rows+zstd"
-"""Its name in the metadata of a trial."""
-ROW_GROUP = 64
-"""Frames that are written, and can be read, together."""
 
 
 def encode_pixels(pixels: UInt8[np.ndarray, "height width *channels"]) -> bytes:
@@ -111,54 +122,52 @@ def decode_pixels(
     return np.cumsum(rows.reshape(size), axis=0, dtype=np.uint8)
 
 
-DESCRIPTION = ("trial", "sensor", "day", "condition")
-"""What every trial tells in its metadata."""
-OBJECT = "object"
-"""And what it may tell."""
+@dataclass(frozen=True, kw_only=True)
+class TruthHeader:
+    """Truth of a simulated trial that is not told frame by frame; see `GroundTruth`."""
+
+    recipe: str
+    displacement: str
+    marker_rest_px: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
-class StoredTrial:
-    """What a trial's file says without its frames being read."""
+class TrialHeader(TrialFacts):
+    """Facts of a stored trial that are read without its frames."""
 
-    trial: str
-    sensor: str
-    day: int
-    condition: str
-    object: str
     frames: int
     height: int
     width: int
-    recipe: str | None
-    """Hash of the recipe of a simulated trial."""
+    labelling: Labelling | None = None
+    truth: TruthHeader | None = None
 
 
-def read_header(path: Path) -> StoredTrial:
-    """Read what a trial is, without its frames.
+_HEADER = b"sliplens"
+
+
+def read_header(path: Path) -> TrialHeader:
+    """Read what a trial is and how its labels were made, without its frames.
 
     Raises
     ------
-    RecordingError
+    InputError
         If the file is missing or damaged, or no trial.
-    ImageError
-        If its reference frame is damaged.
     """
-    metadata = _read_metadata(path)
-    missing = {"reference", *DESCRIPTION} - set(metadata)
+    with reading(path):
+        file = pq.read_metadata(path)
+    return replace(_parse_header(file.metadata, path), frames=file.num_rows)
+
+
+def _parse_header(metadata: dict[bytes, bytes] | None, path: Path) -> TrialHeader:
+    metadata = metadata or {}
+    missing = [key.decode() for key in (_HEADER, b"reference") if key not in metadata]
     if missing:
-        raise RecordingError(f"{path} lacks {', '.join(sorted(missing))}; write it with save_recording")
-    height, width, _ = decode_png(metadata["reference"], where=f"the reference frame of {path}").shape
-    return StoredTrial(
-        trial=metadata["trial"].decode(),
-        sensor=metadata["sensor"].decode(),
-        day=int(metadata["day"]),
-        condition=metadata["condition"].decode(),
-        object=metadata.get(OBJECT, b"").decode(),
-        frames=int(metadata["frames"]),
-        height=height,
-        width=width,
-        recipe=json.loads(metadata["truth"])["recipe"] if "truth" in metadata else None,
-    )
+        raise RecordingError(f"{path} lacks {', '.join(missing)} in its metadata; make the data set again")
+    try:
+        values = msgspec.json.decode(metadata[_HEADER])
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise RecordingError(f"the header of {path} is no JSON ({error}); make the data set again") from None
+    return from_builtins(values, TrialHeader, where=f"the header of {path}", command=_COMMAND)
 
 
 def read_reference(path: Path) -> UInt8[np.ndarray, "height width 3"]:
@@ -171,141 +180,39 @@ def read_reference(path: Path) -> UInt8[np.ndarray, "height width 3"]:
     ImageError
         If the image is damaged.
     """
-    metadata = _read_metadata(path)
-    if "reference" not in metadata:
-        raise RecordingError(f"{path} lacks a reference frame; write it with save_recording")
-    return decode_png(metadata["reference"], where=f"the reference frame of {path}")
-
-
-def read_labelling(path: Path) -> dict[str, Any] | None:
-    """What the labels of an imported trial rest on, as `import_trial` found it; None where nothing is kept.
-
-    Raises
-    ------
-    RecordingError
-        If the file is missing or damaged, or what it tells of its labels is.
-    """
-    metadata = _read_metadata(path)
-    if "labelling" not in metadata:
-        return None
-    try:
-        labelling = json.loads(metadata["labelling"])
-    except ValueError:
-        labelling = None
-    require_labelling(labelling, where=str(path))
-    return labelling
-
-
-def require_labelling(labelling: object, *, where: str) -> None:
-    """Check that what is told of labels has the parts that pages and tables show.
-
-    Raises
-    ------
-    RecordingError
-        If a part is missing or of another kind.
-    """
-
-    def fits(value: object, parts: dict[str, Any]) -> bool:
-        return isinstance(value, dict) and all(name in value and kind(value[name]) for name, kind in parts.items())
-
-    def number(value: object) -> bool:
-        return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
-
-    def words(value: object) -> bool:
-        return isinstance(value, list) and all(isinstance(one, str) for one in value)
-
-    def counts(value: object) -> bool:
-        return isinstance(value, dict) and all(isinstance(one, int) and one >= 0 for one in value.values())
-
-    def maybe(**parts: Any) -> Any:
-        return lambda value: value is None or fits(value, parts)
-
-    def text(value: object) -> bool:
-        return value is None or isinstance(value, str)
-
-    def three(value: object) -> bool:
-        return isinstance(value, list) and len(value) == 3 and all(map(number, value))
-
-    seen = {f"{name}_found": text for name in ("normal", "sign", "tare")}
-    axes = maybe(
-        notes=words,
-        normal=text,
-        sign=number,
-        still_until_s=number,
-        tare_n=three,
-        tare_sigma_n=three,
-        noise_n=three,
-        **seen,
-    )
-    parts = {
-        "source": text,
-        "forces": text,
-        "frames_by_reason": counts,
-        "notes": words,
-        "axes": axes,
-        "friction": maybe(mu=number, low=number, high=number, found=text, method=text, image_sigmas=number),
-        "lag": maybe(lag_s=number, sigma_s=number, doubt=text, correlation=number),
-        "lag_applied": lambda value: isinstance(value, bool),
-        "reference": lambda value: fits(
-            value, {"index": number, "method": text, "contact_energy": number, "drift": number}
-        ),
-        **dict.fromkeys(("slip_s", "contact_threshold_n", "window_s", "gap_s", "force_range_n"), number),
-    }
-    if not fits(labelling, parts):
-        wrong = [
-            name for name, kind in parts.items() if not (isinstance(labelling, dict) and fits(labelling, {name: kind}))
-        ]
-        raise RecordingError(
-            f"{where} tells nothing usable of how its labels were made ({', '.join(wrong[:3])}); import the trial again"
-        )
-
-
-def _read_metadata(path: Path) -> dict[str, bytes]:
     with reading(path):
-        file = pq.read_metadata(path)
-    metadata = {key.decode(): value for key, value in (file.metadata or {}).items()}
-    return {**metadata, "frames": str(file.num_rows).encode()}
+        metadata = pq.read_metadata(path).metadata
+    if not metadata or b"reference" not in metadata:
+        raise RecordingError(f"{path} lacks reference in its metadata; make the data set again")
+    return decode_png(metadata[b"reference"], where=f"the reference frame of {path}")
 
 
-SCHEMA_VERSION = 1
-_OPTIONAL = ("safety_margin_sigma", "valid")
 _TRUTH_SIGNALS = ("static_friction", "contact_radius_m", "stick_radius_m")
 _TRUTH_COLUMNS = frozenset({*_TRUTH_SIGNALS, "marker_px", "contact_map"})
 
 
 def save_recording(recording: Recording, path: Path) -> None:
-    """Write a trial as one Parquet file: a row a frame, its image lossless (`pixels`); whole or not at all."""
-    columns: dict[str, Any] = {name: getattr(recording, name) for name in SIGNALS}
-    columns["contact_state"] = [str(state) for state in recording.contact_state]
-    description = {name: str(getattr(recording, name)) for name in DESCRIPTION}
-    if recording.object:
-        description[OBJECT] = recording.object
-    columns |= {name: getattr(recording, name) for name in _OPTIONAL if getattr(recording, name) is not None}
-    if recording.truth is not None:
-        truth = recording.truth
-        columns |= {name: getattr(truth, name) for name in _TRUTH_SIGNALS}
-        columns["marker_px"] = pa.FixedSizeListArray.from_arrays(
-            truth.marker_px.ravel(), list_size=truth.marker_rest_px.size
-        )
-        maps = [encoded for chunk in encode_frames(truth.contact_map) for encoded in chunk]
-        columns["contact_map"] = pa.array(maps, type=pa.binary())
-        description["truth"] = json.dumps(
-            {
-                "recipe": truth.recipe,
-                "displacement": truth.displacement,
-                "marker_rest_px": truth.marker_rest_px.tolist(),
-            }
-        )
-    write_trial(path, encode_frames(recording.frames), columns, description, reference=recording.reference)
+    """Write a trial as one Parquet file, its images lossless; whole or not at all."""
+    write_trial(
+        path,
+        encode_frames(recording.frames),
+        facts=recording,
+        time_s=recording.time_s,
+        labels=recording,
+        reference=recording.reference,
+        truth=recording.truth,
+    )
 
 
 def write_trial(
     path: Path,
     images: Iterable[list[bytes]],
-    columns: Mapping[str, Any],
-    description: Mapping[str, str],
     *,
+    facts: TrialFacts,
+    time_s: Float[np.ndarray, " frames"],
+    labels: Labels,
     reference: UInt8[np.ndarray, "height width 3"],
+    truth: GroundTruth | None = None,
 ) -> None:
     """Write the Parquet file of a trial, chunk by chunk; it appears when complete.
 
@@ -314,27 +221,55 @@ def write_trial(
     path
         File to write.
     images
-        Encoded frames in chunks, a row group each.
-    columns
-        One value a frame for everything else.
-    description, reference
-        What the trial is, and its untouched sensor.
+        Encoded frames in chunks, a row group each; see `encode_frames`.
+    facts
+        Name of the trial, its sensor, day, condition and object.
+    time_s
+        Times of the frames.
+    labels
+        Labels of the frames, and how they were made.
+    reference
+        Image of the untouched sensor.
+    truth
+        Truth of a simulated trial.
     """
-    labels = pa.table(columns)
+    columns: dict[str, Any] = {"time_s": time_s, "contact_state": [str(state) for state in labels.contact_state]}
+    columns |= {name: getattr(labels, name) for name in SIGNALS[1:]}
+    for name in OPTIONAL_LABELS:
+        values = getattr(labels, name)
+        if values is not None:
+            columns[name] = [str(reason) for reason in values] if name == "reason" else values
+    kept = None
+    if truth is not None:
+        rest = tuple((float(x), float(y)) for x, y in truth.marker_rest_px)
+        kept = TruthHeader(recipe=truth.recipe, displacement=truth.displacement, marker_rest_px=rest)
+        columns |= {name: getattr(truth, name) for name in _TRUTH_SIGNALS}
+        columns["marker_px"] = pa.FixedSizeListArray.from_arrays(truth.marker_px.ravel(), list_size=2 * len(rest))
+        maps = [encoded for chunk in encode_frames(truth.contact_map) for encoded in chunk]
+        columns["contact_map"] = pa.array(maps, type=pa.binary())
+    height, width, _ = reference.shape
+    header = TrialHeader(
+        **_facts(facts),
+        frames=len(time_s),
+        height=height,
+        width=width,
+        labelling=labels.labelling,
+        truth=kept,
+    )
     metadata = {
-        **description,
-        "codec": CODEC,
-        "schema_version": str(SCHEMA_VERSION),
+        _HEADER: msgspec.json.encode(to_builtins(header)),
+        b"codec": CODEC.encode(),
         b"reference": encode_png(reference),
     }
-    fields = [pa.field("frame", pa.int64()), *labels.schema, pa.field("image", pa.binary())]
+    table = pa.table(columns)
+    schema = pa.schema([pa.field("frame", pa.int64()), *table.schema, pa.field("image", pa.binary())], metadata)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
     written = 0
     # the images, nearly all of the file, neither compress further nor repeat
-    with pq.ParquetWriter(part, pa.schema(fields, metadata), compression="none", use_dictionary=False) as writer:
+    with pq.ParquetWriter(part, schema, compression="none", use_dictionary=False) as writer:
         for chunk in images:
-            rows = labels.slice(written, len(chunk)).combine_chunks()
+            rows = table.slice(written, len(chunk)).combine_chunks()
             numbers = pa.array(np.arange(written, written + len(chunk)))
             arrays = [numbers, *(column.combine_chunks() for column in rows.columns), _in_place(chunk)]
             writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema))
@@ -343,7 +278,7 @@ def write_trial(
 
 
 def _in_place(images: list[bytes]) -> pa.ChunkedArray:
-    """As Arrow sees them, none copied."""
+    """Images as Arrow sees them, none copied."""
     ends = (pa.py_buffer(np.array([0, len(image)], dtype=np.int32)) for image in images)
     parts = [
         pa.Array.from_buffers(pa.binary(), 1, [None, end, pa.py_buffer(image)])
@@ -367,41 +302,77 @@ def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Re
 
     Raises
     ------
-    RecordingError
+    InputError
         If the file is missing, damaged or empty, or its labels break a law.
     ImageError
         If an image inside is damaged.
     """
+    without = (set() if pixels else {"image"}) | (set() if truth and pixels else _TRUTH_COLUMNS)
+    header, table = _read_columns(path, without=without)
+    reference = decode_png(table.schema.metadata[b"reference"], where=f"the reference frame of {path}")
+    if table.num_rows == 0:
+        raise RecordingError(f"trial {header.trial} has no frames; leave it out or record it again")
+    size = reference.shape
+    return Recording(
+        **_facts(header),
+        **_label_values(table, header),
+        reference=reference,
+        frames=_decode(table.column("image"), size=size, where=f"of {path}")
+        if pixels
+        else np.broadcast_to(reference, (table.num_rows, *size)),
+        time_s=table.column("time_s").to_numpy().astype(np.float64),
+        truth=_read_truth(table, header.truth, size[:2], path) if truth and pixels and header.truth else None,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredLabels:
+    """Times and labels of a stored trial."""
+
+    header: TrialHeader
+    time_s: Float[np.ndarray, " frames"]
+    labels: Labels
+
+
+def load_labels(path: Path) -> StoredLabels:
+    """Read the times and labels of a trial, without any image.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged.
+    """
+    header, table = _read_columns(path, without={"image"} | _TRUTH_COLUMNS)
+    time_s = table.column("time_s").to_numpy().astype(np.float64)
+    return StoredLabels(header=header, time_s=time_s, labels=Labels(**_label_values(table, header)))
+
+
+def _facts(trial: TrialFacts) -> dict[str, Any]:
+    return {field.name: getattr(trial, field.name) for field in fields(TrialFacts)}
+
+
+def _read_columns(path: Path, *, without: set[str] | frozenset[str]) -> tuple[TrialHeader, pa.Table]:
     with reading(path):
         stored = pq.read_schema(path)
-        left_out = (set() if truth and pixels else _TRUTH_COLUMNS) | (set() if pixels else {"image"})
-        table = pq.read_table(path, columns=[name for name in stored.names if name not in left_out])
-    metadata = {key.decode(): value for key, value in (table.schema.metadata or {}).items()}
-    missing = ({"reference", *DESCRIPTION} - set(metadata)) | ({"image", "contact_state", *SIGNALS} - set(stored.names))
+        table = pq.read_table(path, columns=[name for name in stored.names if name not in without])
+    header = _parse_header(stored.metadata, path)
+    missing = {"image", "contact_state", *SIGNALS} - set(stored.names)
     if missing:
-        raise RecordingError(f"{path} lacks {', '.join(sorted(missing))}; write it with save_recording")
-    _require_codec(table.schema, path)
-    reference = decode_png(metadata["reference"], where=f"the reference frame of {path}")
-    trial = metadata["trial"].decode()
-    if table.num_rows == 0:
-        raise RecordingError(f"trial {trial} has no frames; leave it out or record it again")
-    return Recording(
-        trial=trial,
-        sensor=metadata["sensor"].decode(),
-        day=int(metadata["day"]),
-        condition=metadata["condition"].decode(),
-        object=metadata.get(OBJECT, b"").decode(),
-        reference=reference,
-        frames=_decode(table.column("image"), size=reference.shape, where=f"of {path}")
-        if pixels
-        else np.broadcast_to(reference, (table.num_rows, *reference.shape)),
-        contact_state=tuple(ContactState(state) for state in table.column("contact_state").to_pylist()),
-        **{name: table.column(name).to_numpy() for name in _OPTIONAL if name in table.column_names},
-        truth=_read_truth(table, json.loads(metadata["truth"]), reference.shape[:2], path)
-        if truth and pixels and "truth" in metadata
-        else None,
-        **{name: table.column(name).to_numpy().astype(np.float64) for name in SIGNALS},
-    )
+        raise RecordingError(f"{path} lacks {', '.join(sorted(missing))}; make the data set again")
+    _require_codec(stored, path)
+    return replace(header, frames=table.num_rows), table
+
+
+def _label_values(table: pa.Table, header: TrialHeader) -> dict[str, Any]:
+    columns = {name: table.column(name).to_numpy() for name in OPTIONAL_LABELS if name in table.column_names}
+    if "reason" in columns:
+        columns["reason"] = tuple(str(reason) for reason in columns["reason"])
+    return {
+        **{name: table.column(name).to_numpy().astype(np.float64) for name in SIGNALS[1:]},
+        "contact_state": tuple(ContactState(state) for state in table.column("contact_state").to_pylist()),
+        **columns,
+        "labelling": header.labelling,
+    }
 
 
 def stream_frames(path: Path) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
@@ -477,17 +448,16 @@ def _require_codec(schema: pa.Schema, path: Path) -> None:
         raise RecordingError(f"{path} keeps its images as {codec}, {CODEC} is needed; make the data set again")
 
 
-def _read_truth(table: pa.Table, description: dict[str, Any], size: tuple[int, ...], path: Path) -> GroundTruth:
+def _read_truth(table: pa.Table, header: TruthHeader, size: tuple[int, ...], path: Path) -> GroundTruth:
     missing = _TRUTH_COLUMNS - set(table.column_names)
     if missing:
         raise RecordingError(f"{path} lacks {', '.join(sorted(missing))} of its truth; make the data set again")
-    rest = np.array(description["marker_rest_px"], dtype=np.float32).reshape(-1, 2)
     # a trial is read as one chunk or many, as Arrow likes
     flat = table.column("marker_px").combine_chunks().flatten()
     return GroundTruth(
-        recipe=description["recipe"],
-        displacement=description["displacement"],
-        marker_rest_px=rest,
+        recipe=header.recipe,
+        displacement=header.displacement,
+        marker_rest_px=np.array(header.marker_rest_px, dtype=np.float32).reshape(-1, 2),
         marker_px=flat.to_numpy().astype(np.float32).reshape(table.num_rows, -1, 2),
         contact_map=_decode(table.column("contact_map"), size=size, where=f"(contact map) of {path}"),
         **{name: table.column(name).to_numpy().astype(np.float64) for name in _TRUTH_SIGNALS},
@@ -504,3 +474,42 @@ def _decode(images: pa.ChunkedArray, *, size: tuple[int, ...], where: str) -> UI
     with ThreadPoolExecutor() as pool:
         list(pool.map(decode, range(len(images))))
     return pixels
+
+
+_AXES = ("x_n", "y_n", "z_n")
+
+
+def forces_path(folder: Path, trial: str) -> Path:
+    """File that holds the force samples of a trial of a data set."""
+    return folder / "forces" / f"{trial}.parquet"
+
+
+def save_forces(forces: Forces, path: Path) -> None:
+    """Write samples as one Parquet file, a row a sample; whole or not at all."""
+    columns = {"time_s": forces.time_s, **{name: forces.force_n[:, at] for at, name in enumerate(_AXES)}}
+    table = pa.table(columns).replace_schema_metadata({"source": forces.source})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    pq.write_table(table, part, compression="zstd")
+    part.replace(path)
+
+
+def load_forces(path: Path) -> Forces:
+    """Read samples written by `save_forces`.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing or damaged, or breaks a law of `Forces`.
+    """
+    try:
+        table = pq.read_table(path)
+        source = (table.schema.metadata or {}).get(b"source", b"the force sensor").decode()
+        values = [table.column(name).to_numpy().astype(np.float64) for name in ("time_s", *_AXES)]
+    except FileNotFoundError:
+        raise RecordingError(f"{path} does not exist; make the data set again") from None
+    except (*DAMAGED_PARQUET, TypeError) as error:  # the latter of values that are missing
+        raise RecordingError(
+            f"{path} does not hold samples of forces ({one_line(error)}); make the data set again"
+        ) from None
+    return Forces(time_s=values[0], force_n=np.stack(values[1:], axis=-1), source=source)

@@ -1,5 +1,6 @@
 """One trial of a tactile sensor: frames, forces, labels, and who, when and what."""
 
+from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -7,9 +8,141 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from sliplens.errors import RecordingError
+from sliplens.mechanics import stick_ratio
+from sliplens.recordings.labelling import Labelling
 
 OUTSIDE, SLIPS, STICKS = 0, 1, 2
 """Values of a contact map."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialFacts:
+    """Who, when and what of a trial: what rules of splits ask for, and trials are grouped by."""
+
+    trial: str
+    """Name of the trial: letters, digits, dots, dashes and underscores."""
+    sensor: str = ""
+    """Name of the sensor; empty where it is not told."""
+    day: int = 1
+    """Day of the recording, counted from 1."""
+    condition: str = "dry"
+    """dry or wet, or any other word for the state of the surface."""
+    object: str = ""
+    """Name of what was held; empty where it is not told."""
+
+
+class ContactState(StrEnum):
+    """Phase of a grasp, as in Fig. 4 of the thesis; unknown where nothing measured it."""
+
+    NO_CONTACT = "no contact"
+    CONTACT = "contact"
+    INCIPIENT_SLIP = "incipient slip"
+    FULL_SLIP = "full slip"
+    UNKNOWN = "unknown"
+
+
+LABEL_SIGNALS = (
+    "normal_force_n",
+    "tangential_force_n",
+    "friction_coefficient",
+    "safety_margin",
+    "stick_ratio",
+)
+"""The numbers of `Labels`, in the order they are stored."""
+SIGNALS = ("time_s", *LABEL_SIGNALS)
+"""The per-frame numbers of a `Recording`, in the order they are stored."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Labels:
+    """Forces and labels of a trial's frames, one value a frame; NaN where nothing is known.
+
+    Forces are in newtons, the normal force positive when pressing. Without contact the safety margin has no meaning
+    and is NaN.
+
+    Raises
+    ------
+    RecordingError
+        If lengths disagree.
+    """
+
+    # sizes that must agree are left open here and checked below, in the user's words
+    normal_force_n: Float[np.ndarray, " _"]
+    tangential_force_n: Float[np.ndarray, " _"]
+    friction_coefficient: Float[np.ndarray, " _"]
+    safety_margin: Float[np.ndarray, " _"]
+    stick_ratio: Float[np.ndarray, " _"]
+    contact_state: tuple[ContactState, ...]
+    safety_margin_sigma: Float[np.ndarray, " _"] | None = None
+    """Standard uncertainty of the safety margin; None where it is exact or was not estimated."""
+    valid: Bool[np.ndarray, " _"] | None = None
+    """Frames whose label can be trusted; None where all that have one can."""
+    reason: tuple[str, ...] | None = None
+    """Why a label is not valid; empty where it is."""
+    force_time_s: Float[np.ndarray, " _"] | None = None
+    """Times of the frames on the force sensor's clock, where forces were interpolated."""
+    labelling: Labelling | None = None
+    """How the labels were made; None where that is not told."""
+
+    def __post_init__(self) -> None:
+        """Check that there is one of each a frame."""
+        self._require_one_each(len(self.safety_margin), f"there are {len(self.safety_margin)} safety margins but")
+
+    def _require_one_each(self, count: int, begin: str) -> None:
+        for name in (*LABEL_SIGNALS, "contact_state", *OPTIONAL_LABELS):
+            values = getattr(self, name)
+            if values is not None and len(values) != count:
+                raise RecordingError(f"{begin} {len(values)} values of {name}; give one value a frame")
+
+    @property
+    def labelled(self) -> Bool[np.ndarray, " frames"]:
+        """Frames that have a safety margin, and one that can be trusted."""
+        present = np.isfinite(self.safety_margin)
+        return present if self.valid is None else present & self.valid
+
+    def count(self) -> dict[str, int]:
+        """Number of frames by the reason why they have no valid label; those that have one as 'valid'."""
+        reasons = self.reason or [""] * len(self.safety_margin)
+        return dict(
+            Counter(
+                "valid" if fine else reason or "no label"
+                for fine, reason in zip(self.labelled.tolist(), reasons, strict=True)
+            )
+        )
+
+
+OPTIONAL_LABELS = ("safety_margin_sigma", "valid", "reason", "force_time_s")
+"""What `Labels` may lack."""
+
+
+def labels_of_margins(safety_margin: Float[np.ndarray, " frames"]) -> Labels:
+    """Labels where no force is known, but the margin, or not even that.
+
+    Full slip is where the margin is 0, contact where it is 1; the stick ratio is that of a sphere, as everywhere.
+
+    Parameters
+    ----------
+    safety_margin
+        In [0, 1]; NaN where it is not known.
+
+    Examples
+    --------
+    >>> labels = labels_of_margins(np.array([1.0, 0.4, 0.0, np.nan]))
+    >>> [str(state) for state in labels.contact_state]
+    ['contact', 'incipient slip', 'full slip', 'unknown']
+    """
+    unknown = np.full(len(safety_margin), np.nan)
+    states = (ContactState.UNKNOWN, ContactState.FULL_SLIP, ContactState.CONTACT, ContactState.INCIPIENT_SLIP)
+    kinds = np.select([np.isnan(safety_margin), safety_margin <= 0, safety_margin >= 1], [0, 1, 2], default=3)
+    return Labels(
+        normal_force_n=unknown,
+        tangential_force_n=unknown,
+        friction_coefficient=unknown,
+        safety_margin=safety_margin,
+        stick_ratio=stick_ratio(safety_margin),
+        contact_state=tuple(states[kind] for kind in kinds),
+        reason=tuple("" if known else "not labelled" for known in np.isfinite(safety_margin)),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,22 +203,9 @@ class GroundTruth:
         return self.contact_map == STICKS
 
 
-class ContactState(StrEnum):
-    """Phase of a grasp, as in Fig. 4 of the thesis; unknown where nothing measured it."""
-
-    NO_CONTACT = "no contact"
-    CONTACT = "contact"
-    INCIPIENT_SLIP = "incipient slip"
-    FULL_SLIP = "full slip"
-    UNKNOWN = "unknown"
-
-
 @dataclass(frozen=True, kw_only=True)
-class Recording:
-    """One trial.
-
-    Forces are in newtons (normal force positive when pressing), times in seconds, images uint8 RGB. Labels are NaN
-    where there is none: without contact the safety margin has no meaning.
+class Recording(TrialFacts, Labels):
+    """One trial in memory: its facts, its frames (uint8 RGB) at their times, and their labels.
 
     Raises
     ------
@@ -93,28 +213,13 @@ class Recording:
         If the trial is empty, lengths or sizes disagree, times do not rise, or a label lies outside [0, 1].
     """
 
-    trial: str
-    sensor: str
-    day: int
-    condition: str
-    # sizes that must agree are left open here and checked below, in the user's words
     reference: UInt8[np.ndarray, "_ _ 3"]
+    """Image of the untouched sensor."""
     frames: UInt8[np.ndarray, "_ _ _ 3"]
     time_s: Float[np.ndarray, " _"]
-    normal_force_n: Float[np.ndarray, " _"]
-    tangential_force_n: Float[np.ndarray, " _"]
-    friction_coefficient: Float[np.ndarray, " _"]
-    safety_margin: Float[np.ndarray, " _"]
-    stick_ratio: Float[np.ndarray, " _"]
-    contact_state: tuple[ContactState, ...]
-    safety_margin_sigma: Float[np.ndarray, " _"] | None = None
-    """Standard uncertainty of the safety margin; None where it is exact or was not estimated."""
-    valid: Bool[np.ndarray, " _"] | None = None
-    """Frames whose label can be trusted; None where all that have one can."""
-    object: str = ""
-    """What was held; empty where it is not told."""
+    """Times on the camera's clock, rising."""
     truth: GroundTruth | None = None
-    """What a simulator knows beyond the labels; None for a real trial."""
+    """Knowledge of a simulator beyond the labels; None for a real trial."""
 
     def __post_init__(self) -> None:
         """Check the laws that every trial obeys."""
@@ -126,23 +231,12 @@ class Recording:
                 f"trial {self.trial} has frames of {self.frames.shape[1:3]} pixels but a reference of "
                 f"{self.reference.shape[:2]}; record both with the same camera settings"
             )
-        for name in (*SIGNALS, "contact_state"):
-            if len(getattr(self, name)) != count:
-                raise RecordingError(
-                    f"trial {self.trial} has {count} frames but {len(getattr(self, name))} values of {name}; "
-                    "give one value a frame"
-                )
-        for name in ("safety_margin_sigma", "valid"):
-            values = getattr(self, name)
-            if values is not None and len(values) != count:
-                raise RecordingError(
-                    f"trial {self.trial} has {count} frames but {len(values)} values of {name}; give one value a frame"
-                )
+        begin = f"trial {self.trial} has {count} frames but"
+        self._require_one_each(count, begin)
+        if len(self.time_s) != count:
+            raise RecordingError(f"{begin} {len(self.time_s)} values of time_s; give one value a frame")
         if self.truth is not None and len(self.truth.marker_px) != count:
-            raise RecordingError(
-                f"trial {self.trial} has {count} frames but the truth of {len(self.truth.marker_px)}; "
-                "give the truth of every frame"
-            )
+            raise RecordingError(f"{begin} the truth of {len(self.truth.marker_px)}; give the truth of every frame")
         if not np.all(np.diff(self.time_s) > 0):
             at = int(np.argmax(~(np.diff(self.time_s) > 0))) + 1
             raise RecordingError(
@@ -153,25 +247,8 @@ class Recording:
             require_unit_interval(getattr(self, name), name=name, trial=self.trial)
 
     def __len__(self) -> int:
-        """Count the frames."""
+        """Number of frames."""
         return len(self.frames)
-
-    @property
-    def labelled(self) -> Bool[np.ndarray, " frames"]:
-        """Frames that have a safety margin, and one that can be trusted."""
-        present = np.isfinite(self.safety_margin)
-        return present if self.valid is None else present & self.valid
-
-
-SIGNALS = (
-    "time_s",
-    "normal_force_n",
-    "tangential_force_n",
-    "friction_coefficient",
-    "safety_margin",
-    "stick_ratio",
-)
-"""The per-frame numbers of a `Recording`, in the order they are stored."""
 
 
 def require_unit_interval(values: Float[np.ndarray, " frames"], *, name: str, trial: str) -> None:

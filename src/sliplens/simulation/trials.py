@@ -118,7 +118,8 @@ def simulate_dataset(
     for plan in plans:
         path = trial_path(folder, plan.trial)
         if path.is_file():
-            if read_header(path).recipe != plan.recipe_hash:
+            truth = read_header(path).truth
+            if truth is None or truth.recipe != plan.recipe_hash:
                 raise InputError(f"{path} was made by another recipe; choose another folder")
         else:
             save_recording(simulate_trial(plan, device=device, on_frames=report), path)

@@ -29,7 +29,7 @@ def test_frames_come_in_natural_order(folder: Path, frames: np.ndarray):
     capture = read_image_folder(folder, frame_rate=30.0)
     np.testing.assert_array_equal(list(capture.read_frames()), frames)
     np.testing.assert_allclose(capture.frame_time_s, np.arange(12) / 30)
-    assert (capture.name, capture.frame_size, capture.forces) == ("trial-7", (20, 30), None)
+    assert (capture.trial, capture.frame_size, capture.forces) == ("trial-7", (20, 30), None)
     assert capture.notes == ("trial 7: frames were declared to be taken 30 times a second.",)
 
 

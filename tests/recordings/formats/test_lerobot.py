@@ -158,7 +158,7 @@ def dataset(tmp_path: Path, frames: np.ndarray, wrenches: np.ndarray) -> Path:
 
 def test_episodes_come_back_without_loss(dataset, frames, wrenches):
     captures = read_lerobot(dataset)
-    assert [capture.name for capture in captures] == [f"press-v3-{index:06d}" for index in range(3)]
+    assert [capture.trial for capture in captures] == [f"press-v3-{index:06d}" for index in range(3)]
     for capture, shown, felt in zip(captures, split(frames), split(wrenches), strict=True):
         np.testing.assert_array_equal(list(capture.read_frames()), shown)
         assert capture.frame_size == (HEIGHT, WIDTH)

@@ -14,14 +14,16 @@ import pytest
 from sliplens.errors import InputError, RecordingError
 from sliplens.images.files import decode_png
 from sliplens.recordings import ContactState, Dataset, Recording
-from sliplens.recordings.capture import Capture, Forces, GivenLabels, Told, forces_path, save_forces
+from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.formats.lerobot import read_lerobot
 from sliplens.recordings.formats.lerobot_export import DataFiles, PixelCount, number_stats, write_lerobot
 from sliplens.recordings.formats.stored import read_stored
-from sliplens.recordings.importing import About, import_trial
-from sliplens.recordings.labels import LabelSettings
-from sliplens.recordings.store import encode_frames, load_recording, read_labelling, save_recording, write_trial
+from sliplens.recordings.importing import import_trial
+from sliplens.recordings.labelling import Clip, ForceAxes, Found, LabelBasis, Labelling, Lag, ReferenceChoice
+from sliplens.recordings.labels import given_friction
+from sliplens.recordings.store import forces_path, load_recording, save_forces, save_recording
+from sliplens.recordings.trial import Labels
 
 HEIGHT, WIDTH = 24, 32
 LENGTHS = {"pressed": 19, "found": 37, "wet": 5}
@@ -53,39 +55,51 @@ def make_trial(trial: str, rng: np.random.Generator, *, count: int, **changes: A
     )
 
 
+LABELLING = Labelling(
+    source="Prüfstand ‰",
+    forces=None,
+    notes=("Grüße\u2028",),
+    reference=ReferenceChoice(index=4, method="named", contact_energy=0.1 + 0.2),
+    clip=Clip(slips=True, grasp="cup 1", stale_frames=3),
+    basis=LabelBasis(
+        axes=ForceAxes(
+            normal="z",
+            sign=-1,
+            tare_n=(0.1 + 0.2, -1e-300, 0.0),
+            noise_n=(0.1, 0.2, 0.3),
+            tare_sigma_n=(1 / 3, 0.0, 0.0),
+            still_until_s=None,
+            normal_found=Found.INFERRED,
+            sign_found=Found.DECLARED,
+            tare_found=Found.ASSUMED,
+        ),
+        friction=given_friction(0.3, low=0.2, high=0.4),
+        friction_change=0.0,
+        slip_s=None,
+        lag=Lag(lag_s=0.1, sigma_s=1 / 3),
+        lag_applied=False,
+        contact_threshold_n=0.1,
+        window_s=0.04,
+        gap_s=0.01,
+        force_range_n=None,
+    ),
+)
+"""How labels were made, with all that can be told."""
+
+
 def save_found(folder: Path, trial: Recording, rng: np.random.Generator) -> None:
     """A trial as an import leaves it: doubted labels, what they rest on, and samples of the sensor on another clock."""
-    columns = {
-        name: getattr(trial, name)
-        for name in ("time_s", "normal_force_n", "tangential_force_n", "friction_coefficient", "safety_margin")
-    }
-    columns |= {
-        "stick_ratio": trial.stick_ratio,
-        "contact_state": [str(state) for state in trial.contact_state],
-        "safety_margin_sigma": np.where(np.isnan(trial.safety_margin), np.nan, rng.random(len(trial))),
-        "valid": rng.random(len(trial)) < 0.5,
-        "invalid_reason": [("", "no contact", "between slips")[index % 3] for index in range(len(trial))],
-    }
-    friction = {"mu": 0.6, "low": 0.5, "high": 0.7, "found": "declared", "method": "by hand", "image_sigmas": None}
-    labelling = {
-        **dict.fromkeys(
-            ("forces", "axes", "lag", "slip_s", "contact_threshold_n", "window_s", "gap_s", "force_range_n", "clip")
-        ),
-        "frames_by_reason": {"valid": 3},
-        "lag_applied": False,
-        "reference": {"index": 4, "method": "named", "contact_energy": 0.1 + 0.2, "drift": None},
-        "friction": friction,
-        "notes": ["Grüße\u2028"],
-        "source": "bag.mcap",
-    }
-    about = {"trial": trial.trial, "sensor": "dome", "day": "3", "condition": "dry", "object": "cup"}
-    write_trial(
-        trial_path(folder, trial.trial),
-        encode_frames(trial.frames),
-        columns,
-        {**about, "labelling": json.dumps(labelling)},
-        reference=trial.reference,
+    found = replace(
+        trial,
+        sensor="dome",
+        day=3,
+        object="cup",
+        safety_margin_sigma=np.where(np.isnan(trial.safety_margin), np.nan, rng.random(len(trial))),
+        valid=rng.random(len(trial)) < 0.5,
+        reason=tuple(("", "no contact", "between slips")[index % 3] for index in range(len(trial))),
+        labelling=LABELLING,
     )
+    save_recording(found, trial_path(folder, trial.trial))
     times = 1.7e9 + np.cumsum(rng.uniform(1e-4, 1e-3, 500))
     samples = Forces(time_s=times, force_n=rng.normal(size=(500, 3)), source="/wrench")
     save_forces(samples, forces_path(folder, trial.trial))
@@ -135,10 +149,11 @@ def read_episodes(folder: Path) -> list[dict[str, Any]]:
 def assert_same(first: Capture, second: Capture) -> None:
     """All that is known of two captures is the same, bit by bit, but for where they were found."""
     np.testing.assert_array_equal(list(first.read_frames()), list(second.read_frames()))
-    for name in ("name", "frame_time_s", "frame_size", "reference", "notes", "told"):
+    facts = ("trial", "sensor", "day", "condition", "object", "split", "simulated")
+    for name in ("frame_time_s", "frame_size", "reference", "notes", *facts):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
     assert first.labels is not None
-    for field in fields(GivenLabels):
+    for field in fields(Labels):
         np.testing.assert_array_equal(getattr(first.labels, field.name), getattr(second.labels, field.name))
     assert (first.forces is None) == (second.forces is None)
     if first.forces is not None and second.forces is not None:
@@ -148,42 +163,39 @@ def assert_same(first: Capture, second: Capture) -> None:
 
 
 def test_all_that_is_known_of_a_trial_comes_back(data, exported):
-    back = {capture.name: capture for capture in read_lerobot(exported)}
-    assert back["found"].told == Told(
-        sensor="dome", day=3, condition="dry", object="cup", split="train", simulated=False
-    )
+    back = {capture.trial: capture for capture in read_lerobot(exported)}
+    found = back["found"]
+    assert (found.sensor, found.day, found.condition, found.object) == ("dome", 3, "dry", "cup")
+    assert (found.split, found.simulated) == ("train", False)
     assert back["found"].forces is not None
     assert len(back["found"].forces.time_s) == 500
     assert back["wet"].forces is None
     originals = read_stored(data.folder)
     assert len(back) == len(originals) == 3
     for capture in originals:
-        assert_same(capture, back[capture.name])
+        assert_same(capture, back[capture.trial])
 
 
 def test_an_exported_trial_is_imported_as_it_was(data, exported, tmp_path, rng):
     for capture in read_lerobot(exported):
-        path, told = tmp_path / "again" / f"{capture.name}.parquet", capture.told
-        assert told.sensor is not None
-        assert told.day is not None
-        assert told.condition is not None
-        about = About(sensor=told.sensor, day=told.day, condition=told.condition, object=told.object or "")
-        import_trial(capture, path, about=about, settings=LabelSettings(), rng=rng)
-        original, back = load_recording(trial_path(data.folder, capture.name)), load_recording(path)
-        for field in fields(Recording):
-            np.testing.assert_array_equal(getattr(back, field.name), getattr(original, field.name))
-        if capture.labels is not None and capture.labels.labelling is not None:
-            assert read_labelling(path) == read_labelling(trial_path(data.folder, capture.name))
+        path = tmp_path / "again" / f"{capture.trial}.parquet"
+        import_trial(capture, path, rng=rng)
+        original, back = load_recording(trial_path(data.folder, capture.trial)), load_recording(path)
+        kept = {field.name for field in fields(Recording)}
+        if original.labelling is None:  # an import tells where labels came from
+            kept.remove("labelling")
+        for name in kept:
+            np.testing.assert_array_equal(getattr(back, name), getattr(original, name))
 
 
 def test_trials_and_episodes_are_chosen(data, exported, tmp_path):
     folder = tmp_path / "one"
     folder.mkdir()
     write_lerobot(data, folder, trials=data.select(split="test"))
-    assert [capture.name for capture in read_lerobot(folder)] == ["wet"]
+    assert [capture.trial for capture in read_lerobot(folder)] == ["wet"]
     # trials of a split follow each other
-    assert [capture.name for capture in read_lerobot(exported)] == ["pressed", "found", "wet"]
-    assert [capture.name for capture in read_lerobot(exported, episode=1)] == ["found"]
+    assert [capture.trial for capture in read_lerobot(exported)] == ["pressed", "found", "wet"]
+    assert [capture.trial for capture in read_lerobot(exported, episode=1)] == ["found"]
     with pytest.raises(RecordingError, match="exported has no episode 3; it has 3, from 0 to 2"):
         read_lerobot(exported, episode=3)
 
@@ -191,7 +203,7 @@ def test_trials_and_episodes_are_chosen(data, exported, tmp_path):
 def test_progress_is_told_from_trial_to_trial(data, tmp_path):
     told = []
     (tmp_path / "out").mkdir()
-    write_lerobot(data, tmp_path / "out", on_frames=lambda done, total: told.append((done, total)))
+    write_lerobot(data, tmp_path / "out", on_progress=lambda done, total: told.append((done, total)))
     assert told[-1] == (61, 61)
     assert [done for done, _ in told] == sorted({done for done, _ in told})
 
@@ -247,12 +259,12 @@ def test_counts_and_places_agree(exported):
 
 def test_numbers_and_words_are_where_the_features_say(data, exported):
     rows, features = read_rows(exported), read_info(exported)["features"]
-    (found,) = (capture for capture in read_stored(data.folder) if capture.name == "found")
+    (found,) = (capture for capture in read_stored(data.folder) if capture.trial == "found")
     own = rows.filter(pa.array(rows["episode_index"].to_numpy() == 1))
     labels = found.labels
     assert labels is not None
     force = np.array(own["observation.force"].to_pylist())
-    expected = np.stack([labels.tangential_force_n, np.zeros(len(labels)), labels.normal_force_n], axis=1)
+    expected = np.stack([labels.tangential_force_n, np.zeros(len(force)), labels.normal_force_n], axis=1)
     np.testing.assert_array_equal(force, expected)
     assert features["observation.force"]["names"] == ["tangential_n", "across_n", "normal_n"]
     np.testing.assert_array_equal(own["observation.safety_margin"].to_numpy(), labels.safety_margin)
@@ -399,7 +411,7 @@ def test_a_folder_that_cannot_take_it_is_refused(data, exported, tmp_path):
     (tmp_path / "new").mkdir()
     with pytest.raises(RecordingError, match="there is no trial to export"):
         write_lerobot(data, tmp_path / "new", trials=[])
-    with pytest.raises(RecordingError, match=r"trial '\.\./a' has no name for a file"):
+    with pytest.raises(RecordingError, match=r"trial '\.\./a' cannot name a file"):
         write_lerobot(data, tmp_path / "new", trials=[replace(data.trials[0], trial="../a")])
 
 
@@ -412,7 +424,7 @@ def test_an_interrupted_export_is_made_anew(data, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_lerobot(data, folder, on_frames=stop)
+        write_lerobot(data, folder, on_progress=stop)
     # left behind by an attempt that was longer
     (folder / "data" / "chunk-000" / "file-007.parquet").write_bytes(b"")
     write_lerobot(data, folder)

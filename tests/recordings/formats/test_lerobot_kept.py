@@ -15,11 +15,11 @@ from PIL import Image
 
 from sliplens.errors import RecordingError
 from sliplens.recordings import ContactState, Dataset, Recording
-from sliplens.recordings.capture import Forces, forces_path, save_forces
+from sliplens.recordings.capture import Forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.formats.lerobot import read_lerobot
 from sliplens.recordings.formats.lerobot_export import write_lerobot
-from sliplens.recordings.store import save_recording
+from sliplens.recordings.store import forces_path, save_forces, save_recording
 
 HEIGHT, WIDTH, FRAMES = 24, 32, 20
 CAMERA = "observation.images.tactile"
@@ -84,7 +84,7 @@ def set_column(folder: Path, name: str, values: Any) -> None:
 def test_without_what_is_kept_it_is_a_data_set_like_any_other(exported):
     (exported / "meta" / "sliplens" / "trials.jsonl").unlink()
     first, second = read_lerobot(exported)
-    assert (first.name, second.name) == ("exported-000000", "exported-000001")
+    assert (first.trial, second.trial) == ("exported-000000", "exported-000001")
     assert first.labels is None
     assert first.reference is None
     assert second.forces is not None
@@ -97,18 +97,18 @@ def test_a_feature_that_is_named_is_read_as_of_any_data_set(exported):
     for named in ({"camera_key": CAMERA}, {"force_key": "observation.force"}):
         (capture,) = read_lerobot(exported, episode=1, **named)
         assert capture.labels is None
-        assert capture.name == "exported-000001"
+        assert capture.trial == "exported-000001"
 
 
 @pytest.mark.parametrize("name", ["../../etc/cron", "a/b", "/a", "..", "", "a\0b", 3, None])
 def test_a_name_that_leads_out_of_a_data_set_is_refused(exported, name):
-    edit_line(exported, 1, lambda trial: trial.update(trial=name))
-    with pytest.raises(RecordingError, match=r"line 2 of .*trials\.jsonl has no proper trial"):
+    edit_line(exported, 1, lambda trial: trial["facts"].update(trial=name))
+    with pytest.raises(RecordingError, match=r"line 2 of .*trials\.jsonl is not what was written: .*facts|name"):
         read_lerobot(exported)
 
 
 def test_a_name_that_is_there_twice_is_refused(exported):
-    edit_line(exported, 1, lambda trial: trial.update(trial="first"))
+    edit_line(exported, 1, lambda trial: trial["facts"].update(trial="first"))
     with pytest.raises(RecordingError, match=r"trials\.jsonl names a trial twice"):
         read_lerobot(exported)
 

@@ -14,14 +14,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sliplens.codec import to_builtins
 from sliplens.errors import InputError, RecordingError
-from sliplens.recordings.capture import GIVEN_SIGNALS, Capture, Forces, GivenLabels, Told, forces_path
+from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import Dataset, TrialInfo, trial_info, trial_path, write_dataset_table
 from sliplens.recordings.formats.rosbag import read_rosbag
 from sliplens.recordings.formats.stored import read_stored
-from sliplens.recordings.importing import About, import_trial
-from sliplens.recordings.labels import LabelSettings
-from sliplens.recordings.trial import ContactState
+from sliplens.recordings.importing import import_trial
+from sliplens.recordings.labelling import Clip, ForceAxes, Found, LabelBasis, Labelling, Lag, ReferenceChoice
+from sliplens.recordings.labels import given_friction
+from sliplens.recordings.store import forces_path
+from sliplens.recordings.trial import LABEL_SIGNALS, ContactState, Labels
 
 pytest.importorskip("rosbags")
 pytest.importorskip("mcap")
@@ -42,16 +45,48 @@ Edit = Callable[[str, int, bytes], bytes | None]
 """What becomes of a message, given its topic, its number there, and its bytes; None drops it."""
 
 
-def make_labels(rng: np.random.Generator, *, full: bool) -> GivenLabels:
+LABELLING = Labelling(
+    source="Prüfstand ‰",
+    forces=None,
+    notes=("Grüße\u2028",),
+    reference=ReferenceChoice(index=4, method="named", contact_energy=0.1 + 0.2),
+    clip=Clip(slips=True, grasp="cup 1", stale_frames=3),
+    basis=LabelBasis(
+        axes=ForceAxes(
+            normal="z",
+            sign=-1,
+            tare_n=(0.1 + 0.2, -1e-300, 0.0),
+            noise_n=(0.1, 0.2, 0.3),
+            tare_sigma_n=(1 / 3, 0.0, 0.0),
+            still_until_s=None,
+            normal_found=Found.INFERRED,
+            sign_found=Found.DECLARED,
+            tare_found=Found.ASSUMED,
+        ),
+        friction=given_friction(0.3, low=0.2, high=0.4),
+        friction_change=0.0,
+        slip_s=None,
+        lag=Lag(lag_s=0.1, sigma_s=1 / 3),
+        lag_applied=False,
+        contact_threshold_n=0.1,
+        window_s=0.04,
+        gap_s=0.01,
+        force_range_n=None,
+    ),
+)
+"""How labels were made, with all that can be told."""
+
+
+def make_labels(rng: np.random.Generator, *, full: bool) -> Labels:
     margin = rng.uniform(size=FRAMES)
     margin[:3] = np.nan  # nothing touches yet
     margin[3:5] = 1, 0
-    signals: dict[str, Any] = {name: rng.normal(size=FRAMES) for name in GIVEN_SIGNALS} | {
+    signals: dict[str, Any] = {name: rng.normal(size=FRAMES) for name in LABEL_SIGNALS} | {
         "safety_margin": margin,
         "stick_ratio": margin**2,
     }
     states = list(ContactState)
-    return GivenLabels(
+    return Labels(
         **signals,
         contact_state=tuple(states[i % len(states)] for i in range(FRAMES)),
         safety_margin_sigma=rng.exponential(size=FRAMES) if full else None,
@@ -59,21 +94,6 @@ def make_labels(rng: np.random.Generator, *, full: bool) -> GivenLabels:
         reason=tuple(("no contact", "")[i % 2] for i in range(FRAMES)) if full else None,
         labelling=LABELLING if full else None,
     )
-
-
-LABELLING = {
-    **dict.fromkeys(
-        ("forces", "axes", "lag", "slip_s", "contact_threshold_n", "window_s", "gap_s", "force_range_n", "clip")
-    ),
-    "frames_by_reason": {"valid": 3},
-    "lag_applied": False,
-    "reference": {"index": 4, "method": "named", "contact_energy": 0.1 + 0.2, "drift": None},
-    "friction": {"mu": 0.3, "low": 0.2, "high": 0.4, "found": "declared", "method": "by hand", "image_sigmas": None},
-    "notes": ["Grüße\u2028"],
-    "source": "Prüfstand ‰",
-    "more": {"slips": [1, None, True]},
-}
-"""What is kept of labels, with all that JSON can hold."""
 
 
 def make_capture(name: str, rng: np.random.Generator, *, start_s: float, full: bool, forces: bool) -> Capture:
@@ -84,7 +104,7 @@ def make_capture(name: str, rng: np.random.Generator, *, start_s: float, full: b
         time = start_s - 0.01 + np.cumsum(rng.uniform(1e-6, 1e-3, SAMPLES)) / 3
         samples = Forces(time_s=time, force_n=rng.normal(size=(SAMPLES, 3)), source="/wrench of bag")
     return Capture(
-        name=name,
+        trial=name,
         source=name,
         frame_time_s=start_s + np.arange(FRAMES) / 30,
         frame_size=(HEIGHT, WIDTH),
@@ -92,7 +112,11 @@ def make_capture(name: str, rng: np.random.Generator, *, start_s: float, full: b
         forces=samples,
         labels=make_labels(rng, full=full),
         reference=rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8),
-        told=Told(sensor="Sensor 1", day=3, condition="wet", object="cup" if full else None, split="test"),
+        sensor="Sensor 1",
+        day=3,
+        condition="wet",
+        object="cup" if full else "",
+        split="test",
     )
 
 
@@ -100,14 +124,9 @@ def store(captures: list[Capture], folder: Path) -> Dataset:
     """Import into a data set, as `sliplens import` does."""
     table = []
     for capture in captures:
-        told, path = capture.told, trial_path(folder, capture.name)
-        about = About(
-            sensor=str(told.sensor), day=told.day or 0, condition=str(told.condition), object=told.object or ""
-        )
-        rng = np.random.default_rng(0)
-        samples = forces_path(folder, capture.name)
-        import_trial(capture, path, about=about, settings=LabelSettings(), rng=rng, forces_path=samples)
-        table.append(trial_info(path, split=str(told.split)))
+        path, samples = trial_path(folder, capture.trial), forces_path(folder, capture.trial)
+        import_trial(capture, path, rng=np.random.default_rng(0), forces_file=samples)
+        table.append(trial_info(path, split=capture.split))
     write_dataset_table(folder, table)
     return Dataset.open(folder)
 
@@ -123,7 +142,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     ]
     unknown = np.full(FRAMES, np.nan)
     bare = {**vars(captures[2].labels), "normal_force_n": unknown, "tangential_force_n": unknown}
-    captures[2] = Capture(**{**vars(captures[2]), "labels": GivenLabels(**bare)})
+    captures[2] = Capture(**{**vars(captures[2]), "labels": Labels(**bare)})
     return store(captures, tmp_path_factory.mktemp("data"))
 
 
@@ -192,9 +211,8 @@ def replace_bytes(topic: str, old: bytes, new: bytes) -> Edit:
 
 
 def assert_same(found: Capture, expected: Capture) -> None:
-    assert found.name == expected.name
-    assert found.frame_size == expected.frame_size
-    assert found.told == expected.told
+    for name in ("trial", "sensor", "day", "condition", "object", "split", "simulated", "frame_size"):
+        assert getattr(found, name) == getattr(expected, name)
     assert found.notes == expected.notes == ()
     np.testing.assert_array_equal(found.frame_time_s, expected.frame_time_s, strict=True)
     np.testing.assert_array_equal(list(found.read_frames()), list(expected.read_frames()), strict=True)
@@ -215,7 +233,7 @@ def assert_same(found: Capture, expected: Capture) -> None:
 
 def test_a_trial_comes_back_bit_by_bit(data, exported):
     assert sorted(file.name for file in exported.iterdir()) == ["bare.mcap", "full.mcap", "since-1970.mcap"]
-    stored = {capture.name: capture for capture in read_stored(data.folder)}
+    stored = {capture.trial: capture for capture in read_stored(data.folder)}
     assert stored["bare"].forces is None
     assert stored["full"].labels is not None
     assert stored["full"].labels.safety_margin_sigma is not None
@@ -244,26 +262,30 @@ def test_a_simulated_trial_writes_the_forces_of_its_frames(small_dataset, tmp_pa
     expected = np.stack([recording.tangential_force_n, zero, recording.normal_force_n, zero, zero, zero], axis=-1)
     np.testing.assert_array_equal(pushes, expected)
     assert_same(read_rosbag(path), read_stored(small_dataset.folder)[0])
-    assert read_rosbag(path).told.simulated
+    assert read_rosbag(path).simulated
 
 
 def test_the_library_of_the_format_decodes_every_message_from_the_file_alone(data, exported):
     for expected in read_stored(data.folder):
-        path = exported / f"{expected.name}.mcap"
+        path = exported / f"{expected.trial}.mcap"
         found = decoded(path)
         labels = expected.labels
         assert labels is not None
         (_, text), *others = found[TRIAL]
         table = json.loads(text.data)
         assert not others
-        assert (table["trial"], table["told"]["sensor"], table["frames"]) == (expected.name, "Sensor 1", FRAMES)
-        assert table["labelling"] == labels.labelling
+        assert (table["facts"]["trial"], table["facts"]["sensor"], table["frames"]) == (
+            expected.trial,
+            "Sensor 1",
+            FRAMES,
+        )
+        assert table["labelling"] == json.loads(json.dumps(to_builtins(labels.labelling)))
         ((_, reference),) = found["/tactile/reference"]
         np.testing.assert_array_equal(np.array(Image.open(io.BytesIO(reference.data))), expected.reference)
         for (_, message), frame in zip(found[IMAGE], expected.read_frames(), strict=True):
             assert message.format == "png"
             np.testing.assert_array_equal(np.array(Image.open(io.BytesIO(message.data))), frame)
-        for name in GIVEN_SIGNALS:
+        for name in LABEL_SIGNALS:
             np.testing.assert_array_equal([getattr(m, name) for _, m in found[LABELS]], getattr(labels, name))
         sigma = labels.safety_margin_sigma
         np.testing.assert_array_equal(
@@ -279,10 +301,10 @@ def test_the_library_of_the_format_decodes_every_message_from_the_file_alone(dat
 
 def test_stamps_are_the_times_to_the_nanosecond_later_by_whole_seconds(data, exported):
     for expected in read_stored(data.folder):
-        found = decoded(exported / f"{expected.name}.mcap")
+        found = decoded(exported / f"{expected.trial}.mcap")
         offset_s = json.loads(found[TRIAL][0][1].data)["stamp_offset_s"]
         # -2.71 s goes to 1.29 s, 0 to 1; seconds since 1970 stay
-        assert offset_s == {"full": 4, "since-1970": 0, "bare": 1}[expected.name]
+        assert offset_s == {"full": 4, "since-1970": 0, "bare": 1}[expected.trial]
         series = {IMAGE: expected.frame_time_s, LABELS: expected.frame_time_s}
         if expected.forces is not None:
             series["/tactile/wrench"] = expected.forces.time_s
@@ -327,7 +349,7 @@ def test_progress_counts_the_frames_of_all_trials(data, tmp_path):
     seen: list[tuple[int, int]] = []
     folder = tmp_path / "out"
     folder.mkdir()
-    write_mcap(data, folder, trials=data.trials[1:], on_frames=lambda *counts: seen.append(counts))
+    write_mcap(data, folder, trials=data.trials[1:], on_progress=lambda *counts: seen.append(counts))
     assert seen == [(count, 2 * FRAMES) for count in range(1, 2 * FRAMES + 1)]
     assert sorted(file.name for file in folder.iterdir()) == ["bare.mcap", "since-1970.mcap"]
 
@@ -335,7 +357,7 @@ def test_progress_counts_the_frames_of_all_trials(data, tmp_path):
 def test_where_a_topic_is_named_the_file_is_read_like_any_bag(exported):
     capture = read_rosbag(exported / "full.mcap", image_topic=IMAGE)
     assert capture.labels is None
-    assert capture.told == Told()
+    assert (capture.sensor, capture.split) == ("", "")
     ours = read_rosbag(exported / "full.mcap")
     np.testing.assert_array_equal(list(capture.read_frames()), list(ours.read_frames()))
     assert capture.forces is not None
@@ -351,7 +373,7 @@ def test_a_trial_of_another_program_is_read_as_before(exported, tmp_path):
             return None if topic in {LABELS, "/tactile/reference"} else edit(topic, index, data)
 
         capture = read_rosbag(rewrite(exported / "full.mcap", tmp_path / f"other-{number}.mcap", without_labels))
-        assert capture.name == f"other-{number}"
+        assert capture.trial == f"other-{number}"
         assert capture.labels is None
         assert len(capture.frame_time_s) == FRAMES
 
@@ -362,12 +384,12 @@ def test_definitions_that_a_file_brings_are_not_used(data, exported, tmp_path):
 
 
 def damages() -> Iterator[Any]:
-    told = {"sensor": "s", "day": 1, "condition": "dry", "object": None, "split": "test", "simulated": False}
-    improper = r"/tactile/trial of .* has no proper {}; export the trial again"
+    facts = {"trial": "full", "sensor": "s", "day": 1, "condition": "dry", "object": ""}
+    improper = r"/tactile/trial of .* is not what was written: .*; make it again with `sliplens export`"
     texts = {
         "cut": lambda text: text[:-9],
-        "infinite": lambda text: text.replace('"labelling": {', '"labelling": {"x": 1e999, '),
-        "not a number": lambda text: text.replace('"labelling": {', '"labelling": {"x": NaN, '),
+        "infinite": lambda text: text.replace('"labelling":{', '"labelling":{"x": 1e999, '),
+        "not a number": lambda text: text.replace('"labelling":{', '"labelling":{"x": NaN, '),
         "half a character": lambda text: text.replace('"Sensor 1"', '"\\ud800"'),
         "deep": lambda text: text[:-1] + ', "x": ' + "[" * 100_000,
     }
@@ -377,10 +399,15 @@ def damages() -> Iterator[Any]:
         edit_text(lambda text: text + " " * 2**24), r"has \d+ characters, no description does; export", id="endless"
     )
     yield pytest.param(edit_text(lambda _: "7"), "does not describe a sliplens trial; export", id="another text")
-    yield pytest.param(edit_table(version=2), "is of version 2, this sliplens reads 1; update it", id="version")
+    yield pytest.param(edit_table(version=3), "is of version 3, this sliplens reads 2; update it", id="version")
     for name, values in {
-        "trial": ("../../evil", "", "a/b", 7, None),
-        "told": ({}, None, {**told, "day": "1"}, {**told, "day": True}, {**told, "sensor": 1}, {**told, "more": 1}),
+        "facts": (
+            {},
+            None,
+            *({**facts, "trial": name} for name in ("../../evil", "", "a/b", 7, None)),
+            *({**facts, "day": day} for day in ("1", True, None)),
+            {**facts, "sensor": 1},
+        ),
         "frames": (-1, 0, 1.0, True, None),
         "force_samples": (-1, "2"),
         "force_source": (None, 1),
@@ -388,7 +415,7 @@ def damages() -> Iterator[Any]:
         "labelling": ([], 7),
     }.items():
         for value in values:
-            yield pytest.param(edit_table(**{name: value}), improper.format(name), id=f"{name}={value}")
+            yield pytest.param(edit_table(**{name: value}), improper, id=f"{name}={value}")
     for topic in (LABELS, IMAGE, "/tactile/reference", "/tactile/wrench", "/tactile/wrench_times"):
         yield pytest.param(drop(topic), rf"lacks {topic} \(.*/msg/.*\); export the trial again", id=f"no {topic}")
     for topic, said in {
@@ -401,7 +428,7 @@ def damages() -> Iterator[Any]:
     yield pytest.param(edit_table(frames=10**30), "has 40 frames, .* promises 1000000000000000000000", id="many frames")
     yield pytest.param(
         replace_bytes(LABELS, b"full slip", b"fool slip"),
-        r"label 3 of /tactile/labels in .* has the contact state 'fool slip', none of no contact, contact",
+        r"full of .* has the contact state 'fool slip', none of no contact, contact",
         id="state",
     )
     yield pytest.param(
@@ -468,17 +495,18 @@ def test_memory_does_not_grow_with_the_length_of_the_trial(tmp_path, rng):
     image = rng.integers(0, 256, (*size, 3), dtype=np.uint8)
     unknown = np.full(count, np.nan)
     capture = Capture(
-        name="long",
+        trial="long",
         source="long",
         frame_time_s=np.arange(count) / 30,
         frame_size=size,
         read_frames=lambda: iter([image] * count),
         forces=None,
-        labels=GivenLabels(
-            **dict.fromkeys(GIVEN_SIGNALS, unknown), contact_state=(ContactState.UNKNOWN,) * count, labelling=LABELLING
+        labels=Labels(
+            **dict.fromkeys(LABEL_SIGNALS, unknown), contact_state=(ContactState.UNKNOWN,) * count, labelling=LABELLING
         ),
         reference=image,
-        told=Told(sensor="s", day=1, condition="dry", split="train"),
+        sensor="s",
+        split="train",
     )
     data = store([capture], tmp_path / "data")
     folder = tmp_path / "out"

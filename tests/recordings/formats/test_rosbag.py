@@ -154,7 +154,7 @@ def test_a_bag_comes_back_without_loss(tmp_path, pixels, forces, recorded, kind)
     np.testing.assert_array_equal(list(capture.read_frames()), pixels)
     assert capture.forces is not None
     np.testing.assert_array_equal(capture.forces.force_n, forces)
-    assert (capture.name, capture.frame_size, capture.notes) == ("trial", (HEIGHT, WIDTH), ())
+    assert (capture.trial, capture.frame_size, capture.notes) == ("trial", (HEIGHT, WIDTH), ())
 
 
 def test_frames_and_forces_count_from_the_first_of_them_without_rounding(tmp_path, recorded):
@@ -173,7 +173,7 @@ def test_a_file_of_a_bag_is_read_like_its_folder(tmp_path, pixels, frames_of, su
     (folder / "metadata.yaml").unlink()
     capture = read_rosbag(file)
     np.testing.assert_array_equal(list(capture.read_frames()), pixels)
-    assert capture.name == "trial-7"
+    assert capture.trial == "trial-7"
 
 
 @pytest.mark.parametrize("storage", ["MCAP", "SQLITE3"])

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from sliplens.errors import RecordingError
 from sliplens.images import write_png
 from sliplens.recordings.formats.gelsight import list_gelsight_clips, read_gelsight_clip
-from sliplens.recordings.formats.stored import least_contact, small_copies, stale_frames
-from sliplens.recordings.formats.video import read_video
+from sliplens.recordings.formats.video import least_contact, read_video, small_copies, stale_frames
 
 MILLISECOND = Fraction(1, 1000)
 SIZE = 64, 96
@@ -87,7 +86,7 @@ def test_lossless_frames_come_back_as_they_were(tmp_path: Path, rng: np.random.G
     capture = read_video(write_video(tmp_path / "trial 1.mkv", frames))
     np.testing.assert_array_equal(list(capture.read_frames()), frames)
     np.testing.assert_array_equal(list(capture.read_frames()), frames)
-    assert (capture.name, capture.frame_size, capture.forces, capture.notes) == ("trial-1", SIZE, None, ())
+    assert (capture.trial, capture.frame_size, capture.forces, capture.notes) == ("trial-1", SIZE, None, ())
 
 
 @pytest.mark.parametrize(("name", "codec", "reordered"), LOSSY)
@@ -361,7 +360,7 @@ def test_every_gelsight_clip_has_the_frames_its_table_lists(gelsight_folder: Pat
 def test_a_gelsight_clip_comes_without_its_pitfalls(gelsight_folder: Path, clip: str, slipped: bool, stale: int):
     read = read_gelsight_clip(gelsight_folder / clip)
     assert (read.slipped, read.stale_frames) == (slipped, stale)
-    assert f"{read.grasp}-camera_0" == read.capture.name
+    assert f"{read.grasp}-camera_0" == read.capture.trial
     assert clip.split("/")[1].startswith(read.grasped)
     copies = small_copies(read.capture.read_frames())
     assert len(copies) == len(read.capture.frame_time_s)

@@ -56,9 +56,9 @@ class Trial:
         axes = ForceAxes(
             normal="x",
             sign=1,
-            tare_n=np.zeros(3),
-            noise_n=np.full(3, noise_n),
-            tare_sigma_n=np.zeros(3),
+            tare_n=(0.0, 0.0, 0.0),
+            noise_n=(noise_n, noise_n, noise_n),
+            tare_sigma_n=(0.0, 0.0, 0.0),
             still_until_s=TOUCH_S,
             normal_found=Found.DECLARED,
             sign_found=Found.DECLARED,

@@ -44,7 +44,7 @@ def test_friction_has_no_unit(trial: Trial):
     contact = trial.contact(noise_n=0.02, rng=np.random.default_rng(3))
     doubled = apply_axes(
         replace(contact.recorded, force_n=2 * contact.recorded.force_n),
-        replace(contact.axes, noise_n=2 * contact.axes.noise_n),
+        replace(contact.axes, noise_n=tuple(2 * noise for noise in contact.axes.noise_n)),
     )
     one, two = (
         estimate_friction(each, contact_threshold_n=THRESHOLD_N, rng=np.random.default_rng(4))
@@ -55,7 +55,7 @@ def test_friction_has_no_unit(trial: Trial):
 
 def test_an_uncertain_tare_widens_the_interval(trial: Trial):
     contact = trial.contact(noise_n=0.02, rng=np.random.default_rng(3))
-    axes = replace(contact.axes, tare_sigma_n=np.full(3, 0.03))
+    axes = replace(contact.axes, tare_sigma_n=(0.03, 0.03, 0.03))
     sure, unsure = (
         estimate_friction(each, contact_threshold_n=THRESHOLD_N, rng=np.random.default_rng(4))
         for each in (contact, apply_axes(contact.recorded, axes))
@@ -81,6 +81,7 @@ def test_a_knock_that_the_image_does_not_see_is_no_slip(trial: Trial, rng: np.ra
     friction = estimate_friction(forces, contact_threshold_n=THRESHOLD_N, rng=rng, image=seen)
     assert friction.onset_s == pytest.approx(SLIP_S, abs=0.01)
     assert friction.method == "break of F_t / F_n, seen in the image"
+    assert friction.image_sigmas is not None
     assert friction.image_sigmas > 5
 
 

@@ -5,7 +5,15 @@ import pytest
 
 from sliplens.errors import RecordingError
 from sliplens.recordings import ContactState
-from sliplens.recordings.labels import Labels, Lag, Reason, apply_axes, estimate_friction, given_friction, label_frames
+from sliplens.recordings.labels import (
+    FoundLabels,
+    Lag,
+    Reason,
+    apply_axes,
+    estimate_friction,
+    given_friction,
+    label_frames,
+)
 
 from .conftest import NORMAL_N, PULL_S, SLIP_S, STATIC, TOUCH_S, Trial, ratio
 
@@ -13,7 +21,7 @@ FRICTION = given_friction(STATIC, onset_s=SLIP_S)
 LAG = Lag(lag_s=0.04, sigma_s=0.003, correlation=0.9)
 
 
-def reasons(labels: Labels) -> set[Reason]:
+def reasons(labels: FoundLabels) -> set[Reason]:
     return set(labels.reason)
 
 
@@ -29,7 +37,7 @@ def test_the_margin_is_one_less_the_used_friction(trial: Trial):
 def test_frames_keep_their_own_times(trial: Trial, rng: np.random.Generator):
     time = np.sort(rng.uniform(0.1, 5.4, 80))
     labels = label_frames(time, trial.contact(), friction=FRICTION, window_s=0.0)
-    np.testing.assert_array_equal(labels.time_s, time)
+    np.testing.assert_array_equal(labels.force_time_s, time)
     np.testing.assert_allclose(labels.normal_force_n, np.interp(time, trial.time_s, trial.contact_n[:, 0]))
 
 
@@ -101,7 +109,7 @@ def test_forces_outside_the_range_have_no_label(trial: Trial):
 def test_range_is_that_of_the_sensor_not_of_the_contact(trial: Trial):
     contact = trial.contact()
     offset = replace(contact.recorded, force_n=contact.recorded.force_n + np.array([5.0, 0, 0]))
-    turned = apply_axes(offset, replace(contact.axes, tare_n=np.array([5.0, 0, 0])))
+    turned = apply_axes(offset, replace(contact.axes, tare_n=(5.0, 0.0, 0.0)))
     labels = label_frames(trial.frame_time_s, turned, friction=FRICTION, force_range_n=6.0)
     assert Reason.OUT_OF_RANGE in reasons(labels)
 
@@ -113,7 +121,7 @@ def test_a_lag_is_applied_only_when_asked(trial: Trial):
     np.testing.assert_array_equal(known.safety_margin, plain.safety_margin)
     np.testing.assert_allclose(applied.safety_margin, plain.safety_margin, atol=1e-9)
     np.testing.assert_allclose(applied.force_time_s, trial.frame_time_s, atol=1e-12)
-    assert (known.lag_applied, applied.lag_applied) == (False, True)
+    assert (known.basis.lag_applied, applied.basis.lag_applied) == (False, True)
 
 
 def test_an_unapplied_lag_is_an_error_of_its_size(trial: Trial):
@@ -175,15 +183,15 @@ def test_the_band_of_the_margin_covers(trial: Trial):
 def test_without_an_onset_slip_begins_outside_the_friction_cone(trial: Trial):
     labels = label_frames(trial.frame_time_s, trial.contact(), friction=given_friction(0.4))
     # the ratio reaches 0.4 after two thirds of the pull; the next frame is outside
-    assert labels.slip_s == pytest.approx(PULL_S + 2 / 3 * (SLIP_S - PULL_S), abs=0.04)
-    assert not labels.valid[trial.frame_time_s > labels.slip_s].any()
+    assert labels.basis.slip_s == pytest.approx(PULL_S + 2 / 3 * (SLIP_S - PULL_S), abs=0.04)
+    assert not labels.valid[trial.frame_time_s > labels.basis.slip_s].any()
 
 
 def test_a_contact_that_holds_is_valid_to_the_end(trial_without_slip: Trial):
     labels = label_frames(
         trial_without_slip.frame_time_s, trial_without_slip.contact(), friction=given_friction(STATIC)
     )
-    assert labels.slip_s is None
+    assert labels.basis.slip_s is None
     assert labels.valid[trial_without_slip.frame_time_s > TOUCH_S + 0.1].all()
     # pulled to five sixths
     assert labels.safety_margin[-1] == pytest.approx(1 / 6, abs=1e-3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.labels import LabelSettings, Lag, given_friction, label_trial
+from sliplens.recordings.labels import Found, LabelSettings, Lag, given_friction, label_trial
 
 from .conftest import SLIP_S, STATIC, Trial, ratio
 
@@ -17,32 +17,39 @@ def test_labels_come_back_through_noise_tare_lag_and_a_wrong_sign(trial: Trial, 
     forces = trial.forces(noise_n=0.02, rng=rng, tare_n=TARE, order=(2, 0, 1), sign=-1)
     motion = trial.motion + rng.normal(0, 0.01, len(trial.motion))
     labels = label_trial(trial.frame_time_s + 0.04, motion, forces, settings=LabelSettings(apply_lag=True), rng=rng)
-    assert (labels.axes.normal, labels.axes.sign) == ("y", -1)
+    assert (labels.basis.axes.normal, labels.basis.axes.sign) == ("y", -1)
     truth = 1 - ratio(trial.frame_time_s) / STATIC
     error = (labels.safety_margin - truth)[labels.valid]
     # 0.02 N over 17 samples, on the 0.9 N that friction holds, is 0.005; the light touch at the start has more
     assert np.sqrt(np.mean(error**2)) < 0.02
-    assert labels.friction.mu == pytest.approx(STATIC, rel=0.02)
-    assert labels.slip_s == pytest.approx(SLIP_S, abs=0.01)
+    assert labels.basis.friction.mu == pytest.approx(STATIC, rel=0.02)
+    assert labels.basis.slip_s == pytest.approx(SLIP_S, abs=0.01)
 
 
 def test_the_lag_is_reported_and_not_applied_unless_asked(trial: Trial, rng: np.random.Generator):
     time = trial.frame_time_s + 0.04
     labels = label_trial(time, trial.motion, trial.forces(), settings=LabelSettings(), rng=rng)
-    assert labels.lag is not None
-    assert labels.lag.lag_s == pytest.approx(0.04, abs=0.005)
+    assert labels.basis.lag is not None
+    assert labels.basis.lag.lag_s == pytest.approx(0.04, abs=0.005)
     np.testing.assert_array_equal(labels.force_time_s, time)
 
 
 def test_what_is_declared_is_used(trial_without_slip: Trial, rng: np.random.Generator):
-    lag = Lag(lag_s=0.01, sigma_s=0.001, correlation=1.0)
     settings = LabelSettings(
-        normal="x", sign=1, tare_n=(0.0, 0.0, 0.0), friction=given_friction(STATIC), lag=lag, contact_threshold_n=0.3
+        normal_axis="x", normal_sign=1, tare=(0.0, 0.0, 0.0), mu=STATIC, lag_ms=10.0, contact_threshold=0.3
     )
     trial = trial_without_slip
     labels = label_trial(trial.frame_time_s, trial.motion, trial.forces(), settings=settings, rng=rng)
-    assert (labels.lag, labels.friction, labels.contact_threshold_n) == (lag, settings.friction, 0.3)
+    basis = labels.basis
+    assert (basis.axes.tare_found, basis.lag, basis.lag_applied) == (Found.DECLARED, Lag(lag_s=0.01, sigma_s=0.0), True)
+    assert (basis.friction, basis.contact_threshold_n) == (given_friction(STATIC), 0.3)
     assert labels.normal_force_n[labels.valid].min() >= 0.3
+
+
+def test_a_lag_that_was_measured_otherwise_is_used(trial: Trial, rng: np.random.Generator):
+    lag = Lag(lag_s=0.01, sigma_s=0.001, correlation=1.0)
+    labels = label_trial(trial.frame_time_s, trial.motion, trial.forces(), settings=LabelSettings(), rng=rng, lag=lag)
+    assert (labels.basis.lag, labels.basis.lag_applied) == (lag, False)
 
 
 def test_a_trial_that_never_slips_needs_its_friction_by_hand(trial_without_slip: Trial, rng: np.random.Generator):

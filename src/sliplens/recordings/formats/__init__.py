@@ -1,11 +1,11 @@
-"""Readers: one row a format. An installed package adds one through the entry point group `sliplens.readers`."""
+"""Readers of recordings: one row a format. An installed package adds one through `sliplens.formats`."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
-from importlib.metadata import entry_points
+from dataclasses import dataclass
 from pathlib import Path
 
 from sliplens.errors import InputError
+from sliplens.extras import Table
 from sliplens.images.files import IMAGE_SUFFIXES
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import DATASET_FILE
@@ -16,43 +16,7 @@ from sliplens.recordings.formats.rosbag import read_rosbag
 from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.formats.thesis import is_thesis_list, read_thesis
 from sliplens.recordings.formats.video import read_video
-
-_BAG_SUFFIXES = frozenset({".mcap", ".db3"})
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReadOptions:
-    """What a user may say of a source; None where nothing is said. Which reader takes what, `Reader.takes` tells."""
-
-    forces: Path | None = None
-    """Table of forces beside the frames."""
-    frame_rate: float | None = None
-    """Frames a second, where the stamps are missing or wrong."""
-    times: Path | None = None
-    """Table of when each image of a folder was taken."""
-    name_unit: str | None = None
-    """Unit of the last number in the names of images, which is then their time."""
-    skip_frames: int | None = None
-    """Frames at the start of a video to leave out."""
-    skip_stale: bool | None = None
-    """Leave out what a video begins with that belongs to another scene."""
-    start_s: float | None = None
-    """When the first frame was taken, on the clock of the forces."""
-    time_column: str | None = None
-    force_columns: tuple[str, ...] | None = None
-    time_unit: str | None = None
-    force_unit: str | None = None
-    image_topic: str | None = None
-    wrench_topic: str | None = None
-    camera_key: str | None = None
-    force_key: str | None = None
-    image_root: Path | None = None
-    """Folder under which listed images lie now."""
-    margin_unit: str | None = None
-
-    def given(self) -> dict[str, object]:
-        """What was said."""
-        return {field.name: value for field in fields(self) if (value := getattr(self, field.name)) is not None}
+from sliplens.recordings.options import ReadOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,14 +28,14 @@ class Reader:
     recognises: Callable[[Path], bool]
     """Told by names alone, without reading."""
     takes: tuple[str, ...]
-    """Options it understands."""
+    """Fields of `ReadOptions` that it understands."""
     read: Callable[..., Capture | list[Capture]]
     """Called with the path and the options that were given."""
 
 
-_TABLE = ("forces", "frame_rate", "start_s", "time_column", "force_columns", "time_unit", "force_unit")
+_FORCE_TABLE = ("forces", "frame_rate", "start_s", "time_column", "force_columns", "time_unit", "force_unit")
 
-READERS = {
+_ROWS = {
     "sliplens": Reader(
         words="data set of sliplens, simulated or imported, with its labels",
         recognises=lambda path: (path / DATASET_FILE).is_file(),
@@ -80,7 +44,7 @@ READERS = {
     ),
     "rosbag": Reader(
         words="ROS 2 bag (MCAP or sqlite3)",
-        recognises=lambda path: path.suffix in _BAG_SUFFIXES or (path / "metadata.yaml").is_file(),
+        recognises=lambda path: path.suffix in {".mcap", ".db3"} or (path / "metadata.yaml").is_file(),
         takes=("image_topic", "wrench_topic"),
         read=read_rosbag,
     ),
@@ -105,23 +69,24 @@ READERS = {
     "images": Reader(
         words="folder of images, with a table of forces",
         recognises=lambda path: path.is_dir() and any(file.suffix.lower() in IMAGE_SUFFIXES for file in path.iterdir()),
-        takes=(*_TABLE, "times", "name_unit"),
+        takes=(*_FORCE_TABLE, "times", "name_unit"),
         read=read_image_folder,
     ),
     "video": Reader(
         words="video, with a table of forces",
         recognises=lambda path: path.is_file(),
-        takes=(*_TABLE, "skip_frames", "skip_stale"),
+        takes=(*_FORCE_TABLE, "skip_frames", "skip_stale"),
         read=read_video,
     ),
 }
-"""Readers by format, tried in this order where none is named."""
+FORMATS = Table("format", "sliplens.formats", _ROWS)
+"""Readers by format."""
 
 
-def all_readers() -> dict[str, Reader]:
-    """Readers of sliplens and of installed packages, the latter tried first; none replaces one of ours."""
-    found = {point.name: point.load() for point in entry_points(group="sliplens.readers") if point.name not in READERS}
-    return {**found, **READERS}
+def recognise(path: Path) -> str | None:
+    """Format of a source, told by names: those of installed packages are tried first, then ours in their order."""
+    added = [name for name in FORMATS if name not in _ROWS]
+    return next((name for name in (*added, *_ROWS) if FORMATS[name].recognises(path)), None)
 
 
 def open_captures(path: Path, *, format: str | None = None, options: ReadOptions) -> tuple[Capture, ...]:
@@ -132,7 +97,7 @@ def open_captures(path: Path, *, format: str | None = None, options: ReadOptions
     path
         File or folder.
     format
-        Row of `all_readers`; recognised by names if None.
+        Row of `FORMATS`; recognised by names if None.
     options
         What is known of the source.
 
@@ -143,20 +108,23 @@ def open_captures(path: Path, *, format: str | None = None, options: ReadOptions
     RecordingError
         If it cannot be read.
     """
-    readers = all_readers()
-    if format is not None and format not in readers:
-        raise InputError(f"format {format!r} is not known; choose {', '.join(readers)}")
+    if format is not None:
+        FORMATS.pick(format)  # a wrong name is told before a wrong path
     if not path.exists():
         raise InputError(f"{path} does not exist; check the path")
-    name = format or next((name for name, reader in readers.items() if reader.recognises(path)), None)
+    name = format or recognise(path)
     if name is None:
-        known = "; ".join(f"{name}: {reader.words}" for name, reader in readers.items())
+        known = "; ".join(f"{name}: {FORMATS[name].words}" for name in FORMATS)
         raise InputError(f"{path} is none of the formats that are known ({known}); name one with --format")
+    reader = FORMATS[name]
     given = options.given()
-    strange = [option for option in given if option not in readers[name].takes]
+    strange = [option for option in given if option not in reader.takes]
     if strange:
         raise InputError(
             f"{path} is read as {name}, which does not take {', '.join(strange)}; leave it out or name another format"
         )
-    captures = readers[name].read(path, **given)
+    captures = reader.read(path, **given)
     return (captures,) if isinstance(captures, Capture) else tuple(captures)
+
+
+__all__ = ["FORMATS", "Reader", "open_captures", "recognise"]

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.capture import Capture, Told, labels_of_margins
-from sliplens.recordings.formats.stored import count_stale, least_contact, small_copies
-from sliplens.recordings.formats.video import read_video
+from sliplens.recordings.capture import Capture
+from sliplens.recordings.formats.video import count_stale, least_contact, read_video, small_copies
+from sliplens.recordings.labelling import Clip
+from sliplens.recordings.trial import labels_of_margins
 
 LABELS_FILE = "labels.csv"
 FRAME_RATE_HZ = 8.0
@@ -123,13 +124,13 @@ def is_gelsight(path: Path) -> bool:
 
 
 def _labelled(clip: GelSightClip) -> Capture:
-    capture = clip.capture
-    known = {"slips": clip.slipped, "grasp": clip.grasp, "stale_frames": clip.stale_frames}
     return replace(
-        capture,
-        labels=labels_of_margins(np.full(len(capture.frame_time_s), np.nan), clip=known),
+        clip.capture,
+        labels=labels_of_margins(np.full(len(clip.capture), np.nan)),
         reference_index=clip.reference_index,
-        told=Told(sensor="gelsight-mini", object=clip.grasped),
+        clip=Clip(slips=clip.slipped, grasp=clip.grasp, stale_frames=clip.stale_frames),
+        sensor="gelsight-mini",
+        object=clip.grasped,
     )
 
 

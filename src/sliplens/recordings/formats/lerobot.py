@@ -21,11 +21,11 @@ from jaxtyping import Bool, Float, Int64, UInt8
 from PIL import Image
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.capture import Capture, Forces, GivenLabels, load_forces
-from sliplens.recordings.formats.mcap import TrialText
+from sliplens.recordings.capture import Capture, Forces
+from sliplens.recordings.formats.stored import ExportedTrial
 from sliplens.recordings.formats.tables import trial_name
-from sliplens.recordings.store import DAMAGED_PARQUET, one_line
-from sliplens.recordings.trial import ContactState, require_unit_interval
+from sliplens.recordings.store import DAMAGED_PARQUET, load_forces, one_line
+from sliplens.recordings.trial import Labels
 
 _VERSION = re.compile(r"v3\.\d+")
 _FIELD = re.compile(r"\{(video_key|chunk_index|file_index)(?::0?([1-9])d)?\}")
@@ -475,7 +475,6 @@ NUMBERS = {
 """Features of one number, by the labels they hold."""
 VALID, STATE, REASON = "observation.valid", "observation.contact_state", "observation.invalid_reason"
 _COLUMNS = [TIME, FORCE, *NUMBERS.values(), VALID, STATE, REASON]
-_STATES = {str(state): state for state in ContactState}
 
 
 def trials_path(folder: Path) -> Path:
@@ -493,7 +492,7 @@ def samples_path(folder: Path, episode: int) -> Path:
     return folder / "meta" / "sliplens" / f"forces-{episode:06d}.parquet"
 
 
-def read_kept(layout: Layout) -> tuple[TrialText, ...] | None:
+def read_kept(layout: Layout) -> tuple[ExportedTrial, ...] | None:
     """Read what is kept of the trials, one an episode; None where nothing is.
 
     Raises
@@ -508,7 +507,7 @@ def read_kept(layout: Layout) -> tuple[TrialText, ...] | None:
         return None
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path} cannot be read ({error}); copy the data set again") from None
-    trials = tuple(TrialText.parse(line, where=f"line {number + 1} of {path}") for number, line in enumerate(lines))
+    trials = tuple(ExportedTrial.parse(line, where=f"line {number + 1} of {path}") for number, line in enumerate(lines))
     if len({trial.trial for trial in trials}) < len(trials):
         raise RecordingError(f"{path} names a trial twice; copy the data set again")
     missing = [key for key in (CAMERA, *_COLUMNS) if key not in layout.features]
@@ -520,7 +519,7 @@ def read_kept(layout: Layout) -> tuple[TrialText, ...] | None:
     return trials
 
 
-def kept_captures(layout: Layout, trials: tuple[TrialText, ...], *, episode: int | None) -> list[Capture]:
+def kept_captures(layout: Layout, trials: tuple[ExportedTrial, ...], *, episode: int | None) -> list[Capture]:
     """Trials of a data set as they were exported.
 
     Parameters
@@ -550,7 +549,7 @@ def kept_captures(layout: Layout, trials: tuple[TrialText, ...], *, episode: int
     return [_capture(layout, rows, one, trials[one.index]) for one in wanted]
 
 
-def _capture(layout: Layout, rows: EpisodeRows, episode: Episode, trial: TrialText) -> Capture:
+def _capture(layout: Layout, rows: EpisodeRows, episode: Episode, trial: ExportedTrial) -> Capture:
     table = rows.of(episode)
     size, read_frames = image_frames(episode, CAMERA)
     source = f"{trial.trial}, episode {episode.index} of {layout.folder}"
@@ -563,7 +562,7 @@ def _capture(layout: Layout, rows: EpisodeRows, episode: Episode, trial: TrialTe
     except OSError as error:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); copy the data set again") from None
     return Capture(
-        name=trial.trial,
+        **vars(trial.facts),
         source=source,
         frame_time_s=time,
         frame_size=size,
@@ -571,40 +570,26 @@ def _capture(layout: Layout, rows: EpisodeRows, episode: Episode, trial: TrialTe
         forces=_forces(samples_path(layout.folder, episode.index), trial) if trial.force_samples else None,
         labels=_labels(rows, table, episode, trial, source),
         reference=decode_image(png, where=f"{path}"),
-        told=trial.told,
+        split=trial.split,
+        simulated=trial.simulated,
     )
 
 
-def _labels(rows: EpisodeRows, table: pa.Table, episode: Episode, trial: TrialText, source: str) -> GivenLabels:
+def _labels(rows: EpisodeRows, table: pa.Table, episode: Episode, trial: ExportedTrial, source: str) -> Labels:
     force = rows.vectors(table, FORCE, episode)
     if force.shape[1] != len(FORCE_AXES):
         raise RecordingError(f"{FORCE} of {source} has {force.shape[1]} numbers, not 3; copy the data set again")
     numbers = {name: rows.numbers(table, key, episode) for name, key in NUMBERS.items()}
-    for name in ("safety_margin", "stick_ratio"):
-        require_unit_interval(numbers[name], name=name, trial=source)
-    states = rows.words(table, STATE, episode)
-    unknown = set(states) - set(_STATES)
-    if unknown:
-        raise RecordingError(
-            f"{source} has the contact state {min(unknown)[:40]!r}, none of {', '.join(_STATES)}; "
-            "copy the data set again"
-        )
-    optional = {
-        "safety_margin_sigma": numbers.pop("safety_margin_sigma"),
-        "valid": rows.truths(table, VALID, episode),
-        "reason": rows.words(table, REASON, episode),
-    }
-    return GivenLabels(
-        **numbers,
-        tangential_force_n=force[:, 0].copy(),
-        normal_force_n=force[:, 2].copy(),
-        contact_state=tuple(_STATES[state] for state in states),
-        **{name: values for name, values in optional.items() if name in trial.optional},
-        labelling=trial.labelling,
+    return trial.labels(
+        {**numbers, "tangential_force_n": force[:, 0].copy(), "normal_force_n": force[:, 2].copy()},
+        states=rows.words(table, STATE, episode),
+        valid=rows.truths(table, VALID, episode),
+        reasons=rows.words(table, REASON, episode),
+        source=source,
     )
 
 
-def _forces(path: Path, trial: TrialText) -> Forces:
+def _forces(path: Path, trial: ExportedTrial) -> Forces:
     forces = load_forces(path)
     if len(forces.time_s) != trial.force_samples:
         raise RecordingError(
@@ -680,7 +665,7 @@ class _Reader:
             forces = Forces(time_s=time, force_n=force, source=f"{self.force} of {source}")
         size, read_frames, notes = self._frames(episode, time)
         return Capture(
-            name=trial_name(f"{self.layout.folder.resolve().name}-{episode.index:06d}"),
+            trial=trial_name(f"{self.layout.folder.resolve().name}-{episode.index:06d}"),
             source=f"{self.camera} of {source}",
             frame_time_s=time,
             frame_size=size,

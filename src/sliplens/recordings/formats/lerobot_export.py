@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
@@ -17,7 +17,8 @@ from jaxtyping import Int64, Shaped, UInt8
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import require_folder, write_json
 from sliplens.images.files import encode_png, write_png
-from sliplens.recordings.capture import Capture, GivenLabels, save_forces
+from sliplens.progress import OnProgress
+from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import Dataset, TrialInfo
 from sliplens.recordings.formats.lerobot import (
     CAMERA,
@@ -32,10 +33,10 @@ from sliplens.recordings.formats.lerobot import (
     samples_path,
     trials_path,
 )
-from sliplens.recordings.formats.mcap import OPTIONAL, TrialText
-from sliplens.recordings.formats.stored import read_stored_trial
-from sliplens.recordings.formats.tables import trial_name
-from sliplens.recordings.trial import ContactState
+from sliplens.recordings.formats.stored import STATES, ExportedTrial, read_stored_trial
+from sliplens.recordings.formats.tables import require_trial_name
+from sliplens.recordings.store import save_forces
+from sliplens.recordings.trial import Labels
 
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
@@ -255,7 +256,7 @@ def _data_schema(features: Features) -> pa.Schema:
     return pa.schema(fields, {"huggingface": json.dumps({"info": {"features": told}})})
 
 
-_STATES = [str(state) for state in ContactState]
+_STATES = list(STATES)
 
 
 def frame_features(height: int, width: int) -> Features:
@@ -300,13 +301,13 @@ def frame_columns(capture: Capture, *, fps: int | float, reasons: dict[str, int]
     }
 
 
-def _given(labels: GivenLabels, name: str) -> Any:
+def _given(labels: Labels, name: str) -> Any:
     """Labels of a name; those that a trial lacks follow from what it has, or are not known."""
     values = getattr(labels, name)
     if values is not None:
         return values
     known = np.isfinite(labels.safety_margin)
-    return {"safety_margin_sigma": np.full(len(labels), np.nan), "valid": known, "reason": [""] * len(labels)}[name]
+    return {"safety_margin_sigma": np.full(len(known), np.nan), "valid": known, "reason": [""] * len(known)}[name]
 
 
 def frame_places(frames: int, *, first: int, episode: int, task: int) -> dict[str, np.ndarray]:
@@ -341,7 +342,7 @@ def write_lerobot(
     folder: Path,
     *,
     trials: Sequence[TrialInfo] | None = None,
-    on_frames: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> None:
     """Write trials as a LeRobot v3.0 data set, one episode a trial, without loss: `read_lerobot` gives them back.
 
@@ -363,7 +364,7 @@ def write_lerobot(
         Folder to write to; `data` and `meta` of an earlier attempt that came to no end are replaced.
     trials
         Rows of its table; all by default.
-    on_frames
+    on_progress
         Called with the frames written and the frames in all.
 
     Raises
@@ -397,8 +398,8 @@ def write_lerobot(
             chunk, file = files.begin(count)
             shown = PixelCount()
             for done in _write_frames(files, capture, columns, shown):
-                if on_frames is not None:
-                    on_frames(first + done, total)
+                if on_progress is not None:
+                    on_progress(first + done, total)
             stats = {
                 CAMERA: shown.stats(),
                 **{name: number_stats(values.reshape(count, -1)) for name, values in columns.items()},
@@ -447,8 +448,7 @@ def _require_one_kind(trials: Sequence[TrialInfo]) -> tuple[int, int]:
         raise RecordingError("there is no trial to export; name at least one")
     first = trials[0]
     for info in trials:
-        if trial_name(info.trial) != info.trial:
-            raise RecordingError(f"trial {info.trial!r} has no name for a file; rename it")
+        require_trial_name(info.trial)
         if (info.height, info.width) != (first.height, first.width):
             raise RecordingError(
                 f"trial {info.trial} has frames of {info.height} x {info.width} pixels, trial {first.trial} of "
@@ -505,17 +505,8 @@ def _keep(folder: Path, episode: int, capture: Capture) -> None:
     write_png(reference_path(folder, episode), capture.reference)
     if forces is not None:
         save_forces(forces, samples_path(folder, episode))
-    text = TrialText(
-        trial=capture.name,
-        told=capture.told,
-        frames=len(labels),
-        force_samples=len(forces.time_s) if forces else 0,
-        force_source=forces.source if forces else "",
-        optional=tuple(name for name in OPTIONAL if getattr(labels, name) is not None),
-        labelling=labels.labelling,
-    )
     with trials_path(folder).open("a", encoding="utf-8", newline="\n") as lines:
-        lines.write(text.dump() + "\n")
+        lines.write(ExportedTrial.of(capture).dump() + "\n")
 
 
 def _fill_unknown(episodes: Sequence[EpisodeEntry], whole: dict[str, Stats]) -> None:

@@ -1,10 +1,8 @@
 """Trials as MCAP files of ROS 2 messages, which Foxglove, Rerun and ROS play with images, forces and labels."""
 
-import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, fields
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,17 +14,16 @@ from sliplens._version import __version__
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import require_folder
 from sliplens.images.files import encode_png
-from sliplens.recordings.capture import GIVEN_SIGNALS, Capture, Forces, GivenLabels, Told
+from sliplens.progress import OnProgress
+from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import Dataset, TrialInfo
-from sliplens.recordings.formats.stored import read_stored_trial
-from sliplens.recordings.formats.tables import trial_name
+from sliplens.recordings.formats.stored import ExportedTrial, read_stored_trial
+from sliplens.recordings.formats.tables import require_trial_name
+from sliplens.recordings.trial import LABEL_SIGNALS, Labels
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-
-FORMAT, VERSION = "sliplens trial", 1
-"""What the text of a trial calls itself."""
 
 TRIAL, REFERENCE, IMAGE = "/tactile/trial", "/tactile/reference", "/tactile/image"
 LABELS, MARGIN = "/tactile/labels", "/tactile/safety_margin"
@@ -42,11 +39,8 @@ TOPICS = {
 }
 """Types of the messages; wrenches and their times are there where forces are known."""
 
-NUMBERS = ("time_s", *GIVEN_SIGNALS, "safety_margin_sigma")
+NUMBERS = ("time_s", *LABEL_SIGNALS, "safety_margin_sigma")
 """The numbers of a frame, named as in its message."""
-OPTIONAL = ("safety_margin_sigma", "valid", "reason")
-"""What labels may lack, though the message of each frame has room for it."""
-
 _DEFINITIONS = {
     "sliplens_msgs/msg/SafetyMargin": """
 std_msgs/Header header
@@ -66,9 +60,6 @@ std_msgs/Header header
 float64[] time_s
 """,
 }
-_LONGEST = 2**24
-"""Characters of a text that is parsed; those of a trial are some thousands."""
-_TOLD = {"sensor": str, "day": int, "condition": str, "object": str, "split": str, "simulated": bool}
 
 
 def trial_types() -> "Typestore":
@@ -79,88 +70,6 @@ def trial_types() -> "Typestore":
     for kind, definition in _DEFINITIONS.items():
         types.register(get_types_from_msg(definition, kind))
     return types
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrialText:
-    """What a trial is, and how many messages of each kind belong to it."""
-
-    trial: str
-    told: Told
-    frames: int
-    force_samples: int
-    """0 where no force is known."""
-    force_source: str
-    """Topic, file or column names, for people."""
-    optional: tuple[str, ...]
-    """Those of `OPTIONAL` that the labels have."""
-    labelling: dict[str, Any] | None
-    """What the labels rest on."""
-
-    def dump(self, **more: Any) -> str:
-        """Text of `/tactile/trial`; `more` is for people and not read back."""
-        return json.dumps(
-            {"format": FORMAT, "version": VERSION, **asdict(self), **more}, allow_nan=False, ensure_ascii=False
-        )
-
-    @classmethod
-    def parse(cls, text: str, *, where: str) -> "TrialText":
-        """Read what `dump` wrote, believing nothing.
-
-        Parameters
-        ----------
-        text
-            JSON.
-        where
-            Beginning of the error message.
-
-        Raises
-        ------
-        RecordingError
-            If the text is damaged or of another version.
-        """
-        if len(text) > _LONGEST:
-            raise RecordingError(f"{where} has {len(text)} characters, no description does; export the trial again")
-        try:
-            table = json.loads(text)
-            # what JSON of another hand can hold and ours cannot: infinite numbers, halves of characters
-            json.dumps(table, allow_nan=False, ensure_ascii=False).encode()
-        except (ValueError, RecursionError) as error:
-            raise RecordingError(f"{where} is no JSON ({error}); export the trial again") from None
-        if not isinstance(table, dict) or table.get("format") != FORMAT:
-            raise RecordingError(f"{where} does not describe a {FORMAT}; export the trial again")
-        if table.get("version") != VERSION:
-            raise RecordingError(
-                f"{where} is of version {str(table.get('version'))[:20]}, this sliplens reads {VERSION}; update it"
-            )
-        wrong = [name for name, fits in _FITS.items() if name not in table or not fits(table[name])]
-        if wrong:
-            raise RecordingError(f"{where} has no proper {', '.join(wrong)}; export the trial again")
-        values = {field.name: table[field.name] for field in fields(cls)}
-        return cls(**{**values, "told": Told(**values["told"]), "optional": tuple(values["optional"])})
-
-
-def _fits_told(value: object) -> bool:
-    if not isinstance(value, dict) or set(value) != set(_TOLD):
-        return False
-    return all(type(value[name]) is kind or (value[name] is None and kind is not bool) for name, kind in _TOLD.items())
-
-
-def _fits_count(value: object) -> bool:
-    return type(value) is int and value >= 0
-
-
-_FITS = {
-    # it becomes the name of a file
-    "trial": lambda value: isinstance(value, str) and trial_name(value) == value,
-    "told": _fits_told,
-    "frames": lambda value: _fits_count(value) and value > 0,
-    "force_samples": _fits_count,
-    "force_source": lambda value: isinstance(value, str),
-    "optional": lambda value: isinstance(value, list) and all(name in OPTIONAL for name in value),
-    "labelling": lambda value: value is None or isinstance(value, dict),
-}
-"""What each entry must be."""
 
 
 _FRAME_ID = "tactile"
@@ -177,7 +86,7 @@ def write_mcap(
     folder: Path,
     *,
     trials: Sequence[TrialInfo] | None = None,
-    on_frames: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> None:
     """Write trials as `TRIAL.mcap`, without loss: `read_rosbag` gives each back as it is in the data set.
 
@@ -199,7 +108,7 @@ def write_mcap(
         An empty folder.
     trials
         Rows of its table; all by default.
-    on_frames
+    on_progress
         Called with the frames written and the frames in all.
 
     Raises
@@ -215,11 +124,12 @@ def write_mcap(
     chosen = data.trials if trials is None else tuple(trials)
     written, total = 0, sum(info.frames for info in chosen)
     for info in chosen:
-        with _Bag(folder / f"{_require_name(info.trial)}.mcap") as bag:
+        require_trial_name(info.trial)
+        with _Bag(folder / f"{info.trial}.mcap") as bag:
             for _ in _write_trial(bag, read_stored_trial(data, info)):
                 written += 1
-                if on_frames is not None:
-                    on_frames(written, total)
+                if on_progress is not None:
+                    on_progress(written, total)
 
 
 class _Bag:
@@ -287,15 +197,7 @@ def _write_trial(bag: _Bag, capture: Capture) -> Iterator[None]:
     frame_ns = _stamps_ns(capture.frame_time_s, offset_s)
     force_ns = _stamps_ns(forces.time_s, offset_s) if forces else np.zeros(0, dtype=np.int64)
     start_ns = min(series[0].item() for series in (frame_ns, force_ns) if len(series))
-    about = TrialText(
-        trial=capture.name,
-        told=capture.told,
-        frames=len(frame_ns),
-        force_samples=len(force_ns),
-        force_source=forces.source if forces else "",
-        optional=tuple(name for name in OPTIONAL if getattr(labels, name) is not None),
-        labelling=labels.labelling,
-    )
+    about = ExportedTrial.of(capture)
     bag.write(TRIAL, start_ns, data=about.dump(stamp_offset_s=offset_s, sliplens_version=__version__))
     bag.write(REFERENCE, start_ns, **_image(bag, encode_png(capture.reference), start_ns))
     sampled = 0
@@ -332,11 +234,11 @@ def _image(bag: _Bag, png: bytes, stamp_ns: int) -> dict[str, Any]:
     return {"header": bag.header(stamp_ns), "format": "png", "data": np.frombuffer(png, dtype=np.uint8)}
 
 
-def _label(labels: GivenLabels, index: int) -> dict[str, Any]:
+def _label(labels: Labels, index: int) -> dict[str, Any]:
     """Fields of a label; what the trial does not have follows from what it has, or is not known."""
     sigma, valid, reason = labels.safety_margin_sigma, labels.valid, labels.reason
     return {
-        **{name: getattr(labels, name)[index].item() for name in GIVEN_SIGNALS},
+        **{name: getattr(labels, name)[index].item() for name in LABEL_SIGNALS},
         "safety_margin_sigma": math.nan if sigma is None else sigma[index].item(),
         "valid": math.isfinite(labels.safety_margin[index]) if valid is None else bool(valid[index]),
         "contact_state": str(labels.contact_state[index]),
@@ -358,7 +260,7 @@ def _stamp_offset_s(capture: Capture) -> int:
     offset_s = 0 if first >= 1 else 1 - math.floor(first)
     if first < -_LAST_S or last + offset_s >= _LAST_S:
         raise RecordingError(
-            f"trial {capture.name} goes from {first:.6g} s to {last:.6g} s, and stamps of ROS end at {_LAST_S} s; "
+            f"trial {capture.trial} goes from {first:.6g} s to {last:.6g} s, and stamps of ROS end at {_LAST_S} s; "
             "import it with times in seconds"
         )
     return offset_s
@@ -368,11 +270,3 @@ def _stamps_ns(time_s: Float[np.ndarray, " samples"], offset_s: int) -> Int64[np
     """Nearest nanoseconds; whole seconds apart, for of a time since 1970 the product would be rounded to 256 ns."""
     whole = np.floor(time_s)
     return (whole.astype(np.int64) + offset_s) * 10**9 + np.rint((time_s - whole) * 1e9).astype(np.int64)
-
-
-def _require_name(trial: str) -> str:
-    if trial_name(trial) != trial:
-        raise RecordingError(
-            f"trial {trial[:40]!r} cannot name a file; name it with letters, digits, dots, dashes and underscores"
-        )
-    return trial

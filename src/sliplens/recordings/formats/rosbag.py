@@ -19,9 +19,8 @@ from jaxtyping import Float, Int64, UInt8
 from PIL import Image
 
 from sliplens.errors import InputError, RecordingError, SliplensError
-from sliplens.recordings.capture import GIVEN_SIGNALS, Capture, Forces, GivenLabels
+from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.formats.mcap import (
-    FORMAT,
     IMAGE,
     LABELS,
     NUMBERS,
@@ -30,11 +29,11 @@ from sliplens.recordings.formats.mcap import (
     TRIAL,
     WRENCH,
     WRENCH_TIMES,
-    TrialText,
     trial_types,
 )
+from sliplens.recordings.formats.stored import FORMAT, ExportedTrial
 from sliplens.recordings.formats.tables import trial_name
-from sliplens.recordings.trial import ContactState, require_unit_interval
+from sliplens.recordings.trial import LABEL_SIGNALS
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
@@ -363,9 +362,6 @@ def _require_whole_pages(file: Path) -> None:
         raise RecordingError(f"{file} is cut off; copy it again")
 
 
-_STATES = {str(state): state for state in ContactState}
-
-
 def read_trial_bag(path: Path, topics: dict[str, str]) -> Capture | None:
     """Read a bag that `write_mcap` wrote; None where it is another one.
 
@@ -389,7 +385,7 @@ def read_trial_bag(path: Path, topics: dict[str, str]) -> Capture | None:
     # either is enough: the other may be what is damaged
     if FORMAT not in text and topics.get(LABELS) != TOPICS[LABELS]:
         return None
-    about = TrialText.parse(text, where=f"{TRIAL} of {path}")
+    about = ExportedTrial.parse(text, where=f"{TRIAL} of {path}")
     needed = {REFERENCE, IMAGE, LABELS} | ({WRENCH, WRENCH_TIMES} if about.force_samples else set())
     missing = [topic for topic in sorted(needed) if topics.get(topic) != TOPICS[topic]]
     if missing:
@@ -399,12 +395,10 @@ def read_trial_bag(path: Path, topics: dict[str, str]) -> Capture | None:
     found = _scan_labels(path, needed)
     _require_whole(found, about, path)
     assert found.size is not None
-    labels = _labels(found, about)
-    for name in ("safety_margin", "stick_ratio"):
-        require_unit_interval(getattr(labels, name), name=name, trial=f"{about.trial} of {path}")
+    source = f"{about.trial} of {path}"
     return Capture(
-        name=about.trial,
-        source=f"{about.trial} of {path}",
+        **vars(about.facts),
+        source=source,
         frame_time_s=found.column("time_s"),
         frame_size=found.size,
         read_frames=lambda: _read_labelled_frames(path),
@@ -415,9 +409,16 @@ def read_trial_bag(path: Path, topics: dict[str, str]) -> Capture | None:
             force_n=np.array(found.force_n, dtype=np.float64).reshape(-1, 3),
             source=about.force_source,
         ),
-        labels=labels,
+        labels=about.labels(
+            {name: found.column(name) for name in (*LABEL_SIGNALS, "safety_margin_sigma")},
+            states=tuple(found.states),
+            valid=np.array(found.valid, dtype=bool),
+            reasons=tuple(found.reasons),
+            source=source,
+        ),
         reference=found.reference,
-        told=about.told,
+        split=about.split,
+        simulated=about.simulated,
     )
 
 
@@ -432,7 +433,7 @@ class _LabelScan:
     label_ns: array = field(default_factory=lambda: array("q"))
     numbers: array = field(default_factory=lambda: array("d"))
     valid: list[bool] = field(default_factory=list)
-    states: list[ContactState] = field(default_factory=list)
+    states: list[str] = field(default_factory=list)
     reasons: list[str] = field(default_factory=list)
     force_n: array = field(default_factory=lambda: array("d"))
     force_time_s: array = field(default_factory=lambda: array("d"))
@@ -453,7 +454,7 @@ def _scan_labels(path: Path, topics: Collection[str]) -> _LabelScan:
                 raise RecordingError(f"{where} has another size than those before it; export the trial again")
             found.size = size
         elif topic == LABELS:
-            _add_label(found, message, where=f"label {len(found.label_ns)} of {LABELS} in {path}")
+            _add_label(found, message)
         elif topic == WRENCH:
             force = message.wrench.force
             found.force_n.extend((force.x, force.y, force.z))
@@ -465,20 +466,16 @@ def _scan_labels(path: Path, topics: Collection[str]) -> _LabelScan:
     return found
 
 
-def _add_label(found: _LabelScan, message: Any, *, where: str) -> None:
-    if message.contact_state not in _STATES:
-        raise RecordingError(
-            f"{where} has the contact state {message.contact_state[:40]!r}, none of {', '.join(_STATES)}; "
-            "export the trial again"
-        )
+def _add_label(found: _LabelScan, message: Any) -> None:
     found.label_ns.append(_stamp_ns(message))
     found.numbers.extend(getattr(message, name) for name in NUMBERS)
-    found.states.append(_STATES[message.contact_state])
     found.valid.append(bool(message.valid))
-    found.reasons.append(sys.intern(message.invalid_reason))  # few, and often
+    # few words, and often
+    found.states.append(sys.intern(message.contact_state))
+    found.reasons.append(sys.intern(message.invalid_reason))
 
 
-def _require_whole(found: _LabelScan, about: TrialText, path: Path) -> None:
+def _require_whole(found: _LabelScan, about: ExportedTrial, path: Path) -> None:
     """Check that all that was promised is there, and that labels belong to their frames."""
     counts = {
         "reference frames": (found.references, 1),
@@ -495,20 +492,6 @@ def _require_whole(found: _LabelScan, about: TrialText, path: Path) -> None:
         raise RecordingError(f"label {at} of {path} has another stamp than its frame; export the trial again")
     if not np.isfinite(found.column("time_s")).all():
         raise RecordingError(f"{LABELS} of {path} has a time that is not a number; export the trial again")
-
-
-def _labels(found: _LabelScan, about: TrialText) -> GivenLabels:
-    optional = {
-        "safety_margin_sigma": found.column("safety_margin_sigma"),
-        "valid": np.array(found.valid, dtype=bool),
-        "reason": tuple(found.reasons),
-    }
-    return GivenLabels(
-        **{name: found.column(name) for name in GIVEN_SIGNALS},
-        contact_state=tuple(found.states),
-        **{name: values for name, values in optional.items() if name in about.optional},
-        labelling=about.labelling,
-    )
 
 
 def _read_labelled_frames(path: Path) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
@@ -593,7 +576,7 @@ def read_rosbag(path: Path, *, image_topic: str | None = None, wrench_topic: str
     frame_ns, wrench_ns = found.frames.times(clock), found.wrenches.times(clock)
     zero = min(series[0] for series in (frame_ns, wrench_ns) if len(series))
     return Capture(
-        name=trial_name(path.stem if path.is_file() else path.resolve().name),
+        trial=trial_name(path.stem if path.is_file() else path.resolve().name),
         source=f"{images} of {path}",
         frame_time_s=_seconds(frame_ns - zero),
         frame_size=found.size,

@@ -473,6 +473,20 @@ def trial_name(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9._-]+", "-", text).strip("-.") or "trial"
 
 
+def require_trial_name(trial: str) -> None:
+    """Check that the name of a trial can name a file.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot.
+    """
+    if trial_name(trial) != trial:
+        raise RecordingError(
+            f"trial {trial[:40]!r} cannot name a file; name it with letters, digits, dots, dashes and underscores"
+        )
+
+
 MOST_FORCE_N = 1e4
 """No fingertip survives more; a larger number is in another unit."""
 

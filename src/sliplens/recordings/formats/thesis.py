@@ -11,10 +11,10 @@ from jaxtyping import Float, UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.images.files import natural_key
-from sliplens.recordings.capture import Capture, labels_of_margins
+from sliplens.recordings.capture import Capture
 from sliplens.recordings.formats.images import common_size, read_frame
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
-from sliplens.recordings.trial import require_unit_interval
+from sliplens.recordings.trial import labels_of_margins, require_unit_interval
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,7 +219,7 @@ def read_thesis(
     times = f"The lists give no times: {rate:g} frames/s were {how}; how fast the margin falls rests on it."
     return [
         Capture(
-            name=trial.name,
+            trial=trial.name,
             source=f"{trial.name} of {trial.source}",
             frame_time_s=evenly_spaced(len(trial), frame_rate=rate),
             frame_size=trial.frame_size,

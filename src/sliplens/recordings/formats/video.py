@@ -1,6 +1,6 @@
 """Frames of a video file, with the presentation stamps of its container."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -13,105 +13,83 @@ from av.error import FFmpegError
 from av.stream import Disposition
 from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
-from jaxtyping import Float, Int64, UInt8
+from jaxtyping import Float, Float32, Int64, UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.formats.stored import stale_frames
-from sliplens.recordings.formats.tables import (
-    TIME_UNITS,
-    TextTable,
-    evenly_spaced,
-    guess_time_column,
-    guess_time_unit,
-    open_table,
-    place_on_clock,
-    read_force_table,
-    require_rising,
-    to_number,
-    trial_name,
-    unit_of,
-)
+from sliplens.recordings.formats.tables import evenly_spaced, place_on_clock, read_force_table, trial_name
 
-_NAME_COLUMNS = ("file", "filename", "file_name", "image", "image_name", "frame", "path", "name")
+HEAD = 13
+"""Frames at the start that may be stale."""
+HORIZON = 500
+"""Frames that the head is compared with; a longer video is read no further."""
+_BLOCKS = 24, 32
+_LEAST_LEAP = 1.5  # grey levels, mean over the image: several times what noise and coding change
+_FROZEN = 0.75  # grey levels: no more than noise and coding change
+_WAKES = 1.015  # a camera that adapts its exposure when it is started grows brighter by more
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameTimes:
-    """Images in the order they were taken."""
+def stale_frames(frames: Iterable[UInt8[np.ndarray, "height width 3"]]) -> int:
+    """Count the frames at the start that belong to another scene.
 
-    paths: tuple[Path, ...]
-    time_s: Float[np.ndarray, " frames"]
-    notes: tuple[str, ...]
-
-
-def read_frame_times(table: Path, images: Sequence[Path]) -> FrameTimes:
-    """Find the time of every image in a table with a column of file names and one of times.
+    A camera that was just started hands out dark frames, and then what lay in its buffers: frozen frames of an earlier
+    moment. The last of them is unlike every frame that follows it. An object that slides from frame to frame is not
+    stale: there, all frames leap, or none does. (Where the camera ran already, an object that is pressed all at once
+    within the first 13 frames and never let go cannot be told from a frozen start; do not ask there.)
 
     Parameters
     ----------
-    table
-        Text table with a header; folders before a file's name, and its ending, may be left out or differ.
-    images
-        Files of one folder.
+    frames
+        From the first; the first 500 are looked at.
 
-    Raises
-    ------
-    RecordingError
-        If a column or an image is missing in the table, or two images have one time.
+    Returns
+    -------
+    int
+        How many to leave out: 0 where none is stale.
     """
-    text = open_table(table)
-    name_column, time_column = _name_column(text), guess_time_column(text)
-    stamps, listed = _stamps(text, name_column, time_column)
-    found = []
-    for image in images:
-        row = stamps.get(image.name, stamps.get(image.stem))
-        if row is None:
-            raise RecordingError(f"{table} has no time for {image.name}; add a row for every image of the folder")
-        found.append((row[0], row[1], image))
-    found.sort(key=lambda row: row[0])
-    time = np.array([row[0] for row in found])
-    require_rising(time, [row[1] for row in found], path=table, column=time_column)
-    unit = unit_of(time_column, quantity="time", path=str(table))
-    how = "by its name"
-    if unit is None:
-        unit, how = guess_time_unit(time), "guessed from its steps"
-    notes = [
-        f"{table.name}: times of images are those of column {time_column!r}, in {unit} ({how}), "
-        f"their names those of {name_column!r}."
-    ]
-    if listed > len(images):
-        notes.append(f"{table.name}: {listed - len(images)} of {listed} rows name no image of the folder.")
-    return FrameTimes(paths=tuple(row[2] for row in found), time_s=time * TIME_UNITS[unit], notes=tuple(notes))
+    return count_stale(small_copies(frames))
 
 
-def _name_column(text: TextTable) -> str:
-    found = next((name for name in text.header if name.lower().replace(" ", "_") in _NAME_COLUMNS), None)
-    if found is None:
-        raise RecordingError(
-            f"{text.path} has no column with the names of images among {', '.join(map(repr, text.header))}; "
-            "call it file"
-        )
-    return found
+def small_copies(frames: Iterable[UInt8[np.ndarray, "height width 3"]]) -> Float32[np.ndarray, "frames rows columns 3"]:
+    """Reduce frames to the means of blocks, enough to tell scenes apart and small enough to keep."""
+    copies = [_block_means(frame) for frame in islice(frames, HORIZON)]
+    return np.stack(copies) if copies else np.empty((0, *_BLOCKS, 3), dtype=np.float32)
 
 
-def _stamps(text: TextTable, name_column: str, time_column: str) -> tuple[dict[str, tuple[float, int]], int]:
-    """Time and line of every name, with and without its ending, and how many rows there are."""
-    name_at, time_at = text.header.index(name_column), text.header.index(time_column)
-    stamps: dict[str, tuple[float, int]] = {}
-    count = 0
-    for line, fields in text.rows():
-        count += 1
-        name = fields[name_at].replace("\\", "/").rsplit("/", maxsplit=1)[-1]
-        where = f"{text.path}, line {line}, {time_column!r}"
-        value = to_number(fields[time_at].replace(",", "."), shown=fields[time_at], where=where)
-        if name in stamps:
-            raise RecordingError(f"{text.path}, line {line} names {name!r} again; give each image one time")
-        stamps[name] = value, line
-    # "frame_1.5" has no ending: a full name is looked for before one without it
-    for name in list(stamps):
-        stamps.setdefault(Path(name).stem, stamps[name])
-    return stamps, count
+def count_stale(copies: Float32[np.ndarray, "frames rows columns 3"]) -> int:
+    """Count the stale frames of `small_copies`."""
+    head = min(HEAD, len(copies) // 3)  # what follows must be seen long enough to compare with
+    if not head:
+        return 0
+    flat = copies.reshape(len(copies), -1)
+    leap = np.array([np.abs(flat[at + 1 :] - flat[at]).mean(axis=1).min() for at in range(head)])
+    brightness = flat[: head + 1].mean(axis=1)
+    wakes = bool(np.any(brightness[1:] > _WAKES * brightness[:-1]))
+    frozen = np.append(False, leap[:-1] < np.minimum(leap[1:] / 4, _FROZEN))
+    # where all frames move, none of them leaps
+    stale = (leap > max(_LEAST_LEAP, 4 * float(np.median(leap)))) & (frozen | wakes)
+    return int(np.flatnonzero(stale)[-1]) + 1 if stale.any() else 0
+
+
+def least_contact(copies: Float32[np.ndarray, "frames rows columns 3"]) -> int:
+    """Frame that shows the least relief: the candidate for a reference where none was recorded.
+
+    What presses into a gel lit by coloured lamps shows as colours that change within a few pixels, where the untouched
+    gel changes slowly.
+    """
+    colour = copies[..., [0, 2]] - copies[..., [1]]
+    padded = np.pad(colour, ((0, 0), (2, 2), (2, 2), (0, 0)), mode="edge")
+    smooth = np.lib.stride_tricks.sliding_window_view(padded, (5, 5), axis=(1, 2)).mean(axis=(-2, -1))
+    return int(np.argmin(np.abs(colour - smooth).mean(axis=(1, 2, 3))))
+
+
+def _block_means(frame: UInt8[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "rows columns 3"]:
+    rows, columns = (min(most, size) for most, size in zip(_BLOCKS, frame.shape[:2], strict=True))
+    height, width = frame.shape[0] // rows, frame.shape[1] // columns
+    whole = frame[: rows * height, : columns * width]
+    # rows first, which lie in one piece: several times faster than both at once
+    sums = whole.reshape(rows, height, -1).sum(axis=1, dtype=np.uint32).reshape(rows, columns, width, 3).sum(axis=2)
+    return (sums / (height * width)).astype(np.float32)
 
 
 MOST_PIXELS = 100_000_000
@@ -377,7 +355,7 @@ def read_video(
         return islice(decode_video(file), skipped, None)
 
     return Capture(
-        name=trial_name(path.stem if name is None else name),
+        trial=trial_name(path.stem if name is None else name),
         source=str(path),
         frame_time_s=clock.time_s[skipped:],
         frame_size=file.frame_size,

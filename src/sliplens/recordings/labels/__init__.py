@@ -1,24 +1,23 @@
 """Labels from force samples and frames: axes, lag, friction, safety margins with uncertainty, the reference frame."""
 
-from sliplens.recordings.labels.axes import ContactForces, ForceAxes, Found, apply_axes, infer_axes
-from sliplens.recordings.labels.friction import FrictionEstimate, ImageMotion, estimate_friction, given_friction
-from sliplens.recordings.labels.labelling import LabelSettings, label_trial
-from sliplens.recordings.labels.lag import Lag, estimate_lag, given_lag, image_motion, measure_motion
-from sliplens.recordings.labels.margin import Labels, Reason, contact_threshold, label_frames
-from sliplens.recordings.labels.reference import REFERENCES, Reference, choose_reference
+from sliplens.recordings.labelling import ForceAxes, Found, FrictionEstimate, Lag
+from sliplens.recordings.labels.axes import ContactForces, apply_axes, infer_axes
+from sliplens.recordings.labels.friction import ImageMotion, estimate_friction, given_friction
+from sliplens.recordings.labels.lag import estimate_lag, given_lag, image_motion, measure_motion
+from sliplens.recordings.labels.margin import FoundLabels, Reason, contact_threshold, label_frames, label_trial
+from sliplens.recordings.labels.reference import choose_reference
+from sliplens.recordings.options import LabelSettings
 
 __all__ = [
-    "REFERENCES",
     "ContactForces",
     "ForceAxes",
     "Found",
+    "FoundLabels",
     "FrictionEstimate",
     "ImageMotion",
     "LabelSettings",
-    "Labels",
     "Lag",
     "Reason",
-    "Reference",
     "apply_axes",
     "choose_reference",
     "contact_threshold",

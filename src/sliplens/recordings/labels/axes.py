@@ -1,16 +1,14 @@
 """Which axis of the force sensor presses, with which sign, and what it reads untouched: declared or inferred."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 from jaxtyping import Float
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
+from sliplens.recordings.labelling import AXES, ForceAxes, Found, Vector
 from sliplens.recordings.labels.smoothing import mean_force, noise_sigma
-
-AXES = ("x", "y", "z")
 
 _WINDOW_S = 0.03
 """Time over which the force is averaged to find the touch: a press takes longer, a spike is shorter."""
@@ -38,61 +36,12 @@ _DOUBTFUL = 0.6
 """A second axis that departs by this share of the first makes the normal axis doubtful."""
 
 
-class Found(StrEnum):
-    """How a setting came about."""
-
-    DECLARED = "declared"
-    INFERRED = "inferred"
-    ASSUMED = "assumed"
-
-
-@dataclass(frozen=True, kw_only=True)
-class ForceAxes:
-    """How to read a force sensor.
-
-    Raises
-    ------
-    RecordingError
-        If the axis or the sign is none.
-    """
-
-    normal: str
-    """x, y or z: the axis that presses."""
-    sign: int
-    """1 where pressing is positive as recorded, else -1."""
-    tare_n: Float[np.ndarray, "3"]
-    """What the sensor reads untouched, x, y, z as recorded."""
-    noise_n: Float[np.ndarray, "3"]
-    """Standard deviation of a sample's noise, x, y, z."""
-    tare_sigma_n: Float[np.ndarray, "3"]
-    """Standard uncertainty of the tare."""
-    still_until_s: float | None
-    """Until when the sensor is surely untouched; None where it is never touched."""
-    normal_found: Found
-    sign_found: Found
-    tare_found: Found
-    notes: tuple[str, ...] = ()
-    """What is doubtful, a sentence each, for people."""
-
-    def __post_init__(self) -> None:
-        """Check what can be declared wrongly."""
-        if self.normal not in AXES:
-            raise RecordingError(f"the normal axis is {self.normal!r}; name x, y or z")
-        if self.sign not in (-1, 1):
-            raise RecordingError(f"the sign of the normal force is {self.sign}; give 1, or -1 if pressing is negative")
-
-    @property
-    def normal_index(self) -> int:
-        """Column of the normal axis."""
-        return AXES.index(self.normal)
-
-
 def infer_axes(
     forces: Forces,
     *,
     normal: str | None = None,
     sign: int | None = None,
-    tare_n: Float[np.ndarray, "3"] | None = None,
+    tare_n: Vector | None = None,
 ) -> ForceAxes:
     """Infer what is not declared of how to read a force sensor.
 
@@ -123,7 +72,7 @@ def infer_axes(
     tare = (
         _read_tare(forces, until_s=until, noise=noise)
         if tare_n is None
-        else _Tare(value_n=tare_n, sigma_n=np.zeros(3), found=Found.DECLARED)
+        else _Tare(value_n=np.array(tare_n, dtype=np.float64), sigma_n=np.zeros(3), found=Found.DECLARED)
     )
     press = _mean_press(forces, touch_s=touch, tare_n=tare.value_n)
     axis = AXES[int(np.argmax(np.abs(press)))] if normal is None else normal
@@ -139,9 +88,9 @@ def infer_axes(
     return ForceAxes(
         normal=axis,
         sign=inferred_sign if sign is None else sign,
-        tare_n=tare.value_n,
-        noise_n=noise,
-        tare_sigma_n=tare.sigma_n,
+        tare_n=_vector(tare.value_n),
+        noise_n=_vector(noise),
+        tare_sigma_n=_vector(tare.sigma_n),
         still_until_s=None if np.isinf(until) else until,
         normal_found=Found.INFERRED if normal is None else Found.DECLARED,
         sign_found=Found.INFERRED if sign is None else Found.DECLARED,
@@ -191,11 +140,16 @@ def _mean_press(forces: Forces, *, touch_s: float, tare_n: Float[np.ndarray, "3"
     return np.mean(forces.force_n[(forces.time_s >= touch_s) & (forces.time_s <= end)], axis=0) - tare_n
 
 
-def _find_touch(forces: Forces, *, tare_n: Float[np.ndarray, "3"] | None) -> tuple[float, float]:
+def _vector(values: Float[np.ndarray, "3"]) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def _find_touch(forces: Forces, *, tare_n: Vector | None) -> tuple[float, float]:
     """When the sensor is first touched, and until when its samples are surely still; infinite if it never is."""
     time, start = forces.time_s, float(forces.time_s[0])
     first = forces.force_n[time <= start + _FIRST_S]
-    rest = np.median(first, axis=0) if tare_n is None else tare_n
+    rest = np.median(first, axis=0) if tare_n is None else np.array(tare_n)
     # means taken one after the other tell their noise, whatever its memory
     apart = np.arange(start + _WINDOW_S / 2, time[-1], _WINDOW_S)
     sigma = float(np.linalg.norm(noise_sigma(mean_force(time, forces.force_n, apart, window_s=_WINDOW_S))))
@@ -257,7 +211,7 @@ class ContactForces:
         # too few means tell no spread: the samples then have to
         return self._split(noise_sigma(means)) if len(means) >= _FEW_MEANS else self.noise_n
 
-    def _split(self, of_axes: Float[np.ndarray, "3"]) -> NormalTangential:
+    def _split(self, of_axes: Vector | Float[np.ndarray, "3"]) -> NormalTangential:
         index = self.axes.normal_index
         return NormalTangential(
             normal=float(of_axes[index]), tangential=float(np.sqrt(np.mean(np.delete(of_axes, index) ** 2)))

@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.labels.axes import ContactForces, Found, magnitude
+from sliplens.recordings.labelling import Found, FrictionEstimate
+from sliplens.recordings.labels.axes import ContactForces, magnitude
 from sliplens.recordings.labels.smoothing import mean_force, typical_step
 
 _REACH_S = 0.08
@@ -174,47 +175,6 @@ _QUIET_S = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrictionEstimate:
-    """Static friction of a trial, and when its contact slipped."""
-
-    mu: float
-    """Static coefficient of friction mu_s."""
-    low: float
-    high: float
-    """Ends of the coefficient's 68 % interval."""
-    onset_s: float | None
-    """First gross slip, on the force sensor's clock; None where it is not known to slip."""
-    found: Found
-    method: str
-    """How it was found, for people."""
-    onset_sigma_s: float = float("nan")
-    """Standard uncertainty of the onset, from the same bootstrap; NaN where it is not known."""
-    image_sigmas: float = float("nan")
-    """By how much the image moves more than before, at the onset, in standard deviations; NaN where not asked."""
-
-    def __post_init__(self) -> None:
-        """Check what can be given wrongly.
-
-        Raises
-        ------
-        RecordingError
-            If the coefficient is not positive or outside its interval.
-        """
-        if not 0 < self.mu < np.inf:
-            raise RecordingError(f"the coefficient of friction is {self.mu:.3g}; give a positive one")
-        if not 0 <= self.low <= self.mu <= self.high < np.inf:
-            raise RecordingError(
-                f"the coefficient of friction {self.mu:.3g} lies outside its interval {self.low:.3g} to "
-                f"{self.high:.3g}; give low, mu, high in their order"
-            )
-
-    @property
-    def sigma(self) -> float:
-        """Standard uncertainty: half the 68 % interval."""
-        return (self.high - self.low) / 2
-
-
-@dataclass(frozen=True, kw_only=True)
 class ImageMotion:
     """How much each frame differs from the one before, at the frames' times on the force sensor's clock."""
 
@@ -290,9 +250,8 @@ def estimate_friction(
             f"the trial never slips (F_t / F_n reaches {highest:.2f} without breaking off), so its friction is "
             "unknown; give the coefficient of friction by hand"
         )
-    support = [_image_sigmas(image, rough) for rough in candidates]
     # a slip that the image does not see is a knock at the force sensor, unless no fall is seen
-    seen = [rough for rough, sigmas in zip(candidates, support, strict=True) if sigmas >= _SEEN_SIGMAS]
+    seen = [rough for rough in candidates if (_image_sigmas(image, rough) or 0) >= _SEEN_SIGMAS]
     rough = (seen or candidates)[0]
     near = (forces.time_s >= rough - _BEFORE_S) & (forces.time_s <= rough + _AFTER_S)
     near &= forces.normal_n > contact_threshold_n
@@ -362,17 +321,17 @@ def _tare_share(forces: ContactForces, *, mu: float, at: Bool[np.ndarray, " samp
     return float(np.hypot(tare.tangential, mu * tare.normal) / forces.normal_n[at].mean())
 
 
-def _image_sigmas(image: ImageMotion | None, onset_s: float) -> float:
-    """How far the image's largest motion at the onset stands out of that before it."""
+def _image_sigmas(image: ImageMotion | None, onset_s: float) -> float | None:
+    """How far the image's largest motion at the onset stands out of that before it; None where it cannot be told."""
     if image is None:
-        return float("nan")
+        return None
     # a frame's motion happens between it and the one before; a lag may not be known to the frame
     step = typical_step(image.time_s)
     after = image.time_s - onset_s
     quiet = image.motion[1:][(after[1:] < -3 * step) & (after[1:] > -_QUIET_S - 3 * step)]
     burst = image.motion[1:][(after[1:] >= -2 * step) & (after[1:] <= 3 * step)]
     if len(quiet) < 3 or len(burst) == 0:
-        return float("nan")
+        return None
     middle = np.median(quiet)
     spread = 1.4826 * np.median(np.abs(quiet - middle))
     return float((burst.max() - middle) / max(spread, 1e-9))

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
+from sliplens.recordings.labelling import Lag
 from sliplens.recordings.labels.axes import infer_axes
 from sliplens.recordings.labels.smoothing import mean_force, typical_step
 
@@ -73,20 +74,6 @@ _SUDDEN_STEPS = 2.0
 """A fall between these within so many frames tells the time however the gel yields."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Lag:
-    """By how much the camera's stamps are later than the force sensor's, for the same event."""
-
-    lag_s: float
-    """Positive where the camera is late; an event stamped t by the camera is t - lag_s to the force sensor."""
-    sigma_s: float
-    """Standard uncertainty of the lag."""
-    correlation: float
-    """Correlation coefficient of image motion and force rate at this lag; NaN where it was given by hand."""
-    doubt: str = ""
-    """Why the lag cannot be told from this trial, a sentence for people; empty where it can."""
-
-
 def given_lag(lag_s: float, *, sigma_s: float = 0.0) -> Lag:
     """Lag given by hand; without an uncertainty it counts as exact.
 
@@ -97,7 +84,7 @@ def given_lag(lag_s: float, *, sigma_s: float = 0.0) -> Lag:
     """
     if not (np.isfinite(lag_s) and sigma_s >= 0):
         raise RecordingError(f"a lag of {lag_s:g} s with an uncertainty of {sigma_s:g} s cannot be; give it in seconds")
-    return Lag(lag_s=lag_s, sigma_s=sigma_s, correlation=float("nan"))
+    return Lag(lag_s=lag_s, sigma_s=sigma_s)
 
 
 def estimate_lag(

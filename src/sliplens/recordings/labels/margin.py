@@ -1,6 +1,5 @@
 """The label of every frame: its forces, its safety margin with uncertainty, its contact state, and its validity."""
 
-from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -9,12 +8,104 @@ from jaxtyping import Bool, Float
 
 from sliplens.errors import RecordingError
 from sliplens.mechanics import safety_margin, stick_ratio
-from sliplens.recordings.labels.axes import ContactForces, ForceAxes
-from sliplens.recordings.labels.friction import FrictionEstimate
-from sliplens.recordings.labels.interpolation import FrameForces, interpolate_forces
-from sliplens.recordings.labels.lag import Lag
-from sliplens.recordings.labels.smoothing import mean_force, typical_step
-from sliplens.recordings.trial import ContactState
+from sliplens.recordings.capture import Forces
+from sliplens.recordings.labelling import FrictionEstimate, LabelBasis, Lag
+from sliplens.recordings.labels.axes import ContactForces, apply_axes, infer_axes, magnitude
+from sliplens.recordings.labels.friction import ImageMotion, estimate_friction, given_friction
+from sliplens.recordings.labels.lag import estimate_lag, given_lag
+from sliplens.recordings.labels.smoothing import half_window, mean_force, typical_step
+from sliplens.recordings.options import LabelSettings
+from sliplens.recordings.trial import ContactState, Labels
+
+_NO_FLAG = 1e-6
+"""Rounding of a mean of flags that are all 0."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameForces:
+    """Forces at the times of frames."""
+
+    normal_n: Float[np.ndarray, " frames"]
+    tangential_n: Float[np.ndarray, " frames"]
+    """Length of the tangential force."""
+    normal_sigma_n: Float[np.ndarray, " frames"]
+    """Standard uncertainty, from noise and tare."""
+    tangential_sigma_n: Float[np.ndarray, " frames"]
+    missing: Bool[np.ndarray, " frames"]
+    """Whether the neighbouring samples are too far apart, or there are none on one side."""
+    out_of_range: Bool[np.ndarray, " frames"]
+
+
+def interpolate_forces(
+    forces: ContactForces,
+    time_s: Float[np.ndarray, " frames"],
+    *,
+    window_s: float,
+    gap_s: float,
+    until_s: float = np.inf,
+    force_range_n: float | None = None,
+) -> FrameForces:
+    """Interpolate the forces onto given times: the mean, over a window about each, of the line through the samples.
+
+    Parameters
+    ----------
+    forces
+        In the axes of the contact.
+    time_s
+        Where to have them, on the force sensor's clock.
+    window_s
+        Full length of the window; 0 interpolates between two samples.
+    gap_s
+        Samples further apart count as missing.
+    until_s
+        A time that no window reaches over.
+    force_range_n
+        What each axis of the sensor can measure, either way; None if it is not known.
+    """
+    samples = forces.time_s
+    normal, tangential = (
+        mean_force(samples, values, time_s, window_s=window_s, until_s=until_s)
+        for values in (forces.normal_n, forces.tangential_n)
+    )
+    noise, one = forces.noise_of_means_n(window_s), forces.noise_n
+    # a shorter window averages less noise away, at worst none
+    length = 2 * half_window(samples, np.clip(time_s, samples[0], samples[-1]), window_s=window_s, until_s=until_s)
+    more = np.sqrt(window_s / np.maximum(length, 1e-9))
+    normal_noise = np.minimum(noise.normal * more, max(one.normal, noise.normal))
+    tangential_noise = np.minimum(noise.tangential * more, max(one.tangential, noise.tangential))
+    tare = forces.tare_sigma_n
+    return FrameForces(
+        normal_n=normal,
+        tangential_n=magnitude(tangential, sigma_n=tangential_noise),
+        normal_sigma_n=np.hypot(normal_noise, tare.normal),
+        tangential_sigma_n=np.hypot(tangential_noise, tare.tangential),
+        missing=_missing(samples, time_s, gap_s=gap_s),
+        out_of_range=_out_of_range(forces, time_s, window_s=window_s, range_n=force_range_n),
+    )
+
+
+def _missing(
+    samples_s: Float[np.ndarray, " samples"], time_s: Float[np.ndarray, " frames"], *, gap_s: float
+) -> Bool[np.ndarray, " frames"]:
+    """Whether the samples on both sides of a time are too far apart, or one side has none."""
+    after = np.searchsorted(samples_s, time_s, side="left")
+    outside = (time_s < samples_s[0]) | (time_s > samples_s[-1])
+    next_one = np.clip(after, 0, len(samples_s) - 1)
+    apart = samples_s[next_one] - samples_s[np.maximum(next_one - 1, 0)]
+    on_sample = samples_s[next_one] == time_s
+    return outside | ((apart > gap_s) & ~on_sample)
+
+
+def _out_of_range(
+    forces: ContactForces, time_s: Float[np.ndarray, " frames"], *, window_s: float, range_n: float | None
+) -> Bool[np.ndarray, " frames"]:
+    """Whether any sample that a frame's force rests on reaches the end of the sensor's range, tare included."""
+    if range_n is None:
+        return np.zeros(len(time_s), dtype=bool)
+    full = np.any(np.abs(forces.recorded.force_n) >= range_n, axis=1, keepdims=True).astype(np.float64)
+    # the slip's onset hides no sample here: a window more is a frame less, a window less a wrong label
+    return mean_force(forces.time_s, full, time_s, window_s=window_s)[:, 0] > _NO_FLAG
+
 
 _CONTACT_SIGMAS = 8.0
 """Least normal force of a contact, in standard deviations of its noise."""
@@ -39,48 +130,20 @@ class Reason(StrEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Labels:
-    """Labels of a trial's frames, and all that they rest on.
+class FoundLabels(Labels):
+    """Labels that were found from forces, and all that they rest on.
 
     After gross slip the margin is 0 and not valid: the friction that then holds is another one, and the margin never
     silently returns. The friction coefficient is static until the slip, then F_t / F_n, so that in contact every margin
     is 1 - F_t / (mu F_n).
     """
 
-    time_s: Float[np.ndarray, " frames"]
-    """On the camera's clock, untouched."""
-    force_time_s: Float[np.ndarray, " frames"]
-    """On the force sensor's clock: where the forces were taken."""
-    normal_force_n: Float[np.ndarray, " frames"]
-    """NaN where samples are missing."""
-    tangential_force_n: Float[np.ndarray, " frames"]
-    friction_coefficient: Float[np.ndarray, " frames"]
-    safety_margin: Float[np.ndarray, " frames"]
-    """NaN without contact, where samples are missing and outside the sensor's range."""
-    safety_margin_sigma: Float[np.ndarray, " frames"]
-    """Standard uncertainty; NaN where the label is not valid."""
-    stick_ratio: Float[np.ndarray, " frames"]
-    """Of a sphere on a flat: the margin to the power 2/3."""
-    contact_state: tuple[ContactState, ...]
-    valid: Bool[np.ndarray, " frames"]
-    reason: tuple[Reason, ...]
-    axes: ForceAxes
-    friction: FrictionEstimate
-    slip_s: float | None
-    """First gross slip, on the force sensor's clock; None if there is none."""
-    lag: Lag | None
-    """As estimated; None if it was not."""
-    lag_applied: bool
-    contact_threshold_n: float
-    window_s: float
-    """Time over which the forces of a frame were averaged."""
-    gap_s: float
-    """Samples further apart than this count as missing."""
-    force_range_n: float | None
-
-    def count(self) -> dict[str, int]:
-        """Count the frames by reason, those with a valid label as 'valid'."""
-        return dict(Counter(str(reason) or "valid" for reason in self.reason))
+    # required here: a keyword needs no default, though the base has one
+    safety_margin_sigma: Float[np.ndarray, " _"]  # pyright: ignore[reportGeneralTypeIssues]
+    valid: Bool[np.ndarray, " _"]  # pyright: ignore[reportGeneralTypeIssues]
+    reason: tuple[Reason, ...]  # pyright: ignore[reportGeneralTypeIssues]
+    force_time_s: Float[np.ndarray, " _"]  # pyright: ignore[reportGeneralTypeIssues]
+    basis: LabelBasis
 
 
 def contact_threshold(forces: ContactForces, *, window_s: float) -> float:
@@ -101,7 +164,7 @@ def label_frames(
     window_s: float | None = None,
     gap_s: float | None = None,
     friction_change: float = 0.0,
-) -> Labels:
+) -> FoundLabels:
     """Label frames, each at its own time.
 
     The force of a frame is the mean over a short window of the line through the samples; no window reaches over the
@@ -175,8 +238,7 @@ def label_frames(
     margin = np.where(at.missing | at.out_of_range, np.nan, np.where(slipped & contact, 0.0, margin))
     valid = reliable & ~slipped
     holds = np.where(slipped & contact & (at.tangential_n > 0), used * friction.mu, friction.mu)
-    return Labels(
-        time_s=frame_time_s,
+    return FoundLabels(
         force_time_s=time,
         normal_force_n=np.where(at.missing, np.nan, at.normal_n),
         tangential_force_n=np.where(at.missing, np.nan, at.tangential_n),
@@ -187,15 +249,18 @@ def label_frames(
         contact_state=_states(contact, slipped=slipped, stuck=used < _STUCK_SIGMAS * sigma),
         valid=valid,
         reason=_reasons(at, contact, slipped),
-        axes=forces.axes,
-        friction=friction,
-        slip_s=slip_s,
-        lag=lag,
-        lag_applied=apply_lag,
-        contact_threshold_n=threshold,
-        window_s=window,
-        gap_s=gap,
-        force_range_n=force_range_n,
+        basis=LabelBasis(
+            axes=forces.axes,
+            friction=friction,
+            friction_change=friction_change,
+            slip_s=slip_s,
+            lag=lag,
+            lag_applied=apply_lag,
+            contact_threshold_n=threshold,
+            window_s=window,
+            gap_s=gap,
+            force_range_n=force_range_n,
+        ),
     )
 
 
@@ -238,3 +303,64 @@ def _reasons(
     names = (Reason.MISSING_SAMPLES, Reason.OUT_OF_RANGE, Reason.NO_CONTACT, Reason.AFTER_GROSS_SLIP, Reason.NONE)
     flags = [at.missing, at.out_of_range, ~contact, slipped]
     return tuple(names[index] for index in np.select(flags, [0, 1, 2, 3], default=4))
+
+
+def label_trial(
+    frame_time_s: Float[np.ndarray, " frames"],
+    image_motion: Float[np.ndarray, " frames"],
+    forces: Forces,
+    *,
+    settings: LabelSettings,
+    rng: np.random.Generator,
+    lag: Lag | None = None,
+) -> FoundLabels:
+    """Label the frames of a trial: axes, lag, friction and margins, in that order.
+
+    The lag is estimated whether or not it is applied, and helps to tell at which fall of the force the image moves.
+
+    Parameters
+    ----------
+    frame_time_s
+        Times on the camera's clock.
+    image_motion
+        See `measure_motion`.
+    forces
+        As recorded.
+    settings
+        What is known beforehand.
+    rng
+        Source of the bootstraps.
+    lag
+        Lag that was measured otherwise, with its uncertainty; that of the settings, or estimated, if None.
+
+    Raises
+    ------
+    RecordingError
+        If nothing touches, the trial never slips and no friction is given, or a doubtful lag is to be applied.
+    """
+    axes = infer_axes(forces, normal=settings.normal_axis, sign=settings.normal_sign, tare_n=settings.tare)
+    contact = apply_axes(forces, axes)
+    if lag is None and settings.lag_ms is not None:
+        lag = given_lag(settings.lag_ms / 1e3)
+    elif lag is None:
+        lag = estimate_lag(frame_time_s, image_motion, forces, rng=rng)
+    window = typical_step(frame_time_s)
+    threshold = settings.contact_threshold
+    if threshold is None:
+        threshold = contact_threshold(contact, window_s=window)
+    if settings.mu is not None:
+        friction = given_friction(settings.mu)
+    else:
+        motion = ImageMotion(time_s=frame_time_s - (0.0 if lag.doubt else lag.lag_s), motion=image_motion)
+        friction = estimate_friction(contact, contact_threshold_n=threshold, rng=rng, image=motion)
+    return label_frames(
+        frame_time_s,
+        contact,
+        friction=friction,
+        lag=lag,
+        apply_lag=settings.apply_lag or settings.lag_ms is not None,
+        contact_threshold_n=threshold,
+        force_range_n=settings.force_range,
+        window_s=window,
+        friction_change=settings.friction_change,
+    )

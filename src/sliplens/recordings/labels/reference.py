@@ -1,14 +1,15 @@
 """The reference frame of a trial, the sensor untouched: named, or chosen; and how it drifts."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from sliplens.errors import RecordingError
+from sliplens.recordings.labelling import ReferenceChoice
 from sliplens.recordings.labels.lag import measure_motion, soften
+from sliplens.recordings.options import REFERENCE_METHODS
 
 _STILL_TIMES = 1.5
 """A frame that moves by so many times what the stillest quarter of its fellows do is not still."""
@@ -20,33 +21,13 @@ _SMOOTH = 9
 """Blocks over which the slow part of an image is taken: wider than a contact's rim, narrower than the light's fall."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reference:
-    """The sensor untouched, and how sure that is."""
-
-    image: UInt8[np.ndarray, "height width 3"]
-    index: int
-    """Of the frame it is."""
-    method: str
-    contact_energy: float
-    """Mean absolute high-pass difference from the median untouched frame, in grey levels."""
-    drift: float
-    """Mean absolute difference between the first and the last untouched frames, in grey levels; NaN if too few."""
-    drift_span: tuple[int, int] | None
-    """First and last untouched frame: without a release, both before the contact. None if there is none."""
-
-
-REFERENCES = ("least contact energy", "first still")
-"""Ways to choose a reference frame."""
-
-
 def choose_reference(
     read_frames: Callable[[], Iterator[UInt8[np.ndarray, "height width 3"]]],
     untouched: Bool[np.ndarray, " frames"],
     *,
     index: int | None = None,
     method: str = "least contact energy",
-) -> Reference:
+) -> ReferenceChoice:
     """Choose the reference among the untouched frames before the contact, or take the one that is named.
 
     These are the first stretch of untouched frames: a recording that begins pressed has them after its first contact.
@@ -72,8 +53,8 @@ def choose_reference(
     RecordingError
         If no frame is untouched and none is named, or the name or method is none.
     """
-    if method not in REFERENCES:
-        raise RecordingError(f"the reference cannot be chosen by {method!r}; choose {' or '.join(REFERENCES)}")
+    if method not in REFERENCE_METHODS:
+        raise RecordingError(f"the reference cannot be chosen by {method!r}; choose {' or '.join(REFERENCE_METHODS)}")
     if index is not None and not 0 <= index < len(untouched):
         raise RecordingError(f"the reference is frame {index} of {len(untouched)}; name one from 0 on that is there")
     places = np.flatnonzero(untouched)
@@ -94,8 +75,7 @@ def choose_reference(
     middle = np.median(np.stack([soft[place] for place in compared or sorted(wanted)]), axis=0)
     if chosen is None:
         chosen, how = min(compared, key=lambda place: _energy(soft[place] - middle)), method
-    return Reference(
-        image=next(islice(read_frames(), chosen, None)),
+    return ReferenceChoice(
         index=chosen,
         method=how,
         contact_energy=_energy(soft[chosen] - middle),
@@ -123,10 +103,10 @@ def _first_still(motion: Float[np.ndarray, " frames"]) -> int:
 
 def _drift(
     first: Sequence[Float[np.ndarray, "rows columns 3"]], last: Sequence[Float[np.ndarray, "rows columns 3"]]
-) -> float:
-    """Mean absolute difference of their medians."""
+) -> float | None:
+    """Mean absolute difference of their medians; None without any."""
     if not first:
-        return float("nan")
+        return None
     return float(np.mean(np.abs(np.median(last, axis=0) - np.median(first, axis=0))))
 
 

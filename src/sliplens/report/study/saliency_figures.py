@@ -21,7 +21,7 @@ from sliplens.plots.style import (
     short_input_name,
     signed,
 )
-from sliplens.report.plates import (
+from sliplens.report.study.plates import (
     THESIS_LEVEL,
     Cell,
     Plate,

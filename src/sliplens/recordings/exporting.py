@@ -1,0 +1,121 @@
+"""Data sets for other programs: LeRobot data sets and MCAP files, complete or absent."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sliplens.files import exported_folder
+from sliplens.progress import OnProgress, stage, wrote
+from sliplens.recordings.dataset import Dataset, load_dataset
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Trials that were written for other programs."""
+
+    folder: Path
+    trials: tuple[str, ...]
+    frames: int
+
+
+def export_lerobot(
+    data: Dataset | Path | str,
+    out: Path | str,
+    *,
+    trials: Sequence[str] | None = None,
+    overwrite: bool = False,
+    on_progress: OnProgress | None = None,
+) -> Export:
+    """Write trials as a LeRobot v3.0 data set, one episode a trial, without loss; see `write_lerobot`.
+
+    Parameters
+    ----------
+    data
+        Data set, or its folder.
+    out
+        Folder to make.
+    trials
+        Names of trials; all if None.
+    overwrite
+        Replace a folder that an export made.
+    on_progress
+        Called with the frames written and the frames in all.
+
+    Raises
+    ------
+    InputError
+        If `out` holds something else, or there is no such trial.
+    RecordingError
+        If a trial is damaged, or sizes of frames or frame rates differ.
+    """
+    from sliplens.recordings.formats.lerobot_export import write_lerobot  # noqa: PLC0415 (Pillow and PyAV come with it)
+
+    # LeRobot reads what `meta` holds by name
+    kind = _Kind(name="lerobot", run_file="meta/sliplens/run.json", write=write_lerobot)
+    return _export(kind, data, Path(out), trials=trials, overwrite=overwrite, on_progress=on_progress)
+
+
+def export_mcap(
+    data: Dataset | Path | str,
+    out: Path | str,
+    *,
+    trials: Sequence[str] | None = None,
+    overwrite: bool = False,
+    on_progress: OnProgress | None = None,
+) -> Export:
+    """Write trials as `TRIAL.mcap`, files of ROS 2 messages, without loss; see `write_mcap`.
+
+    Parameters
+    ----------
+    data
+        Data set, or its folder.
+    out
+        Folder to make.
+    trials
+        Names of trials; all if None.
+    overwrite
+        Replace a folder that an export made.
+    on_progress
+        Called with the frames written and the frames in all.
+
+    Raises
+    ------
+    InputError
+        If `out` holds something else, there is no such trial, or the extra `ros` is not installed.
+    RecordingError
+        If a trial is damaged, or its times do not fit into stamps.
+    """
+    from sliplens.recordings.formats.mcap import write_mcap  # noqa: PLC0415 (not needed where nothing is exported)
+
+    # tools for MCAP open single files
+    kind = _Kind(name="mcap", run_file="run.json", write=write_mcap)
+    return _export(kind, data, Path(out), trials=trials, overwrite=overwrite, on_progress=on_progress)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Kind:
+    name: str
+    run_file: str
+    """Place of `run.json`, below the folder."""
+    write: Callable[..., None]
+
+
+def _export(
+    kind: _Kind,
+    data: Dataset | Path | str,
+    out: Path,
+    *,
+    trials: Sequence[str] | None,
+    overwrite: bool,
+    on_progress: OnProgress | None,
+) -> Export:
+    data = data if isinstance(data, Dataset) else load_dataset(data)
+    chosen = data.trials if not trials else tuple(data.find(name) for name in dict.fromkeys(trials))
+    config = {"format": kind.name, "data_hash": data.hash, "trials": [info.trial for info in chosen]}
+    with exported_folder(out, run_file=kind.run_file, config=config, overwrite=overwrite) as output:
+        if not output.complete:
+            with stage(on_progress, "Writing frames") as count:
+                kind.write(data, output.folder, trials=chosen, on_progress=count)
+    frames = sum(info.frames for info in chosen)
+    wrote(on_progress, out, f"{len(chosen)} trials, {frames:,} frames", kept=output.complete)
+    return Export(folder=out, trials=tuple(info.trial for info in chosen), frames=frames)

@@ -1,0 +1,183 @@
+"""How the labels of a trial were made: kept with it, shown by the audit and the viewer."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TypeAlias
+
+import numpy as np
+
+from sliplens.errors import RecordingError
+
+AXES = ("x", "y", "z")
+
+Vector: TypeAlias = tuple[float, float, float]
+"""x, y, z of the force sensor, as recorded."""
+
+
+class Found(StrEnum):
+    """How a setting came about."""
+
+    DECLARED = "declared"
+    INFERRED = "inferred"
+    ASSUMED = "assumed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForceAxes:
+    """How to read a force sensor.
+
+    Raises
+    ------
+    RecordingError
+        If the axis or the sign is none.
+    """
+
+    normal: str
+    """x, y or z: the axis that presses."""
+    sign: int
+    """1 where pressing is positive as recorded, else -1."""
+    tare_n: Vector
+    """Reading of the untouched sensor."""
+    noise_n: Vector
+    """Standard deviation of a sample's noise."""
+    tare_sigma_n: Vector
+    """Standard uncertainty of the tare."""
+    still_until_s: float | None
+    """Time until which the sensor is surely untouched; None where it is never touched."""
+    normal_found: Found
+    sign_found: Found
+    tare_found: Found
+    notes: tuple[str, ...] = ()
+    """Doubts, a sentence each."""
+
+    def __post_init__(self) -> None:
+        """Check what can be declared wrongly."""
+        if self.normal not in AXES:
+            raise RecordingError(f"the normal axis is {self.normal!r}; name x, y or z")
+        if self.sign not in (-1, 1):
+            raise RecordingError(f"the sign of the normal force is {self.sign}; give 1, or -1 if pressing is negative")
+
+    @property
+    def normal_index(self) -> int:
+        """Column of the normal axis."""
+        return AXES.index(self.normal)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrictionEstimate:
+    """Static friction of a trial, and when its contact slipped.
+
+    Raises
+    ------
+    RecordingError
+        If the coefficient is not positive or outside its interval.
+    """
+
+    mu: float
+    """Static coefficient of friction mu_s."""
+    low: float
+    """Lower end of the coefficient's 68 % interval."""
+    high: float
+    """Upper end of the coefficient's 68 % interval."""
+    onset_s: float | None
+    """First gross slip, on the force sensor's clock; None where it is not known to slip."""
+    found: Found
+    method: str
+    """Words for people."""
+    onset_sigma_s: float | None = None
+    """Standard uncertainty of the onset; None where it is not known."""
+    image_sigmas: float | None = None
+    """Motion of the image at the onset beyond that before it, in standard deviations; None where not measured."""
+
+    def __post_init__(self) -> None:
+        """Check what can be given wrongly."""
+        if not 0 < self.mu < np.inf:
+            raise RecordingError(f"the coefficient of friction is {self.mu:.3g}; give a positive one")
+        if not 0 <= self.low <= self.mu <= self.high < np.inf:
+            raise RecordingError(
+                f"the coefficient of friction {self.mu:.3g} lies outside its interval {self.low:.3g} to "
+                f"{self.high:.3g}; give low, mu, high in their order"
+            )
+
+    @property
+    def sigma(self) -> float:
+        """Standard uncertainty: half the 68 % interval."""
+        return (self.high - self.low) / 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lag:
+    """Time by which the camera's stamps are later than the force sensor's, for the same event."""
+
+    lag_s: float
+    """Positive where the camera is late; an event stamped t by the camera is t - lag_s to the force sensor."""
+    sigma_s: float
+    """Standard uncertainty of the lag."""
+    correlation: float | None = None
+    """Correlation coefficient of image motion and force rate at this lag; None where it was given by hand."""
+    doubt: str = ""
+    """Why the lag cannot be told from this trial; empty where it can."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReferenceChoice:
+    """Which frame is the sensor untouched, and how sure that is."""
+
+    index: int | None = None
+    """Number of the frame; None where the reference was recorded apart from the frames."""
+    method: str
+    contact_energy: float | None = None
+    """Mean absolute high-pass difference from the median untouched frame, in grey levels; None where not measured."""
+    drift: float | None = None
+    """Mean absolute difference of the first and the last untouched frames, in grey levels; None if too few."""
+    drift_span: tuple[int, int] | None = None
+    """First and last untouched frame: without a release, both before the contact. None if there is none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clip:
+    """Knowledge of a whole recording that tells nothing of a single frame."""
+
+    slips: bool
+    grasp: str
+    """Name of the grasp; its fingers belong into one split."""
+    stale_frames: int
+    """Frames left out at the start."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelBasis:
+    """Estimates and thresholds behind labels that were found from forces."""
+
+    axes: ForceAxes
+    friction: FrictionEstimate
+    friction_change: float
+    """Relative standard deviation of the change of friction from touch to slip."""
+    slip_s: float | None
+    """First gross slip, on the force sensor's clock; None if there is none."""
+    lag: Lag | None
+    """None where it was neither estimated nor given."""
+    lag_applied: bool
+    contact_threshold_n: float
+    window_s: float
+    """Time over which the forces of a frame were averaged."""
+    gap_s: float
+    """Time beyond which samples count as missing between two others."""
+    force_range_n: float | None
+    """Largest force that each axis can measure; None where it is not known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Labelling:
+    """Where a trial and its labels come from."""
+
+    source: str
+    """File, folder or topic of the frames."""
+    forces: str | None
+    """Topic, file or columns of the forces; None where none were recorded."""
+    notes: tuple[str, ...]
+    """Assumptions of the reader, a sentence each."""
+    reference: ReferenceChoice
+    clip: Clip | None = None
+    basis: LabelBasis | None = None
+    """None where the labels came with the frames."""

@@ -1,0 +1,87 @@
+"""Options of reading and labelling recordings: arguments of the library, and of the command line."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Literal
+
+REFERENCE_METHODS = ("least contact energy", "first still")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadOptions:
+    """What a user may say of a source; each reader understands some of it (`Reader.takes`)."""
+
+    forces: Path | None = None
+    """Table of forces beside a video or folder of images (CSV)."""
+    time_column: str | None = None
+    """Column of the table with the times; guessed if not given."""
+    force_columns: tuple[str, ...] | None = None
+    """Columns with the forces, three (x y z) or two (normal and tangential, which become z and x); guessed if not
+    given."""
+    time_unit: str | None = None
+    """s, ms, us or ns; guessed if not given."""
+    force_unit: str | None = None
+    """N, mN, kN, gf, kgf or lbf; guessed if not given."""
+    frame_rate: float | None = None
+    """Frames a second, where a video's stamps are missing or wrong."""
+    times: Path | None = None
+    """Table with the name and the time of every image of a folder (CSV)."""
+    name_unit: str | None = None
+    """Unit (s, ms, us, ns) of the last number in the names of images, which is then their time."""
+    skip_frames: int | None = None
+    """So many frames at the start of a video are left out."""
+    skip_stale: bool = False
+    """Leave out the dark or frozen frames that a camera hands out when it was just started."""
+    start_s: float | None = None
+    """When the first frame was taken, on the clock of the forces."""
+    image_topic: str | None = None
+    """Topic of the images; the only one if not given."""
+    wrench_topic: str | None = None
+    """Topic of the forces; the only one if not given."""
+    camera_key: str | None = None
+    """Feature of a LeRobot data set with the images."""
+    force_key: str | None = None
+    """Feature of a LeRobot data set with the forces."""
+    image_root: Path | None = None
+    """Folder under which the images that a list names lie now."""
+    margin_unit: Literal["fraction", "percent"] | None = None
+    """Unit of a list's safety margins; told by their size if not given."""
+
+    def given(self) -> dict[str, object]:
+        """Options that were said, by name."""
+        return {
+            field.name: getattr(self, field.name)
+            for field in fields(self)
+            if getattr(self, field.name) not in (None, False)
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelSettings:
+    """How labels are found from forces; what is not given is found out."""
+
+    mu: float | None = None
+    """Static coefficient of friction, if you know it; estimated at the onset of slip otherwise."""
+    friction_change: float = 0.0
+    """Relative standard deviation by which friction may change from touch to slip; on wet objects some 0.1 to 0.2. It
+    widens the uncertainty."""
+    tare: tuple[float, float, float] | None = None
+    """What the force sensor reads untouched (x y z), in newtons; found if not given."""
+    lag_ms: float | None = None
+    """Thousandths of seconds by which the camera's clock is late, if you know them; the lag is then applied."""
+    apply_lag: bool = False
+    """Shift the forces by the lag that was found between camera and force sensor; it is always shown."""
+    normal_axis: Literal["x", "y", "z"] | None = None
+    """Axis of the force sensor that presses; found if not given."""
+    normal_sign: Literal[1, -1] | None = None
+    """1 if pressing is positive as recorded, -1 if negative; found if not given."""
+    contact_threshold: float | None = None
+    """Least normal force of a contact, in newtons; chosen from the noise if not given."""
+    force_range: float | None = None
+    """What each axis of the force sensor can measure, in newtons; frames beyond are not valid."""
+    reference: Literal["least contact energy", "first still"] = "least contact energy"
+    """How to choose the untouched frame among those before the contact, where the source does not tell it."""
+    reference_frame: int | None = None
+    """Number of the untouched frame, by hand."""
+    seed: int = 0
+    """Seed of the bootstraps behind the uncertainties."""
