@@ -1,0 +1,54 @@
+"""What the README shows in Python runs as it stands, on small networks and data."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from sliplens.models import Manifest, build_model, save_checkpoint
+from sliplens.recordings import Dataset
+from sliplens.training import RECIPES
+
+README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```python\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
+
+
+IMAGE_SIZE = 32
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_dataset: Dataset) -> Path:
+    """Folder in which the names of the README stand for small things: networks, a data set, a recording."""
+    (tmp_path / "data").symlink_to(small_dataset.folder)
+    for kind in ("difference", "raw"):
+        manifest = Manifest(
+            backbone="shufflenet_v2_x1_0",
+            head="histogram",
+            input=kind,
+            image_size=IMAGE_SIZE,
+            frame_size=(small_dataset.trials[0].height, small_dataset.trials[0].width),
+            sensor="test-sensor",
+            data_hash="none",
+        )
+        run = tmp_path / f"chromatouch-{kind}"
+        run.mkdir()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            save_checkpoint(run, build_model(head="histogram").eval(), manifest)
+    monkeypatch.setitem(RECIPES, "default", replace(RECIPES["default"], image_size=IMAGE_SIZE, batch_size=16))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=range(len(BLOCKS)))
+def test_what_the_readme_shows_runs(block: str, folder: Path, small_dataset: Dataset):
+    recording = small_dataset.load(small_dataset.trials[0])
+    given = {"frames": recording.frames[6:7], "untouched": recording.reference}
+    exec(compile(block, "README.md", "exec"), given)
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=range(len(BLOCKS)))
+def test_what_the_readme_shows_is_short(block: str):
+    assert len(block.splitlines()) <= 10
