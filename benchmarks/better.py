@@ -233,7 +233,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.exit(f"{Path(__file__).name}: {error}")
     if options.json:
         asked = {key: str(value) for key, value in vars(options).items()}
-        print(json.dumps({"networks": found, "asked": asked, "machine": machine(), "versions": versions()}))
+        print(json.dumps({"networks": found, "asked": asked, "machine": vars(machine()), "versions": versions()}))
 
 
 if __name__ == "__main__":

@@ -103,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "batch": options.batch,
             "threads": torch.get_num_threads(),
             "device": str(options.device),
-            "machine": machine(),
+            "machine": vars(machine()),
             "versions": versions(),
         }
         print(json.dumps(result))

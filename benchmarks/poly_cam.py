@@ -188,7 +188,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"{key:20} {'not measured' if value is None else format(value, '.4g')}")
     if options.json:
         more = {"budget": options.budget, "threads": torch.get_num_threads(), "networks": found}
-        print(json.dumps({**result, **more, "machine": machine(), "versions": versions()}))
+        print(json.dumps({**result, **more, "machine": vars(machine()), "versions": versions()}))
 
 
 if __name__ == "__main__":

@@ -145,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "size": options.size,
         "head": options.head,
         "threads": options.threads,
-        "machine": machine(),
+        "machine": vars(machine()),
         "versions": versions(),
     }
     print(f"{'engine':12s} {'p50 ms':>8s} {'p99 ms':>8s} {'of eager':>9s} {'off eager':>10s} {'ready s':>8s}")

@@ -19,7 +19,7 @@ from sliplens.models import load_checkpoint
 from sliplens.models.encodings import get_encoding
 from sliplens.recordings import Dataset
 from sliplens.simulation import PRESETS, simulate_dataset
-from sliplens.training import evaluate, fit, get_recipe
+from sliplens.training import evaluate_frames, fit, get_recipe
 from sliplens.training.data import load_frames
 
 INPUTS = ("difference", "raw")
@@ -57,7 +57,7 @@ def train_and_test(data: Dataset, folder: Path, *, name: str, options: argparse.
         data_hash=data.hash,
     )
     minutes = (time.perf_counter() - started) / 60
-    scores = evaluate(load_checkpoint(folder), frames("test")).conditions
+    scores = evaluate_frames(load_checkpoint(folder), frames("test")).conditions
     told = {f"{condition}_{key}": getattr(one, key) for condition, one in scores.items() for key in ("r2", "mse")}
     return {**told, "minutes": minutes}
 

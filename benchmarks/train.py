@@ -22,7 +22,7 @@ from sliplens.files import machine, versions
 from sliplens.models import build_model
 from sliplens.models.backbones import margin_loss
 from sliplens.models.encodings import get_encoding
-from sliplens.training import TrainConfig, TrainProgress, fit, get_recipe
+from sliplens.training import TrainConfig, fit, get_recipe
 from sliplens.training.data import FrameSet, get_augmentation
 
 
@@ -96,8 +96,7 @@ def measure(config: TrainConfig, *, steps: int) -> dict[str, float]:
         bare.synchronise()
         return Cost(wall_s=time.perf_counter(), processor_s=time.process_time())
 
-    def after_step(_: TrainProgress) -> None:
-        # after the last step, the validation is told of too
+    def after_step(*_: int) -> None:
         if 0 < len(ended) < steps:
             start = now()
             bare.step(augment=False)
@@ -146,7 +145,7 @@ def main() -> None:
     for name, value in numbers.items():
         print(f"{name:46s} {value:.3f}")
     if arguments.json:
-        print(json.dumps({**numbers, **vars(arguments), "machine": machine(), "versions": versions()}))
+        print(json.dumps({**numbers, **vars(arguments), "machine": vars(machine()), "versions": versions()}))
 
 
 if __name__ == "__main__":

@@ -29,9 +29,9 @@ from sliplens.errors import SliplensError
 from sliplens.models import TrainedModel, load_checkpoint
 from sliplens.models.checkpoint import find_run
 from sliplens.simulation import PRESETS, SimulationRecipe, simulate_dataset
-from sliplens.training import evaluate
+from sliplens.training import evaluate_frames
 from sliplens.training.data import load_frames
-from sliplens.training.evaluate import regression_scores
+from sliplens.training.metrics import regression_scores
 
 VIEWS = {"one frame": (0.0,), "and one 0.5 s earlier": (0.0, 0.5), "8 frames over 2.2 s": tuple(np.linspace(0, 2.2, 8))}
 """How many seconds before the last frame each frame lies."""
@@ -98,7 +98,7 @@ def answered(trained: TrainedModel, recipe: SimulationRecipe, folder: Path, *, s
     frames = load_frames(
         data, data.select(split=split), encoding=trained.encoding, image_size=trained.manifest.image_size
     )
-    return Answers(evaluate(trained, frames).predictions)
+    return Answers(evaluate_frames(trained, frames).frame())
 
 
 def main() -> None:

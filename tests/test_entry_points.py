@@ -11,10 +11,12 @@ from sliplens.extras import Table
 from sliplens.faithfulness import FILLS
 from sliplens.models.backbones import BACKBONES
 from sliplens.models.encodings import ENCODINGS
+from sliplens.models.engines import ENGINES
 
 TABLES = {
     "sliplens.backbones": BACKBONES,
     "sliplens.encodings": ENCODINGS,
+    "sliplens.engines": ENGINES,
     "sliplens.explainers": EXPLAINERS,
     "sliplens.fills": FILLS,
 }

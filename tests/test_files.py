@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.files import hash_json, output_folder, read_json, to_jsonable, write_json
+from sliplens.files import hash_json, output_folder, read_json, to_builtins, write_json
 
 
 def make(target: Path, config: dict, *, text: str = "x", overwrite: bool = False) -> bool:
@@ -98,7 +98,7 @@ def test_hash_does_not_depend_on_the_order_of_keys():
 
 def test_numpy_numbers_and_paths_become_json(tmp_path: Path):
     value = {"a": np.float32(0.5), "b": Path("c"), "d": (np.int64(1),)}
-    assert json.loads(json.dumps(to_jsonable(value))) == {"a": 0.5, "b": "c", "d": [1]}
+    assert json.loads(json.dumps(to_builtins(value))) == {"a": 0.5, "b": "c", "d": [1]}
 
 
 def test_nan_is_not_written_as_json(tmp_path: Path):

@@ -22,7 +22,7 @@ from house import examples_table
 ROOT = Path(__file__).parents[1]
 API_PAGE = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
 
-UNIT_IN_NAME = re.compile(r"_(n|m|pa|px|s|hz|deg|rad)$|(seconds|minutes|percent)$|_per_")
+UNIT_IN_NAME = re.compile(r"_(n|m|pa|px|s|ms|hz|deg|rad)$|(seconds|minutes|percent)$|_per_")
 """House style: a number of a physical quantity has its unit in its name."""
 NONE_IN_NAME = re.compile(
     r"coefficient|ratio|share|margin|exponent|quantile|level|strain|temperature|factor|learning_rate|fraction|score|auroc"

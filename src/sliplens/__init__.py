@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from sliplens.errors import SliplensError
     from sliplens.explainers.table import explain
     from sliplens.faithfulness.scoring import score
+    from sliplens.markers.tracking import track
     from sliplens.models.checkpoint import load
     from sliplens.models.onnx import export_onnx
     from sliplens.models.predictions import predict
@@ -16,11 +17,14 @@ if TYPE_CHECKING:
     from sliplens.recordings.dataset import load_dataset
     from sliplens.recordings.exporting import export_lerobot, export_mcap
     from sliplens.recordings.importing import import_recordings, label_dataset
+    from sliplens.training.evaluate import evaluate
+    from sliplens.training.fit import train
 
 # where each name lives: importing sliplens alone imports neither torch nor NumPy
 _MODULES = {
     "SliplensError": "sliplens.errors",
     "check_dataset": "sliplens.recordings.check",
+    "evaluate": "sliplens.training.evaluate",
     "explain": "sliplens.explainers.table",
     "export_lerobot": "sliplens.recordings.exporting",
     "export_mcap": "sliplens.recordings.exporting",
@@ -31,12 +35,15 @@ _MODULES = {
     "load_dataset": "sliplens.recordings.dataset",
     "predict": "sliplens.models.predictions",
     "score": "sliplens.faithfulness.scoring",
+    "track": "sliplens.markers.tracking",
+    "train": "sliplens.training.fit",
 }
 
 __all__ = [
     "SliplensError",
     "__version__",
     "check_dataset",
+    "evaluate",
     "explain",
     "export_lerobot",
     "export_mcap",
@@ -47,6 +54,8 @@ __all__ = [
     "load_dataset",
     "predict",
     "score",
+    "track",
+    "train",
 ]
 
 

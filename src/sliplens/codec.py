@@ -8,6 +8,7 @@ import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from pathlib import Path
+from types import NoneType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -17,7 +18,7 @@ import pyarrow.parquet as pq
 from jaxtyping import AbstractArray, jaxtyped
 
 from sliplens.errors import InputError
-from sliplens.files import write_json
+from sliplens.files import to_builtins, write_json
 
 RESULT_FILE = "result.json"
 """Record of a folder."""
@@ -25,35 +26,28 @@ ARRAYS_FILE = "arrays.npz"
 """Arrays beside it."""
 
 Record = TypeVar("Record")
+_Columns = TypeVar("_Columns", bound="Columns")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
     """Base of a table: a record whose fields are arrays of one length, a value a row.
 
-    Text columns are declared as `np.ndarray`, numbers with their jaxtyping type (`Float64[np.ndarray, " rows"]`).
-    NaN stands where a number is unknown.
+    Text columns are declared as `Shaped[np.ndarray, " rows"]`, numbers with their jaxtyping type
+    (`Float64[np.ndarray, " rows"]`). NaN stands where a number is unknown.
     """
 
     def __len__(self) -> int:
         """Number of rows."""
         return len(getattr(self, fields(self)[0].name))
 
+    def where(self: _Columns, rows: np.ndarray) -> _Columns:
+        """Rows of a mask, or of these numbers."""
+        return type(self)(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
     def table(self) -> pa.Table:
         """Arrow table with a column a field; NaN stays NaN. `.to_pandas()` where pandas is installed."""
         return pa.table({field.name: getattr(self, field.name) for field in fields(self)})
-
-
-def to_builtins(value: object) -> Any:
-    """What JSON can hold of a record: mappings, lists, texts, numbers.
-
-    Parameters
-    ----------
-    value
-        Record, or anything made of records, mappings, sequences, paths, texts and numbers. Arrays have no
-        form in JSON: declare short ones as tuples, and long ones as fields of a result (`save_result`).
-    """
-    return msgspec.to_builtins(value, enc_hook=_encode, str_keys=True)
 
 
 def save_record(record: object, path: Path) -> None:
@@ -135,7 +129,7 @@ def save_result(result: object, folder: Path) -> None:
     Parameters
     ----------
     result
-        Frozen dataclass; its `Columns` and array fields are stored beside the JSON, named as the fields are.
+        Frozen dataclass; its `Columns` (or None) and array fields are stored beside the JSON, named as the fields are.
     folder
         Folder to write to; must exist.
     """
@@ -178,22 +172,23 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
     if not isinstance(values, dict):
         raise InputError(f"{path} holds no JSON object; make it again with `{command}`")
     declared = get_type_hints(kind)
-    beside: dict[str, object] = {}
-    arrays: Mapping[str, np.ndarray] | None = None
-    for name, hint in declared.items():
-        if isinstance(hint, type) and issubclass(hint, Columns):
-            beside[name] = load_columns(folder / f"{name}.parquet", hint, command=command)
-        elif _is_array(hint) or _is_array_mapping_type(hint):
-            if arrays is None:
-                arrays = load_arrays(folder / ARRAYS_FILE, command=command)
-            beside[name] = _pick_arrays(arrays, name, hint, path=folder / ARRAYS_FILE, command=command)
+    beside = {name for name, hint in declared.items() if _is_array(hint) or _is_array_mapping_type(hint)}
+    columns = {name: _columns_type(hint) for name, hint in declared.items()}
+    # None stands in the JSON where there is no table
+    tables = {name: table for name, table in columns.items() if table and values.get(name, ...) is not None}
     # one dataclass of what is in the JSON, so that msgspec checks it as declared; defaults are kept
-    inside = [field for field in fields(kind) if field.name not in beside]  # pyright: ignore[reportArgumentType]
+    inside = [field for field in fields(kind) if field.name not in beside | tables.keys()]  # pyright: ignore[reportArgumentType]
     partial = msgspec.defstruct(
         kind.__name__, [(field.name, declared[field.name], _default(field)) for field in inside], kw_only=True
     )
     told = from_builtins(values, partial, where=path, command=command)
-    return kind(**{field.name: getattr(told, field.name) for field in inside}, **beside)
+    given = {field.name: getattr(told, field.name) for field in inside}
+    given |= {name: load_columns(folder / f"{name}.parquet", table, command=command) for name, table in tables.items()}
+    if beside:
+        arrays = load_arrays(folder / ARRAYS_FILE, command=command)
+        where = folder / ARRAYS_FILE
+        given |= {name: _pick_arrays(arrays, name, declared[name], path=where, command=command) for name in beside}
+    return kind(**given)
 
 
 def save_columns(columns: Columns, path: Path) -> None:
@@ -201,9 +196,6 @@ def save_columns(columns: Columns, path: Path) -> None:
     part = path.with_name(path.name + ".part")
     pq.write_table(columns.table(), part, compression="zstd")
     part.replace(path)
-
-
-_Columns = TypeVar("_Columns", bound=Columns)
 
 
 def load_columns(path: Path, kind: type[_Columns], *, command: str) -> _Columns:
@@ -217,7 +209,7 @@ def load_columns(path: Path, kind: type[_Columns], *, command: str) -> _Columns:
     cure = f"make it again with `{command}`"
     names = [field.name for field in fields(kind)]
     try:
-        table = pq.read_table(path, columns=names)
+        table = pq.read_table(path)
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; {cure}") from None
     except (pa.ArrowException, OSError, ValueError, LookupError) as error:
@@ -236,7 +228,7 @@ def load_columns(path: Path, kind: type[_Columns], *, command: str) -> _Columns:
             value = column.to_numpy()
         if _is_array(hint) and not _is_of(value, hint):
             raise InputError(f"{path} holds {column.type} as {name!r} where {_shown(hint)} belongs; {cure}")
-        if hint is np.ndarray and value.dtype.kind != "U":
+        if (hint is np.ndarray or _shown(hint).startswith("Shaped")) and value.dtype.kind != "U":
             raise InputError(f"{path} holds {column.type} as {name!r} where texts belong; {cure}")
         values[name] = value
     return kind(**values)
@@ -326,6 +318,12 @@ def _pick_arrays(arrays: Mapping[str, np.ndarray], name: str, hint: Any, *, path
     return picked[name] if _is_array(hint) else {key.removeprefix(start): array for key, array in picked.items()}
 
 
+def _columns_type(hint: object) -> type[Columns] | None:
+    """Kind of columns that a field declares, `X` or `X | None`."""
+    kinds = [kind for kind in get_args(hint) or (hint,) if kind is not NoneType]
+    return kinds[0] if len(kinds) == 1 and isinstance(kinds[0], type) and issubclass(kinds[0], Columns) else None
+
+
 def _is_array(hint: object) -> bool:
     return isinstance(hint, type) and (issubclass(hint, AbstractArray) or hint is np.ndarray)
 
@@ -352,16 +350,6 @@ def _default(field: Field[Any]) -> Any:
     if field.default_factory is not MISSING:
         return msgspec.field(default_factory=field.default_factory)
     return msgspec.NODEFAULT if field.default is MISSING else field.default
-
-
-def _encode(value: object) -> object:
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, Mapping):
-        return dict(value)
-    raise NotImplementedError(f"{type(value).__name__} has no form in JSON")
 
 
 def _decode(kind: Any, value: object) -> object:

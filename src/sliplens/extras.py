@@ -4,7 +4,7 @@ import os
 import sys
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from importlib import metadata
+from importlib import import_module, metadata
 from importlib.util import find_spec
 from types import ModuleType
 from typing import TypeVar
@@ -176,6 +176,25 @@ def import_openvino() -> ModuleType:
         if hide:
             del sys.modules[reporter]
     return openvino
+
+
+def require_device(name: str) -> None:
+    """Refuse a device that is not known or not there.
+
+    Raises
+    ------
+    InputError
+        Naming those that can be used.
+    """
+    torch = import_module("torch")  # takes seconds, and the floors below the networks do without
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise InputError(f"device {name!r} is not known; use cpu, cuda or cuda:1") from None
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise InputError(f"device {name} is not on this machine; use cpu")
+    if device.type not in {"cpu", "cuda"}:
+        raise InputError(f"device {name} cannot be used; use cpu or cuda")
 
 
 def import_cv2() -> ModuleType:

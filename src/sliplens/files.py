@@ -1,4 +1,4 @@
-"""Folders in formats of others: complete or absent, with our `run.json` where no reader of theirs looks."""
+"""Files and folders that are whole or absent, and where they come from."""
 
 import hashlib
 import json
@@ -6,14 +6,16 @@ import os
 import platform
 import shutil
 import sys
+import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, is_dataclass
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from sliplens._version import __version__
@@ -34,34 +36,66 @@ def versions() -> dict[str, str]:
     return found
 
 
-def machine() -> dict[str, Any]:
-    """Processor, cores and system of this machine, as far as the standard library can tell."""
-    return {
-        "system": platform.system(),
-        "processor": platform.machine(),
-        "cores": os.cpu_count(),
-        "implementation": sys.implementation.name,
-    }
+@dataclass(frozen=True, kw_only=True)
+class Machine:
+    """A machine, as far as the standard library can tell."""
+
+    system: str
+    processor: str
+    cores: int | None
+    implementation: str
+    """Of Python."""
 
 
-def to_jsonable(value: Any) -> Any:
-    """Turn records, paths and tuples into what JSON can hold; everything else must be JSON already."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return to_jsonable(asdict(value))
-    if isinstance(value, Mapping):
-        return {str(key): to_jsonable(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [to_jsonable(item) for item in value]
-    if isinstance(value, Path):
-        return str(value)
+def machine() -> Machine:
+    """System, processor and cores of this machine."""
+    return Machine(
+        system=platform.system(),
+        processor=platform.machine(),
+        cores=os.cpu_count(),
+        implementation=sys.implementation.name,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """Where a folder comes from: what its `run.json` says."""
+
+    stage: str
+    config: Mapping[str, Any]
+    """All that shaped the result, as JSON."""
+    config_hash: str
+    versions: Mapping[str, str]
+    machine: Machine
+    finished: str
+    """Date and time in UTC, as ISO 8601."""
+
+
+def to_builtins(value: object) -> Any:
+    """What JSON can hold of a record: mappings, lists, texts, numbers.
+
+    Parameters
+    ----------
+    value
+        Record, or anything made of records, mappings, sequences, paths, texts and numbers. Arrays have no
+        form in JSON: declare short ones as tuples, and long ones as fields of a result (`codec.save_result`).
+    """
+    return msgspec.to_builtins(value, enc_hook=_encode, str_keys=True)
+
+
+def _encode(value: object) -> object:
     if isinstance(value, np.generic):
         return value.item()
-    return value
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return dict(value)
+    raise NotImplementedError(f"{type(value).__name__} has no form in JSON")
 
 
 def hash_json(value: Any) -> str:
     """SHA-256 (first 16 hex digits) of a value's canonical JSON: the same recipe gives the same hash."""
-    text = json.dumps(to_jsonable(value), sort_keys=True, separators=(",", ":"))
+    text = json.dumps(to_builtins(value), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -74,7 +108,7 @@ def hash_file(path: Path) -> str:
 def write_json(path: Path, value: Any) -> None:
     """Write a value as indented JSON, beside the target first, so that no half-written file is ever seen."""
     part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps(to_jsonable(value), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    part.write_text(json.dumps(to_builtins(value), indent=2, allow_nan=False) + "\n", encoding="utf-8")
     part.replace(path)
 
 
@@ -109,6 +143,13 @@ def require_folder(path: Path, *, what: str) -> Path:
     return path
 
 
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Folder for what must lie on disk for a while; it is gone afterwards."""
+    with tempfile.TemporaryDirectory(prefix="sliplens-") as folder:
+        yield Path(folder)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Output:
     """A folder being written: `folder` lies beside the target until everything is in it."""
@@ -119,8 +160,21 @@ class Output:
     """True when the target was already made by the same recipe; then there is nothing to do."""
 
 
+def partial_folder(target: Path) -> Path:
+    """Folder in which `output_folder` makes a target."""
+    return target.with_name(f".{target.name}.partial")
+
+
 @contextmanager
-def output_folder(target: Path, *, stage: str, config: Mapping[str, Any], overwrite: bool = False) -> Iterator[Output]:
+def output_folder(
+    target: Path,
+    *,
+    stage: str,
+    config: Mapping[str, Any],
+    overwrite: bool = False,
+    run_file: str = RUN_FILE,
+    resumable: bool = True,
+) -> Iterator[Output]:
     """Write a folder that is complete or absent.
 
     The caller writes into a hidden folder beside the target (`.NAME.partial`). On success it gets `run.json` (stage,
@@ -130,14 +184,14 @@ def output_folder(target: Path, *, stage: str, config: Mapping[str, Any], overwr
 
     Parameters
     ----------
-    target
-        Folder to be made.
     stage
         Name of the command, kept in `run.json`.
     config
         All that shapes the result: the recipe that decides whether a partial or complete folder is the same.
-    overwrite
-        Replace a target made by another recipe, or by the same one.
+    run_file
+        Where `run.json` goes in a folder of another format, below it: where that format's readers do not look.
+    resumable
+        Keep what is finished for the next call; a folder of another format begins empty every time.
 
     Yields
     ------
@@ -162,112 +216,51 @@ def output_folder(target: Path, *, stage: str, config: Mapping[str, Any], overwr
     ...     before, sorted(path.name for path in target.iterdir())
     (False, ['hello.txt', 'run.json'])
     """
-    recipe = to_jsonable(config)
+    recipe = to_builtins(config)
     config_hash = hash_json({"stage": stage, "config": recipe, "sliplens": __version__})
+    empty = target.is_dir() and not any(target.iterdir())
+    if target.exists() and not (target / run_file).is_file() and not (overwrite and empty):
+        raise InputError(f"{target} exists and was not made by sliplens; choose another output folder")
     if target.exists() and not overwrite:
-        if not (target / RUN_FILE).is_file():
-            raise InputError(f"{target} exists and was not made by sliplens; choose another output folder")
-        if read_json(target / RUN_FILE).get("config_hash") != config_hash:
+        if read_json(target / run_file).get("config_hash") != config_hash:
             raise InputError(f"{target} holds a result of other settings; choose another folder or pass --overwrite")
         yield Output(target=target, folder=target, complete=True)
         return
-    if target.exists() and not (target / RUN_FILE).is_file() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(f"{target} was not made by sliplens and will not be overwritten; choose another output folder")
-    partial = target.with_name(f".{target.name}.partial")
+    partial = partial_folder(target)
     state = partial / ".recipe"
-    if partial.exists() and (not state.is_file() or state.read_text() != config_hash):
+    if partial.exists() and not (resumable and state.is_file() and state.read_text() == config_hash):
         shutil.rmtree(partial)
     try:
         partial.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot write to {target.parent} ({error.strerror}); choose another output folder") from None
-    state.write_text(config_hash)
+    if resumable:
+        state.write_text(config_hash)
     try:
         yield Output(target=target, folder=partial, complete=False)
     except BaseException:
         # what is finished stays for the next try; where nothing is, nothing is left behind
-        if not any(path != state for path in partial.iterdir()):
+        if not resumable or all(path == state for path in partial.iterdir()):
             shutil.rmtree(partial)
         raise
-    write_json(
-        partial / RUN_FILE,
-        {
-            "stage": stage,
-            "config": recipe,
-            "config_hash": config_hash,
-            "versions": versions(),
-            "machine": machine(),
-            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-        },
+    state.unlink(missing_ok=True)
+    provenance = Provenance(
+        stage=stage,
+        config=recipe,
+        config_hash=config_hash,
+        versions=versions(),
+        machine=machine(),
+        finished=datetime.now(UTC).isoformat(timespec="seconds"),
     )
-    state.unlink()
+    (partial / run_file).parent.mkdir(parents=True, exist_ok=True)
+    write_json(partial / run_file, provenance)
     if target.exists():
         shutil.rmtree(target)
     partial.rename(target)
 
 
-@contextmanager
 def exported_folder(
     target: Path, *, run_file: str, config: Mapping[str, Any], overwrite: bool = False
-) -> Iterator[Output]:
-    """Write a folder that is complete or absent, as `output_folder` does, but empty at first and never resumed.
-
-    Parameters
-    ----------
-    target
-        Folder to be made.
-    run_file
-        Where `run.json` goes, below the folder.
-    config
-        All that shapes the result.
-    overwrite
-        Replace a folder that an export made.
-
-    Yields
-    ------
-    Output
-        `complete` is True when the target already holds the result of this very configuration.
-
-    Raises
-    ------
-    InputError
-        If the target exists with another configuration, or was not made by an export.
-    """
-    recipe = to_jsonable(config)
-    config_hash = hash_json({"stage": "export", "config": recipe, "sliplens": __version__})
-    made = target / run_file
-    if target.exists() and not made.is_file():
-        raise InputError(f"{target} exists and was not made by this export; choose another output folder")
-    if target.exists() and not overwrite:
-        if read_json(made).get("config_hash") != config_hash:
-            raise InputError(f"{target} holds a result of other settings; choose another folder or pass --overwrite")
-        yield Output(target=target, folder=target, complete=True)
-        return
-    partial = target.with_name(f".{target.name}.partial")
-    if partial.exists():
-        shutil.rmtree(partial)
-    try:
-        partial.mkdir(parents=True)
-    except OSError as error:
-        raise InputError(f"cannot write to {target.parent} ({error.strerror}); choose another output folder") from None
-    try:
-        yield Output(target=target, folder=partial, complete=False)
-        record = partial / run_file
-        record.parent.mkdir(parents=True, exist_ok=True)
-        write_json(
-            record,
-            {
-                "stage": "export",
-                "config": recipe,
-                "config_hash": config_hash,
-                "versions": versions(),
-                "machine": machine(),
-                "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-            },
-        )
-    except BaseException:
-        shutil.rmtree(partial)
-        raise
-    if target.exists():
-        shutil.rmtree(target)
-    partial.rename(target)
+) -> AbstractContextManager[Output]:
+    """Write a folder in a format of others, as `output_folder` does."""
+    return output_folder(target, stage="export", config=config, overwrite=overwrite, run_file=run_file, resumable=False)

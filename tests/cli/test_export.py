@@ -83,7 +83,7 @@ def test_a_failure_leaves_nothing_behind(small_dataset: Dataset, tmp_path: Path,
 
 def test_what_others_made_is_never_replaced(small_dataset: Dataset, tmp_path: Path):
     (tmp_path / "mine").write_text("")
-    refused("was not made by this export", small_dataset.folder, "-o", tmp_path, "--lerobot", "--overwrite")
+    refused("was not made by sliplens", small_dataset.folder, "-o", tmp_path, "--lerobot", "--overwrite")
     assert names(tmp_path) == ["mine"]
 
 

@@ -55,6 +55,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory, small_dataset: Dataset) -
 def test_a_run_holds_its_learning_curve_and_what_its_logger_kept(finished: Path):
     names = {path.name for path in finished.iterdir()}
     expected = {"model.safetensors", "manifest.json", "metrics.csv", "result.json", "run.json", "curves.png"}
+    expected.add("curve.parquet")
     assert names == expected | {"tensorboard"}
     with Image.open(finished / "curves.png") as picture:
         assert np.asarray(picture).std() > 0  # not blank

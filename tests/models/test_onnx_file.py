@@ -1,7 +1,6 @@
 """ONNX files: what they answer and tell, and that they appear right or not at all."""
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from torch import Tensor, nn
 from sliplens import __version__
 from sliplens.errors import InputError, ModelError
 from sliplens.extras import import_onnxruntime
-from sliplens.files import to_jsonable
+from sliplens.files import to_builtins
 from sliplens.models import Manifest, TrainedModel
 from sliplens.models import onnx as onnx_file
 from sliplens.models.onnx import difference, export_onnx, require_file_of
@@ -85,7 +84,7 @@ def test_the_file_is_valid_and_tells_how_to_feed_it(
         **({"probabilities": ["batch", 60]} if head == "histogram" else {}),
     }
     told = {item.key: json.loads(item.value) for item in model.metadata_props}
-    assert told["sliplens.manifest"] == to_jsonable(asdict(networks[head].manifest))
+    assert told["sliplens.manifest"] == json.loads(json.dumps(to_builtins(networks[head].manifest)))
     assert told["sliplens.input"]["encoding"] == "difference"
     assert told["sliplens.input"]["image_size"] == 32
     edges = told["sliplens.output"]["bin_edges"]

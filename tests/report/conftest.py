@@ -4,10 +4,10 @@ import shutil
 from pathlib import Path
 
 import pytest
+from made_up import write_workspace
 
 from sliplens.report import Written, build_report
 
-from .made_up import write_workspace
 from .study_results import Made, write_study
 
 

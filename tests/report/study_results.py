@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from made_up import picture_and_maps, write_evaluation, write_run
 from PIL import Image
 from scipy.stats import kendalltau
 
 from sliplens.intervals import Difference, paired_difference
-
-from .made_up import picture_and_maps, write_evaluation, write_run
 
 INPUTS = ("difference", "raw")
 METHODS = ("grad-cam", "integrated-gradients", "poly-cam")

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_up import write_run
 
 from sliplens.intervals import Difference
 from sliplens.report import load_results
-from sliplens.report.study.believing import _tell_lead, compare_gain, judge_study, rank_methods, share_of_strongest
-from sliplens.report.study.claims import all_of, judge_claims, judge_gap, most_of
+from sliplens.report.believing import _tell_lead, compare_gain, judge_study, rank_methods, share_of_strongest
+from sliplens.report.claims import all_of, judge_claims, judge_gap, most_of
 
-from .made_up import write_run
 from .study_results import (
     GAINS,
     MAP_MEASURES,

@@ -3,8 +3,8 @@ import pytest
 
 from sliplens.intervals import bootstrap_difference
 from sliplens.report.tables import agreement, compare_deletion, compare_errors
+from sliplens.results.evaluation import Predictions
 from sliplens.results.faithfulness import DeletionCurve
-from sliplens.results.records import Predictions
 
 
 def predictions(error: np.ndarray, *, order: np.ndarray | None = None) -> Predictions:
@@ -13,10 +13,12 @@ def predictions(error: np.ndarray, *, order: np.ndarray | None = None) -> Predic
     return Predictions(
         trial=np.repeat([f"t{index}" for index in range(trials)], frames)[rows],
         condition=np.full(error.size, "dry")[rows],
+        day=np.zeros(error.size, dtype=np.int64),
         frame=np.tile(np.arange(frames), trials)[rows],
         time_s=np.zeros(error.size),
         safety_margin=np.full(error.size, 0.5),
         prediction=(0.5 + error.ravel())[rows],
+        **{name: np.full(error.size, np.nan) for name in ("sigma", "low_90", "high_90")},
     )
 
 

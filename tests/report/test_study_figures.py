@@ -11,7 +11,8 @@ from sliplens.errors import InputError
 from sliplens.faithfulness.deletion import deletion_order
 from sliplens.plots.style import ORANGE, SKY
 from sliplens.report import load_results
-from sliplens.report.study.plates import (
+from sliplens.report.method_tables import table_scores
+from sliplens.report.plates import (
     Cell,
     Plate,
     bright_pictures,
@@ -23,9 +24,8 @@ from sliplens.report.study.plates import (
     told_frame,
     write_plates,
 )
-from sliplens.report.study.removal_figures import plate_removal
-from sliplens.report.study.state_figures import paint_effects
-from sliplens.report.study.tables import table_scores
+from sliplens.report.removal_figures import plate_removal
+from sliplens.report.state_figures import paint_effects
 
 from .study_results import METHODS, Made, write_choice, write_faithfulness
 

@@ -1,9 +1,10 @@
 import json
 import shutil
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 import torch
@@ -15,9 +16,10 @@ from sliplens.markers import track_markers
 from sliplens.markers.estimators import ESTIMATORS, field_trial, get_estimator
 from sliplens.models import Manifest, build_model, save_checkpoint
 from sliplens.recordings import Dataset
+from sliplens.results.evaluation import BaselinePredictions, Baselines, Predictions
 from sliplens.simulation import SimulationRecipe, simulate_dataset
 from sliplens.training import baselines
-from sliplens.training.baselines import Baselines, choose_training, evaluate_baselines, marker_kind
+from sliplens.training.baselines import BaselinePlan, choose_training, evaluate_baselines, marker_kind
 
 pytest.importorskip("cv2", reason="markers are found with OpenCV, of the extra `markers`")
 
@@ -32,7 +34,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def fields(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def followed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What one test followed, the next need not."""
     return tmp_path_factory.mktemp("fields")
 
@@ -56,92 +58,95 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def labelled_frames(data: Dataset, *, split: str = "test") -> pa.Table:
-    """What a network's predictions say of the frames."""
-    rows = []
+def labelled_frames(data: Dataset, *, split: str = "test") -> Predictions:
+    """The frames of a split, as if a network had answered with nothing."""
+    parts = []
     for info in data.select(split=split):
         recording = data.load(info, truth=False)
-        rows += [
-            {
-                "trial": info.trial,
-                "condition": info.condition,
-                "frame": int(frame),
-                "time_s": float(recording.time_s[frame]),
-                "safety_margin": float(recording.safety_margin[frame]),
-            }
-            for frame in np.flatnonzero(recording.labelled)
-        ]
-    return pa.Table.from_pylist(rows)
-
-
-def evaluated(data: Dataset, folder: Path, *, names=CHOSEN) -> Baselines:
-    return evaluate_baselines(
-        names,
-        data,
-        training=data.select(split="train"),
-        predictions=labelled_frames(data),
-        kind="chromatouch",
-        folder=folder,
+        rows = np.flatnonzero(recording.labelled)
+        unknown = np.full(len(rows), np.nan)
+        parts.append(
+            Predictions(
+                trial=np.full(len(rows), info.trial),
+                condition=np.full(len(rows), info.condition),
+                day=np.full(len(rows), info.day),
+                frame=rows,
+                time_s=recording.time_s[rows],
+                safety_margin=recording.safety_margin[rows],
+                prediction=unknown,
+                sigma=unknown,
+                low_90=unknown,
+                high_90=unknown,
+            )
+        )
+    return Predictions(
+        **{item.name: np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(Predictions)}
     )
 
 
-def test_answers_are_those_of_estimators_fitted_by_hand(data: Dataset, fields: Path):
-    found = evaluated(data, fields)
+def plan(data: Dataset, *, names: tuple[str, ...] = CHOSEN, condition: str | None = None) -> BaselinePlan:
+    training = data.select(split="train", condition=condition)
+    return BaselinePlan(estimators=names, training=training, offered_trials=len(training), markers="chromatouch")
+
+
+def evaluated(data: Dataset, folder: Path) -> tuple[Baselines, BaselinePredictions]:
+    return evaluate_baselines(plan(data), data, labelled_frames(data), folder=folder)
+
+
+def test_answers_are_those_of_estimators_fitted_by_hand(data: Dataset, followed: Path):
+    found, answered = evaluated(data, followed)
     tracked, margins = {}, {}
     for info in data.trials:
         recording = data.load(info, truth=False)
         tracked[info.trial] = field_trial(track_markers(recording.frames, recording.reference, "chromatouch"))
         margins[info.trial] = np.where(recording.labelled, recording.safety_margin, np.nan)
     train = [info.trial for info in data.select(split="train")]
-    table = found.predictions.to_pydict()
-    label = np.array(table["safety_margin"])
+    frames = labelled_frames(data)
     for name in CHOSEN:
         estimator = get_estimator(name).fit([tracked[one] for one in train], [margins[one] for one in train])
         answers = {one: estimator.estimate(field) for one, field in tracked.items()}
-        expected = [answers[trial][frame] for trial, frame in zip(table["trial"], table["frame"], strict=True)]
+        expected = [answers[trial][frame] for trial, frame in zip(frames.trial, frames.frame, strict=True)]
+        shown = answered.where(answered.estimator == name)
+        assert (shown.trial == frames.trial).all()
+        assert (shown.frame == frames.frame).all()
         # frames are stored without loss, so only the order of sums may differ
-        np.testing.assert_allclose(table[name], expected, atol=1e-9)
+        np.testing.assert_allclose(shown.prediction, expected, atol=1e-9)
         for condition, scores in found.estimators[name].conditions.items():
-            rows = np.array(table["condition"]) == condition
-            assert scores.mae == pytest.approx(np.abs(np.array(expected) - label)[rows].mean())
+            rows = frames.condition == condition
+            assert scores.mae == pytest.approx(np.abs(np.array(expected) - frames.safety_margin)[rows].mean())
             assert scores.frames == rows.sum()
     assert found.training_trials == len(train)
     assert found.training_frames == sum(np.isfinite(margins[one]).sum() for one in train)
     assert found.followed > 0.9
 
 
-def test_the_constant_explains_nothing_of_frames_with_the_mean_it_was_fitted_to(data: Dataset, fields: Path):
+def test_the_constant_explains_nothing_of_frames_with_the_mean_it_was_fitted_to(data: Dataset, followed: Path):
     # scored on its own training trials, the mean of the labels leaves all of their variance
-    found = evaluate_baselines(
-        ("constant",),
-        data,
-        training=[info for info in data.select(split="train") if info.condition == "dry"],
-        predictions=labelled_frames(data, split="train"),
-        kind="chromatouch",
-        folder=fields,
-    )
+    on_dry = plan(data, names=("constant",), condition="dry")
+    found, _ = evaluate_baselines(on_dry, data, labelled_frames(data, split="train"), folder=followed)
+    assert found.shared_trials == found.training_trials
     assert found.estimators["constant"].conditions["dry"].r2 == pytest.approx(0, abs=1e-9)
 
 
-def test_fields_that_were_followed_before_are_not_followed_again(data: Dataset, fields: Path, monkeypatch):
-    first = evaluated(data, fields)
+def test_fields_that_were_followed_before_are_not_followed_again(data: Dataset, followed: Path, monkeypatch):
+    first, answered = evaluated(data, followed)
 
     def refuse(*_: object) -> None:
         raise AssertionError("followed again")
 
     monkeypatch.setattr(baselines, "track_markers", refuse)
-    again = evaluated(data, fields)
-    assert again.predictions == first.predictions
-    assert again.followed == first.followed
+    again, answered_again = evaluated(data, followed)
+    assert again == first
+    assert answered_again.table() == answered.table()
 
 
 def test_trials_without_markers_are_named_and_answered_with_the_training_mean(
-    data: Dataset, fields: Path, tmp_path: Path, monkeypatch
+    data: Dataset, followed: Path, tmp_path: Path, monkeypatch
 ):
-    evaluated(data, fields)
+    evaluated(data, followed)
     blind = data.select(split="test", condition="dry")[0].trial
     lost = data.select(split="train")[0].trial
-    for path in fields.iterdir():
+    for path in followed.iterdir():
         if path.stem not in {blind, lost}:
             shutil.copy(path, tmp_path)
 
@@ -149,13 +154,11 @@ def test_trials_without_markers_are_named_and_answered_with_the_training_mean(
         raise ImageError("the reference shows 0 whole markers")
 
     monkeypatch.setattr(baselines, "track_markers", find_none)
-    found = evaluated(data, tmp_path)
+    found, answered = evaluated(data, tmp_path)
     assert found.failed == dict.fromkeys((lost, blind), "the reference shows 0 whole markers")
     assert found.training_trials == len(data.select(split="train")) - 1
-    table = found.predictions.to_pydict()
-    rows = np.array(table["trial"]) == blind
-    for name in CHOSEN:
-        np.testing.assert_allclose(np.array(table[name])[rows], table["constant"][0])
+    constant = answered.prediction[answered.estimator == "constant"][0]
+    np.testing.assert_allclose(answered.prediction[answered.trial == blind], constant)
 
 
 def test_no_trial_with_markers_is_refused(small_dataset: Dataset, tmp_path: Path):
@@ -188,18 +191,20 @@ def test_the_command_puts_them_beside_the_network(data: Dataset, network: Path, 
     assert f"of 2 of the {len(data.select(split='train'))} training trials" in said
     assert "last frame before the pull" in said
     results = [json.loads((folder / "result.json").read_text()) for folder in (plain, beside)]
-    own = results[1].pop("baselines")
+    own = results[1]["baselines"]
     # who reads the network's scores finds them where they were
+    for name in ("baselines", "baseline_predictions"):
+        assert results[0].pop(name) is None
+        results[1].pop(name, None)
     assert results[0] == results[1]
     assert list(own["estimators"]) == list(ESTIMATORS)
-    assert (own["training_trials"], own["training_trials_the_network_knew"], own["failed"]) == (2, 0, {})
+    assert (own["training_trials"], own["known_trials"], own["failed"]) == (2, 0, {})
     assert own["estimators"]["constant"]["conditions"].keys() == results[0]["conditions"].keys()
-    tables = [pq.read_table(beside / name) for name in ("predictions.parquet", "baselines.parquet")]
-    assert tables[1].select(["trial", "frame", "safety_margin"]) == tables[0].select(
-        ["trial", "frame", "safety_margin"]
-    )
+    tables = [pq.read_table(beside / name) for name in ("predictions.parquet", "baseline_predictions.parquet")]
+    constant = tables[1].filter(pc.field("estimator") == "constant")
+    assert constant.select(["trial", "frame"]) == tables[0].select(["trial", "frame"])
     assert sorted(path.name for path in beside.iterdir()) == [
-        "baselines.parquet",
+        "baseline_predictions.parquet",
         "evaluation.png",
         "predictions.parquet",
         "result.json",

@@ -10,7 +10,7 @@ from sliplens.errors import RecordingError
 from sliplens.models import load_checkpoint
 from sliplens.models.encodings import get_encoding
 from sliplens.recordings import Dataset
-from sliplens.training import evaluate, regression_scores
+from sliplens.training import evaluate_frames, regression_scores
 from sliplens.training.data import load_frames
 
 MARGINS = arrays(np.float64, 30, elements=st.floats(0, 1))
@@ -61,8 +61,8 @@ def test_every_condition_is_scored_on_its_own_frames(small_dataset: Dataset, dif
     frames = load_frames(
         small_dataset, small_dataset.select(split="test"), encoding=get_encoding("difference"), image_size=32
     )
-    evaluation = evaluate(trained, frames, batch_size=5)
-    table = evaluation.predictions.to_pydict()
+    evaluation = evaluate_frames(trained, frames, batch_size=5)
+    table = evaluation.frame().to_pydict()
     for condition in ("dry", "wet"):
         rows = [index for index, name in enumerate(table["condition"]) if name == condition]
         squares = [(table["prediction"][row] - table["safety_margin"][row]) ** 2 for row in rows]

@@ -39,7 +39,7 @@ def test_progress_counts_trials(small_dataset: Dataset):
         trials,
         encoding=get_encoding("raw"),
         image_size=32,
-        on_trial=lambda done, total: seen.append((done, total)),
+        on_progress=lambda done, total: seen.append((done, total)),
     )
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
 

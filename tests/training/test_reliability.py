@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sliplens.training.evaluate import auroc, coverage, lead_times
+from sliplens.training.metrics import auroc, coverage, lead_times
 
 SCORES = arrays(np.float64, st.integers(1, 12), elements=st.integers(0, 5).map(float))
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sliplens.errors import InputError
-from sliplens.training.fit import WholeCheckpoints
+from sliplens.training.trainer import WholeCheckpoints
 
 
 def test_a_checkpoint_comes_back(tmp_path: Path):

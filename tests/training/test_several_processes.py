@@ -15,7 +15,7 @@ from torch import distributed
 from sliplens.models import load_checkpoint
 from sliplens.models.encodings import get_encoding
 from sliplens.recordings import Dataset
-from sliplens.training import evaluate
+from sliplens.training import evaluate_frames
 from sliplens.training.data import EpochShuffle, load_frames
 
 pytestmark = pytest.mark.skipif(
@@ -54,7 +54,7 @@ def test_a_run_of_two_processes_is_whole_and_tells_its_own_error(tmp_path: Path,
     assert done.stderr == ""
     # one process speaks
     assert len(re.findall("wrote", done.stdout)) == 1
-    assert len(re.findall("Reading trials", done.stdout)) == 1
+    assert len(re.findall("Reading training trials", done.stdout)) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
     assert json.loads((tmp_path / "run" / "result.json").read_text())["processes"] == 2
     trained = load_checkpoint(tmp_path / "run")
@@ -64,7 +64,7 @@ def test_a_run_of_two_processes_is_whole_and_tells_its_own_error(tmp_path: Path,
         encoding=get_encoding("difference"),
         image_size=32,
     )
-    alone = evaluate(trained, frames).conditions["dry"].mse
+    alone = evaluate_frames(trained, frames).conditions["dry"].mse
     # the same weights and frames in other batches: sums of single floats in another order
     assert trained.manifest.metrics["validation_mse"] == pytest.approx(alone, abs=1e-5)
 
@@ -106,7 +106,7 @@ def test_two_processes_started_by_torchrun_take_the_steps_of_one(tmp_path: Path,
         torch.testing.assert_close(value, weights[1][name], rtol=1e-3, atol=1e-4)
 
     # both stop at one step, or the first would wait for the other
-    assert notes["results"][1]["stopped_by"] == "time limit"
+    assert notes["stops"][1] == "time limit"
 
     order = EpochShuffle(44, seed=5).order(0)
     place = order.index(script["BAD_ROW"])

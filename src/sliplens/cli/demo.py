@@ -17,7 +17,7 @@ from sliplens.cli.score import Score
 from sliplens.cli.simulate import Simulate
 from sliplens.cli.train import Train
 from sliplens.errors import InputError
-from sliplens.files import read_json, require_folder, to_jsonable, write_json
+from sliplens.files import hash_json, read_json, require_folder, to_builtins, write_json
 
 INPUTS = ("difference", "raw")
 _PLAN = "plan.json"
@@ -116,11 +116,11 @@ class Demo:
 
     def _open_workspace(self, real: Path | None) -> None:
         """Make the workspace, or go on in one that was begun with the same settings."""
-        settings = to_jsonable({**asdict(self), "real_frames": None if real is None else real.resolve()})
+        settings = to_builtins({**asdict(self), "real_frames": None if real is None else real.resolve()})
         del settings["output"]  # the same folder, named from elsewhere
         plan = self.output / _PLAN
         if plan.is_file():
-            if read_json(plan)["settings"] != settings:
+            if hash_json(read_json(plan)["settings"]) != hash_json(settings):
                 raise InputError(f"{self.output} holds a demo of other settings; choose another folder or delete it")
             say(f"going on in {self.output}")
             return

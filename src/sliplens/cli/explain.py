@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sliplens.cli.console import print_table, progress_bar, say, unchanged, wrote
-from sliplens.cli.devices import require_device
 from sliplens.errors import InputError
+from sliplens.extras import require_device
 from sliplens.files import output_folder, read_json
 
 if TYPE_CHECKING:

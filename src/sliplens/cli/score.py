@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from sliplens.cli.console import print_table, progress_bar, say, unchanged, wrote
-from sliplens.cli.devices import require_device
+from sliplens.extras import require_device
 from sliplens.files import hash_file, output_folder
 
 

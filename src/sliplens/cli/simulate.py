@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from sliplens.cli.console import print_table, progress_bar, unchanged, wrote
-from sliplens.cli.devices import require_device
 from sliplens.errors import InputError
+from sliplens.extras import require_device
 from sliplens.files import output_folder, write_json
 
 if TYPE_CHECKING:

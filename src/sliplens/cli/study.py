@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sliplens.cli.devices import require_device
 from sliplens.cli.evaluate import Evaluate
 from sliplens.cli.report import Report
 from sliplens.cli.screen import Screen, Terminal
 from sliplens.cli.simulate import Simulate
 from sliplens.cli.together import run_together
 from sliplens.errors import InputError
+from sliplens.extras import require_device
 
 if TYPE_CHECKING:
     from sliplens.cli.study_stages import Stages

@@ -10,7 +10,7 @@ from sliplens.cli.screen import Count, Screen, Terminal
 from sliplens.errors import InputError
 from sliplens.explainers import Explainer, IntegratedGradients
 from sliplens.faithfulness.removal import Faithfulness
-from sliplens.files import hash_json, output_folder, read_json, to_jsonable
+from sliplens.files import hash_json, output_folder, read_json
 from sliplens.models import TrainedModel
 from sliplens.recordings import Dataset
 from sliplens.simulation.intervention import rebuild_trial
@@ -241,7 +241,7 @@ class Stages:
         return True
 
     def _frames(self) -> dict[str, Any]:
-        return {"data_hash": self.data.hash, "choice": hash_json(to_jsonable(self.choice))}
+        return {"data_hash": self.data.hash, "choice": hash_json(self.choice)}
 
     def _run(self, name: str, stage: str, config: Mapping[str, Any], title: str, work: Work) -> None:
         target = self.output / name

@@ -222,12 +222,8 @@ def measure(
         The image and its masks.
     channels
         Which, in rising order.
-    passes
-        The network.
     variant
         Which points are predicted.
-    on_channels
-        Called with the number of channels done since the last call.
 
     Returns
     -------

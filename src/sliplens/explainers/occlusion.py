@@ -129,8 +129,6 @@ class Occlusion(Method):
         as `find_markers`; they are then the regions, and what lies between them is one more.
     radius_px
         How far a marker reaches; see `marker_regions`.
-    batch_size
-        Occluded images in one pass.
 
     References
     ----------

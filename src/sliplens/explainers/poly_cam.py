@@ -64,8 +64,6 @@ class PolyCam(Method):
         Masked images in one pass; None for what suits the engine.
     levels
         Keep the saliency and the weights of each layer in the explanation, those finer than `level` too.
-    seed
-        Of the draws that tell the error of a map with a budget.
 
     References
     ----------

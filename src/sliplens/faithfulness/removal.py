@@ -52,8 +52,6 @@ def answer_removals(
 
     Parameters
     ----------
-    predict
-        The network.
     paint
         Makes the images, a batch in memory at a time.
     removals
@@ -237,8 +235,6 @@ class Faithfulness:
         ----------
         trials
             Trial of each image: whole trials are resampled, since frames of one resemble one another.
-        seed
-            Seed of the resampling.
         """
         nothing = np.zeros_like(self.symmetric_gain)
         return paired_difference(self.symmetric_gain, nothing, trials=trials, rng=np.random.default_rng(seed))
@@ -290,16 +286,10 @@ def removal_curves(
         Inputs in [0, 1], and those of the untouched sensor where the fill needs them.
     orders
         Flat pixel indices, first to be removed first (`unit_order`, `random_unit_order`).
-    fill
-        What removed pixels become (`get_fill`).
     areas
         Shares of the image to remove, rising from 0 to 1.
-    seed
-        For the fill that adds noise.
     batch_size
         Images that are made and answered at a time: bounds the memory.
-    on_progress
-        Called with the number of images done and the number of all.
 
     Raises
     ------
@@ -372,12 +362,8 @@ def faithfulness(
         works towards the target, `relevance * sign(target)`, and `towards`.
     units
         What is removed at once, for each image (`pixel_units`, `tile_units`, `marker_units`).
-    rng
-        Source of the random orders.
     towards
         Sign of the target f(x) - f(untouched sensor) of each image: changes count along it; by their size if None.
-    random_orders
-        How many of them.
 
     References
     ----------

@@ -68,10 +68,6 @@ def score(
         What is removed at once: pixels, or square tiles of a fourteenth of the image.
     random_orders
         How many random orders are removed beside.
-    seed
-        Seed of the random orders and of the noise of a fill.
-    on_progress
-        Called with the frames done and their number.
 
     Returns
     -------
@@ -145,10 +141,6 @@ def score_by_deletion(
         What removed pixels become, a row of `FILLS`.
     steps
         Steps until every pixel is gone; the image's height if None, as in the thesis.
-    seed
-        Seed of the random control.
-    on_progress
-        Called with the frames done, those of the control too, and their number.
 
     Returns
     -------

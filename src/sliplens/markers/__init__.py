@@ -3,7 +3,7 @@
 from sliplens.markers.detect import KINDS, Appearance, MarkerKind, Markers, detect_markers
 from sliplens.markers.displacement import DisplacementField, compute_field, interpolate_field
 from sliplens.markers.doublets import Doublets, fit_doublets
-from sliplens.markers.track import Tracker, track_markers
+from sliplens.markers.tracker import Tracker, track_markers
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame, Tracks
 
 __all__ = [

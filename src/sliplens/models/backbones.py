@@ -107,8 +107,6 @@ def histogram_targets(margins: Float[Tensor, " batch"], edges: Float[Tensor, " e
 
     Parameters
     ----------
-    margins
-        Labels.
     edges
         Of bins of one width, rising.
 

@@ -119,8 +119,6 @@ def conformal_offset(
     ----------
     low, high
         Intervals of validation frames; equal for one number.
-    margins
-        Their labels.
     level
         Share that is to hold.
 

@@ -12,12 +12,14 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from sliplens.codec import load_record, save_record
+from sliplens.codec import load_record, load_result, save_record
 from sliplens.errors import CheckpointError, ImageError, InputError
+from sliplens.extras import require_device
 from sliplens.files import hash_file, require_folder
 from sliplens.models.backbones import HistogramRegressor, bin_edges, build_model
 from sliplens.models.calibration import Calibration, quantiles
 from sliplens.models.encodings import Encoding, get_encoding
+from sliplens.results.training import Training
 
 WEIGHTS_FILE = "model.safetensors"
 MANIFEST_FILE = "manifest.json"
@@ -50,10 +52,12 @@ class Manifest:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainedModel:
-    """A network with its manifest; in evaluation mode."""
+    """A trained network, in evaluation mode, with what it is and how it was trained."""
 
     model: nn.Module
     manifest: Manifest
+    training: Training | None = None
+    """How it was trained, with its learning curve; None where its folder does not tell."""
 
     @property
     def device(self) -> torch.device:
@@ -72,8 +76,6 @@ class TrainedModel:
 
         Parameters
         ----------
-        frames
-            RGB.
         reference
             The sensor untouched; None for frames that were compared before, or that need not be.
 
@@ -222,7 +224,10 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> TrainedModel:
         ) from None
     # channels last: depthwise convolutions run up to half as fast again on a CPU
     model = model.to(device, memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
-    return TrainedModel(model=model, manifest=manifest)
+    # the networks of the package come without their learning curve
+    told = (folder / "curve.parquet").is_file()
+    training = load_result(folder, Training, command="sliplens train") if told else None
+    return TrainedModel(model=model, manifest=manifest, training=training)
 
 
 def _read_manifest(path: Path) -> Manifest:
@@ -246,7 +251,7 @@ def load(run: str | Path, *, device: str = "cpu") -> TrainedModel:
     run
         One of `shipped_names`, such as `chromatouch-difference`, or a folder that training wrote.
     device
-        Where to put it.
+        Where to put it: cpu, cuda or cuda:1.
 
     Raises
     ------
@@ -264,24 +269,6 @@ def load(run: str | Path, *, device: str = "cpu") -> TrainedModel:
     """
     require_device(device)
     return load_checkpoint(find_run(Path(run)), device=device)
-
-
-def require_device(name: str) -> None:
-    """Refuse a device that is not known or not there.
-
-    Raises
-    ------
-    InputError
-        Naming those that can be used.
-    """
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise InputError(f"device {name!r} is not known; use cpu, cuda or cuda:1") from None
-    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise InputError(f"device {name} is not on this machine; use cpu")
-    if device.type not in {"cpu", "cuda"}:
-        raise InputError(f"device {name} cannot be used; use cpu or cuda")
 
 
 def find_run(run: Path) -> Path:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from sliplens._version import __version__
 from sliplens.errors import InputError, ModelError
 from sliplens.extras import ONNX_PACKAGES, import_onnxruntime, require_packages
-from sliplens.files import to_jsonable
+from sliplens.files import to_builtins
 from sliplens.models.backbones import Answers, answer_names, bin_edges
 from sliplens.models.checkpoint import TrainedModel, load
 
@@ -56,8 +56,6 @@ def export_onnx(run: TrainedModel | Path | str, out: Path | str, *, overwrite: b
         Network, its folder, or the name of one that comes with sliplens.
     out
         File to write, NAME.onnx.
-    overwrite
-        Write the file anew if it exists.
 
     Raises
     ------
@@ -157,7 +155,7 @@ def _describe(proto: "ModelProto", trained: TrainedModel) -> None:
         },
     }
     for key, value in properties.items():
-        proto.metadata_props.add(key=key, value=json.dumps(to_jsonable(value)))
+        proto.metadata_props.add(key=key, value=json.dumps(to_builtins(value)))
 
 
 @torch.no_grad()

@@ -20,7 +20,7 @@ from sliplens.models.engines import Engine, make_engine
 from sliplens.progress import OnProgress, note, stage
 from sliplens.recordings import Dataset
 from sliplens.recordings.options import ReadOptions
-from sliplens.recordings.source import Frame, Frames, TrialFrames, describe_source, open_source
+from sliplens.recordings.source import Frame, Frames, TrialFrames, open_source
 
 LEVEL = 0.9
 """Confidence of the intervals."""
@@ -129,7 +129,6 @@ def predict(
     path = None if out is None else Path(out)
     _check_arguments(path, overwrite=overwrite, batch_size=batch_size, engine=engine, onnx_file=onnx_file)
     trained = run if isinstance(run, TrainedModel) else load(run, device=device)
-    described = describe_source(source)
     if isinstance(source, Path | str | np.ndarray | Dataset):
         with stage(on_progress, "Opening the source"):
             source = open_source(
@@ -148,7 +147,7 @@ def predict(
         ready = make_engine(engine, trained, frames=total, batch_size=batch_size, onnx_file=onnx_file)
     metadata = {
         "sliplens.engine": ready.name,
-        "sliplens.source": described,
+        "sliplens.source": source[0].source,
         "sliplens.manifest_hash": hash_json(trained.manifest),
         "sliplens.weights_sha256": trained.manifest.weights_sha256,
     }

@@ -2,10 +2,8 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
@@ -30,9 +28,16 @@ from sliplens.plots.style import (
     methods_in_order,
     short_input_name,
 )
+from sliplens.results.evaluation import (
+    BaselineScores,
+    BinScore,
+    Evaluation,
+    Predictions,
+    RegressionScores,
+    Reliability,
+)
 from sliplens.results.faithfulness import DeletionCurve
-from sliplens.results.files import read_learning_curve
-from sliplens.results.records import BinScore, Predictions, Training
+from sliplens.results.training import Training
 
 MARGIN_LABEL = "Safety margin Γ (%)"
 
@@ -91,8 +96,8 @@ def plot_learning_curves(trainings: Mapping[str, Training], *, ax: Axes) -> Axes
     for name in inputs_in_order(trainings):
         training, colour = trainings[name], INPUT_COLOURS.get(name, PURPLE)
         label = short_input_name(name)
-        ax.plot(training.epoch, training.train_mse, color=colour, linestyle=":", label=f"{label}, training")
-        ax.plot(training.epoch, training.validation_mse, color=colour, label=f"{label}, validation")
+        ax.plot(training.curve.epoch, training.curve.train_mse, color=colour, linestyle=":", label=f"{label}, training")
+        ax.plot(training.curve.epoch, training.curve.validation_mse, color=colour, label=f"{label}, validation")
     ax.set(xlabel="Epoch (passes over the training frames)", ylabel="MSE (Γ as a fraction, squared)", yscale="log")
     ax.legend()
     return ax
@@ -176,21 +181,12 @@ _READER = 0.36  # inches a reader of the margin
 _LOWEST_R2 = -0.3  # further down it does not matter how far; the number says it
 
 
-def draw_evaluation(predictions: pa.Table, told: Mapping[str, Any], path: Path, *, title: str) -> None:
+def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
     """Save a page of six charts as .png, .pdf or .svg, or of eight where there are baselines.
 
     Answers against labels; mean squared error in ten bins of the margin (thesis, Fig. 7); bias of each trial; how often
     intervals hold; uncertainty by condition; the trial of median error over time. Below, R2 and mean absolute error of
-    the network beside those of model-based estimators, where `told` has them.
-
-    Parameters
-    ----------
-    predictions, told
-        `predictions.parquet` and `result.json` of `sliplens evaluate`.
-    path
-        File to write.
-    title
-        Head of the page.
+    the network beside those of model-based estimators, where there are any.
 
     Raises
     ------
@@ -198,10 +194,9 @@ def draw_evaluation(predictions: pa.Table, told: Mapping[str, Any], path: Path, 
         If the suffix is another one, or the file cannot be written.
     """
     require_picture_path(path, example="evaluation.png")
-    columns = {name: predictions.column(name).to_numpy() for name in predictions.column_names}
-    conditions = conditions_in_order(told["conditions"])
+    conditions = conditions_in_order(evaluation.conditions)
+    estimators = {} if evaluation.baselines is None else evaluation.baselines.estimators
     with drawing_style():
-        estimators = told["baselines"]["estimators"] if "baselines" in told else {}
         figure = Figure(figsize=(_WIDTH, _HEIGHT + (0.9 + _READER * (len(estimators) + 1) if estimators else 0)))
         charts = []
         for index in range(6):
@@ -209,51 +204,56 @@ def draw_evaluation(predictions: pa.Table, told: Mapping[str, Any], path: Path, 
             left = _LEFT + column * (_CHART[0] + _GAP)
             top = _TOP + row * (_CHART[1] + 1.05)
             charts.append(place_axes(figure, left, top, *_CHART))
-        _plot_answers(columns, conditions, ax=charts[0])
-        _plot_bins(told["conditions"], conditions, ax=charts[1])
-        _plot_trials(columns, conditions, ax=charts[2])
-        _plot_coverage(told["reliability"], conditions, ax=charts[3])
-        _plot_uncertainty(columns, conditions, told["wet_auroc"], ax=charts[4])
-        _plot_typical(columns, told["trials"], ax=charts[5])
+        predictions = evaluation.predictions
+        _plot_answers(predictions, conditions, ax=charts[0])
+        _plot_bins(evaluation.conditions, conditions, ax=charts[1])
+        _plot_trials(predictions, conditions, ax=charts[2])
+        _plot_coverage(evaluation.reliability, conditions, ax=charts[3])
+        _plot_uncertainty(predictions, conditions, evaluation.wet_auroc, ax=charts[4])
+        _plot_typical(predictions, evaluation.trials, ax=charts[5])
         if estimators:
-            _plot_readers(figure, {"network": told, **estimators}, conditions, top=_HEIGHT + 0.25)
+            _plot_readers(figure, {"network": evaluation, **estimators}, conditions, top=_HEIGHT + 0.25)
         place_text(figure, _LEFT - 0.5, 0.2, title, fontsize=13, fontweight="bold", parse_math=False)
-        place_text(figure, _LEFT - 0.5, 0.52, _summary(told, conditions), fontsize=9, color=GREY)
+        place_text(figure, _LEFT - 0.5, 0.52, _summary(evaluation, conditions), fontsize=9, color=GREY)
     save_page(figure, path)
 
 
-def _plot_answers(columns: Mapping[str, np.ndarray], conditions: list[str], *, ax: Axes) -> None:
+def _plot_answers(predictions: Predictions, conditions: list[str], *, ax: Axes) -> None:
     for name in conditions:
-        rows = np.flatnonzero(columns["condition"] == name)
+        rows = np.flatnonzero(predictions.condition == name)
         rows = rows[:: max(1, len(rows) // _MOST_DOTS)]
-        label, answer = (100 * columns[key][rows] for key in ("safety_margin", "prediction"))
         ax.scatter(
-            label, answer, s=5, alpha=0.35, linewidths=0, rasterized=True, color=_COLOURS.get(name, GREEN), label=name
+            100 * predictions.safety_margin[rows],
+            100 * predictions.prediction[rows],
+            s=5,
+            alpha=0.35,
+            linewidths=0,
+            rasterized=True,
+            color=_COLOURS.get(name, GREEN),
+            label=name,
         )
     ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="perfect")
     ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103), title="Answers")
     ax.legend(markerscale=2.5, fontsize=8, loc="upper left")
 
 
-def _plot_bins(scores: Mapping[str, Any], conditions: list[str], *, ax: Axes) -> None:
+def _plot_bins(scores: Mapping[str, RegressionScores], conditions: list[str], *, ax: Axes) -> None:
     width = 0.8 / max(1, len(conditions))
     for index, name in enumerate(conditions):
-        bins = scores[name]["bins"]
+        bins = scores[name].bins
         at = np.arange(len(bins)) + (index - (len(conditions) - 1) / 2) * width
-        heights = [np.nan if one["mse"] is None else one["mse"] for one in bins]
+        heights = [np.nan if one.mse is None else one.mse for one in bins]
         ax.bar(at, heights, width=width, color=_COLOURS.get(name, GREEN), label=name)
     ax.set(xlabel="True Γ, lower edge of the bin (%)", ylabel="MSE (Γ as a fraction, squared)", title="Error by margin")
     ax.set_xticks(range(10), [str(10 * one) for one in range(10)])
     ax.legend(fontsize=8)
 
 
-def _plot_trials(columns: Mapping[str, np.ndarray], conditions: list[str], *, ax: Axes) -> None:
+def _plot_trials(predictions: Predictions, conditions: list[str], *, ax: Axes) -> None:
     for place, name in enumerate(conditions):
-        biases = []
-        inside = columns["condition"] == name
-        for trial in np.unique(columns["trial"][inside]):
-            rows = inside & (columns["trial"] == trial)
-            biases.append(100 * float(np.mean(columns["prediction"][rows] - columns["safety_margin"][rows])))
+        shown = predictions.where(predictions.condition == name)
+        error = 100 * (shown.prediction - shown.safety_margin)
+        biases = [float(error[shown.trial == trial].mean()) for trial in np.unique(shown.trial)]
         spread = np.linspace(-0.25, 0.25, len(biases)) if len(biases) > 1 else np.zeros(1)
         ax.scatter(np.sort(biases), place + spread, s=14, color=_COLOURS.get(name, GREEN), linewidths=0)
     ax.axvline(0, color=BLACK, linewidth=1, linestyle="--")
@@ -263,8 +263,8 @@ def _plot_trials(columns: Mapping[str, np.ndarray], conditions: list[str], *, ax
     ax.set_yticks(range(len(conditions)), conditions)
 
 
-def _plot_coverage(reliability: Mapping[str, Any], conditions: list[str], *, ax: Axes) -> None:
-    known = {name: reliability[name]["coverage"] for name in conditions if reliability[name]["coverage"]}
+def _plot_coverage(reliability: Mapping[str, Reliability], conditions: list[str], *, ax: Axes) -> None:
+    known = {name: reliability[name].coverage for name in conditions if reliability[name].coverage}
     for name, shares in known.items():
         levels = sorted(shares, key=float)
         drawn = {"color": _COLOURS.get(name, GREEN), "marker": "o", "markersize": 4}
@@ -278,42 +278,38 @@ def _plot_coverage(reliability: Mapping[str, Any], conditions: list[str], *, ax:
     ax.legend(fontsize=8, loc="upper left")
 
 
-def _plot_uncertainty(
-    columns: Mapping[str, np.ndarray], conditions: list[str], auroc: float | None, *, ax: Axes
-) -> None:
+def _plot_uncertainty(predictions: Predictions, conditions: list[str], auroc: float | None, *, ax: Axes) -> None:
     title = "Uncertainty" if auroc is None else f"Wet told from dry: AUROC {auroc:.2f}"
     ax.set(xlabel="Standard deviation of the answer (points of Γ)", ylabel="Share of the frames (%)", title=title)
-    if "sigma" not in columns:
+    if not np.isfinite(predictions.sigma).any():
         _say(ax, "one number, and no distribution")
         return
-    sigma = 100 * columns["sigma"]
+    sigma = 100 * predictions.sigma
     edges = np.linspace(0, max(1.0, float(np.quantile(sigma, 0.995))), 30).tolist()
     for name in conditions:
-        shown = sigma[columns["condition"] == name]
+        shown = sigma[predictions.condition == name]
         weights = np.full(len(shown), 100 / len(shown))
         ax.hist(shown, bins=edges, weights=weights, color=_COLOURS.get(name, GREEN), alpha=0.6, label=name)
     ax.legend(fontsize=8)
 
 
-def _plot_typical(columns: Mapping[str, np.ndarray], trials: Mapping[str, Any], *, ax: Axes) -> None:
-    ranked = sorted(trials, key=lambda name: trials[name]["mse"])
+def _plot_typical(predictions: Predictions, trials: Mapping[str, RegressionScores], *, ax: Axes) -> None:
+    ranked = sorted(trials, key=lambda name: trials[name].mse)
     trial = ranked[(len(ranked) - 1) // 2]
-    rows = np.flatnonzero(columns["trial"] == trial)
-    rows = rows[np.argsort(columns["time_s"][rows], kind="stable")]
-    time = columns["time_s"][rows]
-    if "low_90" in columns:
-        low, high = 100 * columns["low_90"][rows], 100 * columns["high_90"][rows]
-        ax.fill_between(time, low, high, color=VERMILLION, alpha=0.2, linewidth=0, label="90 % interval")
-    ax.plot(time, 100 * columns["prediction"][rows], color=VERMILLION, label="predicted")
-    ax.plot(time, 100 * columns["safety_margin"][rows], color=BLACK, linestyle="--", label="true")
+    rows = np.flatnonzero(predictions.trial == trial)
+    shown = predictions.where(rows[np.argsort(predictions.time_s[rows], kind="stable")])
+    if np.isfinite(shown.low_90).any():
+        interval = {"color": VERMILLION, "alpha": 0.2, "linewidth": 0, "label": "90 % interval"}
+        ax.fill_between(shown.time_s, 100 * shown.low_90, 100 * shown.high_90, **interval)
+    ax.plot(shown.time_s, 100 * shown.prediction, color=VERMILLION, label="predicted")
+    ax.plot(shown.time_s, 100 * shown.safety_margin, color=BLACK, linestyle="--", label="true")
     ax.set(xlabel="Time (s)", ylabel="Γ (%)")
-    shown = trial if len(trial) <= 18 else f"…{trial[-17:]}"
-    ax.set_title(f"Median error: {shown}", parse_math=False)
+    ax.set_title(f"Median error: {trial if len(trial) <= 18 else f'…{trial[-17:]}'}", parse_math=False)
     ax.legend(fontsize=8)
 
 
 def _plot_readers(
-    figure: Figure, readers: Mapping[str, Mapping[str, Any]], conditions: list[str], *, top: float
+    figure: Figure, readers: Mapping[str, Evaluation | BaselineScores], conditions: list[str], *, top: float
 ) -> None:
     """Bars of R2 and of the mean absolute error, a row a reader of the margin."""
     left, gap = 2.35, 0.5
@@ -321,10 +317,10 @@ def _plot_readers(
     first, second = (place_axes(figure, left + at * (size[0] + gap), top, *size) for at in range(2))
     thick = 0.8 / max(1, len(conditions))
     for index, name in enumerate(conditions):
-        scores = [one["conditions"][name] for one in readers.values()]
+        scores = [one.conditions[name] for one in readers.values()]
         at = np.arange(len(readers)) + (index - (len(conditions) - 1) / 2) * thick
-        r2 = np.array([np.nan if one["r2"] is None else one["r2"] for one in scores])
-        mae = np.array([100 * one["mae"] for one in scores])
+        r2 = np.array([np.nan if one.r2 is None else one.r2 for one in scores])
+        mae = np.array([100 * one.mae for one in scores])
         for ax, values, digits in ((first, r2, 2), (second, mae, 1)):
             ax.barh(at, np.maximum(values, _LOWEST_R2), height=thick, color=_COLOURS.get(name, GREEN), label=name)
             for place, value in zip(at, values, strict=True):
@@ -342,16 +338,16 @@ def _plot_readers(
     second.legend(fontsize=8, loc="lower right")
 
 
-def _summary(told: Mapping[str, Any], conditions: list[str]) -> str:
+def _summary(evaluation: Evaluation, conditions: list[str]) -> str:
     parts = []
     for name in conditions:
-        scores, lead = told["conditions"][name], told["lead_times"][name]
-        r2 = "none" if scores["r2"] is None else f"{scores['r2']:.3f}"
-        words = f"{name}: {scores['frames']:,} frames, MSE {scores['mse']:.4f}, R² {r2}"
-        words += f", MAE {100 * scores['mae']:.1f} points"
-        if lead["median_ms"] is not None:
-            words += f", warns {lead['median_ms']:.0f} ms before the slip (the true Γ: {lead['ideal_ms']:.0f} ms)"
-        parts.append(f"{words}, {lead['false_per_minute']:.1f} false alarms a minute")
+        scores, lead = evaluation.conditions[name], evaluation.lead_times[name]
+        r2 = "none" if scores.r2 is None else f"{scores.r2:.3f}"
+        words = f"{name}: {scores.frames:,} frames, MSE {scores.mse:.4f}, R² {r2}"
+        words += f", MAE {100 * scores.mae:.1f} points"
+        if lead.median_ms is not None:
+            words += f", warns {lead.median_ms:.0f} ms before the slip (the true Γ: {lead.ideal_ms:.0f} ms)"
+        parts.append(f"{words}, {lead.false_per_minute:.1f} false alarms a minute")
     return "\n".join(parts)
 
 
@@ -363,32 +359,26 @@ _FEW = 40
 """Epochs up to which each has a dot: one epoch alone makes no line."""
 
 
-def draw_learning_curve(metrics: Path, path: Path, *, input_name: str, title: str) -> None:
-    """Save the errors of a `metrics.csv` by epoch, on a logarithmic scale, with the epoch whose weights were kept.
+def draw_learning_curve(training: Training, path: Path, *, title: str) -> None:
+    """Save the errors of a training by epoch, on a logarithmic scale, with the epoch whose weights were kept.
 
     Parameters
     ----------
-    metrics
-        As `fit` writes it.
     path
         File to write: .png, .pdf or .svg.
-    input_name
-        What the network sees; it sets the colour, as in the report.
-    title
-        Head of the page.
 
     Raises
     ------
     InputError
-        If a file cannot be read or written.
+        If the file cannot be written.
     """
-    curve = read_learning_curve(metrics, command="sliplens train")
-    epoch, train, validation = (curve[name] for name in ("epoch", "train_mse", "validation_mse"))
+    curve = training.curve
+    epoch, train, validation = curve.epoch, curve.train_mse, curve.validation_mse
     best = int(np.argmin(validation))
     with drawing_style():
         figure = Figure(figsize=(7.0, 4.4))
         ax = place_axes(figure, 0.95, 0.75, 5.8, 3.05)
-        _plot(ax, epoch, train, validation, best=best, colour=INPUT_COLOURS.get(input_name, BLUE))
+        _plot(ax, epoch, train, validation, best=best, colour=INPUT_COLOURS.get(training.input, BLUE))
         place_text(figure, 0.25, 0.15, title, fontsize=12, fontweight="bold", parse_math=False)
         kept = f"kept: epoch {epoch[best]:.4g}, validation MSE {validation[best]:.4g}"
         kept += f", root mean square error {100 * np.sqrt(validation[best]):.1f} points of Γ"

@@ -45,6 +45,15 @@ class TrialFrames:
     """Names of the images of a folder."""
     notes: tuple[str, ...] = ()
     """What was assumed, a sentence each, for people."""
+    source: str = "frames in memory"
+    """Path that was opened, for people and metadata."""
+
+    @property
+    def frame_rate_hz(self) -> float:
+        """Frames a second at which it can be watched, 1 to 120; 25 where times are not known."""
+        if self.time_s is None or len(self.time_s) < 2:
+            return 25.0
+        return float(np.clip(1 / np.median(np.diff(self.time_s)), 1, 120))
 
 
 def open_source(
@@ -103,8 +112,11 @@ def open_source(
         names = [info.trial for info in source.select(split=split)]
         return tuple(open_trial() for open_trial in _chosen(trials, names, trial, source.folder))
     if split is not None:
-        raise InputError(f"{describe_source(source)} is no data set of sliplens and has no splits; leave out --split")
-    opened = [_with_reference(one, reference, reference_frame) for one in _open(source, format, options)]
+        raise InputError(f"{_words(source)} is no data set of sliplens and has no splits; leave out --split")
+    opened = [
+        replace(_with_reference(one, reference, reference_frame), source=_words(source))
+        for one in _open(source, format, options)
+    ]
     return tuple(_chosen(opened, [one.name for one in opened], trial, source))
 
 
@@ -129,15 +141,12 @@ def _chosen(trials: list, names: list[str], trial: str | None, source: Path | Fr
     if trial is None:
         return trials
     if trial not in names:
-        raise InputError(f"{describe_source(source)} has no trial {trial}; choose one such as {names[0]}")
+        raise InputError(f"{_words(source)} has no trial {trial}; choose one such as {names[0]}")
     return [trials[names.index(trial)]]
 
 
-def describe_source(source: Path | str | Frames | Dataset | Sequence[TrialFrames]) -> str:
-    """Where frames come from, for people and metadata: a path, or what else they are."""
-    if isinstance(source, Dataset):
-        return str(source.folder)
-    return str(source) if isinstance(source, str | Path) else "frames in memory"
+def _words(source: Path | Frames) -> str:
+    return str(source) if isinstance(source, Path) else TrialFrames.source
 
 
 def _stored(folder: Path, info: TrialInfo) -> TrialFrames:
@@ -147,6 +156,7 @@ def _stored(folder: Path, info: TrialInfo) -> TrialFrames:
         name=info.trial,
         frames=info.frames,
         frame_size=(info.height, info.width),
+        source=str(folder),
         read_frames=partial(stream_frames, path),
         read_reference=partial(read_reference, path),
         time_s=recording.time_s,

@@ -8,17 +8,17 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from sliplens.errors import InputError
+from sliplens.files import Provenance
 from sliplens.plots.layout import Picture, draw_picture, written_whole
 from sliplens.plots.saliency import plot_colour_bar
 from sliplens.plots.style import input_name, method_name, source_name
-from sliplens.report.results import READERS, load_results
+from sliplens.report.believing import judge_study, tell_interval
+from sliplens.report.plates import FOLDER, Plate, write_plates
+from sliplens.report.results import READERS, RECORDS, load_results
 from sliplens.report.sections import Section, build_sections
-from sliplens.report.study.believing import judge_study, tell_interval
-from sliplens.report.study.plates import FOLDER, Plate, write_plates
 from sliplens.report.study.sections import build_study_page
 from sliplens.report.verdict import Statement, judge
 from sliplens.report.workspace import Results
-from sliplens.results.records import Run
 
 _TEMPLATE = "report.html.j2"
 
@@ -35,7 +35,7 @@ class Page:
     study: bool
     colour_bar: Picture
     warnings: tuple[str, ...]
-    runs: tuple[Run, ...]
+    runs: dict[str, Provenance]
     recipes: tuple[str, ...]
     versions: tuple[tuple[str, str], ...]
     machine: tuple[tuple[str, str], ...]
@@ -100,7 +100,7 @@ def build_page(results: Results) -> Page:
     """Draw and judge the results of a workspace."""
     # one stream, seeded: the same results give the same intervals
     rng = np.random.default_rng(0)
-    newest = results.runs[-1]
+    newest = list(results.runs.values())[-1]
     if results.study:
         drawn = build_study_page(results, rng=rng)
         sections, plates, statements = drawn.sections, drawn.plates, judge_study(results, rng=rng)
@@ -120,9 +120,9 @@ def build_page(results: Results) -> Page:
         ),
         warnings=tuple(_warnings(results)),
         runs=results.runs,
-        recipes=tuple(json.dumps(run.config, indent=2, ensure_ascii=False) for run in results.runs),
+        recipes=tuple(json.dumps(run.config, indent=2, ensure_ascii=False) for run in results.runs.values()),
         versions=tuple(newest.versions.items()),
-        machine=tuple((str(name), str(value)) for name, value in newest.machine.items()),
+        machine=tuple((str(name), str(value)) for name, value in vars(newest.machine).items()),
     )
 
 
@@ -137,7 +137,11 @@ def _warnings(results: Results) -> list[str]:
             for method, cost in explained.methods.items()
             for warning in cost.warnings
         ]
-    versions = {tuple(sorted(run.versions.items())) for run in results.runs if run.stage in READERS}
+    versions = {
+        tuple(sorted(run.versions.items()))
+        for run in results.runs.values()
+        if run.stage in READERS.keys() | RECORDS.keys()
+    }
     if len(versions) > 1:
         told.append("The stages were run with different versions of the libraries; see the versions of each run.json.")
     return told

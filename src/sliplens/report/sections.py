@@ -29,7 +29,7 @@ from sliplens.plots.style import (
     source_name,
 )
 from sliplens.report.blocks import Notes
-from sliplens.report.study.claims import Claim
+from sliplens.report.claims import Claim
 from sliplens.report.tables import (
     Table,
     table_accuracy,
@@ -39,8 +39,8 @@ from sliplens.report.tables import (
     table_training,
 )
 from sliplens.report.workspace import Results
+from sliplens.results.evaluation import Predictions
 from sliplens.results.faithfulness import DeletionScores
-from sliplens.results.records import Predictions
 
 
 def chart_bins(results: Results) -> Chart:
@@ -302,9 +302,8 @@ def recipe_section(results: Results) -> Section:
         counts = "; ".join(
             f"{name} {count.trials} trials, {count.frames} frames" for name, count in simulation.by_split.items()
         )
-        total = f"{simulation.trials or 'an unknown number of'} trials, {simulation.frames or 'unknown'} frames"
-        conditions = f" Objects: {', '.join(simulation.conditions)}." if simulation.conditions else ""
-        intro = f"Simulated: {total}{f' ({counts})' if counts else ''}.{conditions}"
+        intro = f"Simulated: {simulation.trials} trials, {simulation.frames} frames ({counts})."
+        intro += f" Objects: {', '.join(simulation.conditions)}."
     return Section(
         id="recipe",
         title="How these results were made",

@@ -22,8 +22,8 @@ from sliplens.plots.style import (
 )
 from sliplens.report.thesis import ACCURACY, DELETION, MARK, NETWORK_PIXELS, SECONDS
 from sliplens.report.workspace import Results
+from sliplens.results.evaluation import Predictions
 from sliplens.results.faithfulness import DeletionCurve, DeletionScores
-from sliplens.results.records import Predictions
 
 
 def compare_errors(first: Predictions, second: Predictions, *, rng: np.random.Generator) -> Difference | None:

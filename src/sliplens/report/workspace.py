@@ -3,10 +3,13 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from sliplens.files import Provenance
+from sliplens.results.evaluation import Evaluation
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionScores
-from sliplens.results.records import Evaluation, Run, Simulation, Training
+from sliplens.results.simulation import Simulation
 from sliplens.results.study import Study
+from sliplens.results.training import Training
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,6 +18,8 @@ class Results:
 
     Attributes
     ----------
+    runs
+        By the name of the folder, last finished last.
     trainings, evaluations
         By input ("raw", "difference").
     explanations, scores
@@ -26,7 +31,7 @@ class Results:
     """
 
     workspace: Path
-    runs: tuple[Run, ...]
+    runs: dict[str, Provenance]
     simulation: Simulation | None = None
     trainings: dict[str, Training] = field(default_factory=dict)
     evaluations: dict[str, Evaluation] = field(default_factory=dict)

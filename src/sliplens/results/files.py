@@ -1,6 +1,5 @@
 """Files beside `result.json`: tables, maps and pictures, each checked as it is read."""
 
-import csv
 import zipfile
 from pathlib import Path
 
@@ -14,47 +13,6 @@ from sliplens.errors import ImageError, InputError, SaliencyError
 from sliplens.images import read_image
 from sliplens.results.explanation import ExplainedFrame
 from sliplens.results.faithfulness import DeletionCurve
-from sliplens.results.records import Predictions
-
-
-def read_learning_curve(path: Path, *, command: str) -> dict[str, Float[np.ndarray, " epochs"]]:
-    """Columns epoch, train_mse and validation_mse of a `metrics.csv`; an empty cell becomes NaN.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, lacks a column, or holds something that is no number.
-    """
-    names = ("epoch", "train_mse", "validation_mse")
-    try:
-        with path.open(encoding="utf-8", newline="") as stream:
-            rows = list(csv.DictReader(stream))
-        columns = {name: np.array([float(row[name] or "nan") for row in rows], dtype=np.float64) for name in names}
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; make the folder again with `{command}`") from None
-    except (KeyError, TypeError, ValueError, csv.Error) as error:
-        raise InputError(
-            f"{path} is no table of {', '.join(names)} ({error}); make the folder again with `{command}`"
-        ) from None
-    return columns
-
-
-def read_predictions(path: Path, *, command: str) -> Predictions:
-    """Labels and answers of the test frames.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or damaged, or lacks a column.
-    """
-    numbers = ("time_s", "safety_margin", "prediction")
-    table = read_table(path, ("trial", "condition", "frame", *numbers), command=command)
-    return Predictions(
-        trial=np.array(table["trial"].to_pylist(), dtype=str),
-        condition=np.array(table["condition"].to_pylist(), dtype=str),
-        frame=table["frame"].to_numpy().astype(np.int64),
-        **{name: table[name].to_numpy().astype(np.float64) for name in numbers},
-    )
 
 
 def read_deletion(path: Path, *, command: str) -> dict[str, DeletionCurve]:

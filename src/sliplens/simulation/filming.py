@@ -175,8 +175,6 @@ def prepare_film(
 
     Parameters
     ----------
-    rng
-        Source of noise and of the focus' wander.
     noise
         The camera's noise; None films without it.
 

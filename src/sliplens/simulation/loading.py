@@ -123,8 +123,6 @@ def load_grasp(grasp: Grasp, *, frames: int, rng: np.random.Generator, release: 
 
     Parameters
     ----------
-    rng
-        Source of the pull's small unevenness.
     release
         Let go at the end: the normal force falls to nothing while the object slides, and the last frames have no
         contact.

@@ -1,19 +1,20 @@
 """Train a network and measure how well it reads the safety margin."""
 
 from sliplens.training.config import RECIPES, TrainConfig, get_recipe
-from sliplens.training.evaluate import Evaluation, RegressionScores, evaluate, regression_scores
-from sliplens.training.fit import TrainProgress, fit
-from sliplens.training.hardware import Hardware
+from sliplens.training.evaluate import evaluate, evaluate_frames
+from sliplens.training.fit import fit, train
+from sliplens.training.metrics import lead_times, regression_scores
+from sliplens.training.trainer import make_trainer
 
 __all__ = [
     "RECIPES",
-    "Evaluation",
-    "Hardware",
-    "RegressionScores",
     "TrainConfig",
-    "TrainProgress",
     "evaluate",
+    "evaluate_frames",
     "fit",
     "get_recipe",
+    "lead_times",
+    "make_trainer",
     "regression_scores",
+    "train",
 ]

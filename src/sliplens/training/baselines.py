@@ -1,50 +1,44 @@
 """What markers alone tell: model-based estimators, fitted on training trials and scored as a network is."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from jaxtyping import Float
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.markers import KINDS, MarkerStatus, track_markers
 from sliplens.markers.estimators import FieldTrial, field_trial, get_estimator
+from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import trial_path
 from sliplens.recordings.store import load_recording, stream_frames
-from sliplens.training.evaluate import LeadTimes, RegressionScores, lead_times, regression_scores
-
-_KEYS = ("trial", "condition", "frame", "time_s", "safety_margin")
-
-
-@dataclass(frozen=True, kw_only=True)
-class BaselineScores:
-    """How well one estimator reads the margin, by condition."""
-
-    conditions: dict[str, RegressionScores]
-    lead_times: dict[str, LeadTimes]
+from sliplens.results.evaluation import BaselinePredictions, Baselines, BaselineScores, Predictions
+from sliplens.training.metrics import find_lead_times, score_predictions
 
 
 @dataclass(frozen=True, kw_only=True)
-class Baselines:
-    """Scores of estimators, and what they were fitted on."""
+class BaselinePlan:
+    """Which estimators are fitted on which trials."""
 
+    estimators: tuple[str, ...]
+    """Rows of `ESTIMATORS`."""
+    training: tuple[TrialInfo, ...]
+    offered_trials: int
+    """Training trials of the data set."""
     markers: str
-    """Kind of markers that was followed."""
-    training_trials: int
-    training_frames: int
-    """With a label."""
-    followed: float
-    """Share of markers followed while in view, over all frames of the trials fitted on and scored."""
-    failed: dict[str, str]
-    """Trials in which no field could be followed, and why: not fitted on, and answered with the training mean."""
-    estimators: dict[str, BaselineScores]
-    predictions: pa.Table = field(repr=False)
-    """Frames as in the network's predictions, a column an estimator."""
-    hold: str = "found in each trial as a whole, by find_hold"
-    """Where the frame comes from from which motion is counted."""
+    """Row of `markers.KINDS`."""
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """What shapes the result, as `run.json` keeps it."""
+        return {
+            "estimators": self.estimators,
+            "markers": self.markers,
+            "trials": [trial.trial for trial in self.training],
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,74 +70,76 @@ def choose_training(trials: Sequence[TrialInfo], count: int) -> tuple[TrialInfo,
 
 
 def evaluate_baselines(
-    names: Sequence[str],
+    plan: BaselinePlan,
     data: Dataset,
+    predictions: Predictions,
     *,
-    training: Sequence[TrialInfo],
-    predictions: pa.Table,
-    kind: str,
     folder: Path,
-    on_trial: Callable[[int, int], None] | None = None,
-) -> Baselines:
+    on_progress: OnProgress | None = None,
+) -> tuple[Baselines, BaselinePredictions]:
     """Follow markers, fit estimators on training trials, and score them on the very frames a network was scored on.
 
     Parameters
     ----------
-    names
-        Rows of `ESTIMATORS`.
+    plan
+        Estimators, the trials to fit on, and the kind of their markers.
     data
-        Data set that holds both kinds of trials.
-    training
-        Trials to fit on.
+        Data set that holds the trials.
     predictions
-        The network's: trial, condition, frame, time and label of each frame.
-    kind
-        Row of `markers.KINDS`.
+        The network's, for the trial, condition, frame, time and label of each frame.
     folder
-        For the field of each trial: those that are there are not followed again.
-    on_trial
-        Called with the number of trials followed and the number of all.
+        Keeps the field of each trial: those that are there are not followed again.
 
     Raises
     ------
     InputError
         If a name is not known, OpenCV is missing, or markers could be followed in none of the trials.
     """
-    estimators = {name: get_estimator(name) for name in names}
-    columns = {name: predictions.column(name).to_numpy(zero_copy_only=False) for name in _KEYS}
-    tested = set(columns["trial"].tolist())
-    trials = {info.trial: info for info in (*training, *(one for one in data.trials if one.trial in tested))}
+    estimators = {name: get_estimator(name) for name in plan.estimators}
+    tested = set(predictions.trial.tolist())
+    trials = {info.trial: info for info in (*plan.training, *(one for one in data.trials if one.trial in tested))}
     fields: dict[str, _Followed] = {}
     failed: dict[str, str] = {}
     for done, info in enumerate(trials.values(), start=1):
         try:
-            fields[info.trial] = _follow(data, info, kind, folder)
+            fields[info.trial] = _follow(data, info, plan.markers, folder)
         except RecordingError:
             raise
         except InputError as error:
             failed[info.trial] = str(error)
-        if on_trial is not None:
-            on_trial(done, len(trials))
-    fitted = [info for info in training if info.trial in fields]
-    for what, found in (("training", fitted), ("tested", tested - set(failed))):
-        if not found:
+        if on_progress is not None:
+            on_progress(done, len(trials))
+    fitted = [info for info in plan.training if info.trial in fields]
+    for what, usable in (("training", fitted), ("tested", tested - set(failed))):
+        if not usable:
             name, why = next(iter(failed.items()))
             raise InputError(
                 f"markers were followed in none of the {what} trials ({name}: {why}); name another kind with --markers"
             )
     margins = [_margins(data, info) for info in fitted]
+    mean = float(np.nanmean(np.concatenate(margins)))
     answers = {}
     for name, estimator in estimators.items():
         estimator.fit([fields[info.trial].trial for info in fitted], margins)
-        answers[name] = _answer(estimator.estimate, fields, columns, mean=float(np.nanmean(np.concatenate(margins))))
-    return Baselines(
-        markers=kind,
+        answers[name] = replace(predictions, prediction=_answer(estimator.estimate, fields, predictions, mean=mean))
+    scores = Baselines(
+        markers=plan.markers,
+        hold="found in each trial as a whole, by find_hold",
+        offered_trials=plan.offered_trials,
         training_trials=len(fitted),
-        training_frames=sum(int(np.isfinite(one).sum()) for one in margins),
+        known_trials=0,
+        shared_trials=sum(info.trial in tested for info in plan.training),
+        training_frames=sum(int(np.isfinite(margin).sum()) for margin in margins),
         followed=sum(one.followed for one in fields.values()) / max(1, sum(one.in_view for one in fields.values())),
         failed=failed,
-        estimators={name: _score(columns, answer) for name, answer in answers.items()},
-        predictions=pa.table({name: predictions.column(name) for name in _KEYS} | answers),
+        estimators={name: _score(answer) for name, answer in answers.items()},
+    )
+    frames = len(predictions)
+    return scores, BaselinePredictions(
+        estimator=np.repeat(list(answers), frames),
+        trial=np.tile(predictions.trial, len(answers)),
+        frame=np.tile(predictions.frame, len(answers)),
+        prediction=np.concatenate([answer.prediction for answer in answers.values()]),
     )
 
 
@@ -180,23 +176,20 @@ def _margins(data: Dataset, info: TrialInfo) -> Float[np.ndarray, " frames"]:
 def _answer(
     estimate: Callable[[FieldTrial], Float[np.ndarray, " _"]],
     fields: Mapping[str, _Followed],
-    columns: Mapping[str, np.ndarray],
+    predictions: Predictions,
     *,
     mean: float,
 ) -> Float[np.ndarray, " frames"]:
-    answer = np.full(len(columns["trial"]), mean)
-    for name in set(columns["trial"].tolist()) & set(fields):
-        rows = columns["trial"] == name
-        answer[rows] = estimate(fields[name].trial)[columns["frame"][rows]]
+    answer = np.full(len(predictions), mean)
+    for name in set(predictions.trial.tolist()) & set(fields):
+        rows = predictions.trial == name
+        answer[rows] = estimate(fields[name].trial)[predictions.frame[rows]]
     return answer
 
 
-def _score(columns: Mapping[str, np.ndarray], answer: Float[np.ndarray, " frames"]) -> BaselineScores:
-    conditions, leads = {}, {}
-    for name in sorted(set(columns["condition"].tolist())):
-        rows = columns["condition"] == name
-        trial = columns["trial"][rows].tolist()
-        labels = columns["safety_margin"][rows]
-        conditions[name] = regression_scores(labels, answer[rows], trials=len(set(trial)))
-        leads[name] = lead_times(trial, columns["time_s"][rows], labels, answer[rows])
-    return BaselineScores(conditions=conditions, lead_times=leads)
+def _score(answers: Predictions) -> BaselineScores:
+    conditions = {name: answers.where(answers.condition == name) for name in sorted(set(answers.condition.tolist()))}
+    return BaselineScores(
+        conditions={name: score_predictions(rows) for name, rows in conditions.items()},
+        lead_times={name: find_lead_times(rows) for name, rows in conditions.items()},
+    )

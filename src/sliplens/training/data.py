@@ -3,7 +3,7 @@
 import math
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,6 +20,7 @@ from torchvision.transforms.v2 import functional as transforms
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.models.encodings import Encoding
+from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import count_labelled, trial_path
 
@@ -157,7 +158,7 @@ def load_frames(
     image_size: int,
     untouched_share: float = 0.0,
     scratch: Path | None = None,
-    on_trial: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> FrameSet:
     """Read trials, encode them, and keep the frames that have a label.
 
@@ -165,8 +166,6 @@ def load_frames(
 
     Parameters
     ----------
-    data, trials
-        The data set and the trials of it to read.
     encoding, image_size
         Input of the network, and its height and width in pixels.
     untouched_share
@@ -177,8 +176,6 @@ def load_frames(
     scratch
         Folder for what does not fit into memory: frames that would take more than half of what is free go into a file
         there, which is read as needed and gone when the frames are. Always in memory if None.
-    on_trial
-        Called with the number of trials read and the number of all.
 
     Raises
     ------
@@ -208,8 +205,8 @@ def load_frames(
             labels.append(np.ones(copies))
             times.append(np.full(copies, recording.time_s[0]))
             rows += [(recording.trial, UNTOUCHED, recording.condition, recording.day)] * copies
-        if on_trial is not None:
-            on_trial(done, len(trials))
+        if on_progress is not None:
+            on_progress(done, len(trials))
     trial, frame, condition, day = zip(*rows, strict=True)
     return FrameSet(
         encoding=encoding,
@@ -255,8 +252,6 @@ class EpochShuffle(Sampler[int]):
     ----------
     count
         Frames there are; those that do not divide among the processes are left out of this epoch.
-    seed
-        Of the orders.
     rank, processes
         Number of this process, from 0, and how many there are.
     """
@@ -292,8 +287,6 @@ class EvenShares(Sampler[list[int]]):
     ----------
     count
         Frames there are, at least one for each process.
-    batch_size
-        Most frames of a batch.
     rank, processes
         Number of this process, from 0, and how many there are.
     """

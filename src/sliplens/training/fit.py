@@ -1,213 +1,217 @@
 """Fit a network to a data set."""
 
-import io
-import logging
-import os
 import shutil
-import signal
-import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning
 import numpy as np
 import torch
-from lightning.fabric.plugins import TorchCheckpointIO
-from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import Logger
 from torch import nn
-from torch.utils.data import DataLoader
 
-from sliplens.errors import InputError, ModelError
-from sliplens.files import versions
-from sliplens.models import Manifest, TrainedModel, build_model, save_checkpoint
+from sliplens.codec import save_result
+from sliplens.errors import InputError, ModelError, RecordingError
+from sliplens.files import output_folder, partial_folder, scratch_folder, versions
+from sliplens.models import Manifest, TrainedModel, build_model, load_checkpoint, save_checkpoint
 from sliplens.models.backbones import HistogramRegressor, histogram_targets
 from sliplens.models.calibration import LEVELS, Calibration, conformal_offset, fit_temperature, quantiles
-from sliplens.training.config import TrainConfig
-from sliplens.training.data import EpochShuffle, FrameSet, get_augmentation, make_loaders
-from sliplens.training.hardware import Hardware
-from sliplens.training.module import Clock, DivergedError, Regressor, TrainProgress
+from sliplens.models.checkpoint import load
+from sliplens.models.encodings import get_encoding
+from sliplens.progress import OnProgress, stage, wrote
+from sliplens.recordings import Dataset, TrialInfo
+from sliplens.results.training import Training
+from sliplens.training.config import TrainConfig, get_recipe
+from sliplens.training.data import EpochShuffle, FrameSet, get_augmentation, load_frames, make_loaders
+from sliplens.training.loggers import open_logger
+from sliplens.training.module import Clock, DivergedError, Regressor
+from sliplens.training.trainer import make_trainer, run_trainer, share_of_batch
 
 
-class WholeCheckpoints(TorchCheckpointIO):
-    """Writes each checkpoint beside the one it replaces, so that a crash or a full disk leaves the old one.
-
-    Lightning's own way goes through the system's temporary folder, and is whole only where that is on the same disk.
-    """
-
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Write a checkpoint.
-
-        Raises
-        ------
-        InputError
-            If it cannot be written.
-        """
-        if storage_options is not None:
-            raise TypeError("this way of saving takes no storage_options")
-        target = Path(path)
-        part = target.with_name(target.name + ".part")
-        buffer = io.BytesIO()
-        torch.save(checkpoint, buffer)
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with part.open("wb") as stream:
-                stream.write(buffer.getbuffer())
-                stream.flush()
-                os.fsync(stream.fileno())  # the new name must not come before the bytes
-            part.replace(target)
-        except OSError as error:
-            with suppress(OSError):
-                part.unlink()
-            raise InputError(
-                f"cannot save the checkpoint {target} ({error.strerror}); make room and give the same command again, "
-                "it goes on after the last whole epoch"
-            ) from None
-
-
-def make_trainer(
-    config: TrainConfig,
+def train(
+    data: Dataset | Path | str,
+    out: Path | str | None = None,
     *,
-    hardware: Hardware,
-    callbacks: Sequence[Callback],
-    folder: Path,
-    logger: Logger | None,
-    steps_per_epoch: int,
-) -> lightning.Trainer:
-    """Trainer of one process; nothing runs yet.
+    input: str = "difference",
+    recipe: str = "default",
+    start_from: TrainedModel | Path | str | None = None,
+    condition: str | None = None,
+    accelerator: Literal["auto", "cpu", "gpu"] = "auto",
+    devices: int = 1,
+    num_nodes: int = 1,
+    logger: str = "csv",
+    overwrite: bool = False,
+    on_progress: OnProgress | None = None,
+    **changes: Any,
+) -> TrainedModel:
+    """Train a network on the training trials of a data set, and keep the weights that read its validation trials best.
+
+    Interrupted, it goes on after the last whole epoch when it is called again with the same `out`.
 
     Parameters
     ----------
-    folder
-        For what Lightning writes of its own accord.
+    data
+        Data set with labels, divided into training and validation trials, or its folder.
+    out
+        Folder to write: weights, manifest, learning curve; nothing is kept if None.
+    input
+        What the network sees, a row of `ENCODINGS`.
+    recipe
+        Row of `RECIPES`.
+    start_from
+        Network whose weights to start from, its folder, or the name of one that comes with sliplens: to teach it
+        another sensor, or to go on at another image size.
+    condition
+        Train and validate on the trials of one condition alone, such as dry.
+    accelerator, devices, num_nodes
+        As Lightning takes them: devices of each node, a process each, which Lightning, torchrun or SLURM starts. They
+        and the logger are no part of what makes the result. All processes but the first end here.
+    logger
+        Where the numbers go besides `metrics.csv`: `csv` for nowhere, or a row of `LOGGERS`.
+    changes
+        Fields of `TrainConfig` that are to differ from the recipe's, such as `epochs`, `image_size`, `batch_size`,
+        `max_minutes` or `seed`; None leaves one as it is.
 
     Raises
     ------
     InputError
-        If this machine has not the devices.
-    """
-    on_gpu = hardware.accelerator != "cpu" and torch.cuda.is_available()
-    try:
-        with quiet_lightning():
-            return lightning.Trainer(
-                accelerator=hardware.accelerator,
-                devices=hardware.devices,
-                num_nodes=hardware.num_nodes,
-                strategy="ddp" if hardware.processes > 1 else "auto",
-                max_epochs=config.epochs,
-                callbacks=list(callbacks),
-                plugins=[WholeCheckpoints()],
-                logger=logger or False,
-                log_every_n_steps=min(50, steps_per_epoch),
-                default_root_dir=folder,
-                enable_progress_bar=False,
-                enable_model_summary=False,
-                num_sanity_val_steps=0,
-                # ours share the frames as the loss and the validation error need it
-                use_distributed_sampler=False,
-                # Ranger21 clips by itself, adaptively
-                gradient_clip_val=1.0 if config.optimizer == "adamw" else None,
-                precision="16-mixed" if config.mixed_precision and on_gpu else "32-true",
-            )
-    except MisconfigurationException as error:
-        reason = " ".join(str(error).split()).rstrip(".")
-        raise InputError(
-            f"this machine cannot train on {hardware.devices} x {hardware.accelerator} ({reason}); "
-            "lower --devices or choose another --accelerator"
-        ) from None
-
-
-def run_trainer(
-    trainer: lightning.Trainer, module: Regressor, loaders: tuple[DataLoader, DataLoader], last: Path
-) -> None:
-    """Train, going on from a checkpoint where there is one.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If interrupted or told to end; Lightning would exit.
-    DivergedError
-        If a loss is not finite, in every process.
+        If the data, the recipe, the start or the machine does not allow it.
+    RecordingError
+        If there is no labelled trial to train or to validate on.
     ModelError
-        If the memory of a GPU is full, or another process was lost.
+        If the network to start from is of another kind, or the loss is no longer finite.
     """
-    on_interrupt = signal.getsignal(signal.SIGINT)
-    with quiet_lightning():
-        try:
-            if trainer.global_rank > 0:
-                # returns when the first process has come so far: by then it has decided whether to go on or begin anew
-                trainer.strategy.setup_environment()
-            trainer.fit(module, *loaders, ckpt_path=str(last) if last.is_file() else None, weights_only=True)
-        except DivergedError:
-            raise
-        except SystemExit:
-            # Lightning exits and goes deaf to Ctrl-C; what happens next is the caller's to decide
-            signal.signal(signal.SIGINT, on_interrupt)
-            _end_others(trainer)
-            raise KeyboardInterrupt from None
-        except torch.OutOfMemoryError:
-            _end_others(trainer)
-            raise ModelError("the memory of the GPU is full; lower --batch-size or --image-size") from None
-        except RuntimeError as error:
-            _end_others(trainer)
-            if trainer.world_size > 1 and _is_lost_connection(error):
-                raise ModelError(
-                    "another process of this training was lost; give the same command again, it goes on after the last "
-                    "whole epoch"
-                ) from None
-            raise
-        except BaseException:
-            _end_others(trainer)
-            raise
-
-
-def _is_lost_connection(error: RuntimeError) -> bool:
-    words = str(error).lower()
-    return isinstance(error, torch.distributed.DistError) or any(
-        word in words for word in ("gloo", "connection closed", "connection reset", "broken pipe")
+    config = replace(get_recipe(recipe), **{name: value for name, value in changes.items() if value is not None})
+    trainer = make_trainer(config, accelerator=accelerator, devices=devices, num_nodes=num_nodes)
+    share_of_batch(config.batch_size, trainer.world_size)
+    start = load(start_from) if isinstance(start_from, str | Path) else start_from
+    if start is not None:
+        require_same_kind(start, config, input)
+    data = data if isinstance(data, Dataset) else Dataset.open(Path(data))
+    job = _Job(config=config, input=input, data=data, condition=condition, start=start, trainer=trainer)
+    if out is None:
+        if trainer.world_size > 1:
+            raise InputError("several processes need a folder that all can see; name one with out")
+        with scratch_folder() as folder:
+            training = job.run(folder, scratch=folder, on_progress=on_progress)
+            return replace(load_checkpoint(folder), training=training)
+    out = Path(out)
+    if not trainer.is_global_zero:
+        # the target appears when a training is over, which no process leaves before the others: all see the same here,
+        # and where it is there the first process has nothing to do, or refuses
+        if overwrite or not out.exists():
+            job.assist(partial_folder(out))
+        raise SystemExit(0)  # what comes after a training is for one process
+    with output_folder(out, stage="train", config=job.recipe, overwrite=overwrite) as output:
+        if not output.complete:
+            told = {**asdict(config), **job.origin}
+            with open_logger(logger, output.folder, run_name=out.name, recipe=told) as opened:
+                training = job.run(output.folder, scratch=output.folder, logger=opened, on_progress=on_progress)
+            save_result(training, output.folder)
+    run = load_checkpoint(out)
+    assert run.training is not None
+    wrote(
+        on_progress,
+        out,
+        f"{run.training.epochs:.1f} epochs in {run.training.minutes:.1f} min, "
+        f"validation MSE {run.training.best_validation_mse:.4f}",
+        kept=output.complete,
     )
+    return run
 
 
-def _end_others(trainer: lightning.Trainer) -> None:
-    """End the processes that Lightning started here: they would wait for this one, and write nothing."""
-    launcher = trainer.strategy.launcher
-    if launcher is not None:
-        launcher.kill(getattr(signal, "SIGKILL", signal.SIGTERM))  # the gentler one does not reach a process that waits
+class _Job:
+    """What every process of a training does alike."""
+
+    def __init__(
+        self,
+        *,
+        config: TrainConfig,
+        input: str,
+        data: Dataset,
+        condition: str | None,
+        start: TrainedModel | None,
+        trainer: lightning.Trainer,
+    ) -> None:
+        self.config = config
+        self.encoding = get_encoding(input)
+        self.data = data
+        self.condition = condition
+        self.start = start
+        self.trainer = trainer
+        self.train_trials, self.validation_trials = _choose_trials(data, condition)
+
+    @property
+    def origin(self) -> dict[str, str | None]:
+        """What shapes the result besides the recipe."""
+        origin = {"input": self.encoding.name, "condition": self.condition, "data_hash": self.data.hash}
+        return origin if self.start is None else {**origin, "started_from": self.start.manifest.weights_sha256}
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        return {**self.origin, "training": self.config}
+
+    def run(
+        self, folder: Path, *, scratch: Path, logger: Logger | None = None, on_progress: OnProgress | None = None
+    ) -> Training:
+        """Read the frames and fit."""
+        frames = []
+        for what, trials, share in (
+            ("training", self.train_trials, self.config.untouched_share),
+            ("validation", self.validation_trials, 0.0),
+        ):
+            with stage(on_progress, f"Reading {what} trials ({self.encoding.name})") as count:
+                frames.append(
+                    load_frames(
+                        self.data,
+                        trials,
+                        encoding=self.encoding,
+                        image_size=self.config.image_size,
+                        untouched_share=share,
+                        scratch=scratch,
+                        on_progress=count,
+                    )
+                )
+        info = self.train_trials[0]
+        training = fit(
+            self.config,
+            frames[0],
+            frames[1],
+            folder,
+            frame_size=(info.height, info.width),
+            sensor=info.sensor,
+            data_hash=self.data.hash,
+            trained_on=[trial.sha256[:12] for trial in (*self.train_trials, *self.validation_trials)],
+            start=self.start,
+            trainer=self.trainer,
+            logger=logger,
+            on_progress=on_progress,
+        )
+        return replace(training, condition=self.condition)
+
+    def assist(self, folder: Path) -> None:
+        """Help the first process, in silence: it says what there is to say."""
+        with suppress(KeyboardInterrupt, DivergedError):
+            # the output folder is the first one's to write, and on a cluster this disk is nearer
+            self.run(folder, scratch=Path(tempfile.gettempdir()))
 
 
-@contextmanager
-def quiet_lightning() -> Iterator[None]:
-    """Keep Lightning's notes on hardware, loggers and its own deprecations from the user's terminal."""
-    names = ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero", "lightning.fabric")
-    levels = {name: logging.getLogger(name).level for name in names}
-    for name in names:
-        logging.getLogger(name).setLevel(logging.WARNING)
+def _choose_trials(data: Dataset, condition: str | None) -> tuple[tuple[TrialInfo, ...], tuple[TrialInfo, ...]]:
     try:
-        with warnings.catch_warnings():
-            for message, category in _EXPECTED:
-                warnings.filterwarnings("ignore", message=message, category=category)
-            yield
-    finally:
-        for name, level in levels.items():
-            logging.getLogger(name).setLevel(level)
-
-
-_EXPECTED: tuple[tuple[str, Any], ...] = (
-    # the frames lie in memory: worker processes would only copy them
-    (".*does not have many workers.*", Warning),
-    # going on in a folder that holds a checkpoint is what resuming means
-    (".*Checkpoint directory.*exists and is not empty.*", Warning),
-    # Lightning 2.6 calls what torch 2.13 deprecates
-    (".*LeafSpec.*", FutureWarning),
-    # channels last, which is worth more than this costs
-    (".*Grad strides do not match bucket view strides.*", UserWarning),
-    # who asks for --accelerator cpu has a reason
-    (".*GPU available but not used.*", Warning),
-)
+        train, validation = (data.select(split=split, condition=condition) for split in ("train", "validation"))
+    except RecordingError as error:
+        cure = "divide it" if condition is None else "name another --condition, or divide it"
+        raise RecordingError(f"{error}; {cure} with `sliplens split`") from None
+    sizes = sorted({(info.height, info.width) for info in (*train, *validation)})
+    if len(sizes) > 1:
+        shown = " and ".join(f"{height} x {width}" for height, width in sizes)
+        raise RecordingError(f"{data.folder} mixes frames of {shown} pixels; train on one sensor at a time")
+    return train, validation
 
 
 @torch.no_grad()
@@ -220,8 +224,6 @@ def calibrate(model: nn.Module, validation: FrameSet, *, batch_size: int) -> Cal
         Trained.
     validation
         Labelled frames of trials that did not train it.
-    batch_size
-        Images at a time.
     """
     was_training, device = model.training, next(model.parameters()).device
     model.eval()
@@ -234,9 +236,9 @@ def calibrate(model: nn.Module, validation: FrameSet, *, batch_size: int) -> Cal
     outputs, labels = torch.cat(answers), validation.safety_margin
     margins = labels.double().numpy()
     if not isinstance(model, HistogramRegressor):
-        told = outputs.reshape(-1).double().numpy()
-        offsets = {str(level): conformal_offset(told, told, margins, level=level) for level in LEVELS}
-        mse = float(np.mean((told - margins) ** 2))
+        predictions = outputs.reshape(-1).double().numpy()
+        offsets = {str(level): conformal_offset(predictions, predictions, margins, level=level) for level in LEVELS}
+        mse = float(np.mean((predictions - margins) ** 2))
         return Calibration(temperature=1.0, offsets=offsets, frames=len(margins), mse=mse)
     edges = model.edges.cpu()
     temperature = fit_temperature(outputs, histogram_targets(labels, edges))
@@ -248,25 +250,12 @@ def calibrate(model: nn.Module, validation: FrameSet, *, batch_size: int) -> Cal
             quantiles(probabilities, edges.double().numpy(), share) for share in ((1 - level) / 2, (1 + level) / 2)
         )
         offsets[str(level)] = conformal_offset(np.asarray(low), np.asarray(high), margins, level=level)
-    told = probabilities @ model.centres.double().cpu().numpy()
-    mse = float(np.mean((told - margins) ** 2))
+    predictions = probabilities @ model.centres.double().cpu().numpy()
+    mse = float(np.mean((predictions - margins) ** 2))
     return Calibration(temperature=temperature, offsets=offsets, frames=len(margins), mse=mse)
 
 
 _LAST = "last.ckpt"
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainResult:
-    """What a training came to."""
-
-    epochs: float
-    minutes: float
-    stopped_by: str
-    best_validation_mse: float
-    parameters: int
-    processes: int
-    """That shared it."""
 
 
 def fit(
@@ -280,10 +269,10 @@ def fit(
     data_hash: str,
     trained_on: Sequence[str] = (),
     start: TrainedModel | None = None,
-    hardware: Hardware | None = None,
+    trainer: lightning.Trainer | None = None,
     logger: Logger | None = None,
-    on_progress: Callable[[TrainProgress], None] | None = None,
-) -> TrainResult | None:
+    on_progress: OnProgress | None = None,
+) -> Training:
     """Train a network and save the weights that were best on the validation frames.
 
     With several processes, each calls this with the same frames and takes its share of every batch; the first writes.
@@ -291,8 +280,6 @@ def fit(
 
     Parameters
     ----------
-    config
-        The recipe.
     train, validation
         Encoded frames, of trials that do not overlap.
     folder
@@ -304,29 +291,25 @@ def fit(
     start
         Network whose weights it starts from, instead of random ones: to go on at another image size, or to teach a
         network a sensor that is like the one it knows. It is left as it is.
-    hardware
-        One device, a GPU if there is one, unless told otherwise.
-    logger
-        Gets the errors and the learning rate too.
+    trainer
+        As `make_trainer` makes it, used once; one device, a GPU if there is one, if None.
     on_progress
-        Called after every step, in the first process.
-
-    Returns
-    -------
-    TrainResult or None
-        None in all processes but the first.
+        Called after every step with the steps done and the steps in all, in the first process; under a time limit the
+        share of the time counts where it is further.
 
     Raises
     ------
     InputError
         If the training set is smaller than one batch, a trial is in both sets, the batch does not divide among the
-        processes, the machine has not the devices, or a checkpoint cannot be saved.
+        processes, or a checkpoint cannot be saved.
     ModelError
         If the network to start from has another input, backbone or head, the backbone is unknown, or the loss is no
         longer finite. The best network so far is saved before.
     """
-    hardware = hardware or Hardware()
-    share = _check(config, train, validation, hardware)
+    trainer = trainer or make_trainer(config)
+    rank, processes, first = trainer.global_rank, trainer.world_size, trainer.is_global_zero
+    share = share_of_batch(config.batch_size, processes)
+    _check_frames(config, train, validation, processes)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)  # the initial weights; forked, so that the caller's random state is untouched
         # channels last: depthwise convolutions run up to half as fast again on a CPU
@@ -334,7 +317,6 @@ def fit(
     if start is not None:
         require_same_kind(start, config, train.encoding.name)
         model.load_state_dict(start.model.state_dict())
-    first = hardware.rank() == 0
     per_epoch = len(train) // config.batch_size
     clock = Clock(
         steps=config.epochs * per_epoch,
@@ -344,7 +326,7 @@ def fit(
     )
 
     def batch_rows(epoch: int, batch: int) -> list[str]:
-        order = EpochShuffle(len(train), seed=config.seed).order(epoch)[hardware.rank() :: hardware.processes]
+        order = EpochShuffle(len(train), seed=config.seed).order(epoch)[rank::processes]
         return [_name(train, row) for row in order[batch * share : (batch + 1) * share]]
 
     module = Regressor(
@@ -357,22 +339,10 @@ def fit(
     )
     checkpoints = folder / "checkpoints"
     best = ModelCheckpoint(dirpath=checkpoints, filename="best", monitor="validation_mse", save_last=True)
-    trainer = make_trainer(
-        config,
-        hardware=hardware,
-        callbacks=[clock, best],
-        folder=checkpoints,
-        logger=logger if first else None,
-        steps_per_epoch=per_epoch,
-    )
-    loaders = make_loaders(
-        train,
-        validation,
-        seed=config.seed,
-        batch_size=share,
-        rank=hardware.rank(),
-        processes=hardware.processes,
-    )
+    trainer.callbacks += [clock, best]  # pyright: ignore[reportAttributeAccessIssue] (made when Lightning runs)
+    trainer.loggers = [logger] if logger is not None and first else []
+    trainer.log_every_n_steps = min(50, per_epoch)  # pyright: ignore[reportAttributeAccessIssue]
+    loaders = make_loaders(train, validation, seed=config.seed, batch_size=share, rank=rank, processes=processes)
 
     def save_best() -> float:
         # our own file of tensors and plain numbers, read back without unpickling anything else
@@ -381,65 +351,67 @@ def fit(
         # as the file itself has it: after a crash between two files the callback may remember an older one
         best_mse = float(kept["callbacks"][best.state_key]["current_score"])
         calibration = calibrate(module.model, validation, batch_size=config.batch_size)
-        save_checkpoint(
-            folder,
-            module.model,
-            Manifest(
-                backbone=config.backbone,
-                head=config.head,
-                recipe=config.recipe,
-                input=train.encoding.name,
-                image_size=config.image_size,
-                frame_size=frame_size,
-                sensor=sensor,
-                data_hash=data_hash,
-                trained_on=(*trained_on, *(start.manifest.trained_on if start else ())),
-                started_from=start.manifest.weights_sha256 if start else "",
-                metrics={"validation_mse": calibration.mse},
-                calibration=calibration,
-                versions=versions(),
-            ),
+        manifest = Manifest(
+            backbone=config.backbone,
+            head=config.head,
+            recipe=config.recipe,
+            input=train.encoding.name,
+            image_size=config.image_size,
+            frame_size=frame_size,
+            sensor=sensor,
+            data_hash=data_hash,
+            trained_on=(*trained_on, *(start.manifest.trained_on if start else ())),
+            started_from=start.manifest.weights_sha256 if start else "",
+            metrics={"validation_mse": calibration.mse},
+            calibration=calibration,
+            versions=versions(),
         )
+        save_checkpoint(folder, module.model, manifest)
         return best_mse
 
+    def describe(best_mse: float) -> Training:
+        return Training(
+            input=train.encoding.name,
+            backbone=config.backbone,
+            image_size=config.image_size,
+            frame_size=frame_size,
+            train_frames=len(train),
+            validation_frames=len(validation),
+            seed=config.seed,
+            epochs=clock.rows[-1][0],
+            minutes=clock.seconds / 60,
+            stopped_by=clock.stopped_by,
+            best_validation_mse=best_mse,
+            parameters=sum(value.numel() for value in model.parameters()),
+            processes=processes,
+            curve=clock.curve(),
+        )
+
     try:
-        with torch.random.fork_rng(devices=[]):
+        title = f"Training ({train.encoding.name})"
+        with torch.random.fork_rng(devices=[]), stage(on_progress if first else None, title) as clock.count:
             run_trainer(trainer, module, loaders, checkpoints / _LAST)
     except DivergedError as error:
-        if not first:
-            return None
-        if not best.best_model_path:
+        if not first or not best.best_model_path:
             raise
         raise ModelError(
             f"{error} (the best network so far, of validation MSE {save_best():.4g}, is in {folder})"
         ) from None
     if not first:
-        return None
-    best_mse = save_best()
+        return describe(float(best.best_model_score or np.nan))
+    training = describe(save_best())
     shutil.rmtree(checkpoints)
-    return TrainResult(
-        epochs=clock.rows[-1][0],
-        minutes=clock.seconds / 60,
-        stopped_by=clock.stopped_by,
-        best_validation_mse=best_mse,
-        parameters=sum(value.numel() for value in model.parameters()),
-        processes=hardware.processes,
-    )
+    return training
 
 
-def _check(config: TrainConfig, train: FrameSet, validation: FrameSet, hardware: Hardware) -> int:
-    """Refuse frames that this recipe or this hardware cannot take; return the share of a batch of one process."""
-    share = hardware.share(config.batch_size)
+def _check_frames(config: TrainConfig, train: FrameSet, validation: FrameSet, processes: int) -> None:
     if len(train) < config.batch_size:
         raise InputError(f"{len(train)} training frames do not fill a batch of {config.batch_size}; lower batch_size")
-    if len(validation) < hardware.processes:
-        raise InputError(
-            f"{len(validation)} validation frames are too few for {hardware.processes} processes; lower --devices"
-        )
+    if len(validation) < processes:
+        raise InputError(f"{len(validation)} validation frames are too few for {processes} processes; lower --devices")
     shared = set(train.trial) & set(validation.trial)
     if shared:
         raise InputError(f"trial {min(shared)} is in both training and validation; split by trial")
-    return share
 
 
 def require_same_kind(start: TrainedModel, config: TrainConfig, encoding: str) -> None:

@@ -5,11 +5,11 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import lightning
+import numpy as np
 import torch
 from jaxtyping import Float
 from lightning.pytorch.callbacks import Callback
@@ -19,21 +19,13 @@ from torchmetrics import MeanSquaredError
 
 from sliplens.errors import ModelError
 from sliplens.models.backbones import margin_loss
+from sliplens.progress import OnProgress, note
+from sliplens.results.training import LearningCurve
 from sliplens.training.config import TrainConfig
 from sliplens.training.data import Augmentation
 
 _NAMED_ROWS = 3
 """Frames of a batch that a message names."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainProgress:
-    """Where a training stands; `fraction` is the share of the epochs or of the time, whichever is further."""
-
-    fraction: float
-    epoch: int
-    train_mse: float
-    validation_mse: float
 
 
 class DivergedError(ModelError):
@@ -149,12 +141,13 @@ class Clock(Callback):
         steps: int,
         max_minutes: float | None,
         metrics_file: Path | None,
-        on_progress: Callable[[TrainProgress], None] | None,
+        on_progress: OnProgress | None,
     ) -> None:
         self.steps = steps
         self.max_seconds = None if max_minutes is None else 60 * max_minutes
         self.metrics_file = metrics_file
         self.on_progress = on_progress
+        self.count = on_progress
         self.seconds_before = 0.0
         self.step = 0
         self.rows: list[list[float]] = []
@@ -170,6 +163,11 @@ class Clock(Callback):
     def fraction(self) -> float:
         """Share of the training that is done."""
         return min(1.0, max(self.step / self.steps, self._time_share))
+
+    def curve(self) -> LearningCurve:
+        """Learning curve so far."""
+        epoch, train, validation, minutes = np.array(self.rows, dtype=np.float64).reshape(-1, 4).T
+        return LearningCurve(epoch=epoch, train_mse=train, validation_mse=validation, minutes=minutes)
 
     def state_dict(self) -> dict[str, Any]:
         """What a checkpoint keeps of the clock."""
@@ -211,7 +209,8 @@ class Clock(Callback):
             if trainer.strategy.reduce_boolean_decision(late, all=False):
                 self.stopped_by, self._time_share = "time limit", 1.0
                 trainer.should_stop = True
-        self._report(trainer)
+        if self.count is not None:
+            self.count(round(self.fraction() * self.steps), self.steps)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Write the epoch's row; the validation has run by now."""
@@ -223,6 +222,10 @@ class Clock(Callback):
                 f"the validation error is {validation} after epoch {trainer.current_epoch + 1}; "
                 "lower the learning rate and try again"
             )
+        if validation < min((row[2] for row in self.rows), default=math.inf):
+            note(
+                self.on_progress, f"epoch {trainer.current_epoch + 1}: validation MSE {validation:.4f}, the best so far"
+            )
         self.rows.append([epoch, train, validation, self.seconds / 60])
         if self.metrics_file is not None:
             lines = ["epoch,train_mse,validation_mse,minutes"]
@@ -230,13 +233,3 @@ class Clock(Callback):
             part = self.metrics_file.with_name(self.metrics_file.name + ".part")
             part.write_text("\n".join(lines) + "\n", encoding="utf-8")
             part.replace(self.metrics_file)
-        self._report(trainer)
-
-    def _report(self, trainer: lightning.Trainer) -> None:
-        if self.on_progress is not None:
-            last = self.rows[-1] if self.rows else [0.0, math.nan, math.nan, 0.0]
-            self.on_progress(
-                TrainProgress(
-                    fraction=self.fraction(), epoch=trainer.current_epoch, train_mse=last[1], validation_mse=last[2]
-                )
-            )

@@ -7,27 +7,8 @@ import numpy as np
 
 from sliplens.plots.style import input_name, inputs_in_order, name_methods
 from sliplens.report.blocks import Notes
-from sliplens.report.sections import Block, Section, recipe_section
-from sliplens.report.study.claims import judge_claims
-from sliplens.report.study.plates import Plate, show_plate
-from sliplens.report.study.removal_figures import (
-    plate_deletion,
-    plate_highlighted,
-    plate_randomisation,
-    plate_removal,
-    plate_removal_curves,
-    removal_methods,
-)
-from sliplens.report.study.saliency_figures import (
-    plate_bins,
-    plate_each_frame,
-    plate_faithfulness,
-    plate_methods,
-    plate_poly_cam,
-    plate_states,
-)
-from sliplens.report.study.state_figures import plate_contact_states, plate_fields_beside_saliency, plate_truth
-from sliplens.report.study.tables import (
+from sliplens.report.claims import judge_claims
+from sliplens.report.method_tables import (
     table_agreement,
     table_equal_areas,
     table_localisation,
@@ -39,6 +20,25 @@ from sliplens.report.study.tables import (
     table_times,
     table_trials,
 )
+from sliplens.report.plates import Plate, show_plate
+from sliplens.report.removal_figures import (
+    plate_deletion,
+    plate_highlighted,
+    plate_randomisation,
+    plate_removal,
+    plate_removal_curves,
+    removal_methods,
+)
+from sliplens.report.saliency_figures import (
+    plate_bins,
+    plate_each_frame,
+    plate_faithfulness,
+    plate_methods,
+    plate_poly_cam,
+    plate_states,
+)
+from sliplens.report.sections import Block, Section, recipe_section
+from sliplens.report.state_figures import plate_contact_states, plate_fields_beside_saliency, plate_truth
 from sliplens.report.tables import Table, table_accuracy
 from sliplens.report.workspace import Results
 

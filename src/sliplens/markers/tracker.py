@@ -1,6 +1,6 @@
 """Following markers from the untouched sensor through a trial."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -218,8 +218,6 @@ def track_markers(
     frames: Iterable[UInt8[np.ndarray, "_ _ 3"]],
     reference: UInt8[np.ndarray, "height width 3"],
     kind: str | MarkerKind = "auto",
-    *,
-    on_frame: Callable[[int], None] | None = None,
 ) -> Tracks:
     """Follow markers from the untouched sensor through a sequence of frames.
 
@@ -236,8 +234,6 @@ def track_markers(
         T_0.
     kind
         Row of `KINDS`, or a kind of one's own.
-    on_frame
-        Called with the frames done, after each.
 
     Raises
     ------
@@ -249,14 +245,10 @@ def track_markers(
         If there is no frame.
     """
     tracker = Tracker(reference, kind)
-    done: list[TrackedFrame] = []
-    for frame in frames:
-        done.append(tracker.update(frame))
-        if on_frame is not None:
-            on_frame(len(done))
-    if not done:
+    tracked = [tracker.update(frame) for frame in frames]
+    if not tracked:
         raise RecordingError("there is no frame to follow markers into; give one or more beside the reference")
-    return stack_tracks(done, rest_px=tracker.rest.centre_px, rest_radius_px=tracker.rest.radius_px)
+    return stack_tracks(tracked, rest_px=tracker.rest.centre_px, rest_radius_px=tracker.rest.radius_px)
 
 
 def _only(markers: Markers, chosen: Bool[np.ndarray, " markers"]) -> Markers:

@@ -31,8 +31,8 @@ from sliplens.plots.style import (
     short_input_name,
     signed,
 )
-from sliplens.report.study.believing import controls, settings
-from sliplens.report.study.plates import (
+from sliplens.report.believing import controls, settings
+from sliplens.report.plates import (
     CELL_IN,
     Cell,
     Plate,

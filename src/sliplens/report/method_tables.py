@@ -17,7 +17,7 @@ from sliplens.plots.style import (
     short_input_name,
     signed,
 )
-from sliplens.report.study.believing import mean_at, settings, tell_bounds, tell_interval
+from sliplens.report.believing import mean_at, settings, tell_bounds, tell_interval
 from sliplens.report.tables import Cell, Kind, Shade, Table, table_head, tell_spread
 from sliplens.report.thesis import DELETION, MARK, NETWORK_PIXELS, SECONDS, thesis_row
 from sliplens.results.faithfulness import DeletionScores, MethodScore, Remedies, RemovalScore, RemovalScores

@@ -21,7 +21,7 @@ from sliplens.plots.style import (
     short_input_name,
     signed,
 )
-from sliplens.report.study.plates import (
+from sliplens.report.plates import (
     THESIS_LEVEL,
     Cell,
     Plate,

@@ -1,7 +1,7 @@
 """A made-up workspace: the files that the stages write, with plausible numbers and nothing measured."""
 
-import csv
 import json
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,125 +10,124 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
+from sliplens.codec import save_record, save_result
+from sliplens.files import Machine, Provenance
+from sliplens.results.evaluation import Evaluation, Predictions, Reliability
+from sliplens.results.simulation import Simulation, SplitCount
+from sliplens.results.training import LearningCurve, Training
+from sliplens.training.metrics import find_lead_times, score_predictions
+
 METHODS = ("grad-cam", "integrated-gradients", "poly-cam")
 MARGINS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 NOISE = {("raw", "dry"): 0.14, ("raw", "wet"): 0.24, ("difference", "dry"): 0.09, ("difference", "wet"): 0.17}
 FALL = {"grad-cam": 0.25, "integrated-gradients": 0.15, "poly-cam": 0.08, "random": 0.45}
 
 
-def write_run(folder: Path, stage: str, config: dict[str, Any], result: dict[str, Any], *, minute: int = 0) -> Path:
-    """A stage's folder with `run.json` and `result.json`."""
+def write_run(folder: Path, stage: str, config: dict[str, Any], result: object, *, minute: int = 0) -> Path:
+    """A stage's folder with `run.json` and its result, a record or what JSON holds of one."""
     folder.mkdir(parents=True)
-    run = {
-        "stage": stage,
-        "config": config,
-        "config_hash": stage.encode().hex(),
-        "versions": {"sliplens": "0.1.0", "python": "3.12.1", "torch": "2.9.0", "numpy": "2.3.1"},
-        "machine": {"system": "Linux", "processor": "x86_64", "cores": 2},
-        "finished": f"2026-11-21T04:{minute:02d}:00+00:00",
-    }
-    (folder / "run.json").write_text(json.dumps(run), encoding="utf-8")
-    (folder / "result.json").write_text(json.dumps(result), encoding="utf-8")
+    provenance = Provenance(
+        stage=stage,
+        config=config,
+        config_hash=stage.encode().hex(),
+        versions={"sliplens": "0.1.0", "python": "3.12.1", "torch": "2.9.0", "numpy": "2.3.1"},
+        machine=Machine(system="Linux", processor="x86_64", cores=2, implementation="cpython"),
+        finished=f"2026-11-21T04:{minute:02d}:00+00:00",
+    )
+    save_record(provenance, folder / "run.json")
+    if is_dataclass(result):
+        save_result(result, folder)
+    else:
+        (folder / "result.json").write_text(json.dumps(result), encoding="utf-8")
     return folder
 
 
 def write_simulation(workspace: Path) -> Path:
     splits = {"train": (40, 1600), "validation": (8, 320), "test": (16, 640)}
-    return write_run(
-        workspace / "data",
-        "simulate",
-        {"trials": 64, "seed": 0, "size": [224, 224]},
-        {
-            "trials": 64,
-            "frames": 2560,
-            "by_split": {name: {"trials": trials, "frames": frames} for name, (trials, frames) in splits.items()},
-            "conditions": ["dry", "wet"],
-        },
+    result = Simulation(
+        trials=64,
+        frames=2560,
+        by_split={name: SplitCount(trials=trials, frames=frames) for name, (trials, frames) in splits.items()},
+        conditions=("dry", "wet"),
     )
+    return write_run(workspace / "data", "simulate", {"trials": 64, "seed": 0, "size": [224, 224]}, result)
 
 
 def write_training(workspace: Path, name: str, *, size: int, rng: np.random.Generator) -> Path:
-    epochs = np.arange(12)
+    epochs = np.arange(12.0)
     floor = 0.02 if name == "raw" else 0.011
     validation = floor + 0.08 * np.exp(-epochs / 2.5) * rng.uniform(0.9, 1.1, 12)
-    folder = write_run(
-        workspace / f"network-{name}",
-        "train",
-        {"input": name, "data": "data", "seed": 0, "minutes": 2.0},
-        {
-            "input": name,
-            "backbone": "shufflenet_v2_x1_0",
-            "image_size": size,
-            "frame_size": [224, 224],
-            "train_frames": 1600,
-            "validation_frames": 320,
-            "epochs": 12.3,
-            "minutes": 2.0,
-            "seed": 0,
-            "best_validation_mse": float(validation.min()),
-            "parameters": 1254629,
-            "stopped_by": "time limit",
-        },
-        minute=5,
+    result = Training(
+        input=name,
+        backbone="shufflenet_v2_x1_0",
+        image_size=size,
+        frame_size=(224, 224),
+        train_frames=1600,
+        validation_frames=320,
+        epochs=12.3,
+        minutes=2.0,
+        seed=0,
+        best_validation_mse=float(validation.min()),
+        parameters=1254629,
+        processes=1,
+        stopped_by="time limit",
+        curve=LearningCurve(epoch=epochs, train_mse=0.8 * validation, validation_mse=validation, minutes=epochs / 6),
     )
-    with (folder / "metrics.csv").open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(["epoch", "train_mse", "validation_mse", "minutes"])
-        writer.writerows(
-            zip(epochs.tolist(), (0.8 * validation).tolist(), validation.tolist(), (epochs / 6).tolist(), strict=True)
-        )
-    return folder
+    config = {"input": name, "data": "data", "seed": 0, "minutes": 2.0}
+    return write_run(workspace / f"network-{name}", "train", config, result, minute=5)
 
 
-def bins(labels: np.ndarray, squared: np.ndarray) -> list[dict[str, Any]]:
-    rows = []
-    for low in range(10):
-        inside = (labels >= low / 10) & ((labels < (low + 1) / 10) | (low == 9))
-        mse = float(squared[inside].mean()) if inside.any() else None
-        rows.append({"low": low / 10, "high": (low + 1) / 10, "frames": int(inside.sum()), "mse": mse})
-    return rows
+def made_up_evaluation(predictions: Predictions, *, name: str = "difference", sure: bool = False) -> Evaluation:
+    """Scores of some predictions, reliability apart, which is made up too."""
+    by_condition = {
+        one: predictions.where(predictions.condition == one) for one in np.unique(predictions.condition).tolist()
+    }
+    by_trial = {one: predictions.where(predictions.trial == one) for one in np.unique(predictions.trial).tolist()}
+    return Evaluation(
+        input=name,
+        split="test",
+        known_trials=0,
+        conditions={one: score_predictions(rows) for one, rows in by_condition.items()},
+        days={},
+        trials={one: score_predictions(rows) for one, rows in by_trial.items()},
+        reliability={
+            one: Reliability(
+                coverage={"0.5": 0.48, "0.9": 0.88 if one == "dry" else 0.6} if sure else {}, mean_width_90=None
+            )
+            for one in by_condition
+        },
+        wet_auroc=0.97 if sure else None,
+        lead_times={one: find_lead_times(rows) for one, rows in by_condition.items()},
+        predictions=predictions,
+    )
 
 
 def write_evaluation(
     workspace: Path, name: str, *, trials: int, rng: np.random.Generator, trial_name: str = "day4-{}-{:03d}"
 ) -> Path:
     time = np.linspace(0, 2, 40)
-    columns: dict[str, list] = {
-        key: [] for key in ("trial", "condition", "day", "frame", "time_s", "safety_margin", "prediction")
-    }
-    conditions = {}
-    for condition in ("dry", "wet"):
-        labels, answers = [], []
-        for trial in range(trials):
+    trial, condition, labels, answers = [], [], [], []
+    for surface in ("dry", "wet"):
+        for number in range(trials):
             # one law for both inputs: the labels of a test frame do not depend on the network
-            label = np.clip(1.02 - time / (1.5 + 0.05 * trial), 0, 1)
-            answer = (
-                label + NOISE[name, condition] * (rng.normal() * 0.5 + rng.normal(size=40) * 0.8) + 0.05 * (1 - label)
-            )
+            label = np.clip(1.02 - time / (1.5 + 0.05 * number), 0, 1)
+            noise = NOISE[name, surface] * (rng.normal() * 0.5 + rng.normal(size=40) * 0.8)
+            trial += [trial_name.format(surface, number)] * 40
+            condition += [surface] * 40
             labels.append(label)
-            answers.append(answer)
-            columns["trial"] += [trial_name.format(condition, trial)] * 40
-            columns["condition"] += [condition] * 40
-            columns["day"] += ["day4"] * 40
-            columns["frame"] += list(range(40))
-            columns["time_s"] += time.tolist()
-            columns["safety_margin"] += label.tolist()
-            columns["prediction"] += answer.tolist()
-        truth, read = np.concatenate(labels), np.concatenate(answers)
-        squared = (read - truth) ** 2
-        conditions[condition] = {
-            "frames": len(truth),
-            "trials": trials,
-            "mse": float(squared.mean()),
-            "r2": float(1 - squared.mean() / truth.var()),
-            "mae": float(np.abs(read - truth).mean()),
-            "bins": bins(truth, squared),
-        }
-    folder = write_run(
-        workspace / f"test-{name}", "evaluate", {"input": name}, {"input": name, "conditions": conditions}, minute=9
+            answers.append(label + noise + 0.05 * (1 - label))
+    predictions = Predictions(
+        trial=np.array(trial),
+        condition=np.array(condition),
+        day=np.full(len(trial), 4),
+        frame=np.tile(np.arange(40), 2 * trials),
+        time_s=np.tile(time, 2 * trials),
+        safety_margin=np.concatenate(labels),
+        prediction=np.concatenate(answers),
+        **{column: np.full(len(trial), np.nan) for column in ("sigma", "low_90", "high_90")},
     )
-    pq.write_table(pa.table(columns), folder / "predictions.parquet")
-    return folder
+    result = made_up_evaluation(predictions, name=name)
+    return write_run(workspace / f"test-{name}", "evaluate", {"input": name}, result, minute=9)
 
 
 def picture_and_maps(

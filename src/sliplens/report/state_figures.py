@@ -22,8 +22,8 @@ from sliplens.plots.style import (
     percent,
     signed,
 )
-from sliplens.report.study.believing import rank_methods
-from sliplens.report.study.plates import (
+from sliplens.report.believing import rank_methods
+from sliplens.report.plates import (
     CELL_IN,
     Cell,
     Plate,

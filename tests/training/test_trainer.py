@@ -1,13 +1,12 @@
-from pathlib import Path
-
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.files import output_folder
-from sliplens.training.hardware import Hardware, follow_folder
+from sliplens.training import TrainConfig, make_trainer
+from sliplens.training.trainer import share_of_batch
 
 VARIABLES = ("RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "WORLD_SIZE", "TORCHELASTIC_RUN_ID")
-VARIABLES += ("SLURM_NTASKS", "SLURM_NTASKS_PER_NODE", "SLURM_JOB_NAME")
+SECOND_NODE = {"SLURM_PROCID": "2", "SLURM_NODEID": "1", "SLURM_LOCALID": "0"}
+VARIABLES += ("SLURM_NTASKS", "SLURM_NTASKS_PER_NODE", "SLURM_JOB_NAME", *SECOND_NODE)
 
 
 @pytest.fixture(autouse=True)
@@ -25,7 +24,17 @@ def _no_launcher(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"NODE_RANK": "1"}, 2),
         ({"NODE_RANK": "1", "LOCAL_RANK": "1"}, 3),
         ({"TORCHELASTIC_RUN_ID": "a", "RANK": "3", "LOCAL_RANK": "1", "WORLD_SIZE": "4"}, 3),
-        ({"SLURM_NTASKS": "4", "SLURM_NTASKS_PER_NODE": "2", "SLURM_JOB_NAME": "train", "SLURM_PROCID": "2"}, 2),
+        (
+            {
+                "SLURM_NTASKS": "4",
+                "SLURM_NTASKS_PER_NODE": "2",
+                "SLURM_JOB_NAME": "train",
+                "SLURM_PROCID": "2",
+                "SLURM_NODEID": "1",
+                "SLURM_LOCALID": "0",
+            },
+            2,
+        ),
     ],
 )
 def test_a_process_knows_its_number_before_it_trains(
@@ -33,26 +42,26 @@ def test_a_process_knows_its_number_before_it_trains(
 ):
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    assert Hardware(devices=2, num_nodes=2).rank() == rank
+    trainer = make_trainer(TrainConfig(), accelerator="cpu", devices=2, num_nodes=2)
+    assert (trainer.global_rank, trainer.world_size) == (rank, 4)
 
 
 def test_a_cluster_that_lightning_cannot_read_is_one_sentence(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("SLURM_NTASKS", "4")
-    with pytest.raises(InputError, match=r"cannot tell the processes of this cluster apart .*ntasks-per-node"):
-        Hardware(devices=4).rank()
+    with pytest.raises(InputError, match=r"this machine cannot train on 4 x cpu .*ntasks-per-node"):
+        make_trainer(TrainConfig(), accelerator="cpu", devices=4)
 
 
 def test_processes_that_nobody_asked_for_are_refused(monkeypatch: pytest.MonkeyPatch):
     for name, value in {"TORCHELASTIC_RUN_ID": "a", "RANK": "1", "LOCAL_RANK": "1", "WORLD_SIZE": "2"}.items():
         monkeypatch.setenv(name, value)
-    with pytest.raises(InputError, match="2 processes were started, but --devices times --num-nodes is 1; make them"):
-        Hardware().rank()
+    with pytest.raises(InputError, match=r"does not match the world size \(2\)\); change --devices, --num-nodes"):
+        make_trainer(TrainConfig(), accelerator="cpu")
 
 
-@pytest.mark.parametrize("devices", [1, 2, 3, 4, 6])
-def test_the_shares_of_a_batch_make_the_batch(devices: int):
-    hardware = Hardware(devices=devices, num_nodes=2)
-    assert hardware.share(24) * hardware.processes == 24
+@pytest.mark.parametrize("processes", [1, 2, 3, 4, 6, 12])
+def test_the_shares_of_a_batch_make_the_batch(processes: int):
+    assert share_of_batch(24, processes) * processes == 24
 
 
 @pytest.mark.parametrize(
@@ -65,21 +74,10 @@ def test_the_shares_of_a_batch_make_the_batch(devices: int):
 )
 def test_a_batch_that_cannot_be_shared_is_refused(batch_size: int, message: str):
     with pytest.raises(InputError, match=message):
-        Hardware(devices=3).share(batch_size)
+        share_of_batch(batch_size, 3)
 
 
-def test_no_hardware_is_refused():
-    with pytest.raises(InputError, match="devices must be at least 1, got 0"):
-        Hardware(devices=0)
-    with pytest.raises(InputError, match="num_nodes must be at least 1, got -1"):
-        Hardware(num_nodes=-1)
-
-
-def test_the_others_find_the_folder_of_the_first_and_touch_nothing(tmp_path: Path):
-    target = tmp_path / "run"
-    expected = follow_folder(target)
-    assert list(tmp_path.iterdir()) == []
-    with output_folder(target, stage="train", config={}) as out:
-        assert follow_folder(target) == expected == out.folder
-    assert follow_folder(target) is None  # nothing to do
-    assert follow_folder(target, overwrite=True) == expected
+@pytest.mark.parametrize("flags", [{"devices": 0}, {"devices": 1, "num_nodes": 0}])
+def test_no_hardware_is_refused(flags: dict[str, int]):
+    with pytest.raises(InputError, match="this machine cannot train on"):
+        make_trainer(TrainConfig(), accelerator="cpu", **flags)

@@ -1,0 +1,162 @@
+"""Errors, coverage and warnings of predictions against labels."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from sliplens.errors import RecordingError
+from sliplens.results.evaluation import BinScore, LeadTimes, Predictions, RegressionScores
+
+
+def coverage(
+    low: Float[np.ndarray, " frames"], high: Float[np.ndarray, " frames"], labels: Float[np.ndarray, " frames"]
+) -> float:
+    """Share of the labels that lie in their intervals, ends included."""
+    return float(np.mean((labels >= low) & (labels <= high)))
+
+
+def auroc(positive: Float[np.ndarray, " _"], negative: Float[np.ndarray, " _"]) -> float | None:
+    """Area under the receiver operating characteristic: how often a positive scores above a negative; ties count half.
+
+    Parameters
+    ----------
+    positive, negative
+        Scores of the two classes.
+
+    Returns
+    -------
+    float or None
+        0.5 where the scores tell nothing apart; None where a class is empty.
+
+    References
+    ----------
+    Hanley & McNeil, *Radiology* 143 (1982) 29: the area is the Mann-Whitney statistic over the number of pairs.
+    """
+    if not (len(positive) and len(negative)):
+        return None
+    ordered = np.sort(negative)
+    below = np.searchsorted(ordered, positive, side="left")
+    not_above = np.searchsorted(ordered, positive, side="right")
+    return float((below + not_above).mean() / 2 / len(negative))
+
+
+THRESHOLD = 0.2
+"""A margin below it is an alarm: people hold 20 to 40 % above the least force."""
+_FALSE_ABOVE = 2.0
+"""An alarm that begins while the true margin is above so many thresholds is false, not early."""
+
+
+def lead_times(
+    trial: Sequence[str],
+    time_s: Float[np.ndarray, " frames"],
+    labels: Float[np.ndarray, " frames"],
+    predictions: Float[np.ndarray, " frames"],
+    *,
+    threshold: float = THRESHOLD,
+) -> LeadTimes:
+    """Measure warnings on the labelled frames of some trials.
+
+    A slip is the first frame of a trial with margin 0; what comes after is left out.
+
+    Parameters
+    ----------
+    trial
+        Name of each frame's trial; the frames of a trial follow each other in time.
+    time_s, labels, predictions
+        Time in seconds, true and predicted margin of each frame in margin units.
+    threshold
+        A prediction below it is an alarm; in margin units.
+    """
+    names = np.array(trial)
+    leads, ideals, slips, false, minutes = [], [], 0, 0, 0.0
+    for name in dict.fromkeys(trial):
+        rows = np.flatnonzero(names == name)
+        order = rows[np.argsort(time_s[rows], kind="stable")]
+        slipped = labels[order] <= 0
+        slips_at = int(np.argmax(slipped)) if slipped.any() else None
+        before = order if slips_at is None else order[:slips_at]
+        if not len(before):
+            continue
+        alarms = predictions[before] < threshold
+        begins = np.flatnonzero(alarms & ~np.insert(alarms[:-1], 0, False))
+        is_false = labels[before][begins] > _FALSE_ABOVE * threshold
+        false += int(is_false.sum())
+        minutes += float(time_s[before[-1]] - time_s[before[0]]) / 60
+        if slips_at is None:
+            continue
+        slips += 1
+        slip_s = float(time_s[order[slips_at]])
+        # an alarm that began in vain and never ended is true from where the margin is low on
+        due = alarms & (labels[before] <= _FALSE_ABOVE * threshold)
+        if due.any():
+            leads.append(1e3 * (slip_s - float(time_s[before[np.argmax(due)]])))
+        low = labels[before] < threshold
+        ideals.append(1e3 * (slip_s - float(time_s[before[np.argmax(low)]])) if low.any() else 0.0)
+    return LeadTimes(
+        trials=slips,
+        warned=len(leads),
+        median_ms=float(np.median(leads)) if leads else None,
+        ideal_ms=float(np.median(ideals)) if ideals else None,
+        false_per_minute=false / minutes if minutes > 0 else 0.0,
+        threshold=threshold,
+    )
+
+
+_BINS = 10
+
+
+def regression_scores(
+    labels: Float[np.ndarray, " frames"], predictions: Float[np.ndarray, " frames"], *, trials: int = 1
+) -> RegressionScores:
+    """MSE, R2, MAE and the MSE in ten bins of the safety margin.
+
+    Raises
+    ------
+    RecordingError
+        If there is no frame, or a label lies outside [0, 1].
+
+    References
+    ----------
+    Polak, Table 1 and Fig. 7.
+    """
+    if len(labels) == 0:
+        raise RecordingError("there is no labelled frame to evaluate; check the split and the condition")
+    if not np.all((labels >= 0) & (labels <= 1)):
+        raise RecordingError("labels must lie in [0, 1]; give the safety margin as a fraction, not in percent")
+    squared = (predictions - labels) ** 2
+    spread = np.sum((labels - labels.mean()) ** 2)
+    return RegressionScores(
+        frames=len(labels),
+        trials=trials,
+        mse=float(squared.mean()),
+        r2=float(1 - squared.sum() / spread) if spread > 0 else None,
+        mae=float(np.abs(predictions - labels).mean()),
+        bins=_bin_scores(labels, squared),
+    )
+
+
+def _bin_scores(labels: Float[np.ndarray, " frames"], squared: Float[np.ndarray, " frames"]) -> tuple[BinScore, ...]:
+    # times ten, rounded: 0.3 * 10 must fall in bin 3 although 0.3 is not exact in binary
+    bins = np.minimum(np.floor(np.round(labels * _BINS, 9)), _BINS - 1)
+    errors = [squared[bins == index] for index in range(_BINS)]
+    return tuple(
+        BinScore(
+            low=index / _BINS,
+            high=(index + 1) / _BINS,
+            frames=len(inside),
+            mse=float(inside.mean()) if len(inside) else None,
+        )
+        for index, inside in enumerate(errors)
+    )
+
+
+def score_predictions(predictions: Predictions) -> RegressionScores:
+    """Errors of some predictions against their labels."""
+    count = len(set(predictions.trial.tolist()))
+    return regression_scores(predictions.safety_margin, predictions.prediction, trials=count)
+
+
+def find_lead_times(predictions: Predictions) -> LeadTimes:
+    """Warnings of some predictions, see `lead_times`."""
+    return lead_times(predictions.trial.tolist(), predictions.time_s, predictions.safety_margin, predictions.prediction)
