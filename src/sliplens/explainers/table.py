@@ -19,7 +19,7 @@ from sliplens.explainers.occlusion import Occlusion, find_markers
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.extras import Table
 from sliplens.models import TrainedModel
-from sliplens.models.checkpoint import find_run, load_checkpoint
+from sliplens.models.checkpoint import load
 from sliplens.progress import OnProgress
 
 _ROWS: dict[str, Explainer] = {
@@ -96,7 +96,7 @@ def explain(
 
 def open_run(run: TrainedModel | Path | str) -> TrainedModel:
     """Network that a caller named: itself, its folder, or the name of one that comes with sliplens."""
-    return run if isinstance(run, TrainedModel) else load_checkpoint(find_run(Path(run)))
+    return run if isinstance(run, TrainedModel) else load(run)
 
 
 def get_explainer(method: str, **options: Any) -> Explainer:
