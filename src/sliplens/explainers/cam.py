@@ -26,13 +26,6 @@ def grad_cam_map(
     In margin units for each cell: for a head f = bias + w . mean over space of A, alpha_c = w_c / (rows x columns), so
     the cells add up to f - bias without any further normalisation.
 
-    Parameters
-    ----------
-    activations
-        A, the output of a layer.
-    gradients
-        df/dA in margin units over the activation's.
-
     References
     ----------
     Selvaraju et al., *Grad-CAM: Visual explanations from deep networks via gradient-based localization*, ICCV 2017,

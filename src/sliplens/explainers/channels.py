@@ -136,13 +136,6 @@ def combine(
     From the last layer to the first a layer's map is divided by itself resized to the coarser result and back (LNorm),
     then multiplied by that result; a level's saliency is this product normalised like a mask.
 
-    Parameters
-    ----------
-    activations, weights
-        Those of each layer, fine to coarse.
-    size
-        Height and width of the image in pixels.
-
     References
     ----------
     Englebert, Cornu and De Vleeschouwer, *Poly-CAM*, ICPR 2022, section III, and its public code.
@@ -210,36 +203,24 @@ def measure(
     regions: Regions,
     channels: Int[Tensor, " some"],
     *,
-    passes: Engine,
+    engine: Engine,
     variant: Variant,
     on_channels: Callable[[int], None],
 ) -> Float[Tensor, "points some"]:
-    """Predictions of the masked images of some channels; memory is bounded by the batch of the passes.
+    """Predictions of the masked images of some channels, in rising order; memory is bounded by the engine's batch.
 
-    Parameters
-    ----------
-    regions
-        The image and its masks.
-    channels
-        Which, in rising order.
-    variant
-        Which points are predicted.
-
-    Returns
-    -------
-    Tensor
-        One row for what is kept and one for what is removed, as far as the variant has them.
+    One row for what is kept and one for what is removed, as far as the variant has them.
     """
-    parts = channels.split(max(1, passes.batch_size // variant.passes))
+    parts = channels.split(max(1, engine.batch_size // variant.passes))
 
     def batches() -> Iterator[Tensor]:
         for part in parts:
             # in pieces, where even one channel's images are more than a batch
-            yield from regions.blends(part, variant=variant).split(passes.batch_size)
+            yield from regions.blends(part, variant=variant).split(engine.batch_size)
 
     waiting, points = list(parts), []
     pieces: list[Tensor] = []
-    for predictions in passes.run(batches()):
+    for predictions in engine.run(batches()):
         pieces.append(predictions)
         if sum(map(len, pieces)) == variant.passes * len(waiting[0]):
             points.append(torch.cat(pieces).reshape(variant.passes, -1))

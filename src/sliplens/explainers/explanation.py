@@ -146,17 +146,7 @@ def check_maps(
 def check_weights(
     layers: Sequence[str], weights: Sequence[Sequence[Float[Tensor, " _channels"]]], *, change: Sequence[float]
 ) -> Iterator[str]:
-    """What is wrong with the weights of the channels, one sentence for each image and layer.
-
-    Parameters
-    ----------
-    layers
-        Names.
-    weights
-        For each image those of each layer.
-    change
-        f(x) - f(reference) of each image in margin units.
-    """
+    """What is wrong with the weights of the channels, one sentence for each image and layer."""
     for index, (shares, difference) in enumerate(zip(weights, change, strict=True)):
         for layer, weight in zip(layers, shares, strict=True):
             bad = int((~weight.isfinite()).sum())
@@ -192,13 +182,6 @@ def check_slopes(sizes: Sequence[float], *, change: Sequence[float]) -> Iterator
     least |f(x) - f(reference)|. Where that sum is below a tenth of it, the gradients would not explain more than a
     tenth even if all of them pulled one way: the network is saturated at the image, and its slope there has little to
     do with how the prediction came about.
-
-    Parameters
-    ----------
-    sizes
-        Sum of |gradient x contrast| of each image in margin units.
-    change
-        f(x) - f(reference) of each image in margin units.
     """
     for index, (size, difference) in enumerate(zip(sizes, change, strict=True)):
         if abs(difference) >= CLOSE and size < FLAT * abs(difference):

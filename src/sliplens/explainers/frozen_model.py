@@ -159,19 +159,7 @@ class Comparison(FrozenModel):
         approximations: tuple[Approximation, ...] = (),
         engine: str = "eager",
     ) -> Explanation:
-        """Record of an explanation, with its warnings.
-
-        Parameters
-        ----------
-        relevance
-            Signed maps in margin units, in the network's type.
-        complete
-            Whether the relevance of an image is meant to add up to f(x) - f(b).
-        warnings
-            Those of the method itself.
-        method, target, levels, approximations, engine
-            As `Explanation` has them.
-        """
+        """Record of an explanation, with its warnings."""
         gap = (relevance.sum(dim=(1, 2)) - self.change).abs().float() if complete else None
         single = relevance.float()
         of_maps = check_maps(

@@ -153,10 +153,10 @@ class Occlusion(Method):
     def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
         comparison = frozen.compare()
         tiles = -(-comparison.images.shape[-2] // self.tile_px) * -(-comparison.images.shape[-1] // self.tile_px)
-        passes = comparison.prepare(len(comparison.images) * tiles)  # markers are about as many
+        engine = comparison.prepare(len(comparison.images) * tiles)  # markers are about as many
 
         def predict(images: Tensor) -> Tensor:
-            return torch.cat(list(passes.run(images.split(passes.batch_size))))
+            return torch.cat(list(engine.run(images.split(engine.batch_size))))
 
         captum = attr.FeatureAblation(predict)
 
@@ -179,7 +179,7 @@ class Occlusion(Method):
             complete=False,
             target="f(x) - f(x with one region as in the reference), "
             + (f"tiles of {self.tile_px} px" if by_tile else "markers"),
-            engine=passes.name,
+            engine=engine.name,
         )
 
     def _regions(self, image: Tensor, empty: Tensor) -> Tensor:

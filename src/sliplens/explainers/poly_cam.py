@@ -13,7 +13,7 @@ from sliplens.explainers.contract import Method
 from sliplens.explainers.explanation import Approximation, Explanation, Level, check_approximations, check_weights
 from sliplens.explainers.frozen_model import Comparison, FrozenModel
 from sliplens.explainers.maps import local_change, to_masks
-from sliplens.explainers.poly_cam_budget import Likeness, estimate_weights, mask_kernel
+from sliplens.explainers.poly_cam_budget import ChannelSearch, Likeness, mask_kernel
 from sliplens.models.engines import Engine
 from sliplens.progress import OnProgress
 
@@ -100,7 +100,7 @@ class PolyCam(Method):
         channels = sum(layer.channels for layer in layers)
         count = _Count(total=len(comparison.images) * channels, on_progress=on_progress)
         # one engine for all rounds and images
-        passes = comparison.prepare(
+        engine = comparison.prepare(
             len(comparison.images) * round(self.budget * channels) * VARIANTS[self.variant].passes,
             engine=self.engine,
             batch_size=self.batch_size,
@@ -109,7 +109,7 @@ class PolyCam(Method):
         for index in range(len(comparison.images)):
             activations = _activations(comparison, index, layers)
             shown_at = self._shown_at(comparison, index)
-            shares, estimated = self._weights(comparison, index, activations, shown_at, passes=passes, count=count)
+            shares, estimated = self._weights(comparison, index, activations, shown_at, engine=engine, count=count)
             weights.append(shares)
             approximations += estimated
             saliencies.append(combine(activations, shares, size=_size(shown_at)))
@@ -132,7 +132,7 @@ class PolyCam(Method):
             ),
             levels=levels if self.levels else (),
             approximations=tuple(approximations),
-            engine=passes.name,
+            engine=engine.name,
         )
 
     @property
@@ -164,7 +164,7 @@ class PolyCam(Method):
         activations: list[Tensor],
         shown_at: Tensor,
         *,
-        passes: Engine,
+        engine: Engine,
         count: "_Count",
     ) -> tuple[list[Tensor], list[Approximation]]:
         """Weight >= 0 of each channel, layer by layer, and how far they are estimates."""
@@ -183,24 +183,23 @@ class PolyCam(Method):
             return score.support(MaskedPredictions(image=image, empty=empty, variant=variant, points=points))
 
         def measured(channels: Int[Tensor, " some"]) -> Float[Tensor, "points some"]:
-            return measure(regions, channels, passes=passes, variant=variant, on_channels=count.add)
+            return measure(regions, channels, engine=engine, variant=variant, on_channels=count.add)
 
         # an empty mask keeps nothing and removes nothing, which needs no pass
         at_empty = torch.stack([empty] * variant.keep + [image] * variant.remove)[:, None]
         active = regions.active()
         count.add(sum(regions.layer_sizes) - len(active))
         if self.budget < 1 and len(active):
-            weights, approximation = estimate_weights(
+            search = ChannelSearch(
                 activations,
                 mask_kernel(regions, active),
                 active=active,
-                budget=self.budget,
-                likeness=self.likeness,
                 at_empty=supports(at_empty)[0],
                 measure=lambda channels: supports(measured(channels)),
                 to_map=lambda weights: combine(activations, weights, size=_size(shown_at))[self._place] * shown_at,
                 seed=self.seed,
             )
+            weights, approximation = search.run(budget=self.budget, likeness=self.likeness)
             count.add(len(active) - approximation.measured)
             return weights, [approximation]
         points = at_empty.repeat(1, sum(regions.layer_sizes))

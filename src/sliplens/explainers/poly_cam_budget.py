@@ -146,19 +146,8 @@ class Likeness:
                 raise InputError(f"the likeness asks for a {name} of {getattr(self, name)}; give a number from 0 to 1")
 
 
-def estimate_weights(
-    activations: Sequence[Float[Tensor, "_channels _rows _columns"]],
-    kernel: Float[Tensor, "some some"],
-    *,
-    active: Int[Tensor, " some"],
-    budget: float,
-    likeness: Likeness | None,
-    at_empty: Float[Tensor, ""],
-    measure: Callable[[Int[Tensor, " part"]], Float[Tensor, " part"]],
-    to_map: Callable[[list[Tensor]], Float[Tensor, "height width"]],
-    seed: int,
-) -> tuple[list[Tensor], Approximation]:
-    """Measure the support of some channels and estimate that of the others from it; a weight is the support, or 0.
+class ChannelSearch:
+    """Channels measured where they matter to the map, the supports of the others estimated from them.
 
     The supports are taken for a Gaussian process over the masks (`mask_kernel`). An error of a channel's support costs
     its layer's map the channel's activation, so channels are measured in order of the norm of the activation, over that
@@ -177,64 +166,28 @@ def estimate_weights(
     Parameters
     ----------
     activations
-        Of each layer, fine to coarse.
+        Activations of each layer, fine to coarse.
     kernel
         How alike the supports of the active channels should be.
     active
         Channels whose mask is not empty, all layers in a row.
-    budget
-        Share of them to measure at first, in (0, 1).
-    likeness
-        What the map should have in common with the exact one, for which more channels are measured, all if need be;
-        None for those of the budget only.
     at_empty
         Support of a channel whose mask is empty.
     measure
         Supports of channels, in rising order; see `Score.support`.
     to_map
         The map that weights of each layer give.
-
-    Returns
-    -------
-    tuple
-        Weights >= 0 of each layer's channels, and what their map is expected to have in common with the exact one.
     """
-    search = _Search(activations, kernel, active=active, at_empty=at_empty, measure=measure, to_map=to_map, seed=seed)
-    count = min(len(active), max(1, math.ceil(budget * len(active))))
-    first = math.ceil(_FIRST * count)
-    rounds = min(_ROUNDS, max(1, count - first))
-    search.explore(first)
-    for step in range(1, rounds + 1):
-        search.explore(first + (count - first) * step // rounds)
-    while True:
-        approximation = search.judge()
-        if likeness is None or count == len(active) or _reached(approximation, likeness):
-            return search.weights(), approximation
-        wanted = math.ceil(_GROWTH * count)
-        count = len(active) if wanted > _NEARLY_ALL * len(active) else wanted
-        search.explore(count)
-
-
-def _reached(approximation: Approximation, likeness: Likeness) -> bool:
-    # not "short > allowed": of a map that holds NaN nothing is expected
-    return all(
-        _SURE * (1 - getattr(approximation, name)) <= 1 - getattr(likeness, name)
-        for name in ("pearson_r", "top_overlap")
-    )
-
-
-class _Search:
-    """The channels measured so far, and what they say of all."""
 
     def __init__(
         self,
-        activations: Sequence[Tensor],
-        kernel: Tensor,
+        activations: Sequence[Float[Tensor, "_channels _rows _columns"]],
+        kernel: Float[Tensor, "some some"],
         *,
-        active: Tensor,
-        at_empty: Tensor,
-        measure: Callable[[Tensor], Tensor],
-        to_map: Callable[[list[Tensor]], Tensor],
+        active: Int[Tensor, " some"],
+        at_empty: Float[Tensor, ""],
+        measure: Callable[[Int[Tensor, " part"]], Float[Tensor, " part"]],
+        to_map: Callable[[list[Tensor]], Float[Tensor, "height width"]],
         seed: int,
     ) -> None:
         self._activations, self._active, self._at_empty = activations, active, at_empty
@@ -243,7 +196,26 @@ class _Search:
         self._norms = [activation.flatten(1).norm(dim=1) for activation in activations]
         self._dtype = kernel.dtype
 
-    def explore(self, until: int) -> None:
+    def run(self, *, budget: float, likeness: Likeness | None) -> tuple[list[Tensor], Approximation]:
+        """Weights >= 0 of each layer's channels, and what their map should have in common with the exact one.
+
+        A share of the channels (`budget`, in (0, 1)) is measured at first, more until the likeness is reached.
+        """
+        count = min(len(self._active), max(1, math.ceil(budget * len(self._active))))
+        first = math.ceil(_FIRST * count)
+        rounds = min(_ROUNDS, max(1, count - first))
+        self._explore(first)
+        for step in range(1, rounds + 1):
+            self._explore(first + (count - first) * step // rounds)
+        while True:
+            approximation = self._judge()
+            if likeness is None or count == len(self._active) or _reached(approximation, likeness):
+                return self._weights(self._process.estimate()[0]), approximation
+            wanted = math.ceil(_GROWTH * count)
+            count = len(self._active) if wanted > _NEARLY_ALL * len(self._active) else wanted
+            self._explore(count)
+
+    def _explore(self, until: int) -> None:
         """Measure channels until there are so many."""
         count = until - len(self._process.chosen)
         if count < 1:
@@ -254,11 +226,7 @@ class _Search:
         supports[order] = self._measure(self._active[chosen[order]]).to(supports)
         self._process.learn(supports)
 
-    def weights(self) -> list[Tensor]:
-        """Weights of the channels of each layer."""
-        return self._weights(self._process.estimate()[0])
-
-    def judge(self) -> Approximation:
+    def _judge(self) -> Approximation:
         """What the map is expected to have in common with the exact one."""
         estimate, _ = self._process.estimate()
         result = self._to_map(self._weights(estimate))
@@ -291,3 +259,11 @@ class _Search:
         every = self._at_empty.to(supports).repeat(sum(map(len, self._activations)))
         every[self._active] = supports
         return list(torch.relu(every).to(self._at_empty.dtype).split([len(norm) for norm in self._norms]))
+
+
+def _reached(approximation: Approximation, likeness: Likeness) -> bool:
+    # not "short > allowed": of a map that holds NaN nothing is expected
+    return all(
+        _SURE * (1 - getattr(approximation, name)) <= 1 - getattr(likeness, name)
+        for name in ("pearson_r", "top_overlap")
+    )

@@ -17,13 +17,7 @@ _FEWEST = 3
 
 
 def fill_decides(whole: Float[np.ndarray, " images"], filled: Float[np.ndarray, " images"], *, fill: str) -> list[str]:
-    """Say in how many images the fill alone is answered like the whole image: there no map can move the answer.
-
-    Parameters
-    ----------
-    whole, filled
-        Answers on the images, and on images of nothing but fill, in margin units.
-    """
+    """Say in how many images the fill alone is answered like the whole image: there no map can move the answer."""
     near = int(np.sum(np.abs(whole - filled) < FILL_DECIDES))
     if not near:
         return []
@@ -36,15 +30,7 @@ def fill_decides(whole: Float[np.ndarray, " images"], filled: Float[np.ndarray, 
 def follows_last_step(
     score: Float[np.ndarray, " images"], last: Float[np.ndarray, " images"], *, name: str
 ) -> list[str]:
-    """Say whether a score follows its own last step, where all is filled and no map has a part.
-
-    Parameters
-    ----------
-    score, last
-        Score of each image, and its value at the last step.
-    name
-        Name of the score, for the sentence.
-    """
+    """Say whether a score follows its own last step, where all is filled and no map has a part."""
     if len(score) < _FEWEST or np.std(score) == 0 or np.std(last) == 0:
         return []
     tied = float(np.corrcoef(score, last)[0, 1])
@@ -99,13 +85,7 @@ def rankings_disagree(scores: Mapping[str, Mapping[str, float]]) -> list[str]:
 
 
 def controls_win(scores: Mapping[str, Faithfulness], controls: Mapping[str, Faithfulness]) -> list[str]:
-    """Say which methods gain no more than a map that knows nothing of the network, or than random orders.
-
-    Parameters
-    ----------
-    scores, controls
-        Scores of the methods, and of the controls, on the same images.
-    """
+    """Say which methods gain no more than a map that knows nothing of the network, or than random orders."""
     alarms = []
     best = max(controls, key=lambda name: float(controls[name].symmetric_gain.mean()), default=None)
     for method, score in scores.items():
