@@ -16,7 +16,7 @@ PAGE = pytest.mark.parametrize(
 )
 
 
-NO_MODULES = {f"sliplens.{name}" for name in ("fills", "formats", "readers", "encodings", "backbones", "engines")} | {
+NO_MODULES = {f"sliplens.{name}" for name in ("fills", "formats", "encodings", "backbones", "engines")} | {
     f"sliplens.{name}" for name in ("manifest", "input", "output")
 }
 """Groups of entry points, and keys in the metadata of an ONNX file."""

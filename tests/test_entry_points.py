@@ -12,6 +12,7 @@ from sliplens.faithfulness import FILLS
 from sliplens.models.backbones import BACKBONES
 from sliplens.models.encodings import ENCODINGS
 from sliplens.models.engines import ENGINES
+from sliplens.recordings.formats import FORMATS
 
 TABLES = {
     "sliplens.backbones": BACKBONES,
@@ -19,6 +20,7 @@ TABLES = {
     "sliplens.engines": ENGINES,
     "sliplens.explainers": EXPLAINERS,
     "sliplens.fills": FILLS,
+    "sliplens.formats": FORMATS,
 }
 
 
