@@ -1,13 +1,13 @@
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations, pairwise
+from itertools import pairwise
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 import pytest
+from drawn import misplaced, pulled_trial
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
@@ -32,37 +32,11 @@ NO_CONTACT, CONTACT, INCIPIENT_SLIP, FULL_SLIP, _ = ContactState
 MU = 0.53
 
 
-def make_trial(
-    *, pull: int = 41, lowest: float = 0.0, size: tuple[int, int] = (24, 24), step_s: float = 0.04
-) -> Recording:
-    """Four frames untouched, five of pressing, a pull down to the lowest margin and, if that is 0, three of sliding."""
-    slide = 3 if lowest == 0 else 0
-    margin = np.concatenate([np.full(4, np.nan), np.ones(5), np.linspace(1, lowest, pull), np.zeros(slide)])
-    state = [NO_CONTACT] * 4 + [CONTACT] * 5 + [INCIPIENT_SLIP] * pull + [FULL_SLIP] * slide
-    normal = np.concatenate([np.zeros(4), [0.1, 0.3, 0.6, 0.9, 1.2], np.full(pull + slide, 1.1)])
-    valid = np.array([one in (CONTACT, INCIPIENT_SLIP) for one in state])
-    rng = np.random.default_rng(pull)
-    reference = rng.integers(0, 100, (*size, 3), dtype=np.uint8)
-    frames = np.repeat(reference[None], len(margin), axis=0)
-    for index in range(4, len(margin)):
-        frames[index, index % 8 : index % 8 + 8, 5:15] += 90
-    return Recording(
-        trial="day1-dry-001",
-        sensor="test-sensor",
-        day=1,
-        condition="dry",
-        reference=reference,
-        frames=frames,
-        time_s=np.arange(len(margin)) * step_s,
-        normal_force_n=normal,
-        tangential_force_n=np.nan_to_num(MU * normal * (1 - margin)),
-        friction_coefficient=np.full(len(margin), MU),
-        safety_margin=margin,
-        stick_ratio=margin ** (2 / 3),
-        contact_state=tuple(state),
-        safety_margin_sigma=np.where(valid, 0.031, np.nan),
-        valid=valid,
-    )
+def make_trial(*, pull: int = 41, lowest: float = 0.0, step_s: float = 0.04, **more: Any) -> Recording:
+    """A pulled trial whose labels are valid while the contact holds."""
+    trial = pulled_trial(pull=pull, lowest=lowest, step_s=step_s, mu=MU, **more)
+    valid = np.array([state in (CONTACT, INCIPIENT_SLIP) for state in trial.contact_state])
+    return replace(trial, safety_margin_sigma=np.where(valid, 0.031, np.nan), valid=valid)
 
 
 AXES = ForceAxes(
@@ -144,24 +118,6 @@ def bands(ax: Axes) -> list[PolyCollection]:
 
 def onsets(ax: Axes) -> list[float]:
     return [float(np.asarray(line.get_xdata())[0]) for line in ax.lines if str(line.get_label()).startswith("slip at")]
-
-
-def misplaced(figure: Figure) -> tuple[list[str], list[tuple[str, str]]]:
-    """Words that leave the page, and pairs that lie over each other."""
-    FigureCanvasAgg(figure).draw()
-    # ticks beyond the limits of their axis have a place but are never drawn
-    ticks = [
-        (tick, axis.get_view_interval())
-        for ax in figure.axes
-        for axis in (ax.xaxis, ax.yaxis)
-        for tick in axis.get_major_ticks()
-    ]
-    beyond = {tick.label1 for tick, (low, high) in ticks if not low <= tick.get_loc() <= high}
-    shown = [found for found in figure.findobj(Text) if found.get_visible() and found.get_text().strip()]
-    boxes = [(found.get_text(), found.get_window_extent()) for found in shown if found not in beyond]
-    width, height = figure.bbox.size
-    outside = [text for text, box in boxes if box.x0 < 0 or box.y0 < 0 or box.x1 > width or box.y1 > height]
-    return outside, [(one, other) for (one, a), (other, b) in combinations(boxes, 2) if a.overlaps(b)]
 
 
 def test_words_hold_what_the_labels_rest_on():
