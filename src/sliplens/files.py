@@ -8,7 +8,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -257,10 +257,3 @@ def output_folder(
     if target.exists():
         shutil.rmtree(target)
     partial.rename(target)
-
-
-def exported_folder(
-    target: Path, *, run_file: str, config: Mapping[str, Any], overwrite: bool = False
-) -> AbstractContextManager[Output]:
-    """Write a folder in a format of others, as `output_folder` does."""
-    return output_folder(target, stage="export", config=config, overwrite=overwrite, run_file=run_file, resumable=False)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sliplens.files import exported_folder
+from sliplens.files import output_folder
 from sliplens.progress import OnProgress, stage, wrote
 from sliplens.recordings.dataset import Dataset, load_dataset
 
@@ -112,7 +112,9 @@ def _export(
     data = data if isinstance(data, Dataset) else load_dataset(data)
     chosen = data.trials if not trials else tuple(data.find(name) for name in dict.fromkeys(trials))
     config = {"format": kind.name, "data_hash": data.hash, "trials": [info.trial for info in chosen]}
-    with exported_folder(out, run_file=kind.run_file, config=config, overwrite=overwrite) as output:
+    with output_folder(
+        out, stage="export", config=config, overwrite=overwrite, run_file=kind.run_file, resumable=False
+    ) as output:
         if not output.complete:
             with stage(on_progress, "Writing frames") as count:
                 kind.write(data, output.folder, trials=chosen, on_progress=count)
