@@ -71,8 +71,8 @@ def make_ready(
     for name in names:
         start = time.perf_counter()
         try:
-            engines[name] = make_engine(name, trained)
-            engines[name](inputs)
+            engines[name] = make_engine(name, trained, batch_size=1, streams=1)
+            engines[name].estimate(trained, inputs)
         except SliplensError as error:
             missing[name] = str(error)
             engines.pop(name, None)
@@ -104,9 +104,9 @@ def encoders(trained: TrainedModel) -> dict[str, Callable[[], object]]:
     return work
 
 
-def parity(engine: Engine, eager: Engine, inputs: Tensor) -> float:
+def parity(trained: TrainedModel, engine: Engine, eager: Engine, inputs: Tensor) -> float:
     """Largest difference between the margins of an engine and those of `eager`."""
-    return max(difference(engine(one[None]).margin, eager(one[None]).margin) for one in inputs)
+    return difference(engine.estimate(trained, inputs).margin, eager.estimate(trained, inputs).margin)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -124,20 +124,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     inputs = clouds(8, size=options.size, seed=3)
     engines, ready_s, missing = make_ready(options.engines, trained, inputs[:1])
     load = [os.getloadavg()[0]]
-    times = time_rounds(
-        {name: lambda engine=engine: engine(inputs[:1]) for name, engine in engines.items()}, rounds=options.rounds
-    )
+    work = {name: partial(engine.estimate, trained, inputs[:1]) for name, engine in engines.items()}
+    times = time_rounds(work, rounds=options.rounds)
     load.append(os.getloadavg()[0])
     encode_times = time_rounds(encoders(trained), rounds=options.rounds)
-    eager = engines.get("eager") or make_engine("eager", trained)
+    eager = engines.get("eager") or make_engine("eager", trained, batch_size=1, streams=1)
     result = {
         "p50_ms": {name: float(np.percentile(values, 50)) for name, values in times.items()},
         "p99_ms": {name: float(np.percentile(values, 99)) for name, values in times.items()},
-        "parity": {name: parity(engine, eager, inputs) for name, engine in engines.items()},
+        "parity": {name: parity(trained, engine, eager, inputs) for name, engine in engines.items()},
         "fastest": min(times, key=lambda name: float(np.median(times[name]))),
         "ready_s": ready_s,
         "missing": missing,
-        "margin_sd": float(eager(inputs).margin.std()),
+        "margin_sd": float(eager.estimate(trained, inputs).margin.std()),
         "encode_p50_ms": {name: float(np.percentile(values, 50)) for name, values in encode_times.items()},
         "encode_p99_ms": {name: float(np.percentile(values, 99)) for name, values in encode_times.items()},
         "load_average": load,

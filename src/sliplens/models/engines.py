@@ -378,7 +378,7 @@ def _openvino(model: nn.Module, job: EngineJob) -> RunBatches:
             )
     settings = {
         "NUM_STREAMS": job.streams,
-        "INFERENCE_NUM_THREADS": torch.get_num_threads(),
+        "INFERENCE_NUM_THREADS": max(torch.get_num_threads(), job.streams),
         # pinned, the threads of two processes share the first core and leave the second idle
         "ENABLE_CPU_PINNING": False,
         "INFERENCE_PRECISION_HINT": "f32",  # where the processor knows bfloat16 that is the default, at 3 digits
