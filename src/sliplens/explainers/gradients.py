@@ -251,8 +251,6 @@ class SmoothGrad(Method):
 
     Parameters
     ----------
-    samples
-        Noisy copies of each image.
     noise
         Standard deviation of the noise, in units of the input's range [0, 1].
     seed

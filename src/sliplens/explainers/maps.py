@@ -110,8 +110,6 @@ def top_overlap(
 
     Parameters
     ----------
-    one, other
-        Maps of one size.
     share
         Of the pixels, that count as strongest.
 

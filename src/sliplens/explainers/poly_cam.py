@@ -58,8 +58,6 @@ class PolyCam(Method):
     likeness
         What that should be: more channels are measured until it is expected, all of them if need be. None to stop at
         the budget, whatever the map is like.
-    engine
-        What runs the masked images; see `models.engines.prepare`.
     batch_size
         Masked images in one pass; None for what suits the engine.
     levels

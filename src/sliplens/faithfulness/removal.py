@@ -58,8 +58,6 @@ def answer_removals(
         What to answer, in this order.
     shape, device
         Height and width of the images, and where they are.
-    batch_size
-        Images at a time; an engine has its own.
     on_progress
         Called with the number of images done and of all; removals are given image by image.
     """

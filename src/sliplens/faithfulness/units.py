@@ -44,8 +44,6 @@ def marker_units(shape: tuple[int, int], centres_px: Float[np.ndarray, "markers 
     ----------
     shape
         Height and width of the image.
-    centres_px
-        Markers as x, y.
     reach_px
         How far a marker's unit reaches: its radius, and as far as it moves.
 

@@ -230,8 +230,6 @@ def track_markers(
     ----------
     frames
         T_1 to T_n: RGB, of the reference's size.
-    reference
-        T_0.
     kind
         Row of `KINDS`, or a kind of one's own.
 

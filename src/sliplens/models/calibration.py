@@ -85,8 +85,6 @@ def quantiles(
     ----------
     probabilities
         Each row sums to 1.
-    edges
-        Of the bins, rising.
     share
         Between 0 and 1.
 

@@ -64,10 +64,6 @@ class Encoding:
 
         Parameters
         ----------
-        frames
-            Frames T_n, uint8 RGB.
-        reference
-            The sensor untouched, T_0.
         image_size
             Height and width of the network's input, in pixels.
 

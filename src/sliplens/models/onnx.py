@@ -92,8 +92,6 @@ def convert_network(model: nn.Module, images: Float[Tensor, "batch 3 height widt
     ----------
     model
         In evaluation mode, one number an image; it stays as it is.
-    images
-        Of the size to come.
 
     Raises
     ------

@@ -103,10 +103,6 @@ def predict(
         Device of a network that is loaded here: cpu or cuda.
     out
         Parquet file to write, whole or not at all; rows are kept in memory if None.
-    overwrite
-        Write the file anew if it exists.
-    on_progress
-        Called with the frames done and the frames in all.
 
     Raises
     ------

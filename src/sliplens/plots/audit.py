@@ -280,8 +280,6 @@ def draw_audit(recording: Recording, labelling: Labelling, *, read_frames: ReadF
 
     Parameters
     ----------
-    recording
-        The trial.
     labelling
         How its labels were made.
     read_frames
@@ -314,8 +312,6 @@ def write_audit(
     ----------
     recording, labelling
         As `draw_audit` takes them.
-    path
-        File to write.
     read_frames
         As `draw_audit` takes it.
 
@@ -337,8 +333,6 @@ def write_audits(data: Dataset, folder: Path, *, on_progress: OnProgress | None 
         Data set whose trials were imported or labelled.
     folder
         Where to write, made if it is missing.
-    on_progress
-        Called with the pages done and the pages in all.
 
     Returns
     -------

@@ -130,8 +130,6 @@ def clip_frames(time_s: Float[np.ndarray, " frames"], frames_per_s: float) -> In
     ----------
     time_s
         When each frame was recorded, in seconds; the last one is shown for the typical time between two.
-    frames_per_s
-        Frames a second of the clip.
     """
     duration = time_s[-1] - time_s[0] + _interval(time_s, otherwise=1 / frames_per_s)
     moments = time_s[0] + np.arange(max(1, round(duration * frames_per_s))) / frames_per_s

@@ -92,11 +92,6 @@ def draw_contact_sheet(recordings: Sequence[Recording], *, title: str | None = N
     brightened by one factor for the whole sheet so that trials compare, and at the right forces and safety margin over
     time. Where a recording knows the true contact, its outline and that of its stick zone lie over the camera frames.
 
-    Parameters
-    ----------
-    recordings
-        Trials, of any frame size.
-
     Raises
     ------
     InputError

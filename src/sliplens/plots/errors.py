@@ -112,8 +112,6 @@ def plot_faithfulness(curves: Mapping[str, DeletionCurve], *, pixels: int, ax: A
     ----------
     curves
         Deletion curves by method, the random control among them.
-    pixels
-        Pixels of an image, for the share removed.
     """
     for name in methods_in_order(curves):
         curve, colour = curves[name], METHOD_COLOURS.get(name, PURPLE)

@@ -229,8 +229,6 @@ def describe_trial(trial: Recording, info: TrialInfo, labelling: Labelling | Non
     ----------
     trial
         Its labels; frames are not looked at.
-    info
-        What the data set says of it.
     labelling
         How its labels were made; None where that is not told.
     truth
@@ -462,12 +460,8 @@ def write_rrd(
 
     Parameters
     ----------
-    data, info
-        The data set, and the trial of it.
     path
         File to write, .rrd.
-    on_frames
-        Called with the frames done and the frames in all, now and then.
 
     Raises
     ------
@@ -486,13 +480,6 @@ def write_rrd(
 
 def open_viewer(data: Dataset, info: TrialInfo, *, on_frames: Callable[[int, int], None] | None = None) -> None:
     """Open a trial in a Rerun viewer of its own, which stays when this process ends.
-
-    Parameters
-    ----------
-    data, info
-        The data set, and the trial of it.
-    on_frames
-        Called with the frames done and the frames in all, now and then.
 
     Raises
     ------
@@ -513,15 +500,6 @@ def log_trial(
     """Log a trial and its layout to a Rerun stream, a few frames in memory at a time.
 
     Timelines are `time`, on the clock of the camera, and `frame`. What is not known is NaN: there a line breaks.
-
-    Parameters
-    ----------
-    stream
-        Where to log to.
-    data, info
-        The data set, and the trial of it.
-    on_frames
-        Called with the frames done and the frames in all, now and then.
 
     Raises
     ------

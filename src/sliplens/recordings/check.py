@@ -40,8 +40,6 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
     ----------
     data
         Data set, or its folder.
-    on_progress
-        Called with the trials done and the trials in all.
 
     Returns
     -------

@@ -36,10 +36,6 @@ def export_lerobot(
         Folder to make.
     trials
         Names of trials; all if None.
-    overwrite
-        Replace a folder that an export made.
-    on_progress
-        Called with the frames written and the frames in all.
 
     Raises
     ------
@@ -73,10 +69,6 @@ def export_mcap(
         Folder to make.
     trials
         Names of trials; all if None.
-    overwrite
-        Replace a folder that an export made.
-    on_progress
-        Called with the frames written and the frames in all.
 
     Raises
     ------

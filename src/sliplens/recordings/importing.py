@@ -68,10 +68,6 @@ def import_recordings(
         What is known of the sources.
     labelling
         What is known of forces and friction.
-    overwrite
-        Replace the folder if it exists.
-    on_progress
-        Called with the frames written and the frames in all.
 
     Raises
     ------
@@ -136,10 +132,6 @@ def label_dataset(
         Folder to make. The data set's own gets the new labels once all of them are there.
     labelling
         What is known of forces and friction.
-    overwrite
-        Replace another folder if it exists.
-    on_progress
-        Called with the frames written and the frames in all.
 
     Raises
     ------
@@ -274,16 +266,10 @@ def import_trial(
     ----------
     capture
         Recording, which must have labels or forces.
-    path
-        Parquet file to write.
     settings
         What is known of axes, friction and lag, where labels are to be found.
-    rng
-        Source of the bootstraps.
     forces_file
         Where to keep the samples of the force sensor, from which labels can be made anew; not kept if None.
-    on_progress
-        Called with the frames written and the frames in all.
 
     Raises
     ------

@@ -30,8 +30,6 @@ def explain_trial(
 
     Parameters
     ----------
-    run
-        Network that reads the trial.
     recording
         Trial with labels.
     source

@@ -83,8 +83,6 @@ def evaluate_baselines(
     ----------
     plan
         Estimators, the trials to fit on, and the kind of their markers.
-    data
-        Data set that holds the trials.
     predictions
         The network's, for the trial, condition, frame, time and label of each frame.
     folder

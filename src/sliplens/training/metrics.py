@@ -19,11 +19,6 @@ def coverage(
 def auroc(positive: Float[np.ndarray, " _"], negative: Float[np.ndarray, " _"]) -> float | None:
     """Area under the receiver operating characteristic: how often a positive scores above a negative; ties count half.
 
-    Parameters
-    ----------
-    positive, negative
-        Scores of the two classes.
-
     Returns
     -------
     float or None

@@ -33,8 +33,6 @@ def make_trainer(
 
     Parameters
     ----------
-    config
-        Epochs, precision and optimizer.
     accelerator, devices, num_nodes
         Lightning's own: devices of each node, a process each.
 

@@ -94,8 +94,6 @@ def open_captures(path: Path, *, format: str | None = None, options: ReadOptions
 
     Parameters
     ----------
-    path
-        File or folder.
     format
         Row of `FORMATS`; recognised by names if None.
     options

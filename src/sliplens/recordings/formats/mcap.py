@@ -102,14 +102,10 @@ def write_mcap(
 
     Parameters
     ----------
-    data
-        The data set.
     folder
         An empty folder.
     trials
         Rows of its table; all by default.
-    on_progress
-        Called with the frames written and the frames in all.
 
     Raises
     ------

@@ -50,13 +50,6 @@ def infer_axes(
     pulled far; its sign makes that positive. A sensor that is pressed from the first sample on looks untouched: declare
     its tare.
 
-    Parameters
-    ----------
-    forces
-        As recorded.
-    normal, sign, tare_n
-        What is declared.
-
     Raises
     ------
     RecordingError
