@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from sliplens.recordings.dataset import load_dataset
     from sliplens.recordings.exporting import export_lerobot, export_mcap
     from sliplens.recordings.importing import import_recordings, label_dataset
+    from sliplens.simulation.trials import simulate
     from sliplens.training.evaluate import evaluate
     from sliplens.training.fit import train
 
 # where each name lives: importing sliplens alone imports neither torch nor NumPy
 _MODULES = {
-    "SliplensError": "sliplens.errors",
     "check_dataset": "sliplens.recordings.check",
     "evaluate": "sliplens.training.evaluate",
     "explain": "sliplens.explainers.table",
@@ -35,6 +35,8 @@ _MODULES = {
     "load_dataset": "sliplens.recordings.dataset",
     "predict": "sliplens.models.predictions",
     "score": "sliplens.faithfulness.scoring",
+    "simulate": "sliplens.simulation.trials",
+    "SliplensError": "sliplens.errors",
     "track": "sliplens.markers.tracking",
     "train": "sliplens.training.fit",
 }
@@ -54,6 +56,7 @@ __all__ = [
     "load_dataset",
     "predict",
     "score",
+    "simulate",
     "track",
     "train",
 ]

@@ -9,7 +9,7 @@ from command_line import refused, run
 from PIL import Image
 
 from sliplens.recordings import Dataset
-from sliplens.simulation import PRESETS
+from sliplens.simulation import PRESETS, make_recipe
 
 SMALL = ("--dry-trials", "3", "--wet-trials", "1", "--days", "2", "--frames-per-trial", "20")
 
@@ -42,11 +42,9 @@ def test_a_preview_and_a_clip_need_no_folder(tmp_path: Path):
 
 
 def test_options_change_a_preset_and_drop_its_totals():
-    from sliplens.cli.simulate import Simulate  # noqa: PLC0415 (the command line is what is tested elsewhere)
-
-    assert Simulate(preset="thesis")._recipe() == PRESETS["thesis"]
-    assert Simulate()._recipe() == PRESETS["small"]
-    changed = Simulate(preset="thesis", days=6)._recipe()
+    assert make_recipe("thesis", release=False, seed=0) == PRESETS["thesis"]
+    assert make_recipe() == PRESETS["small"]
+    changed = make_recipe("thesis", days=6)
     assert (changed.days, changed.dry_trials, changed.frame_totals) == (6, 191, None)
 
 

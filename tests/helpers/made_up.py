@@ -12,8 +12,9 @@ from PIL import Image
 
 from sliplens.codec import save_record, save_result
 from sliplens.files import Machine, Provenance
+from sliplens.recordings import TrialInfo
+from sliplens.recordings.dataset import write_dataset_table
 from sliplens.results.evaluation import Evaluation, Predictions, Reliability
-from sliplens.results.simulation import Simulation, SplitCount
 from sliplens.results.training import LearningCurve, Training
 from sliplens.training.metrics import find_lead_times, score_predictions
 
@@ -43,14 +44,26 @@ def write_run(folder: Path, stage: str, config: dict[str, Any], result: object, 
 
 
 def write_simulation(workspace: Path) -> Path:
-    splits = {"train": (40, 1600), "validation": (8, 320), "test": (16, 640)}
-    result = Simulation(
-        trials=64,
-        frames=2560,
-        by_split={name: SplitCount(trials=trials, frames=frames) for name, (trials, frames) in splits.items()},
-        conditions=("dry", "wet"),
-    )
-    return write_run(workspace / "data", "simulate", {"trials": 64, "seed": 0, "size": [224, 224]}, result)
+    splits = {"train": (40, 40, "dry"), "validation": (8, 40, "dry"), "test": (16, 40, "wet")}
+    trials = [
+        TrialInfo(
+            trial=f"{split}-{number:03d}",
+            sensor="chromatouch-1",
+            day=1,
+            condition=condition,
+            split=split,
+            frames=frames,
+            height=224,
+            width=224,
+            sha256="0" * 64,
+        )
+        for split, (count, frames, condition) in splits.items()
+        for number in range(count)
+    ]
+    folder = write_run(workspace / "data", "simulate", {"trials": 64, "seed": 0, "size": [224, 224]}, {})
+    (folder / "result.json").unlink()
+    write_dataset_table(folder, trials, simulated=True)
+    return folder
 
 
 def write_training(workspace: Path, name: str, *, size: int, rng: np.random.Generator) -> Path:

@@ -103,7 +103,6 @@ def test_workspace_without_result_is_told(tmp_path):
         ("test-raw", '{"input": "raw", "conditions": NaN}', r"test-raw/result.json is not valid JSON"),
         ("network-raw", '{"input": 3}', r"expected `str`, got `int` at input; .*`sliplens train`"),
         ("network-raw", '{"input": "raw", "image_size": true}', r"expected `int`, got `bool` at image_size"),
-        ("data", '{"trials": 1.5}', r"expected `int`, got `float` at trials; make it again with `sliplens simulate`"),
         ("maps-raw-real", '{"input": "raw", "image_size": 24, "frames": []}', r"names no frame; explain some"),
         ("maps-raw-real", '{"input": "raw", "image_size": 24, "frames": 3}', r"has 3 as 'frames' where a list belongs"),
         ("score-raw", '{"input": "raw", "source": "simulated"}', r"lacks 'fill'; .*`sliplens score`"),

@@ -191,7 +191,7 @@ def test_different_trials_differ(recordings):
 
 def test_progress_is_told_in_frames():
     heard = []
-    simulate_trial(plan_trials(RECIPE)[0], on_frames=lambda done, total: heard.append((done, total)))
+    simulate_trial(plan_trials(RECIPE)[0], on_progress=lambda done, total: heard.append((done, total)))
     assert heard[-1] == (30, 30)
     assert [done for done, _ in heard] == sorted({done for done, _ in heard})
     assert {total for _, total in heard} == {30}
@@ -204,7 +204,7 @@ def test_resuming_skips_what_is_there_and_gives_the_same_bytes(dataset, tmp_path
     stamp = kept.stat().st_mtime_ns
     (tmp_path / "part" / "trials" / "day4-wet-001.parquet").unlink()
     (tmp_path / "part" / "dataset.json").unlink()
-    resumed = simulate_dataset(tmp_path / "part", recipe, on_frames=lambda done, total: heard.append((done, total)))
+    resumed = simulate_dataset(tmp_path / "part", recipe, on_progress=lambda done, total: heard.append((done, total)))
     assert kept.stat().st_mtime_ns == stamp
     assert [info.sha256 for info in resumed.trials] == [info.sha256 for info in dataset.trials]
     assert heard[-1] == (80, 80)
@@ -226,7 +226,7 @@ def test_an_interrupted_data_set_resumes_to_the_same_bytes(dataset, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        simulate_dataset(tmp_path, recipe, on_frames=interrupt)
+        simulate_dataset(tmp_path, recipe, on_progress=interrupt)
     assert len(list((tmp_path / "trials").glob("*.parquet"))) == 2
     assert not (tmp_path / "dataset.json").exists()
     resumed = simulate_dataset(tmp_path, recipe)

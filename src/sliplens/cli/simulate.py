@@ -1,21 +1,18 @@
 """`sliplens simulate`."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sliplens.cli.console import print_table, progress_bar, unchanged, wrote
+from sliplens.cli.console import Terminal, print_table
 from sliplens.errors import InputError
-from sliplens.extras import require_device
-from sliplens.files import output_folder, write_json
 
 if TYPE_CHECKING:
-    from sliplens.simulation import SimulationRecipe, TrialPlan
+    from sliplens.simulation import SimulationRecipe
 
 _CLIP_FRAMES_PER_S = 30
-_PREVIEWED = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,49 +63,30 @@ class Simulate:
 
     def run(self) -> None:
         """Draw what was asked for; simulate and write the data set."""
-        from sliplens.simulation import plan_trials
+        from sliplens.extras import require_device
+        from sliplens.results import describe_simulation
+        from sliplens.simulation import make_recipe, simulate
 
         if self.output is None and self.preview is None and self.video is None:
             raise InputError("nothing to do; name a folder to make, or a picture with --preview")
         self._require_pictures()
         require_device(self.device)
-        recipe = self._recipe()
-        plans = plan_trials(recipe)
+        own = {"output", "preset", "device", "preview", "video", "overwrite"}
+        changes = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in own}
+        recipe, terminal = make_recipe(self.preset, **changes), Terminal()
         if self.preview is not None:
-            self._draw_preview(self.preview, recipe, _spread(plans))
+            self._draw_preview(self.preview, recipe, terminal)
         if self.video is not None:
-            self._draw_video(self.video, plans)
+            self._draw_video(self.video, recipe, terminal)
         if self.output is not None:
-            self._write(self.output, recipe)
-
-    def _recipe(self) -> "SimulationRecipe":
-        from sliplens.simulation import PRESETS, SENSORS
-
-        preset = PRESETS[self.preset]
-        counts = {
-            "dry_trials": self.dry_trials,
-            "wet_trials": self.wet_trials,
-            "days": self.days,
-            "test_days": self.test_days,
-        }
-        changes: dict[str, Any] = {name: value for name, value in counts.items() if value is not None}
-        if "days" in changes and "dry_trials" not in changes and isinstance(preset.dry_trials, tuple):
-            changes["dry_trials"] = sum(preset.dry_trials)
-        if self.frames_per_trial is not None:
-            changes["frames_per_trial"] = self.frames_per_trial
-        if self.dry_friction is not None:
-            changes["nuisances"] = replace(preset.nuisances, dry_friction=self.dry_friction)
-        if changes.keys() - {"nuisances"}:
-            # the totals are those of the preset as it stands
-            changes["frame_totals"] = None
-        return replace(
-            preset,
-            sensor=SENSORS[self.sensor],
-            displacement=self.displacement,
-            release=self.release,
-            seed=self.seed,
-            **changes,
-        )
+            shown = {"device": self.device, "overwrite": self.overwrite, "on_progress": terminal}
+            data = simulate(self.output, preset=self.preset, **shown, **changes)
+            rows = describe_simulation(data).by_split.items()
+            print_table(
+                "Simulated",
+                ("split", "trials", "frames"),
+                [(name, str(row.trials), f"{row.frames:,}") for name, row in rows],
+            )
 
     def _require_pictures(self) -> None:
         """Refuse a wrong suffix before anything is simulated."""
@@ -121,65 +99,26 @@ class Simulate:
 
             require_clip_path(self.video)
 
-    def _draw_preview(self, path: Path, recipe: "SimulationRecipe", plans: "list[TrialPlan]") -> None:
+    def _draw_preview(self, path: Path, recipe: "SimulationRecipe", terminal: Terminal) -> None:
         from sliplens.plots.contact_sheet import write_contact_sheet
-        from sliplens.simulation import simulate_trial
+        from sliplens.simulation import simulate_examples
 
-        recordings = []
-        with progress_bar("Simulating trials for the preview") as bar:
-            for done, plan in enumerate(plans, start=1):
-                recordings.append(simulate_trial(plan, device=self.device))
-                bar(done, len(plans))
+        with terminal.stage("Simulating trials for the preview") as count:
+            recordings = simulate_examples(recipe, device=self.device, on_progress=count)
         title = f"Simulated {recipe.sensor.name}, {recipe.resolved_displacement} displacement, seed {recipe.seed}"
         write_contact_sheet(recordings, path, title=title)
-        wrote(path, f"{len(recordings)} of the trials that this recipe makes")
+        terminal.wrote(path, f"{len(recordings)} of the trials that this recipe makes")
 
-    def _draw_video(self, path: Path, plans: "tuple[TrialPlan, ...]") -> None:
+    def _draw_video(self, path: Path, recipe: "SimulationRecipe", terminal: Terminal) -> None:
         from sliplens.plots.clip import write_clip
-        from sliplens.simulation import simulate_trial
+        from sliplens.simulation import plan_trials, simulate_trial
         from sliplens.simulation.loading import TRIAL_S
 
         # sampled anew, for the eye: a data set may have few frames a second
-        plan = replace(plans[0], frames=round(TRIAL_S * _CLIP_FRAMES_PER_S))
-        with progress_bar("Simulating the trial") as bar:
-            recording = simulate_trial(plan, device=self.device, on_frames=bar)
-        with progress_bar("Writing the clip") as bar:
-            write_clip(recording, path, on_frames=bar)
-        wrote(path, f"trial {plan.trial} at {_CLIP_FRAMES_PER_S} frames/s; to watch, not to train on: video is lossy")
-
-    def _write(self, output: Path, recipe: "SimulationRecipe") -> None:
-        from sliplens.simulation import simulate_dataset
-
-        config = {"recipe": recipe, "device": self.device}
-        with output_folder(output, stage="simulate", config=config, overwrite=self.overwrite) as out:
-            if out.complete:
-                unchanged(output)
-                return
-            with progress_bar("Simulating frames") as bar:
-                data = simulate_dataset(out.folder, recipe, device=self.device, on_frames=bar)
-            splits: dict[str, dict[str, int]] = {}
-            for trial in data.trials:
-                split = splits.setdefault(trial.split, {"trials": 0, "frames": 0})
-                split["trials"] += 1
-                split["frames"] += trial.frames
-            frames = sum(trial.frames for trial in data.trials)
-            write_json(
-                out.folder / "result.json",
-                {
-                    "trials": len(data.trials),
-                    "frames": frames,
-                    "by_split": splits,
-                    "conditions": sorted({trial.condition for trial in data.trials}),
-                },
-            )
-        rows = [(name, str(split["trials"]), f"{split['frames']:,}") for name, split in splits.items()]
-        print_table("Simulated", ("split", "trials", "frames"), rows)
-        wrote(output, f"{len(data.trials)} trials, {frames:,} frames")
-
-
-def _spread(plans: "tuple[TrialPlan, ...]") -> "list[TrialPlan]":
-    """A few trials that show the range: the wet ones last."""
-    dry = [plan for plan in plans if plan.condition == "dry"]
-    wet = [plan for plan in plans if plan.condition == "wet"][:1]
-    count = min(_PREVIEWED - len(wet), len(dry))
-    return [dry[index * (len(dry) - 1) // max(1, count - 1)] for index in range(count)] + wet
+        plan = replace(plan_trials(recipe)[0], frames=round(TRIAL_S * _CLIP_FRAMES_PER_S))
+        with terminal.stage("Simulating the trial") as count:
+            recording = simulate_trial(plan, device=self.device, on_progress=count)
+        with terminal.stage("Writing the clip") as count:
+            write_clip(recording, path, on_frames=count)
+        rate = f"{_CLIP_FRAMES_PER_S} frames/s"
+        terminal.wrote(path, f"trial {plan.trial} at {rate}; to watch, not to train on: video is lossy")

@@ -140,7 +140,7 @@ def _warnings(results: Results) -> list[str]:
     versions = {
         tuple(sorted(run.versions.items()))
         for run in results.runs.values()
-        if run.stage in READERS.keys() | RECORDS.keys()
+        if run.stage in READERS.keys() | RECORDS.keys() | {"simulate"}
     }
     if len(versions) > 1:
         told.append("The stages were run with different versions of the libraries; see the versions of each run.json.")

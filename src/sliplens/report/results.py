@@ -7,6 +7,7 @@ from typing import Any
 from sliplens.codec import load_record, load_result
 from sliplens.errors import InputError
 from sliplens.files import RUN_FILE, Provenance, read_json, require_folder
+from sliplens.recordings.dataset import load_dataset
 from sliplens.report.study.readers import STUDY_READERS, gather_study
 from sliplens.report.workspace import Results
 from sliplens.results.evaluation import Evaluation
@@ -19,7 +20,7 @@ from sliplens.results.files import (
     read_saliency,
 )
 from sliplens.results.records import Run
-from sliplens.results.simulation import Simulation
+from sliplens.results.simulation import describe_simulation
 from sliplens.results.training import Training
 
 RESULT_FILE = "result.json"
@@ -50,7 +51,9 @@ def load_results(workspace: Path) -> Results:
     folder_of: dict[tuple[str, str, str], Path] = {}
     notes = []
     for folder, run in runs.items():
-        if run.stage in RECORDS:
+        if run.stage == "simulate":
+            result = describe_simulation(load_dataset(folder))
+        elif run.stage in RECORDS:
             result = load_result(folder, RECORDS[run.stage], command=f"sliplens {run.stage}")
         elif run.stage in READERS:
             own = Run(folder=folder, stage=run.stage)
@@ -148,6 +151,6 @@ def _read_scored(run: Run, fields: Fields) -> DeletionScores:
     )
 
 
-RECORDS: dict[str, type] = {"simulate": Simulation, "train": Training, "evaluate": Evaluation}
+RECORDS: dict[str, type] = {"train": Training, "evaluate": Evaluation}
 """Record of each stage."""
 READERS: dict[str, Callable[[Run, Fields], Any]] = {"explain": _read_explained, "score": _read_scored, **STUDY_READERS}

@@ -11,7 +11,7 @@ from sliplens.results.evaluation import (
     RegressionScores,
     Reliability,
 )
-from sliplens.results.simulation import Simulation, SplitCount
+from sliplens.results.simulation import Simulation, SplitCount, describe_simulation
 from sliplens.results.training import LearningCurve, Training
 
 __all__ = [
@@ -28,4 +28,5 @@ __all__ = [
     "Simulation",
     "SplitCount",
     "Training",
+    "describe_simulation",
 ]

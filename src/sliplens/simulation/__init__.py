@@ -1,10 +1,10 @@
 """Simulated trials of a marker-based fingertip, with exact labels."""
 
 from sliplens.simulation.nuisances import Nuisances
-from sliplens.simulation.plan import PRESETS, FrameTotals, SimulationRecipe, TrialPlan, plan_trials
+from sliplens.simulation.plan import PRESETS, FrameTotals, SimulationRecipe, TrialPlan, make_recipe, plan_trials
 from sliplens.simulation.sensor import CHROMATOUCH, FLAT_GEL, SENSORS, Sensor
 from sliplens.simulation.stream import SimulatedFrame, SimulatedFrames
-from sliplens.simulation.trials import simulate_dataset, simulate_trial
+from sliplens.simulation.trials import simulate, simulate_dataset, simulate_examples, simulate_trial
 
 __all__ = [
     "CHROMATOUCH",
@@ -18,7 +18,10 @@ __all__ = [
     "SimulatedFrames",
     "SimulationRecipe",
     "TrialPlan",
+    "make_recipe",
     "plan_trials",
+    "simulate",
     "simulate_dataset",
+    "simulate_examples",
     "simulate_trial",
 ]

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from sliplens.errors import InputError
 from sliplens.files import hash_json
 from sliplens.simulation.loading import MINIMUM_FRAMES
 from sliplens.simulation.nuisances import Day, Nuisances, draw_day
-from sliplens.simulation.sensor import CHROMATOUCH, Sensor
+from sliplens.simulation.sensor import CHROMATOUCH, SENSORS, Sensor
 
 # branches of the seed: what is drawn for one never moves what is drawn for another
 _DAYS, _UNITS, _TRIALS = range(3)
@@ -147,6 +148,49 @@ class TrialPlan:
     recipe: SimulationRecipe
     """Recipe that all trials have in common."""
     recipe_hash: str
+
+
+def make_recipe(
+    preset: str = "small", *, sensor: str | None = None, dry_friction: tuple[float, float] | None = None, **changes: Any
+) -> SimulationRecipe:
+    """Recipe of a preset with changes.
+
+    Parameters
+    ----------
+    preset
+        Row of `PRESETS`.
+    sensor
+        Row of `SENSORS`; the preset's own if None.
+    dry_friction
+        Least and largest coefficient of friction of the dry object.
+    changes
+        Other fields of `SimulationRecipe`, such as `dry_trials`, `frames_per_trial`, `days` or `seed`; None leaves one
+        as it is. With other numbers of trials, days or frames the preset's totals no longer hold.
+
+    Raises
+    ------
+    InputError
+        If there is no such preset or sensor, or the recipe cannot be followed.
+
+    Examples
+    --------
+    >>> make_recipe("thesis", days=6).dry_trials
+    191
+    """
+    for what, name, table in (("preset", preset, PRESETS), ("sensor", sensor, SENSORS)):
+        if name is not None and name not in table:
+            raise InputError(f"there is no {what} named {name!r}; choose one of {', '.join(table)}")
+    start = PRESETS[preset]
+    changes = {name: value for name, value in changes.items() if value is not None}
+    if "days" in changes and "dry_trials" not in changes:
+        changes["dry_trials"] = int(np.sum(start.dry_trials))
+    if changes.keys() & {"dry_trials", "wet_trials", "days", "test_days", "frames_per_trial"}:
+        changes["frame_totals"] = None
+    if sensor is not None:
+        changes["sensor"] = SENSORS[sensor]
+    if dry_friction is not None:
+        changes["nuisances"] = replace(start.nuisances, dry_friction=dry_friction)
+    return replace(start, **changes)
 
 
 def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:

@@ -1,19 +1,25 @@
 """Simulated trials: from a plan to a recording, and from a recipe to a data set on disk."""
 
-from collections.abc import Callable
+import shutil
+import tempfile
+import weakref
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from sliplens.errors import InputError
+from sliplens.extras import require_device
+from sliplens.files import output_folder
+from sliplens.progress import OnProgress, stage, wrote
 from sliplens.recordings import Dataset, GroundTruth, Recording
-from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.dataset import load_dataset, trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import read_header, save_recording
 from sliplens.simulation.filming import Film, batches, prepare_film
 from sliplens.simulation.loading import Loading, load_grasp
 from sliplens.simulation.nuisances import draw_grasp, draw_unit
-from sliplens.simulation.plan import SimulationRecipe, TrialPlan, plan_trials
+from sliplens.simulation.plan import SimulationRecipe, TrialPlan, make_recipe, plan_trials
 
 
 def prepare_trial(plan: TrialPlan) -> tuple[Loading, Film]:
@@ -41,13 +47,13 @@ def simulate_trial(
     plan: TrialPlan,
     *,
     device: str | torch.device = "cpu",
-    on_frames: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> Recording:
     """Simulate one trial.
 
     Parameters
     ----------
-    on_frames
+    on_progress
         Called with the frames done and the frames in all, after each batch.
     """
     loading, film = prepare_trial(plan)
@@ -57,8 +63,8 @@ def simulate_trial(
     for part in batches(plan.frames, device=device):
         frames[part] = film.draw(part, device=device).cpu().numpy()
         contact_map[part] = film.contact_map(part)
-        if on_frames is not None:
-            on_frames(part.stop, plan.frames)
+        if on_progress is not None:
+            on_progress(part.stop, plan.frames)
     return Recording(
         trial=plan.trial,
         sensor=f"{plan.recipe.sensor.name}-{plan.unit + 1}",
@@ -86,12 +92,95 @@ def simulate_trial(
     )
 
 
+def simulate_examples(
+    recipe: SimulationRecipe,
+    *,
+    count: int = 4,
+    device: str | torch.device = "cpu",
+    on_progress: OnProgress | None = None,
+) -> list[Recording]:
+    """Simulate a few trials that show the range of a recipe, a wet one last.
+
+    Parameters
+    ----------
+    count
+        Trials at most.
+    on_progress
+        Called with the trials done and the trials in all.
+    """
+    plans = plan_trials(recipe)
+    dry = [plan for plan in plans if plan.condition == "dry"]
+    wet = [plan for plan in plans if plan.condition == "wet"][:1]
+    shown = min(count - len(wet), len(dry))
+    chosen = [dry[index * (len(dry) - 1) // max(1, shown - 1)] for index in range(shown)] + wet
+    recordings = []
+    for plan in chosen:
+        recordings.append(simulate_trial(plan, device=device))
+        if on_progress is not None:
+            on_progress(len(recordings), len(chosen))
+    return recordings
+
+
+def simulate(
+    out: Path | str | None = None,
+    *,
+    preset: str = "small",
+    sensor: str | None = None,
+    device: str = "cpu",
+    overwrite: bool = False,
+    on_progress: OnProgress | None = None,
+    **changes: Any,
+) -> Dataset:
+    """Simulate a data set of labelled trials.
+
+    Interrupted, it goes on after the last whole trial when it is called again with the same `out`.
+
+    Parameters
+    ----------
+    out
+        Folder to write; a temporary one that lives as long as what is returned if None.
+    preset, sensor, changes
+        As `make_recipe` takes them: `preset="small"` is made for a laptop, `"thesis"` has the days and frames of the
+        thesis; `dry_trials`, `wet_trials`, `days`, `frames_per_trial` or `seed` change it.
+    device
+        Where to draw the frames: cpu, cuda or cuda:1. A GPU's pixels may differ by one grey level.
+    overwrite
+        Replace the folder if it exists.
+
+    Raises
+    ------
+    InputError
+        If the recipe cannot be followed, the device is not there, or the folder holds something else.
+    """
+    require_device(device)
+    recipe = make_recipe(preset, sensor=sensor, **changes)
+    if out is None:
+        folder = Path(tempfile.mkdtemp(prefix="sliplens-"))
+        try:
+            with stage(on_progress, "Simulating frames") as count:
+                data = simulate_dataset(folder, recipe, device=device, on_progress=count)
+        except BaseException:
+            shutil.rmtree(folder)
+            raise
+        weakref.finalize(data, shutil.rmtree, folder, ignore_errors=True)
+        return data
+    out, config = Path(out), {"recipe": recipe, "device": device}
+    with output_folder(out, stage="simulate", config=config, overwrite=overwrite) as output:
+        if not output.complete:
+            with stage(on_progress, "Simulating frames") as count:
+                simulate_dataset(output.folder, recipe, device=device, on_progress=count)
+    data = load_dataset(out)
+    frames = sum(trial.frames for trial in data.trials)
+    wrote(on_progress, out, f"{len(data.trials)} trials, {frames:,} frames", kept=output.complete)
+    return data
+
+
 def simulate_dataset(
     folder: Path,
     recipe: SimulationRecipe,
     *,
     device: str | torch.device = "cpu",
-    on_frames: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> Dataset:
     """Simulate a data set into a folder; trials that are already there are kept.
 
@@ -99,7 +188,7 @@ def simulate_dataset(
     ----------
     folder
         Where to write `trials/*.parquet` and, last, `dataset.json`.
-    on_frames
+    on_progress
         Called with the frames done and the frames in all, after each batch.
 
     Raises
@@ -112,8 +201,8 @@ def simulate_dataset(
     table, done = [], 0
 
     def report(drawn: int, _: int) -> None:
-        if on_frames is not None:
-            on_frames(done + drawn, total)
+        if on_progress is not None:
+            on_progress(done + drawn, total)
 
     for plan in plans:
         path = trial_path(folder, plan.trial)
@@ -122,9 +211,9 @@ def simulate_dataset(
             if truth is None or truth.recipe != plan.recipe_hash:
                 raise InputError(f"{path} was made by another recipe; choose another folder")
         else:
-            save_recording(simulate_trial(plan, device=device, on_frames=report), path)
+            save_recording(simulate_trial(plan, device=device, on_progress=report), path)
         table.append(trial_info(path, split=plan.split))
         done += plan.frames
         report(0, 0)
     write_dataset_table(folder, table, simulated=True)
-    return Dataset.open(folder)
+    return load_dataset(folder)

@@ -19,6 +19,7 @@ from sliplens.models import TrainedModel
 from sliplens.models.checkpoint import Estimate, join_estimates, load
 from sliplens.progress import OnProgress, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
+from sliplens.recordings.dataset import load_dataset
 from sliplens.results.evaluation import Evaluation, Predictions, Reliability
 from sliplens.training.baselines import BaselinePlan, choose_training, evaluate_baselines, marker_kind
 from sliplens.training.data import FrameSet, load_frames
@@ -67,7 +68,7 @@ def evaluate(
         If no frame has a label.
     """
     run = run if isinstance(run, TrainedModel) else load(run)
-    data = data if isinstance(data, Dataset) else Dataset.open(Path(data))
+    data = data if isinstance(data, Dataset) else load_dataset(data)
     trials = data.select(split=split)
     for trial in trials:
         run.require_frame_size((trial.height, trial.width))

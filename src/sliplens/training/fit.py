@@ -25,6 +25,7 @@ from sliplens.models.checkpoint import load
 from sliplens.models.encodings import get_encoding
 from sliplens.progress import OnProgress, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
+from sliplens.recordings.dataset import load_dataset
 from sliplens.results.training import Training
 from sliplens.training.config import TrainConfig, get_recipe
 from sliplens.training.data import EpochShuffle, FrameSet, get_augmentation, load_frames, make_loaders
@@ -92,7 +93,7 @@ def train(
     start = load(start_from) if isinstance(start_from, str | Path) else start_from
     if start is not None:
         require_same_kind(start, config, input)
-    data = data if isinstance(data, Dataset) else Dataset.open(Path(data))
+    data = data if isinstance(data, Dataset) else load_dataset(data)
     job = _Job(config=config, input=input, data=data, condition=condition, start=start, trainer=trainer)
     if out is None:
         if trainer.world_size > 1:

@@ -19,7 +19,7 @@ from torchmetrics import MeanSquaredError
 
 from sliplens.errors import ModelError
 from sliplens.models.backbones import margin_loss
-from sliplens.progress import OnProgress, note
+from sliplens.progress import OnProgress
 from sliplens.results.training import LearningCurve
 from sliplens.training.config import TrainConfig
 from sliplens.training.data import Augmentation
@@ -146,7 +146,6 @@ class Clock(Callback):
         self.steps = steps
         self.max_seconds = None if max_minutes is None else 60 * max_minutes
         self.metrics_file = metrics_file
-        self.on_progress = on_progress
         self.count = on_progress
         self.seconds_before = 0.0
         self.step = 0
@@ -221,10 +220,6 @@ class Clock(Callback):
             raise DivergedError(
                 f"the validation error is {validation} after epoch {trainer.current_epoch + 1}; "
                 "lower the learning rate and try again"
-            )
-        if validation < min((row[2] for row in self.rows), default=math.inf):
-            note(
-                self.on_progress, f"epoch {trainer.current_epoch + 1}: validation MSE {validation:.4f}, the best so far"
             )
         self.rows.append([epoch, train, validation, self.seconds / 60])
         if self.metrics_file is not None:
