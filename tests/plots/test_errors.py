@@ -3,6 +3,7 @@ from itertools import pairwise
 import matplotlib as mpl
 import numpy as np
 import pytest
+from made_up import write_workspace
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
@@ -19,8 +20,8 @@ from sliplens.report import Results, load_results
 
 
 @pytest.fixture(scope="module")
-def results(pristine_workspace) -> Results:
-    return load_results(pristine_workspace)
+def results(tmp_path_factory) -> Results:
+    return load_results(write_workspace(tmp_path_factory.mktemp("workspace") / "runs"))
 
 
 @pytest.fixture
