@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from own_recording import write_forces, write_video
 
 from sliplens.models import Manifest, build_model, save_checkpoint
-from sliplens.recordings import Dataset
+from sliplens.recordings import Dataset, Recording
+from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 from sliplens.training import RECIPES
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
@@ -18,10 +20,19 @@ BLOCKS = re.findall(r"^```python\n(.*?)^```", README, flags=re.MULTILINE | re.DO
 IMAGE_SIZE = 32
 
 
+@pytest.fixture(scope="module")
+def grip() -> Recording:
+    """A simulated grip of 8 s, every fourth pixel."""
+    whole = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=240))
+    return replace(whole, frames=whole.frames[:, ::4, ::4].copy(), reference=whole.reference[::4, ::4].copy())
+
+
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_dataset: Dataset) -> Path:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_dataset: Dataset, grip: Recording) -> Path:
     """Folder in which the names of the README stand for small things: networks, a data set, a recording."""
     (tmp_path / "data").symlink_to(small_dataset.folder)
+    write_forces(grip, tmp_path / "cup.csv")
+    write_video(grip, tmp_path / "cup.mp4")  # Matroska, whatever its name: FFmpeg looks inside
     for kind in ("difference", "raw"):
         manifest = Manifest(
             backbone="shufflenet_v2_x1_0",

@@ -1,23 +1,19 @@
 """`sliplens import`: from files of one's own to a data set that trains a network."""
 
-import csv
 import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pytest
 from command_line import refused, run
+from own_recording import TARE, write_forces, write_video
 
 from sliplens.images import write_png
 from sliplens.recordings import Dataset, ReadOptions, Recording
 from sliplens.recordings.store import read_header, write_trial
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
-
-FORCE_RATE = 500
-TARE = np.array([0.3, -0.2, 1.1])
 
 
 @pytest.fixture(scope="module")
@@ -29,33 +25,12 @@ def trial() -> Recording:
 
 @pytest.fixture(scope="module")
 def table(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its forces as a sensor saw them: tared wrongly, upside down, with noise."""
-    rng = np.random.default_rng(1)
-    time = np.arange(0, trial.time_s[-1] + 0.1, 1 / FORCE_RATE)
-    normal, pull = (
-        np.interp(time, trial.time_s, values) for values in (trial.normal_force_n, trial.tangential_force_n)
-    )
-    seen = np.stack([pull, np.zeros_like(pull), -normal], axis=-1) + TARE + rng.normal(0, 0.02, (len(time), 3))
-    path = tmp_path_factory.mktemp("forces") / "forces.csv"
-    with path.open("w", newline="") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(["time [s]", "Fx [N]", "Fy [N]", "Fz [N]"])
-        writer.writerows(np.column_stack([time, seen]).round(5).tolist())
-    return path
+    return write_forces(trial, tmp_path_factory.mktemp("forces") / "forces.csv")
 
 
 @pytest.fixture(scope="module")
 def video(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its frames as a lossless video."""
-    path = tmp_path_factory.mktemp("video") / "cup.mkv"
-    with av.open(str(path), "w", format="matroska") as container:
-        stream = container.add_stream("ffv1", rate=30)
-        stream.height, stream.width = trial.reference.shape[:2]
-        stream.pix_fmt = "bgr0"
-        for frame in trial.frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-        container.mux(stream.encode())
-    return path
+    return write_video(trial, tmp_path_factory.mktemp("video") / "cup.mkv")
 
 
 @pytest.fixture(scope="module")
