@@ -96,20 +96,23 @@ class Clip:
 
 def follow(path: Path, labels: Path | None) -> Clip:
     """Follow the dots of a clip from its frame with least contact."""
-    clip = read_gelsight_clip(path, labels=labels)
-    frames = list(clip.capture.read_frames())
-    tracks = track_markers(frames, frames[clip.reference_index], "gelsight-mini")
+    capture = read_gelsight_clip(path, labels=labels)
+    known_clip, reference = capture.clip, capture.reference_index
+    assert known_clip is not None
+    assert reference is not None
+    frames = list(capture.read_frames())
+    tracks = track_markers(frames, frames[reference], "gelsight-mini")
     known = tracks.from_reference
     return Clip(
         name="/".join(path.parts[-3:]),
         grasp="/".join(path.parts[-3:-1]),
-        grasped=clip.grasped,
-        slipped=clip.slipped,
+        grasped=capture.object,
+        slipped=known_clip.slips,
         rest_px=tracks.rest_px[known],
         position_px=np.where(tracks.followed[:, known, None], tracks.position_px[:, known], np.nan),
         status=tracks.status[:, known],
         picture=np.stack([shrink(frame) for frame in frames]),
-        key_change=measure_key_change(path, frames, skipped=clip.stale_frames),
+        key_change=measure_key_change(path, frames, skipped=known_clip.stale_frames),
         file_bytes=path.stat().st_size,
     )
 

@@ -156,13 +156,7 @@ def trial_path(folder: Path, trial: str) -> Path:
 
 
 def count_labelled(path: Path) -> int:
-    """Count the frames of a trial that have a safety margin, and one that can be trusted, without reading its images.
-
-    Raises
-    ------
-    RecordingError
-        If the file is missing or damaged.
-    """
+    """Number of frames of a trial whose safety margin can be trusted, found without reading its images."""
     with reading(path):
         names = [name for name in ("safety_margin", "valid") if name in pq.read_schema(path).names]
         table = pq.read_table(path, columns=names)
@@ -172,13 +166,7 @@ def count_labelled(path: Path) -> int:
 
 
 def trial_info(path: Path, *, split: str) -> TrialInfo:
-    """Row of the data set's table for a trial saved at `path`.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or damaged, or no trial.
-    """
+    """Row of the data set's table for a trial saved at `path`."""
     header = read_header(path)
     samples = forces_path(path.parent.parent, path.stem)
     shared = {one.name: getattr(header, one.name) for one in fields(TrialInfo) if hasattr(header, one.name)}

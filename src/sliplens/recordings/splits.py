@@ -377,17 +377,7 @@ def assign_splits(plan: SplitPlan, trials: Sequence[TrialFacts]) -> SplitResult:
 
 
 def store_splits(data: Dataset, plan: SplitPlan, result: SplitResult) -> None:
-    """Write splits into the table of a data set, and beside it the rules they come from.
-
-    Parameters
-    ----------
-    data
-        The data set; nothing of its table changes but the splits.
-    plan
-        The rules.
-    result
-        What `assign_splits` made of them for the trials of the data set, in their order.
-    """
+    """Write splits into the table of a data set, and beside it the rules they come from."""
     write_split_record(data.folder, plan, data.trials, result)
     splits = dict(zip((info.trial for info in data.trials), result.splits, strict=True))
     _recount(data, result.splits)
@@ -399,15 +389,7 @@ def store_splits(data: Dataset, plan: SplitPlan, result: SplitResult) -> None:
 
 
 def write_split_record(folder: Path, plan: SplitPlan, trials: Sequence[TrialFacts], result: SplitResult) -> None:
-    """Write `splits.json`: the rules, where they come from, and what they made of which trial.
-
-    Parameters
-    ----------
-    folder
-        Folder of the data set.
-    plan, trials, result
-        The rules, the trials, and what `assign_splits` made of them.
-    """
+    """Write `splits.json`: the rules, where they come from, and what they made of which trial."""
     splits = dict(zip((trial.trial for trial in trials), result.splits, strict=True))
     record = {
         "source": plan.source,

@@ -47,13 +47,7 @@ def one_line(error: Exception) -> str:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Tell of a file of a data set that is missing or damaged, whatever is read of it inside.
-
-    Raises
-    ------
-    RecordingError
-        In place of what Arrow raises.
-    """
+    """Tell of a file of a data set that is missing or damaged, whatever is read of it inside."""
     try:
         yield
     except FileNotFoundError:
@@ -104,13 +98,7 @@ def _in_turn(
 def decode_pixels(
     data: bytes | pa.Buffer, *, size: Sequence[int], where: str
 ) -> UInt8[np.ndarray, "height width *channels"]:
-    """Pixels of an image of known size (height, width, and channels if any).
-
-    Raises
-    ------
-    RecordingError
-        If the bytes are damaged or of another size; the message begins with `where`.
-    """
+    """Pixels of an image of known size (height, width, and channels if any)."""
     count = int(np.prod(size))
     try:
         raw = pa.decompress(data, decompressed_size=count, codec="zstd")
@@ -146,13 +134,7 @@ _HEADER = b"sliplens"
 
 
 def read_header(path: Path) -> TrialHeader:
-    """Read what a trial is and how its labels were made, without its frames.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or damaged, or no trial.
-    """
+    """Read what a trial is and how its labels were made, without its frames."""
     with reading(path):
         file = pq.read_metadata(path)
     return replace(_parse_header(file.metadata, path), frames=file.num_rows)
@@ -171,15 +153,7 @@ def _parse_header(metadata: dict[bytes, bytes] | None, path: Path) -> TrialHeade
 
 
 def read_reference(path: Path) -> UInt8[np.ndarray, "height width 3"]:
-    """Read the reference frame of a trial.
-
-    Raises
-    ------
-    RecordingError
-        If the file is missing or damaged, or no trial.
-    ImageError
-        If the image is damaged.
-    """
+    """Read the reference frame of a trial."""
     with reading(path):
         metadata = pq.read_metadata(path).metadata
     if not metadata or b"reference" not in metadata:
@@ -335,13 +309,7 @@ class StoredLabels:
 
 
 def load_labels(path: Path) -> StoredLabels:
-    """Read the times and labels of a trial, without any image.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or damaged.
-    """
+    """Read the times and labels of a trial, without any image."""
     header, table = _read_columns(path, without={"image"} | _TRUTH_COLUMNS)
     time_s = table.column("time_s").to_numpy().astype(np.float64)
     return StoredLabels(header=header, time_s=time_s, labels=Labels(**_label_values(table, header)))
@@ -376,15 +344,7 @@ def _label_values(table: pa.Table, header: TrialHeader) -> dict[str, Any]:
 
 
 def stream_frames(path: Path) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """Frames of a stored trial one at a time, a row group of them in memory.
-
-    Raises
-    ------
-    RecordingError
-        If the file is missing or damaged, or keeps its images in another way.
-    ImageError
-        If an image inside is damaged.
-    """
+    """Frames of a stored trial one at a time, a row group of them in memory."""
     header, file, first = read_header(path), _open_images(path), 0
     with file:
         for group in range(file.num_row_groups):
@@ -495,13 +455,7 @@ def save_forces(forces: Forces, path: Path) -> None:
 
 
 def load_forces(path: Path) -> Forces:
-    """Read samples written by `save_forces`.
-
-    Raises
-    ------
-    RecordingError
-        If the file is missing or damaged, or breaks a law of `Forces`.
-    """
+    """Read samples written by `save_forces`."""
     try:
         table = pq.read_table(path)
         source = (table.schema.metadata or {}).get(b"source", b"the force sensor").decode()

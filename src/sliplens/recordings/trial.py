@@ -252,13 +252,7 @@ class Recording(TrialFacts, Labels):
 
 
 def require_unit_interval(values: Float[np.ndarray, " frames"], *, name: str, trial: str) -> None:
-    """Check that labels lie in [0, 1]; NaN (no label) passes.
-
-    Raises
-    ------
-    RecordingError
-        Naming the trial, the first offending frame and its value.
-    """
+    """Check that labels lie in [0, 1]; NaN (no label) passes."""
     outside = (values < 0) | (values > 1)
     if outside.any():
         at = int(np.argmax(outside))

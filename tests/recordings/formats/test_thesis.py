@@ -5,7 +5,8 @@ import pytest
 
 from sliplens.errors import ImageError, RecordingError
 from sliplens.images import write_png
-from sliplens.recordings.formats.thesis import read_thesis_lists
+from sliplens.recordings.capture import Capture
+from sliplens.recordings.formats.thesis import read_thesis
 
 HOME = "/home/training-pc/Data/november/"
 
@@ -40,61 +41,71 @@ REFERENCE = ["trial77/L/image_0.tiff"] * 3
 MARGINS = ["1.0", "0.6", "0.2"]
 
 
+def margins_of(capture: Capture) -> np.ndarray:
+    assert capture.labels is not None
+    return capture.labels.safety_margin
+
+
 @pytest.fixture
 def data(tmp_path: Path, images: dict[str, np.ndarray]) -> Path:
     return tmp_path / "data"
 
 
 def test_the_lists_of_the_thesis_give_frames_reference_and_margins(data: Path, images: dict[str, np.ndarray]):
-    (trial,) = read_thesis_lists(write_lists(data, FRAMES, REFERENCE, MARGINS))
+    (trial,) = read_thesis(write_lists(data, FRAMES, REFERENCE, MARGINS))
     np.testing.assert_array_equal(list(trial.read_frames()), [images[name] for name in FRAMES])
-    np.testing.assert_array_equal(trial.read_reference(), images[REFERENCE[0]])
-    np.testing.assert_array_equal(trial.safety_margin, [1, 0.6, 0.2])
-    assert (trial.name, len(trial), trial.frame_size) == ("train_dataset", 3, (16, 16))
-    assert trial.notes == ("train_dataset_gamma.csv: safety margins were read as fractions (by their size).",)
+    assert trial.reference is not None
+    np.testing.assert_array_equal(trial.reference, images[REFERENCE[0]])
+    np.testing.assert_array_equal(margins_of(trial), [1, 0.6, 0.2])
+    assert (trial.trial, len(trial), trial.frame_size) == ("train_dataset", 3, (16, 16))
+    assert trial.notes[0] == "train_dataset_gamma.csv: safety margins were read as fractions (by their size)."
 
 
 @pytest.mark.parametrize("prefix", [HOME, "C:\\Users\\max\\Data\\november\\", "D:/november/", "./", "november/"])
-def test_paths_of_another_computer_are_found_under_the_root(data: Path, tmp_path: Path, prefix: str):
+def test_paths_of_another_computer_are_found_under_the_root(
+    data: Path, images: dict[str, np.ndarray], tmp_path: Path, prefix: str
+):
     frames, references = ([prefix + name for name in names] for names in (FRAMES, REFERENCE))
     if "\\" in prefix:
         frames, references = ([name.replace("/", "\\") for name in names] for names in (frames, references))
-    (trial,) = read_thesis_lists(write_lists(tmp_path / "lists", frames, references, MARGINS), root=tmp_path / "data")
-    assert [path.resolve() for path in trial.frame_paths] == [data.resolve() / name for name in FRAMES]
+    (trial,) = read_thesis(write_lists(tmp_path / "lists", frames, references, MARGINS), image_root=tmp_path / "data")
+    np.testing.assert_array_equal(list(trial.read_frames()), [images[name] for name in FRAMES])
 
 
-def test_paths_that_exist_are_taken_as_they_are(data: Path, tmp_path: Path):
+def test_paths_that_exist_are_taken_as_they_are(data: Path, images: dict[str, np.ndarray], tmp_path: Path):
     frames, references = ([str(data / name) for name in names] for names in (FRAMES, REFERENCE))
-    (trial,) = read_thesis_lists(write_lists(tmp_path / "lists", frames, references, MARGINS))
-    assert trial.frame_paths == tuple(data / name for name in FRAMES)
+    (trial,) = read_thesis(write_lists(tmp_path / "lists", frames, references, MARGINS))
+    np.testing.assert_array_equal(list(trial.read_frames()), [images[name] for name in FRAMES])
 
 
 def test_relative_paths_start_at_the_list_and_stay_in_the_root(data: Path, tmp_path: Path):
     frames, references = ([f"../data/{name}" for name in names] for names in (FRAMES, REFERENCE))
     lists = write_lists(tmp_path / "lists", frames, references, MARGINS)
-    assert len(read_thesis_lists(lists, root=tmp_path)) == 1
+    assert len(read_thesis(lists, image_root=tmp_path)) == 1
     with pytest.raises(RecordingError, match=r"line 1: '\.\./data/trial77/L/image_0\.tiff' leads out of .*lists; give"):
-        read_thesis_lists(lists)
+        read_thesis(lists)
 
 
-def test_each_reference_frame_makes_a_trial(data: Path):
+def test_each_reference_frame_makes_a_trial(data: Path, images: dict[str, np.ndarray]):
     other = [name.replace("trial77", "trial83") for name in FRAMES]
     mixed = [name for pair in zip(other, FRAMES, strict=True) for name in pair]
     references = ["trial83/L/image_0.tiff", "trial77/L/image_0.tiff"] * 3
     margins = ["0.9", "0.8", "0.7", "0.6", "0.5", "0.4"]
-    trials = read_thesis_lists(write_lists(data, mixed, references, margins))
-    assert [trial.name for trial in trials] == ["train_dataset-1", "train_dataset-2"]
-    assert [trial.reference_path.parent.parent.name for trial in trials] == ["trial83", "trial77"]
-    np.testing.assert_array_equal(trials[1].safety_margin, [0.8, 0.6, 0.4])
+    trials = read_thesis(write_lists(data, mixed, references, margins))
+    assert [trial.trial for trial in trials] == ["train_dataset-1", "train_dataset-2"]
+    for trial, place in zip(trials, ("trial83", "trial77"), strict=True):
+        assert trial.reference is not None
+        np.testing.assert_array_equal(trial.reference, images[f"{place}/L/image_0.tiff"])
+    np.testing.assert_array_equal(margins_of(trials[1]), [0.8, 0.6, 0.4])
 
 
-def test_shuffled_frames_are_put_in_order_with_their_margins(data: Path):
+def test_shuffled_frames_are_put_in_order_with_their_margins(data: Path, images: dict[str, np.ndarray]):
     order = [2, 0, 1]
     lists = write_lists(data, [FRAMES[at] for at in order], REFERENCE, [MARGINS[at] for at in order])
-    (trial,) = read_thesis_lists(lists)
-    assert [path.name for path in trial.frame_paths] == ["image_9.tiff", "image_10.tiff", "image_51.tiff"]
-    np.testing.assert_array_equal(trial.safety_margin, [1, 0.6, 0.2])
-    assert "natural order" in trial.notes[-1]
+    (trial,) = read_thesis(lists)
+    np.testing.assert_array_equal(list(trial.read_frames()), [images[name] for name in FRAMES])
+    np.testing.assert_array_equal(margins_of(trial), [1, 0.6, 0.2])
+    assert any("natural order" in note for note in trial.notes)
 
 
 @pytest.mark.parametrize(
@@ -109,23 +120,23 @@ def test_shuffled_frames_are_put_in_order_with_their_margins(data: Path):
     ],
 )
 def test_margins_are_read_in_percent_or_as_fractions(data: Path, lines: list[str], unit: str | None):
-    (trial,) = read_thesis_lists(write_lists(data, FRAMES, REFERENCE, lines), margin_unit=unit)
-    np.testing.assert_allclose(trial.safety_margin, [1, 0.6, 0.2])
+    (trial,) = read_thesis(write_lists(data, FRAMES, REFERENCE, lines), margin_unit=unit)
+    np.testing.assert_allclose(margins_of(trial), [1, 0.6, 0.2])
 
 
 def test_a_margin_may_be_missing(data: Path):
-    (trial,) = read_thesis_lists(write_lists(data, FRAMES, REFERENCE, ["nan", "0.6", "0.2"]))
-    np.testing.assert_array_equal(trial.safety_margin, [np.nan, 0.6, 0.2])
+    (trial,) = read_thesis(write_lists(data, FRAMES, REFERENCE, ["nan", "0.6", "0.2"]))
+    np.testing.assert_array_equal(margins_of(trial), [np.nan, 0.6, 0.2])
 
 
 def test_the_folder_of_one_list_is_enough(data: Path):
     lists = write_lists(data, FRAMES, REFERENCE, MARGINS)
-    assert len(read_thesis_lists(data)[0]) == 3
+    assert len(read_thesis(data)[0]) == 3
     lists.with_name("test_images_L.txt").write_text("a\n")
     with pytest.raises(
         RecordingError, match=r"must hold one list \*_images_L\.txt, it holds test_images_L\.txt, train"
     ):
-        read_thesis_lists(data)
+        read_thesis(data)
 
 
 @pytest.mark.parametrize(
@@ -154,30 +165,30 @@ def test_lists_that_do_not_fit_are_refused(
     data: Path, frames: list[str], references: list[str], margins: list[str], message: str
 ):
     with pytest.raises(RecordingError, match=message):
-        read_thesis_lists(write_lists(data, frames, references, margins))
+        read_thesis(write_lists(data, frames, references, margins))
 
 
 def test_missing_and_binary_lists_are_refused(data: Path):
     lists = write_lists(data, FRAMES, REFERENCE, MARGINS)
     with pytest.raises(RecordingError, match=r"is not a list of the thesis; name the file that ends in _images_L\.txt"):
-        read_thesis_lists(data / "train_dataset_gamma.csv")
+        read_thesis(data / "train_dataset_gamma.csv")
     with pytest.raises(RecordingError, match="'ratio' is no unit of a safety margin"):
-        read_thesis_lists(lists, margin_unit="ratio")
+        read_thesis(lists, margin_unit="ratio")
     (data / "train_dataset_images_Lref.txt").unlink()
     with pytest.raises(RecordingError, match=r"Lref\.txt does not exist; the lists of a set must lie in one folder"):
-        read_thesis_lists(lists)
+        read_thesis(lists)
     lists.write_bytes(b"\x00\xff\x00\xfe")
     with pytest.raises(RecordingError, match="is not a text file"):
-        read_thesis_lists(lists)
+        read_thesis(lists)
 
 
 def test_a_listed_file_that_is_no_image_is_refused(data: Path):
     (data / FRAMES[1]).write_text("no image")
     with pytest.raises(ImageError, match=r"image_10\.tiff cannot be read as an image"):
-        read_thesis_lists(write_lists(data, FRAMES, REFERENCE, MARGINS))
+        read_thesis(write_lists(data, FRAMES, REFERENCE, MARGINS))
 
 
 def test_frames_and_reference_of_two_sizes_are_refused(data: Path, images: dict[str, np.ndarray]):
     write_png(data / FRAMES[1], images[FRAMES[1]][:8])
     with pytest.raises(RecordingError, match=r"image_10\.tiff is 16 x 8 pixels but image_0\.tiff is 16 x 16"):
-        read_thesis_lists(write_lists(data, FRAMES, REFERENCE, MARGINS))
+        read_thesis(write_lists(data, FRAMES, REFERENCE, MARGINS))

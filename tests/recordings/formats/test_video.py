@@ -12,6 +12,7 @@ from sliplens.errors import RecordingError
 from sliplens.images import write_png
 from sliplens.recordings.formats.gelsight import list_gelsight_clips, read_gelsight_clip
 from sliplens.recordings.formats.video import least_contact, read_video, small_copies, stale_frames
+from sliplens.recordings.labelling import Clip
 
 MILLISECOND = Fraction(1, 1000)
 SIZE = 64, 96
@@ -359,14 +360,15 @@ def test_every_gelsight_clip_has_the_frames_its_table_lists(gelsight_folder: Pat
 )
 def test_a_gelsight_clip_comes_without_its_pitfalls(gelsight_folder: Path, clip: str, slipped: bool, stale: int):
     read = read_gelsight_clip(gelsight_folder / clip)
-    assert (read.slipped, read.stale_frames) == (slipped, stale)
-    assert f"{read.grasp}-camera_0" == read.capture.trial
-    assert clip.split("/")[1].startswith(read.grasped)
-    copies = small_copies(read.capture.read_frames())
-    assert len(copies) == len(read.capture.frame_time_s)
-    assert 0 <= read.reference_index < len(copies)
-    np.testing.assert_allclose(read.capture.frame_time_s[0], stale / 8)
-    told = " ".join(read.capture.notes)
+    assert read.clip is not None
+    assert read.clip == Clip(slips=slipped, grasp=clip.split("/")[1], stale_frames=stale)
+    assert f"{read.clip.grasp}-camera_0" == read.trial
+    assert clip.split("/")[1].startswith(read.object)
+    copies = small_copies(read.read_frames())
+    assert len(copies) == len(read)
+    assert read.reference_index in range(len(copies))
+    np.testing.assert_allclose(read.frame_time_s[0], stale / 8)
+    told = " ".join(read.notes)
     for pitfall in ("times are nominal", "one label for the whole clip", "no reference frame was recorded"):
         assert pitfall in told
 

@@ -1,4 +1,8 @@
-"""Readers of recordings: one row a format. An installed package adds one through `sliplens.formats`."""
+"""Readers of recordings: one row a format. An installed package adds one through `sliplens.formats`.
+
+Files come from outside and are believed only as far as they can be true: whatever is missing, damaged or of another
+kind is told as a `RecordingError` (an image as an `ImageError`), one sentence with the place and the cure.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass

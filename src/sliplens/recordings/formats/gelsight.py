@@ -1,7 +1,7 @@
 """The published GelSight Mini clips of grasps that slip or hold, with their pitfalls handled."""
 
 import csv
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,26 +17,11 @@ FRAME_RATE_HZ = 8.0
 """Roughly: the files say 25, their author that 10 to 13 s of video are 37 s of motion."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class GelSightClip:
-    """A clip of one finger, and what its data set says of the whole grasp."""
-
-    capture: Capture
-    """Without the stale frames; times are nominal."""
-    slipped: bool
-    """One label a clip: whether the object slipped at some time, not when."""
-    grasp: str
-    """Same for both fingers: keep them in one split."""
-    grasped: str
-    """The object."""
-    stale_frames: int
-    """Left out at the start."""
-    reference_index: int
-    """Frame of the capture with the least relief: a candidate for the reference, to be looked at before it is used."""
-
-
-def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: float = FRAME_RATE_HZ) -> GelSightClip:
+def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: float = FRAME_RATE_HZ) -> Capture:
     """Open a clip of the data set behind *Incipient Slip Detection* (A. Parag), as laid out in its `labels.csv`.
+
+    No frame has a label; what is known of the whole clip is kept beside. Its reference is the frame with the least
+    relief: a candidate, to be looked at before it is used.
 
     Parameters
     ----------
@@ -77,13 +62,14 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
         f"{path.name}: no reference frame was recorded; frame {reference} of those kept shows the least contact, "
         "look at it before it is used.",
     )
-    return GelSightClip(
-        capture=replace(capture, notes=capture.notes + notes),
-        slipped=slipped,
-        grasp=path.parent.name,
-        grasped=row["object"],
-        stale_frames=stale,
+    return replace(
+        capture,
+        notes=capture.notes + notes,
+        labels=labels_of_margins(np.full(len(capture), np.nan)),
         reference_index=reference,
+        clip=Clip(slips=slipped, grasp=path.parent.name, stale_frames=stale),
+        sensor="gelsight-mini",
+        object=row["object"],
     )
 
 
@@ -111,7 +97,7 @@ def read_gelsight(path: Path, *, frame_rate: float | None = None) -> list[Captur
     if not clips:
         raise RecordingError(f"{path} holds no clip; name a clip, the folder of a grasp, or that of {LABELS_FILE}")
     rate = FRAME_RATE_HZ if frame_rate is None else frame_rate
-    return [_labelled(read_gelsight_clip(clip, frame_rate=rate)) for clip in clips]
+    return [read_gelsight_clip(clip, frame_rate=rate) for clip in clips]
 
 
 def is_gelsight(path: Path) -> bool:
@@ -123,30 +109,13 @@ def is_gelsight(path: Path) -> bool:
         return False
 
 
-def _labelled(clip: GelSightClip) -> Capture:
-    return replace(
-        clip.capture,
-        labels=labels_of_margins(np.full(len(clip.capture), np.nan)),
-        reference_index=clip.reference_index,
-        clip=Clip(slips=clip.slipped, grasp=clip.grasp, stale_frames=clip.stale_frames),
-        sensor="gelsight-mini",
-        object=clip.grasped,
-    )
-
-
 def _columns(table: Path) -> set[str]:
     with table.open(newline="", encoding="utf-8-sig") as stream:
         return set(next(csv.reader(stream), []))
 
 
 def list_gelsight_clips(folder: Path) -> list[Path]:
-    """Clips that the data set's `labels.csv` lists and that are there.
-
-    Raises
-    ------
-    RecordingError
-        If the table is missing or no clip is there.
-    """
+    """Clips that the data set's `labels.csv` lists and that are there."""
     found = [folder / name for name in _read_labels(folder / LABELS_FILE) if (folder / name).is_file()]
     if not found:
         raise RecordingError(f"{folder} holds none of the clips that its {LABELS_FILE} lists; copy them beside it")

@@ -31,13 +31,7 @@ from sliplens.recordings.formats.tables import (
 
 
 def frame_size(path: Path) -> tuple[int, int]:
-    """Height and width of an image, in pixels, read from its header.
-
-    Raises
-    ------
-    ImageError
-        If it is missing or no image, claims an absurd size, or holds several images.
-    """
+    """Height and width of an image, in pixels, read from its header."""
     try:
         with warnings.catch_warnings(), Image.open(path) as image:
             # Pillow warns of a size that would fill the memory, and goes on
@@ -53,13 +47,7 @@ def frame_size(path: Path) -> tuple[int, int]:
 
 
 def read_frame(path: Path, *, size: tuple[int, int]) -> UInt8[np.ndarray, "height width 3"]:
-    """Read an image as a frame.
-
-    Raises
-    ------
-    ImageError
-        If it is missing, truncated or no image, is neither 8-bit RGB nor 8-bit grey, or has another size.
-    """
+    """Read an image as a frame."""
     try:
         with Image.open(path) as image:
             if image.mode != "L" or image.size != size[::-1]:
@@ -71,15 +59,7 @@ def read_frame(path: Path, *, size: tuple[int, int]) -> UInt8[np.ndarray, "heigh
 
 
 def common_size(paths: tuple[Path, ...]) -> tuple[int, int]:
-    """Height and width that all images share.
-
-    Raises
-    ------
-    ImageError
-        If one cannot be read.
-    RecordingError
-        If one has another size than the first.
-    """
+    """Height and width that all images share."""
     first = frame_size(paths[0])
     for path in paths[1:]:
         size = frame_size(path)
@@ -104,20 +84,7 @@ class FrameTimes:
 
 
 def read_frame_times(table: Path, images: Sequence[Path]) -> FrameTimes:
-    """Find the time of every image in a table with a column of file names and one of times.
-
-    Parameters
-    ----------
-    table
-        Text table with a header; folders before a file's name, and its ending, may be left out or differ.
-    images
-        Files of one folder.
-
-    Raises
-    ------
-    RecordingError
-        If a column or an image is missing in the table, or two images have one time.
-    """
+    """Find the time of every image in a table with a column of file names and one of times."""
     text = open_table(table)
     name_column, time_column = _name_column(text), guess_time_column(text)
     stamps, listed = _stamps(text, name_column, time_column)

@@ -61,13 +61,7 @@ class Layout:
 
 
 def read_layout(folder: Path) -> Layout:
-    """Read `meta/info.json`.
-
-    Raises
-    ------
-    RecordingError
-        If it is missing, damaged, or of another version of the format.
-    """
+    """Read `meta/info.json`."""
     path = folder / "meta" / "info.json"
     try:
         info = json.loads(path.read_text(encoding="utf-8"))
@@ -98,23 +92,7 @@ def read_layout(folder: Path) -> Layout:
 
 
 def read_episodes(layout: Layout, *, camera_key: str, only: int | None = None) -> list[Episode]:
-    """Episodes of a data set and where their frames from a camera lie, in their order.
-
-    Parameters
-    ----------
-    layout
-        What the data set says of itself.
-    camera_key
-        Feature with the images.
-    only
-        Index of the only episode that is wanted; all if None.
-
-    Raises
-    ------
-    RecordingError
-        If `meta/episodes` is missing or damaged, holds no episode or one twice, or not that which is wanted, or paths
-        lead out of the folder.
-    """
+    """Episodes of a data set and where their frames from a camera lie, in their order."""
     in_video = layout.features[camera_key]["dtype"] == "video"
     columns = ["episode_index", "length", "data/chunk_index", "data/file_index"]
     video = [f"videos/{camera_key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
@@ -154,13 +132,7 @@ def read_episodes(layout: Layout, *, camera_key: str, only: int | None = None) -
 
 
 def read_columns(path: Path, columns: list[str]) -> pa.Table:
-    """Columns of a Parquet file, with no value missing.
-
-    Raises
-    ------
-    RecordingError
-        If the file is missing or damaged, lacks a column, or a value is missing.
-    """
+    """Columns of a Parquet file, with no value missing."""
     try:
         names = pq.read_schema(path).names
         missing = [name for name in columns if name not in names]
@@ -200,28 +172,14 @@ def _expand(layout: Layout, template: str, values: dict[str, Any]) -> Path:
 
 
 class EpisodeRows:
-    """Rows of episodes one after another; those of one file share what was read of it.
-
-    Parameters
-    ----------
-    layout
-        What the data set says of itself.
-    columns
-        Features to read.
-    """
+    """Rows of episodes one after another; those of one file share what was read of it."""
 
     def __init__(self, layout: Layout, columns: list[str]) -> None:
         self.layout, self.columns = layout, columns
         self.table: tuple[Path, pa.Table] | None = None
 
     def of(self, episode: Episode) -> pa.Table:
-        """Rows of an episode, in their order.
-
-        Raises
-        ------
-        RecordingError
-            If the file is missing or damaged, lacks a column or a value, or has not as many rows as it should.
-        """
+        """Rows of an episode, in their order."""
         path = episode.data_file
         if self.table is None or self.table[0] != path:
             self.table = path, read_columns(path, ["episode_index", *self.columns])
@@ -295,13 +253,7 @@ class VideoInfo:
 
 
 def read_video_info(path: Path) -> VideoInfo:
-    """Read the header of a video.
-
-    Raises
-    ------
-    RecordingError
-        If the file is missing, no video, or its frames are absurdly large.
-    """
+    """Read the header of a video."""
     with _open_video(path) as container:
         coder = container.streams.video[0].codec_context
         if coder is None:
@@ -315,24 +267,7 @@ def read_video_info(path: Path) -> VideoInfo:
 def video_frames(
     path: Path, wanted_s: Float[np.ndarray, " frames"], *, tolerance_s: float, frame_size: tuple[int, int]
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """Decode the frames nearest to some stamps of a video.
-
-    Parameters
-    ----------
-    path
-        Video of many episodes.
-    wanted_s
-        Presentation stamps, rising.
-    tolerance_s
-        How far from it a frame may lie.
-    frame_size
-        Height and width that each must have.
-
-    Raises
-    ------
-    RecordingError
-        If there is no frame near a stamp, its size changes, or the video is damaged.
-    """
+    """Decode the frames nearest to some stamps of a video."""
     with _open_video(path) as container:
         shown = _decode_from(container, float(wanted_s[0]) - tolerance_s)
         current, following = next(shown, None), next(shown, None)
@@ -355,21 +290,7 @@ def video_frames(
 def image_frames(
     episode: Episode, key: str
 ) -> tuple[tuple[int, int], Callable[[], Iterator[UInt8[np.ndarray, "height width 3"]]]]:
-    """Find the height and width of the frames of an episode that lie in a Parquet file, and how they are read.
-
-    Parameters
-    ----------
-    episode
-        Where they lie.
-    key
-        Column of the images.
-
-    Raises
-    ------
-    RecordingError
-        If an image is missing, damaged, neither RGB nor grey, or of another size than the first; of those that follow,
-        when they are read.
-    """
+    """Find the height and width of the frames of an episode that lie in a Parquet file, and how they are read."""
     read = partial(_stored_images, episode.data_file, key, episode.index)
     first = next(read(frame_size=None), None)
     if first is None:
@@ -420,13 +341,7 @@ def _row_groups(file: pq.ParquetFile, episode: int) -> list[int]:
 
 
 def decode_image(data: bytes, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Pixels of a PNG or JPEG; a grey one gets three equal channels.
-
-    Raises
-    ------
-    RecordingError
-        If it is damaged, or neither RGB nor grey; the message begins with `where`.
-    """
+    """Pixels of a PNG or JPEG; a grey one gets three equal channels."""
     try:
         with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
             if image.mode not in {"RGB", "L"}:
@@ -493,13 +408,7 @@ def samples_path(folder: Path, episode: int) -> Path:
 
 
 def read_kept(layout: Layout) -> tuple[ExportedTrial, ...] | None:
-    """Read what is kept of the trials, one an episode; None where nothing is.
-
-    Raises
-    ------
-    RecordingError
-        If it is damaged, or names a trial twice.
-    """
+    """Read what is kept of the trials, one an episode; None where nothing is."""
     path = trials_path(layout.folder)
     try:
         lines = path.read_text(encoding="utf-8").rstrip("\n").split("\n")
@@ -520,22 +429,7 @@ def read_kept(layout: Layout) -> tuple[ExportedTrial, ...] | None:
 
 
 def kept_captures(layout: Layout, trials: tuple[ExportedTrial, ...], *, episode: int | None) -> list[Capture]:
-    """Trials of a data set as they were exported.
-
-    Parameters
-    ----------
-    layout
-        What the data set says of itself.
-    trials
-        What is kept of them.
-    episode
-        Index of the only episode that is wanted; all if None.
-
-    Raises
-    ------
-    RecordingError
-        If the episodes are others than those exported, or one is damaged.
-    """
+    """Trials of a data set as they were exported."""
     episodes = read_episodes(layout, camera_key=CAMERA)
     exported = [(index, trial.frames) for index, trial in enumerate(trials)]
     if [(one.index, one.length) for one in episodes] != exported:

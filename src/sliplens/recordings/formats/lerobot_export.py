@@ -85,13 +85,7 @@ class PixelCount:
 
 
 def number_stats(values: Shaped[np.ndarray, "frames numbers"]) -> Stats:
-    """Statistics of a feature over the frames of which all its numbers are known; zeros, counted 0, where none is.
-
-    Parameters
-    ----------
-    values
-        NaN where a number is not known.
-    """
+    """Statistics of a feature over the frames of which all its numbers are known; zeros, counted 0, where none is."""
     known = values[np.isfinite(values).all(axis=1)]
     counted = known if len(known) else np.zeros_like(values[:1])
     exact = counted.astype(np.float64)
@@ -131,17 +125,7 @@ class EpisodeEntry:
 
 
 class DataFiles:
-    """Writes frames; an episode is in one file, and what would make it too large goes into the next, as with LeRobot.
-
-    Parameters
-    ----------
-    folder
-        Of the data set.
-    features
-        As `meta/info.json` lists them.
-    file_mb
-        Size at which a file is full.
-    """
+    """Writes frames; an episode lies in one file, and what would make that too large goes into the next."""
 
     def __init__(self, folder: Path, features: Features, *, file_mb: float = FILE_MB) -> None:
         self.folder, self.limit = folder, file_mb * 2**20
@@ -170,17 +154,7 @@ class DataFiles:
         return divmod(self.number, CHUNK_FILES)
 
     def write(self, columns: Mapping[str, Any], *, images: str, pngs: Sequence[bytes], first: int) -> None:
-        """Write frames of an episode as a row group.
-
-        Parameters
-        ----------
-        columns
-            All features but the images; an array of vectors has a row a frame.
-        images, pngs
-            Feature of the images, and these.
-        first
-            Number of the first of them in the episode.
-        """
+        """Write frames of an episode as a row group."""
         assert self.writer is not None
         paths = [f"frame-{first + index:06d}.png" for index in range(len(pngs))]
         arrays = {images: pa.StructArray.from_arrays([pa.array(pngs, pa.binary()), pa.array(paths)], ["bytes", "path"])}
@@ -276,17 +250,7 @@ def frame_features(height: int, width: int) -> Features:
 
 
 def frame_columns(capture: Capture, *, fps: int | float, reasons: dict[str, int]) -> dict[str, np.ndarray]:
-    """Features of the frames of a trial, but for its images and its place.
-
-    Parameters
-    ----------
-    capture
-        The trial, with labels.
-    fps
-        Frames in a second of `timestamp`.
-    reasons
-        Numbers of the reasons why labels are not valid; those not met before are added.
-    """
+    """Features of a labelled trial's frames, but for images and places; reasons not met before get a number."""
     labels, count = capture.labels, len(capture.frame_time_s)
     assert labels is not None
     force = np.stack([labels.tangential_force_n, np.zeros(count), labels.normal_force_n], axis=1)
@@ -311,17 +275,7 @@ def _given(labels: Labels, name: str) -> Any:
 
 
 def frame_places(frames: int, *, first: int, episode: int, task: int) -> dict[str, np.ndarray]:
-    """Features that place the frames of an episode in the data set.
-
-    Parameters
-    ----------
-    frames
-        Of the episode.
-    first
-        Number of its first frame in the whole data set.
-    episode, task
-        Their numbers.
-    """
+    """Features that place the frames of an episode in the data set."""
     numbers = np.arange(frames, dtype=np.int64)
     return {
         "frame_index": numbers,

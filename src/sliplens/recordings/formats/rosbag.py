@@ -47,20 +47,7 @@ _DAMAGED = (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Imag
 
 
 def image_size(message: Any, *, where: str) -> tuple[int, int]:
-    """Height and width of an image, in pixels, without decoding it.
-
-    Parameters
-    ----------
-    message
-        A `sensor_msgs/Image` or `CompressedImage`.
-    where
-        Beginning of the error message.
-
-    Raises
-    ------
-    RecordingError
-        If the encoding is another one, or the message claims more pixels than it holds.
-    """
+    """Height and width of an image, in pixels, without decoding it."""
     if message.__msgtype__ == COMPRESSED:
         with _open_compressed(message, where=where) as image:
             return image.height, image.width
@@ -84,20 +71,7 @@ def image_size(message: Any, *, where: str) -> tuple[int, int]:
 
 
 def image_pixels(message: Any, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Pixels of an image as RGB; grey is repeated in all three channels.
-
-    Parameters
-    ----------
-    message
-        A `sensor_msgs/Image` or `CompressedImage`.
-    where
-        Beginning of the error message.
-
-    Raises
-    ------
-    RecordingError
-        If the image is damaged or has another encoding.
-    """
+    """Pixels of an image as RGB; grey is repeated in all three channels."""
     if message.__msgtype__ == COMPRESSED:
         return _decompress(message, where=where)
     height, width = image_size(message, where=where)
@@ -146,13 +120,7 @@ class ExpandsTooFarError(Exception):
 
 @cache
 def bounded_reader() -> "type[Reader]":
-    """`rosbags.rosbag2.Reader`, but it raises `ExpandsTooFarError` before memory or disk are filled.
-
-    Raises
-    ------
-    ImportError
-        If `rosbags` is not installed.
-    """
+    """`rosbags.rosbag2.Reader`, but it raises `ExpandsTooFarError` before memory or disk are filled."""
     mcap, reader = _own_copy("rosbags.rosbag2.storage_mcap"), _own_copy("rosbags.rosbag2.reader")
     sqlite = import_module("rosbags.rosbag2.storage_sqlite3")
     zstd, lz4 = mcap.zstd, import_module("lz4.frame")
@@ -263,15 +231,7 @@ _STORAGE = (".mcap", ".db3")
 
 
 def bag_topics(path: Path) -> dict[str, str]:
-    """Topics of a bag and the types of their messages.
-
-    Raises
-    ------
-    InputError
-        If `rosbags` is not installed.
-    RecordingError
-        If the path is no bag, it is damaged, or expands too far.
-    """
+    """Topics of a bag and the types of their messages."""
     with open_bag(path) as bag:
         return {connection.topic: connection.msgtype for connection in bag.connections}
 
@@ -282,20 +242,6 @@ def bag_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, int
     Definitions that the bag brings along are not used, for `rosbags` turns them into code; those of the messages read
     here are the same in all of ROS 2. Message data are views of the bytes read: a large header claims nothing. What is
     compressed is expanded a chunk, message or file at a time, within the limits of `ros_expansion`.
-
-    Parameters
-    ----------
-    path
-        Folder with `metadata.yaml`, or an .mcap or .db3 file.
-    topics
-        The topics to read.
-
-    Raises
-    ------
-    InputError
-        If `rosbags` is not installed.
-    RecordingError
-        If the path is no bag, it is damaged, or expands too far.
     """
     with open_bag(path) as bag:
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 (an extra)
@@ -366,18 +312,6 @@ def read_trial_bag(path: Path, topics: dict[str, str]) -> Capture | None:
     """Read a bag that `write_mcap` wrote; None where it is another one.
 
     Frames, times, labels, reference frame and forces are those of the data set it came from, bit by bit.
-
-    Parameters
-    ----------
-    path
-        Folder with `metadata.yaml`, or an .mcap or .db3 file.
-    topics
-        Topics of the bag and the types of their messages.
-
-    Raises
-    ------
-    RecordingError
-        If it is one of ours, but damaged, cut, or changed.
     """
     if topics.get(TRIAL) != TOPICS[TRIAL]:
         return None

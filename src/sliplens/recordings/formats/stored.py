@@ -130,13 +130,7 @@ class ExportedTrial:
 
     @classmethod
     def parse(cls, text: str, *, where: str) -> "ExportedTrial":
-        """Read what `dump` wrote, believing nothing.
-
-        Raises
-        ------
-        RecordingError
-            If the text is damaged or of another version; the message begins with `where`.
-        """
+        """Read what `dump` wrote, believing nothing."""
         if len(text) > _LONGEST:
             raise RecordingError(f"{where} has {len(text)} characters, no description does; export the trial again")
         try:
@@ -163,22 +157,7 @@ class ExportedTrial:
         reasons: tuple[str, ...],
         source: str,
     ) -> Labels:
-        """Labels of the trial from the columns of another format, checked.
-
-        Parameters
-        ----------
-        numbers
-            The numbers of `Labels` by name, `safety_margin_sigma` among them.
-        states, valid, reasons
-            The other columns.
-        source
-            Of the trial, for messages.
-
-        Raises
-        ------
-        RecordingError
-            If a label lies outside [0, 1], or a contact state is none.
-        """
+        """Labels of the trial from the columns of another format, checked."""
         for name in ("safety_margin", "stick_ratio"):
             require_unit_interval(numbers[name], name=name, trial=source)
         unknown = set(states) - set(STATES)

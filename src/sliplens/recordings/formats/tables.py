@@ -34,13 +34,7 @@ class TextTable:
     """Line of the file after the header, counted from 1."""
 
     def require(self, name: str, *, option: str) -> str:
-        """Return the name of a column as the file writes it.
-
-        Raises
-        ------
-        RecordingError
-            If there is no such column, or more than one.
-        """
+        """Return the name of a column as the file writes it."""
         same = [there for there in self.header if there == name] or [
             there for there in self.header if there.strip().lower() == name.strip().lower()
         ]
@@ -54,13 +48,7 @@ class TextTable:
         return same[0]
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
-        """Read the rows: the number of the line, and a text a column.
-
-        Raises
-        ------
-        RecordingError
-            If a row has more or fewer columns than the header.
-        """
+        """Read the rows: the number of the line, and a text a column."""
         for line, text in _lines(self.path, self.encoding):
             if line < self.first_line or _is_comment(text):
                 continue
@@ -78,13 +66,7 @@ class TextTable:
 
 
 def open_table(path: Path) -> TextTable:
-    """Find the separator and the header of a table; a byte order mark, comments and empty lines are passed over.
-
-    Raises
-    ------
-    RecordingError
-        If the file is missing or empty, is no text, or has no header.
-    """
+    """Find the separator and the header of a table; a byte order mark, comments and empty lines are passed over."""
     encoding = _encoding(path)
     comment = ""
     for line, text in _lines(path, encoding):
@@ -120,13 +102,7 @@ class Numbers:
 
 
 def read_numbers(table: TextTable, names: Sequence[str]) -> Numbers:
-    """Read columns of a table as finite numbers.
-
-    Raises
-    ------
-    RecordingError
-        If there is no row, or a field is empty, no number or not finite; the message gives its line.
-    """
+    """Read columns of a table as finite numbers."""
     places = [table.header.index(name) for name in names]
     values, lines = array("d"), array("q")
     commas = points = False
@@ -153,13 +129,7 @@ def read_numbers(table: TextTable, names: Sequence[str]) -> Numbers:
 
 
 def to_number(text: str, *, shown: str, where: str) -> float:
-    """Read a finite number.
-
-    Raises
-    ------
-    RecordingError
-        If it is none; the message begins with `where`.
-    """
+    """Read a finite number."""
     if not text:
         raise RecordingError(f"{where} is empty; mend or drop the line")
     try:
@@ -174,13 +144,7 @@ def to_number(text: str, *, shown: str, where: str) -> float:
 
 
 def require_rising(time: Float[np.ndarray, " rows"], lines: Sequence[int], *, path: Path, column: str) -> None:
-    """Check that times rise from row to row.
-
-    Raises
-    ------
-    RecordingError
-        Naming the line of the first that does not.
-    """
+    """Check that times rise from row to row."""
     for row, (before, after) in enumerate(pairwise(time.tolist())):
         if not after > before:
             what = "repeats" if after == before else "falls"
@@ -278,13 +242,7 @@ _AXES = {
 
 
 def unit_of(name: str, *, quantity: str, path: str) -> str | None:
-    """Unit that a column's name gives, in brackets or as its last word; None where it gives none.
-
-    Raises
-    ------
-    RecordingError
-        If the brackets hold a unit that is not known: a voltage must not pass for a force.
-    """
+    """Unit that a column's name gives, in brackets or as its last word; None where it gives none."""
     spellings = _SPELLINGS[quantity]
     bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]", name)
     if bracket:
@@ -303,13 +261,7 @@ def unit_of(name: str, *, quantity: str, path: str) -> str | None:
 
 
 def require_unit(unit: str, *, quantity: str) -> str:
-    """Return a declared unit as it is written here.
-
-    Raises
-    ------
-    RecordingError
-        If it is not known.
-    """
+    """Return a declared unit as it is written here."""
     known = _spelled(unit.lower(), _SPELLINGS[quantity])
     if known is None:
         raise RecordingError(f"{unit!r} is no unit of {quantity}; use one of {', '.join(_SPELLINGS[quantity])}")
@@ -317,13 +269,7 @@ def require_unit(unit: str, *, quantity: str) -> str:
 
 
 def guess_time_column(table: TextTable) -> str:
-    """Column whose name says that it holds times.
-
-    Raises
-    ------
-    RecordingError
-        If there is none, or more than one.
-    """
+    """Column whose name says that it holds times."""
     units = {spelling for names in _TIME_SPELLINGS.values() for spelling in names}
     found = []
     for name in table.header:
@@ -335,13 +281,7 @@ def guess_time_column(table: TextTable) -> str:
 
 
 def guess_force_columns(table: TextTable) -> tuple[str, ...]:
-    """Columns that hold the force along x, y and z, or the normal and the tangential force.
-
-    Raises
-    ------
-    RecordingError
-        If neither set is there, or a force twice.
-    """
+    """Columns that hold the force along x, y and z, or the normal and the tangential force."""
     found: dict[str, list[str]] = {axis: [] for axis in _AXES}
     for name in table.header:
         words = _words(re.sub(r"[\[(].*", "", name))
@@ -420,24 +360,7 @@ class FrameClock:
 def place_on_clock(
     time_s: Float[np.ndarray, " frames"], *, forces: Forces | None, start_s: float | None, source: str
 ) -> FrameClock:
-    """Put frames on the clock of forces that were recorded into another file.
-
-    Parameters
-    ----------
-    time_s
-        Times of the frames, as their file gives them.
-    forces
-        None where only images were recorded.
-    start_s
-        When the first frame was taken, on the clock of the forces; None where both count from the same zero.
-    source
-        Of the frames, for people.
-
-    Raises
-    ------
-    RecordingError
-        If frames and forces have no moment in common.
-    """
+    """Put frames on the clock of forces that were recorded into another file."""
     notes: tuple[str, ...] = ()
     if start_s is not None:
         if not isfinite(start_s):
@@ -456,13 +379,7 @@ def place_on_clock(
 
 
 def evenly_spaced(count: int, *, frame_rate: float) -> Float[np.ndarray, " frames"]:
-    """Times of frames taken at a declared rate, in seconds from the first.
-
-    Raises
-    ------
-    RecordingError
-        If the rate is not a positive number.
-    """
+    """Times of frames taken at a declared rate, in seconds from the first."""
     if not (isfinite(frame_rate) and frame_rate > 0):
         raise RecordingError(f"a frame rate of {frame_rate} frames/s cannot be; declare a positive one")
     return np.arange(count) / frame_rate
@@ -474,13 +391,7 @@ def trial_name(text: str) -> str:
 
 
 def require_trial_name(trial: str) -> None:
-    """Check that the name of a trial can name a file.
-
-    Raises
-    ------
-    RecordingError
-        If it cannot.
-    """
+    """Check that the name of a trial can name a file."""
     if trial_name(trial) != trial:
         raise RecordingError(
             f"trial {trial[:40]!r} cannot name a file; name it with letters, digits, dots, dashes and underscores"

@@ -2,12 +2,11 @@
 
 import os
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from sliplens.errors import RecordingError
 from sliplens.images.files import natural_key
@@ -27,13 +26,7 @@ class Line:
 
 
 def read_lines(path: Path) -> list[Line]:
-    """Read the lines of a list that are neither empty nor comments.
-
-    Raises
-    ------
-    RecordingError
-        If the file is missing, empty or no text.
-    """
+    """Read the lines of a list that are neither empty nor comments."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -62,14 +55,7 @@ class ListedFiles:
     _found: dict[Path, str] = field(default_factory=dict)
 
     def find(self, listed: str, *, where: str) -> Path:
-        """Find a file: where its path says, else under the root by the last parts of its path, the most first.
-
-        Raises
-        ------
-        RecordingError
-            If it is not there, a relative path leads out of the root, or another listed path led to the same file; the
-            message begins with `where`.
-        """
+        """Find a file: where its path says, else under the root by the last parts of its path, the most first."""
         path = self._search(listed, where=where)
         before = self._found.setdefault(path, listed)
         if before != listed:
@@ -115,65 +101,42 @@ FRAMES, REFERENCES, MARGINS = "_images_L.txt", "_images_Lref.txt", "_gamma.csv"
 _FRAME_RATE_HZ = 30.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class ThesisTrial:
-    """Frames that share a reference frame, in natural order; without times and forces, which the lists do not give."""
-
-    name: str
-    source: str
-    frame_paths: tuple[Path, ...]
-    reference_path: Path
-    frame_size: tuple[int, int]
-    """Height and width, in pixels."""
-    safety_margin: Float[np.ndarray, " frames"]
-    """As a fraction; NaN where the list has none."""
-    notes: tuple[str, ...] = ()
-    """What the reader had to assume, a sentence each, to be shown to the user."""
-
-    def __len__(self) -> int:
-        """Count the frames."""
-        return len(self.frame_paths)
-
-    def read_reference(self) -> UInt8[np.ndarray, "height width 3"]:
-        """Read the reference frame T_0."""
-        return read_frame(self.reference_path, size=self.frame_size)
-
-    def read_frames(self) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-        """Read the frames T_n, one at a time."""
-        return (read_frame(path, size=self.frame_size) for path in self.frame_paths)
-
-
-def read_thesis_lists(
-    path: Path, *, root: Path | None = None, margin_unit: str | None = None
-) -> tuple[ThesisTrial, ...]:
+def read_thesis(
+    path: Path, *, image_root: Path | None = None, margin_unit: str | None = None, frame_rate: float | None = None
+) -> list[Capture]:
     """Read the lists of a set: `SET_images_L.txt`, `SET_images_Lref.txt` and `SET_gamma.csv`, in one folder.
 
     The thesis's programs (`get_data` in github.com/MaxPolak97/polycam-regression) read a path a line, and a margin a
     line as a fraction, without a header. The lists themselves are not public, so more is accepted: a header, several
     columns (that called gamma, else the last), percent, backslashes, empty lines and comments. Their paths are those
-    of the computer that recorded them; a path that does not exist here is looked for under `root` by its last parts,
-    the most first.
+    of the computer that recorded them; a path that does not exist here is looked for under `image_root` by its last
+    parts, the most first.
 
     Parameters
     ----------
     path
         The list of frames, or the folder that holds just one.
-    root
-        Folder under which the images lie now; that of the list if None. Relative paths start here and may not lead
-        out of it.
+    image_root
+        Folder under which the images lie now; that of the list if None. Relative paths start at the list and may not
+        lead out of it.
     margin_unit
         "fraction" or "percent"; from the largest margin if None.
+    frame_rate
+        Frames per second, which the lists do not give; those of a usual camera if None.
 
     Returns
     -------
-    tuple of ThesisTrial
-        A trial for each reference frame, in the order of the list.
+    list of Capture
+        A trial for each reference frame, in the order of the list, with the margins of the list as its labels.
 
     Raises
     ------
     RecordingError
         If a list is missing or empty, their lengths differ, a file is not found, sizes disagree, or a margin is none.
     """
+    rate = _FRAME_RATE_HZ if frame_rate is None else frame_rate
+    how = "assumed" if frame_rate is None else "declared"
+    times = f"The lists give no times: {rate:g} frames/s were {how}; how fast the margin falls rests on it."
     frames_list = _frames_list(path)
     stem = frames_list.name.removesuffix(FRAMES)
     lists = [frames_list, *(frames_list.with_name(stem + ending) for ending in (REFERENCES, MARGINS))]
@@ -184,52 +147,16 @@ def read_thesis_lists(
             f"{frames_list} has {len(frames)} frames, {lists[1].name} {len(references)} references and {lists[2].name} "
             f"{len(margins)} margins; give one of each a line"
         )
-    files = ListedFiles(folder=frames_list.parent, root=frames_list.parent if root is None else root)
+    files = ListedFiles(folder=frames_list.parent, root=frames_list.parent if image_root is None else image_root)
     rows: dict[Path, list[tuple[Path, float]]] = {}
     for frame, reference, margin in zip(frames, references, margins.tolist(), strict=True):
         untouched = files.find(reference.text, where=f"{lists[1]}, line {reference.line}")
         found = files.find(frame.text, where=f"{frames_list}, line {frame.line}")
         rows.setdefault(untouched, []).append((found, margin))
     names = _trial_names(stem, len(rows))
-    return tuple(
-        _trial(name, reference, rows[reference], source=str(frames_list), notes=notes)
-        for name, reference in zip(names, rows, strict=True)
-    )
-
-
-def read_thesis(
-    path: Path, *, image_root: Path | None = None, margin_unit: str | None = None, frame_rate: float | None = None
-) -> list[Capture]:
-    """Read the lists of a set as captures, one for each reference frame, with the margins of the list as their labels.
-
-    Parameters
-    ----------
-    path, image_root, margin_unit
-        As `read_thesis_lists` takes them.
-    frame_rate
-        Frames per second, which the lists do not give; those of a usual camera if None.
-
-    Raises
-    ------
-    RecordingError
-        As `read_thesis_lists`.
-    """
-    rate = _FRAME_RATE_HZ if frame_rate is None else frame_rate
-    how = "assumed" if frame_rate is None else "declared"
-    times = f"The lists give no times: {rate:g} frames/s were {how}; how fast the margin falls rests on it."
     return [
-        Capture(
-            trial=trial.name,
-            source=f"{trial.name} of {trial.source}",
-            frame_time_s=evenly_spaced(len(trial), frame_rate=rate),
-            frame_size=trial.frame_size,
-            read_frames=trial.read_frames,
-            forces=None,
-            notes=(*trial.notes, times),
-            labels=labels_of_margins(trial.safety_margin),
-            reference=trial.read_reference(),
-        )
-        for trial in read_thesis_lists(path, root=image_root, margin_unit=margin_unit)
+        _trial(name, reference, rows[reference], source=str(frames_list), notes=(*notes, times), frame_rate=rate)
+        for name, reference in zip(names, rows, strict=True)
     ]
 
 
@@ -256,8 +183,14 @@ def _trial_names(stem: str, count: int) -> list[str]:
 
 
 def _trial(
-    name: str, reference: Path, rows: list[tuple[Path, float]], *, source: str, notes: tuple[str, ...]
-) -> ThesisTrial:
+    name: str,
+    reference: Path,
+    rows: list[tuple[Path, float]],
+    *,
+    source: str,
+    notes: tuple[str, ...],
+    frame_rate: float,
+) -> Capture:
     ordered = sorted(rows, key=lambda row: natural_key(str(row[0])))
     if ordered != rows:
         notes = (*notes, f"{name}: frames were put into the natural order of their names.")
@@ -265,14 +198,17 @@ def _trial(
     if len(set(paths)) < len(paths):
         twice = next(path for path in paths if paths.count(path) > 1)
         raise RecordingError(f"{source} lists {twice} twice with one reference; list every frame once")
-    return ThesisTrial(
-        name=name,
-        source=source,
-        frame_paths=paths,
-        reference_path=reference,
-        frame_size=common_size((reference, *paths)),
-        safety_margin=np.array([margin for _, margin in ordered]),
+    size = common_size((reference, *paths))
+    return Capture(
+        trial=name,
+        source=f"{name} of {source}",
+        frame_time_s=evenly_spaced(len(paths), frame_rate=frame_rate),
+        frame_size=size,
+        read_frames=lambda: (read_frame(path, size=size) for path in paths),
+        forces=None,
         notes=notes,
+        labels=labels_of_margins(np.array([margin for _, margin in ordered])),
+        reference=read_frame(reference, size=size),
     )
 
 

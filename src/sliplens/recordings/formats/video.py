@@ -36,16 +36,6 @@ def stale_frames(frames: Iterable[UInt8[np.ndarray, "height width 3"]]) -> int:
     moment. The last of them is unlike every frame that follows it. An object that slides from frame to frame is not
     stale: there, all frames leap, or none does. (Where the camera ran already, an object that is pressed all at once
     within the first 13 frames and never let go cannot be told from a frozen start; do not ask there.)
-
-    Parameters
-    ----------
-    frames
-        From the first; the first 500 are looked at.
-
-    Returns
-    -------
-    int
-        How many to leave out: 0 where none is stale.
     """
     return count_stale(small_copies(frames))
 
@@ -126,13 +116,7 @@ class VideoFile:
 
 
 def inspect_video(path: Path) -> VideoFile:
-    """Read the stamps of all frames.
-
-    Raises
-    ------
-    RecordingError
-        If the file is missing, no video, truncated, holds no frame or claims absurdly large ones.
-    """
+    """Read the stamps of all frames."""
     with _open(path) as container:
         video = _video_stream(container, path)
         size = video.codec_context.height, video.codec_context.width
@@ -245,13 +229,7 @@ def _ends_early(
 
 
 def decode_video(file: VideoFile) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """Decode the frames in the order they are shown.
-
-    Raises
-    ------
-    RecordingError
-        If a frame is damaged, missing or of another size than the first.
-    """
+    """Decode the frames in the order they are shown."""
     path, count = file.path, 0
     to_rgb = VideoReformatter()  # one for all: preparing it costs as much as a frame
     with _open(path) as container:

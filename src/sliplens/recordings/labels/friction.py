@@ -51,22 +51,6 @@ def fit_break(
 
     Every break within reach and a few lengths of the fall are tried; the bootstrap draws blocks of the residuals anew
     and fits the break anew with each.
-
-    Parameters
-    ----------
-    time_s, values
-        Samples, before and after the break.
-    about_s
-        Roughly where it is.
-    rng
-        Source of the draws.
-    draws
-        How many.
-
-    Raises
-    ------
-    RecordingError
-        If the samples about the break are too few to fit.
     """
     designs = [
         _Design.at(moment, fall, time_s=time_s)

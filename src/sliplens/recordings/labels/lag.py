@@ -17,13 +17,7 @@ _MOTION_BLOCKS = 28
 
 
 def soften(frame: UInt8[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "rows columns 3"]:
-    """Means of square blocks of a frame, in grey levels; what does not fill a block at the right and below is left out.
-
-    Parameters
-    ----------
-    frame
-        RGB image.
-    """
+    """Means of square blocks of a frame, in grey levels; what fills no block at the right and below is left out."""
     height, width, _ = frame.shape
     side = max(1, min(height, width) // _MOTION_BLOCKS)
     rows, columns = height // side, width // side

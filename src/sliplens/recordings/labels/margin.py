@@ -45,23 +45,7 @@ def interpolate_forces(
     until_s: float = np.inf,
     force_range_n: float | None = None,
 ) -> FrameForces:
-    """Interpolate the forces onto given times: the mean, over a window about each, of the line through the samples.
-
-    Parameters
-    ----------
-    forces
-        In the axes of the contact.
-    time_s
-        Where to have them, on the force sensor's clock.
-    window_s
-        Full length of the window; 0 interpolates between two samples.
-    gap_s
-        Samples further apart count as missing.
-    until_s
-        A time that no window reaches over.
-    force_range_n
-        What each axis of the sensor can measure, either way; None if it is not known.
-    """
+    """Interpolate the forces onto given times: the mean, over a window about each, of the line through the samples."""
     samples = forces.time_s
     normal, tangential = (
         mean_force(samples, values, time_s, window_s=window_s, until_s=until_s)
