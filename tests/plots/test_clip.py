@@ -65,7 +65,7 @@ def written(trial, tmp_path_factory) -> tuple[Path, list[tuple[int, int]]]:
     """The clip of the trial, and what was told while it was written."""
     path = tmp_path_factory.mktemp("clip") / "new" / "trial.mp4"
     told = []
-    write_clip(trial, path, on_frames=lambda done, total: told.append((done, total)))
+    write_clip(trial, path, on_progress=lambda done, total: told.append((done, total)))
     return path, told
 
 
@@ -246,7 +246,7 @@ def test_interrupted_clip_leaves_no_file(trial, tmp_path, stop_at):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_clip(trial, tmp_path / "trial.mp4", on_frames=stop)
+        write_clip(trial, tmp_path / "trial.mp4", on_progress=stop)
 
     assert not list(tmp_path.iterdir())
 
@@ -257,7 +257,7 @@ def test_interrupted_clip_leaves_the_one_before(trial, tmp_path):
 
     (tmp_path / "trial.mp4").write_bytes(b"yesterday's")
     with pytest.raises(KeyboardInterrupt):
-        write_clip(trial, tmp_path / "trial.mp4", on_frames=stop)
+        write_clip(trial, tmp_path / "trial.mp4", on_progress=stop)
 
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("trial.mp4", b"yesterday's")]
 

@@ -96,7 +96,9 @@ def written(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("simulated")
     data = stored(folder / "data", trial)
     told = []
-    write_rrd(data, data.trials[0], folder / "new" / "a.rrd", on_frames=lambda done, total: told.append((done, total)))
+    write_rrd(
+        data, data.trials[0], folder / "new" / "a.rrd", on_progress=lambda done, total: told.append((done, total))
+    )
     assert told == [(8, FRAMES), (16, FRAMES), (FRAMES, FRAMES)]
     assert [path.name for path in (folder / "new").iterdir()] == ["a.rrd"]
     return folder / "new" / "a.rrd"
@@ -331,7 +333,7 @@ def test_an_interruption_leaves_no_file(small_dataset: Dataset, tmp_path: Path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_rrd(small_dataset, small_dataset.trials[0], tmp_path / "a.rrd", on_frames=interrupt)
+        write_rrd(small_dataset, small_dataset.trials[0], tmp_path / "a.rrd", on_progress=interrupt)
     assert not list(tmp_path.iterdir())
 
 

@@ -41,9 +41,9 @@ class View:
         info = data.trials[0] if self.trial is None else data.find(self.trial)
         with progress_bar(f"Reading {info.trial}") as bar:
             if self.output is None:
-                open_viewer(data, info, on_frames=bar)
+                open_viewer(data, info, on_progress=bar)
             else:
-                write_rrd(data, info, self.output, on_frames=bar)
+                write_rrd(data, info, self.output, on_progress=bar)
         if self.output is None:
             say(f"{info.trial} is in the Rerun viewer, {info.frames:,} frames")
             say("the viewer tells its makers that it is used, not what is seen; `rerun analytics disable` ends that")

@@ -1,11 +1,12 @@
-"""A clip of the markers for people to watch: rings where they are, arrows from where they were."""
+"""Clips for people to watch: a trial with its forces and labels, or frames with their markers."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
+from typing import TypeAlias
 
 import matplotlib as mpl
 import numpy as np
@@ -29,6 +30,7 @@ from sliplens.plots.contact_sheet import (
 )
 from sliplens.plots.layout import written_whole
 from sliplens.plots.style import BLACK, GREY, PURPLE, SKY, drawing_style, percent
+from sliplens.progress import OnProgress
 from sliplens.recordings import Recording
 from sliplens.recordings.trial import OUTSIDE, STICKS
 
@@ -58,7 +60,7 @@ def write_clip(
     path: Path,
     *,
     frames_per_s: float | None = None,
-    on_frames: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> None:
     """Write a trial as an MP4 that plays at real speed; it appears when complete.
 
@@ -81,28 +83,14 @@ def write_clip(
         If the suffix is another one, PyAV is missing, the rate lies outside 1 to 120, or the file cannot be written.
     """
     require_clip_path(path)
-    if frames_per_s is not None and not 1 <= frames_per_s <= 120:
-        raise InputError(f"{frames_per_s:g} frames a second cannot be watched; ask for {_SLOWEST} to {_FASTEST}")
-    try:
-        import av  # noqa: PLC0415 (it brings all of FFmpeg, and only clips need it)
-    except ImportError:
-        raise InputError("a clip needs PyAV, which is not installed; install it with `pip install av`") from None
-    rate = Fraction(frames_per_s or natural_rate(recording.time_s)).limit_denominator(1001)
-    indices, stage = clip_frames(recording.time_s, float(rate)), _set_stage(recording)
-    with (
-        written_whole(path) as part,
-        # the index comes first, so that a browser plays before it has all
-        av.open(str(part), "w", format="mp4", options={"movflags": "faststart"}) as container,
-    ):
-        stream = container.add_stream("libx264", rate=rate, options={"crf": "20", "preset": "veryfast"})
-        stream.height, stream.width, stream.pix_fmt = *stage.still.shape[:2], "yuv420p"
-        # what FFmpeg turns RGB into, BT.601: untold, a player guesses by the size
-        stream.codec_context.colorspace = 5
-        for done, pixels in enumerate(_draw_frames(recording, indices, stage, float(rate)), start=1):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
-            if on_frames is not None:
-                on_frames(done, len(indices))
-        container.mux(stream.encode())
+    rate = natural_rate(recording.time_s) if frames_per_s is None else frames_per_s
+    with _open_clip(path, frames_per_s=rate) as open_stream:
+        indices, stage = clip_frames(recording.time_s, rate), _set_stage(recording)
+        add = open_stream(stage.still.shape[:2])
+        for done, pixels in enumerate(_draw_frames(recording, indices, stage, rate), start=1):
+            add(pixels)
+            if on_progress is not None:
+                on_progress(done, len(indices))
 
 
 def require_clip_path(path: Path) -> None:
@@ -345,36 +333,44 @@ def clip_writer(
     InputError
         If the suffix is another one, the rate lies outside 1 to 120, or the file cannot be written.
     """
-    if path.suffix.lower() != ".mp4":
-        raise InputError(f"{path} does not end in .mp4; name a clip, such as markers.mp4")
-    if not 1 <= frames_per_s <= 120:
-        raise InputError(f"{frames_per_s:g} frames a second cannot be watched; ask for 1 to 120")
-    import av  # noqa: PLC0415 (it brings all of FFmpeg, and only clips need it)
-
     scale = max(1, _LEAST_SIDE // max(size))
     # H.264 keeps one colour for two by two pixels
     rows, columns = (side * scale // 2 * 2 for side in size)
-    part = path.with_name(f".{path.name}.part")
+    with _open_clip(path, frames_per_s=frames_per_s) as open_stream:
+        add = open_stream((rows, columns))
+        yield lambda frame, tracked, rest_px: add(
+            draw_tracked(frame, tracked, rest_px=rest_px, scale=scale)[:rows, :columns]
+        )
+
+
+_Add: TypeAlias = Callable[[UInt8[np.ndarray, "rows columns 3"]], None]
+
+
+@contextmanager
+def _open_clip(path: Path, *, frames_per_s: float) -> Iterator[Callable[[tuple[int, int]], _Add]]:
+    """Give what begins a clip of a height and width, and so gives what adds a picture to it."""
+    require_clip_path(path)
+    if not 1 <= frames_per_s <= 120:
+        raise InputError(f"{frames_per_s:g} frames a second cannot be watched; ask for {_SLOWEST} to {_FASTEST}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with av.open(str(part), "w", format="mp4", options={"movflags": "faststart"}) as container:
-            rate = Fraction(frames_per_s).limit_denominator(1001)
-            stream = container.add_stream("libx264", rate=rate, options={"crf": "20", "preset": "veryfast"})
-            stream.height, stream.width, stream.pix_fmt = rows, columns, "yuv420p"
+        import av  # noqa: PLC0415 (it brings all of FFmpeg, and only clips need it)
+    except ImportError:
+        raise InputError("a clip needs PyAV, which is not installed; install it with `pip install av`") from None
+    with (
+        written_whole(path) as part,
+        # the index comes first, so that a browser plays before it has all
+        av.open(str(part), "w", format="mp4", options={"movflags": "faststart"}) as container,
+    ):
+        rate = Fraction(frames_per_s).limit_denominator(1001)
+        stream = container.add_stream("libx264", rate=rate, options={"crf": "20", "preset": "veryfast"})
 
-            def add(
-                frame: UInt8[np.ndarray, "height width 3"],
-                tracked: TrackedFrame,
-                rest_px: Float[np.ndarray, "markers 2"],
-            ) -> None:
-                pixels = draw_tracked(frame, tracked, rest_px=rest_px, scale=scale)[:rows, :columns]
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")))
+        def open_stream(size: tuple[int, int]) -> _Add:
+            stream.height, stream.width, stream.pix_fmt = *size, "yuv420p"
+            # what FFmpeg turns RGB into, BT.601: untold, a player guesses by the size
+            stream.codec_context.colorspace = 5
+            return lambda pixels: container.mux(
+                stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24"))
+            )
 
-            yield add
-            container.mux(stream.encode())
-        part.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot write {path} ({error.strerror or error}); choose another file") from None
-    finally:
-        with suppress(OSError):  # it has its name by now, or could not be made
-            part.unlink()
+        yield open_stream
+        container.mux(stream.encode())

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
@@ -29,6 +29,7 @@ from sliplens.plots.audit import Fact, audit_facts
 from sliplens.plots.contact_sheet import STATE_COLOURS, TIMES, brighten, brightening
 from sliplens.plots.layout import written_whole
 from sliplens.plots.style import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
+from sliplens.progress import OnProgress
 from sliplens.recordings import ContactState, Dataset, Recording, TrialInfo
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.dataset import trial_path
@@ -359,7 +360,7 @@ _TOGETHER = 8  # frames that are sent together: a megabyte or so, as much as Rer
 
 
 def log_frames(
-    stream: "RecordingStream", path: Path, trial: Recording, factor: float, on_frames: Callable[[int, int], None] | None
+    stream: "RecordingStream", path: Path, trial: Recording, factor: float, on_progress: OnProgress | None
 ) -> None:
     """Log camera frames and their bright differences from the reference, losslessly.
 
@@ -379,8 +380,8 @@ def log_frames(
                 columns = rerun.EncodedImage.columns(blob=list(blobs), media_type=[_PNG] * len(blobs))
                 stream.send_columns(entity, times, columns)
             done += len(some)
-            if on_frames is not None:
-                on_frames(done, len(trial))
+            if on_progress is not None:
+                on_progress(done, len(trial))
 
 
 _OUTLINES_TOGETHER = 8  # frames whose maps are held and sent together
@@ -453,9 +454,7 @@ _SAMPLED = 32  # frames that are looked at for the brightness of all
 _HIGHEST = 2.5  # times mu_s: where hardly anything presses, F_t / F_n goes anywhere
 
 
-def write_rrd(
-    data: Dataset, info: TrialInfo, path: Path, *, on_frames: Callable[[int, int], None] | None = None
-) -> None:
+def write_rrd(data: Dataset, info: TrialInfo, path: Path, *, on_progress: OnProgress | None = None) -> None:
     """Write a trial as a file of the Rerun viewer; it appears when complete.
 
     Parameters
@@ -475,10 +474,10 @@ def write_rrd(
     with written_whole(path) as part:
         part.touch()  # Rerun would tell of a file that cannot be written in its own way
         stream.save(part)
-        _log_whole(stream, data, info, on_frames, otherwise=f"{path} could not be written; see what space is left")
+        _log_whole(stream, data, info, on_progress, otherwise=f"{path} could not be written; see what space is left")
 
 
-def open_viewer(data: Dataset, info: TrialInfo, *, on_frames: Callable[[int, int], None] | None = None) -> None:
+def open_viewer(data: Dataset, info: TrialInfo, *, on_progress: OnProgress | None = None) -> None:
     """Open a trial in a Rerun viewer of its own, which stays when this process ends.
 
     Raises
@@ -491,11 +490,11 @@ def open_viewer(data: Dataset, info: TrialInfo, *, on_frames: Callable[[int, int
     stream = _new_stream()
     read_header(trial_path(data.folder, info.trial))  # no window for a trial that is not there
     stream.connect_grpc(start_viewer())
-    _log_whole(stream, data, info, on_frames, otherwise="the Rerun viewer was closed too early; leave it open")
+    _log_whole(stream, data, info, on_progress, otherwise="the Rerun viewer was closed too early; leave it open")
 
 
 def log_trial(
-    stream: "RecordingStream", data: Dataset, info: TrialInfo, *, on_frames: Callable[[int, int], None] | None = None
+    stream: "RecordingStream", data: Dataset, info: TrialInfo, *, on_progress: OnProgress | None = None
 ) -> None:
     """Log a trial and its layout to a Rerun stream, a few frames in memory at a time.
 
@@ -531,19 +530,19 @@ def log_trial(
         log_samples(stream, load_forces(samples), labelling)
     if truth is not None:
         log_truth(stream, path, trial, truth)
-    log_frames(stream, path, trial, shown.factor, on_frames)
+    log_frames(stream, path, trial, shown.factor, on_progress)
 
 
 def _log_whole(
     stream: "RecordingStream",
     data: Dataset,
     info: TrialInfo,
-    on_frames: Callable[[int, int], None] | None,
+    on_progress: OnProgress | None,
     *,
     otherwise: str,
 ) -> None:
     try:
-        log_trial(stream, data, info, on_frames=on_frames)
+        log_trial(stream, data, info, on_progress=on_progress)
         stream.flush()
     except RuntimeError as error:
         raise InputError(f"{otherwise} ({error})") from None
