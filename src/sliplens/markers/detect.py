@@ -32,7 +32,6 @@ class MarkerKind:
     """Weights of red, green and blue, by which centres are measured; found from the markers themselves if None."""
 
     def __post_init__(self) -> None:
-        """Check what cannot be looked for."""
         low, high = self.radius_px
         if not 0 < low < high:
             raise InputError(f"markers of {self.name} have radii from {low:g} to {high:g} px; give a low and a high")
@@ -365,7 +364,6 @@ class Markers:
     """Look that they have in common."""
 
     def __len__(self) -> int:
-        """Count the markers."""
         return len(self.centre_px)
 
 

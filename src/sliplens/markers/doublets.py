@@ -80,7 +80,6 @@ class Doublets:
     """False where the edge of the image cuts a doublet."""
 
     def __len__(self) -> int:
-        """Count the markers."""
         return len(self.rest_px)
 
 

@@ -35,7 +35,6 @@ class FieldTrial:
     """Last frame before the pull: slip is told by what moves from there, not from T_0."""
 
     def __post_init__(self) -> None:
-        """Check what every estimator needs."""
         if len(self.rest_px) < _FEWEST:
             raise InputError(f"{len(self.rest_px)} markers are too few to tell slip, at least {_FEWEST} are needed")
         if self.displacement_px.shape[1:] != self.rest_px.shape:
@@ -47,7 +46,6 @@ class FieldTrial:
             raise InputError(f"frame {self.hold} of the hold is not one of {len(self.displacement_px)}")
 
     def __len__(self) -> int:
-        """Count the frames."""
         return len(self.displacement_px)
 
     @property

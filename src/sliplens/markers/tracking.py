@@ -52,7 +52,6 @@ class TrialTracking:
     """Frames in which no marker could be told from the next."""
 
     def __str__(self) -> str:
-        """Give a line for people."""
         lost = f", lost in {self.lost_frames} frames" if self.lost_frames else ""
         return f"{self.trial}: {self.markers} markers, {100 * self.followed_share:.1f} % followed while in view{lost}"
 

@@ -57,7 +57,6 @@ class Tracks:
     status: UInt8[np.ndarray, "frames markers"]
 
     def __len__(self) -> int:
-        """Count the frames."""
         return len(self.status)
 
     @property

@@ -38,7 +38,6 @@ class Calibration:
     """Mean squared error of the answers to them, at this temperature (it moves the mean of a distribution a little)."""
 
     def __post_init__(self) -> None:
-        """Check that logits can be divided by the temperature."""
         if not self.temperature > 0:
             raise ModelError(f"the temperature of a calibration must be positive, got {self.temperature:g}")
 

@@ -28,7 +28,6 @@ class Forces:
     """Topic, file or column names, for people."""
 
     def __post_init__(self) -> None:
-        """Check what every reader must hold."""
         if len(self.time_s) == 0:
             raise RecordingError(f"{self.source} has no force sample; record the force sensor too")
         if len(self.force_n) != len(self.time_s):
@@ -78,7 +77,6 @@ class Capture(TrialFacts):
     simulated: bool = False
 
     def __post_init__(self) -> None:
-        """Check what every reader must hold."""
         if len(self.frame_time_s) == 0:
             raise RecordingError(f"{self.source} has no frame; leave it out or record it again")
         _require_rising(self.frame_time_s, what=f"the frames of {self.source}")
@@ -94,7 +92,6 @@ class Capture(TrialFacts):
             )
 
     def __len__(self) -> int:
-        """Number of frames."""
         return len(self.frame_time_s)
 
 

@@ -85,7 +85,6 @@ class Labels:
     """How the labels were made; None where that is not told."""
 
     def __post_init__(self) -> None:
-        """Check that there is one of each a frame."""
         self._require_one_each(len(self.safety_margin), f"there are {len(self.safety_margin)} safety margins but")
 
     def _require_one_each(self, count: int, begin: str) -> None:
@@ -173,7 +172,6 @@ class GroundTruth:
     """Where the camera sees the skin touch the object: 0 nowhere, 1 slipping, 2 sticking."""
 
     def __post_init__(self) -> None:
-        """Check that all speaks of the same frames and markers."""
         count = len(self.marker_px)
         for name in ("static_friction", "contact_radius_m", "stick_radius_m", "contact_map"):
             if len(getattr(self, name)) != count:
@@ -222,7 +220,6 @@ class Recording(TrialFacts, Labels):
     """Knowledge of a simulator beyond the labels; None for a real trial."""
 
     def __post_init__(self) -> None:
-        """Check the laws that every trial obeys."""
         count = len(self.frames)
         if count == 0:
             raise RecordingError(f"trial {self.trial} has no frames; leave it out or record it again")
@@ -247,7 +244,6 @@ class Recording(TrialFacts, Labels):
             require_unit_interval(getattr(self, name), name=name, trial=self.trial)
 
     def __len__(self) -> int:
-        """Number of frames."""
         return len(self.frames)
 
 

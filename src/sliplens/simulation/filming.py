@@ -44,7 +44,6 @@ class Film:
     rays: Float[np.ndarray, "height width 2"]
 
     def __len__(self) -> int:
-        """Count the frames."""
         return len(self.marker_px)
 
     def draw_reference(self, *, device: str | torch.device = "cpu") -> UInt8[Tensor, "height width 3"]:

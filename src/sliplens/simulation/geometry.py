@@ -75,7 +75,6 @@ class Dome:
     """Marker size by ring."""
 
     def __post_init__(self) -> None:
-        """Check what cannot occur."""
         require_positive(
             {
                 "dome radius": self.radius_m,
@@ -213,7 +212,6 @@ class FlatPad:
     rows: int
 
     def __post_init__(self) -> None:
-        """Check what cannot occur."""
         require_positive(
             {
                 "ball radius": self.ball_radius_m,

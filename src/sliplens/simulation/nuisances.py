@@ -70,7 +70,6 @@ class Nuisances:
     """Standard deviation of the grey levels by which pressed skin shows its grain."""
 
     def __post_init__(self) -> None:
-        """Check that every range can be drawn from."""
         for field in fields(self):
             value = getattr(self, field.name)
             low, high = value if isinstance(value, tuple) else (value, value)

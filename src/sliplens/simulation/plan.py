@@ -64,7 +64,6 @@ class SimulationRecipe:
     nuisances: Nuisances = field(default_factory=Nuisances)
 
     def __post_init__(self) -> None:
-        """Check that the recipe can be followed."""
         if isinstance(self.dry_trials, tuple):
             self._check_days(self.dry_trials)
         least = {

@@ -121,7 +121,6 @@ class MarkerLook:
     """Share of its contrast that a marker loses in a nominal contact."""
 
     def __post_init__(self) -> None:
-        """Check what cannot occur."""
         for name, values in (("marker radius", self.radius_px), ("marker edge", self.edge_px)):
             require_positive(
                 {f"{name} in {channel}": one for channel, one in zip(("red", "green", "blue"), values, strict=True)}
@@ -247,7 +246,6 @@ class Sensor:
     noise: Noise
 
     def __post_init__(self) -> None:
-        """Check what cannot occur."""
         try:
             reduced_modulus(youngs_modulus_pa=self.youngs_modulus_pa, poisson_ratio=self.poisson_ratio)
             require_positive({"image size": self.image_size_px})

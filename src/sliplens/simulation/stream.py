@@ -54,7 +54,6 @@ class SimulatedFrames(Dataset[SimulatedFrame]):
         self._ready: OrderedDict[int, tuple[Loading, Film, Tensor]] = OrderedDict()
 
     def __len__(self) -> int:
-        """Count the frames of all trials."""
         return int(self._ends[-1]) if len(self._ends) else 0
 
     def __getitem__(self, index: int) -> SimulatedFrame:

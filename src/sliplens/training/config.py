@@ -43,7 +43,6 @@ class TrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse numbers that cannot train a network."""
         for name in ("image_size", "epochs", "batch_size", "learning_rate"):
             value = getattr(self, name)
             if not (isfinite(value) and value > 0):

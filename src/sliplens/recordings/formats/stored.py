@@ -97,7 +97,6 @@ class ExportedTrial:
     labelling: Labelling | None
 
     def __post_init__(self) -> None:
-        """Check what a file of another hand could hold: the name becomes that of a file."""
         if trial_name(self.facts.trial) != self.facts.trial:
             raise ValueError("no proper name of a trial")
         if self.frames <= 0 or self.force_samples < 0 or not set(self.optional) <= set(EXPORTED_OPTIONAL):
