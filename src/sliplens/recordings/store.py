@@ -192,18 +192,12 @@ def write_trial(
 
     Parameters
     ----------
-    path
-        File to write.
     images
         Encoded frames in chunks, a row group each; see `encode_frames`.
     facts
         Name of the trial, its sensor, day, condition and object.
-    time_s
-        Times of the frames.
     labels
         Labels of the frames, and how they were made.
-    reference
-        Image of the untouched sensor.
     truth
         Truth of a simulated trial.
     """
@@ -266,8 +260,6 @@ def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Re
 
     Parameters
     ----------
-    path
-        The Parquet file.
     truth
         Read a simulated trial's ground truth too; training does without it.
     pixels
@@ -360,8 +352,6 @@ def read_frames(path: Path, places: Sequence[int]) -> UInt8[np.ndarray, "frames 
 
     Parameters
     ----------
-    path
-        The Parquet file.
     places
         Numbers of the frames.
 

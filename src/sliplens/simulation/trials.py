@@ -49,13 +49,7 @@ def simulate_trial(
     device: str | torch.device = "cpu",
     on_progress: OnProgress | None = None,
 ) -> Recording:
-    """Simulate one trial.
-
-    Parameters
-    ----------
-    on_progress
-        Called with the frames done and the frames in all, after each batch.
-    """
+    """Simulate one trial."""
     loading, film = prepare_trial(plan)
     reference = film.draw_reference(device=device).cpu().numpy()
     frames = np.empty((plan.frames, *reference.shape), dtype=np.uint8)
@@ -105,8 +99,6 @@ def simulate_examples(
     ----------
     count
         Trials at most.
-    on_progress
-        Called with the trials done and the trials in all.
     """
     plans = plan_trials(recipe)
     dry = [plan for plan in plans if plan.condition == "dry"]
@@ -144,8 +136,6 @@ def simulate(
         thesis; `dry_trials`, `wet_trials`, `days`, `frames_per_trial` or `seed` change it.
     device
         Where to draw the frames: cpu, cuda or cuda:1. A GPU's pixels may differ by one grey level.
-    overwrite
-        Replace the folder if it exists.
 
     Raises
     ------
@@ -188,8 +178,6 @@ def simulate_dataset(
     ----------
     folder
         Where to write `trials/*.parquet` and, last, `dataset.json`.
-    on_progress
-        Called with the frames done and the frames in all, after each batch.
 
     Raises
     ------

@@ -44,8 +44,6 @@ def evaluate(
     ----------
     run
         The network, its folder, or the name of one that comes with sliplens.
-    data
-        Data set with labels, or its folder.
     out
         Folder to write, with `result.json` and `predictions.parquet`; nothing is written if None.
     split

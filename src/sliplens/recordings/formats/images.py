@@ -163,15 +163,11 @@ def read_image_folder(
 
     Parameters
     ----------
-    folder
-        One trial.
     forces
         Table of forces; `read_force_table` tells of it and of `time_column`, `force_columns`, `time_unit` and
         `force_unit`.
     times
         Table with the name and the time of every image; frames are then ordered by time.
-    frame_rate
-        Frames per second.
     name_unit
         Unit (s, ms, us, ns) of the last number in every file's name, which is then its time.
     start_s

@@ -312,14 +312,10 @@ def write_lerobot(
 
     Parameters
     ----------
-    data
-        The data set.
     folder
         Folder to write to; `data` and `meta` of an earlier attempt that came to no end are replaced.
     trials
         Rows of its table; all by default.
-    on_progress
-        Called with the frames written and the frames in all.
 
     Raises
     ------

@@ -428,8 +428,6 @@ def read_force_table(
 
     Parameters
     ----------
-    path
-        The table.
     time_column
         Name of the column with the times.
     force_columns

@@ -174,8 +174,6 @@ def given_friction(
 
     Parameters
     ----------
-    mu
-        Static coefficient of friction.
     low, high
         Ends of the coefficient's 68 % interval.
     onset_s
@@ -207,16 +205,10 @@ def estimate_friction(
 
     Parameters
     ----------
-    forces
-        In the axes of the contact.
     contact_threshold_n
         Normal force below which the ratio means nothing.
-    rng
-        Source of the bootstrap.
     image
         How the image moves, to support the onset.
-    draws
-        Bootstrap draws.
 
     Raises
     ------

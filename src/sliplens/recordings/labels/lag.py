@@ -104,14 +104,8 @@ def estimate_lag(
         Times on the camera's clock.
     image_motion
         How much each frame differs from the one before it; see `measure_motion`. The first is not used.
-    forces
-        As recorded.
-    rng
-        Source of the draws.
     longest_s
         Longest lag tried, either way.
-    draws
-        Bootstrap draws.
 
     Raises
     ------

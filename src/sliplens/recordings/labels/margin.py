@@ -160,8 +160,6 @@ def label_frames(
     ----------
     frame_time_s
         Times on the camera's clock.
-    forces
-        In the axes of the contact.
     friction
         Static friction, estimated or given. Where it tells no onset, gross slip begins with the first frame whose
         forces clearly lie outside the friction cone.
@@ -308,12 +306,6 @@ def label_trial(
         Times on the camera's clock.
     image_motion
         See `measure_motion`.
-    forces
-        As recorded.
-    settings
-        What is known beforehand.
-    rng
-        Source of the bootstraps.
     lag
         Lag that was measured otherwise, with its uncertainty; that of the settings, or estimated, if None.
 
