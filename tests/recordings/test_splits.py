@@ -23,7 +23,7 @@ from sliplens.recordings.splits import (
     SplitRule,
     assign_splits,
     read_splits,
-    store_splits,
+    split_dataset,
 )
 from sliplens.simulation import PRESETS as RECIPES
 from sliplens.simulation import SimulationRecipe, plan_trials
@@ -392,7 +392,7 @@ def data(tmp_path: Path, small_dataset: Dataset) -> Dataset:
 def test_nothing_of_a_data_set_changes_but_its_splits(data: Dataset):
     before = json.loads((data.folder / DATASET_FILE).read_text())
     plan = SplitPlan(rules=(SplitRule(day=(2, 3), name="test"), SplitRule(name="train")))
-    store_splits(data, plan, assign_splits(plan, data.trials))
+    split_dataset(data, plan)
     stored = Dataset.open(data.folder)
     assert [info.split for info in stored.trials] == ["test" if info.day in {2, 3} else "train" for info in data.trials]
     assert [replace(info, split="") for info in stored.trials] == [replace(info, split="") for info in data.trials]
@@ -416,8 +416,7 @@ def test_the_rules_are_kept_as_their_file_said_them(data: Dataset, tmp_path: Pat
         seed = 3
         """
     plan = written(tmp_path, text)
-    result = assign_splits(plan, data.trials)
-    store_splits(data, plan, result)
+    result = split_dataset(data, plan)
     record = json.loads((data.folder / SPLITS_FILE).read_text())
     assert record["rules"] == [
         {"day": [4], "name": "test"},
@@ -428,11 +427,9 @@ def test_the_rules_are_kept_as_their_file_said_them(data: Dataset, tmp_path: Pat
     assert record["notes"] == list(result.notes)
 
 
-def test_what_the_simulator_counted_is_counted_anew(data: Dataset):
-    result = data.folder / "result.json"
-    result.write_text(json.dumps({"trials": 8, "by_split": {"train": {"trials": 8, "frames": 96}}}))
-    plan = SplitPlan(rules=(SplitRule(day=(1,), name="test"), SplitRule(name="train")))
-    store_splits(data, plan, assign_splits(plan, data.trials))
-    # eight trials of 12 frames on four days in turn
-    expected = {"test": {"trials": 2, "frames": 24}, "train": {"trials": 6, "frames": 72}}
-    assert json.loads(result.read_text()) == {"trials": 8, "by_split": expected}
+def test_a_dry_run_tells_the_splits_and_writes_nothing(data: Dataset):
+    before = {path: path.read_bytes() for path in data.folder.rglob("*") if path.is_file()}
+    result = split_dataset(data.folder, "thesis", dry_run=True)
+    assert {path: path.read_bytes() for path in data.folder.rglob("*") if path.is_file()} == before
+    assert result == split_dataset(data, "thesis")
+    assert tuple(info.split for info in Dataset.open(data.folder).trials) == result.splits

@@ -13,8 +13,7 @@ from sliplens.cli.console import print_table, say, wrote
 from sliplens.errors import InputError
 
 if TYPE_CHECKING:
-    from sliplens.recordings import Dataset, TrialInfo
-    from sliplens.recordings.splits import SplitPlan
+    from sliplens.recordings import TrialInfo
 
 _SHOWN = 6
 """So many names are shown before the rest is counted."""
@@ -40,14 +39,14 @@ class Split:
 
     def run(self) -> None:
         """Split, show and write."""
-        from sliplens.recordings import Dataset
-        from sliplens.recordings.splits import SPLITS_FILE, assign_splits, store_splits
+        from sliplens.recordings.dataset import load_dataset
+        from sliplens.recordings.splits import SPLITS_FILE, split_dataset
 
-        if (self.rules is None) == (self.preset is None):
+        rules = self.rules or self.preset
+        if rules is None or (self.rules and self.preset):
             raise InputError("give the file of rules with --rules, or a --preset, one of the two")
-        data = Dataset.open(self.data)
-        plan = self._plan(data)
-        result = assign_splits(plan, data.trials)
+        data = load_dataset(self.data)
+        result = split_dataset(data, rules, dry_run=self.dry_run)
         moved = [(info, to) for info, to in zip(data.trials, result.splits, strict=True) if info.split != to]
         _show_splits(data.trials, result.splits)
         _show_moves(moved)
@@ -56,18 +55,9 @@ class Split:
         if self.dry_run:
             say("nothing is written (--dry-run)")
             return
-        store_splits(data, plan, result)
         wrote(self.data, f"{len(moved)} of {len(data.trials)} trials moved; {SPLITS_FILE} keeps the rules")
         if moved:
             say("networks trained before saw other splits: a trial that tests now may have trained them, train anew")
-
-    def _plan(self, data: "Dataset") -> "SplitPlan":
-        from sliplens.recordings.splits import PRESETS, read_splits
-
-        if self.rules is not None:
-            return read_splits(self.rules)
-        assert self.preset is not None
-        return PRESETS[self.preset](data.trials)
 
 
 def _show_splits(trials: "Sequence[TrialInfo]", splits: Sequence[str]) -> None:

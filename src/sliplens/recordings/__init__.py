@@ -6,15 +6,18 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sliplens.recordings.check import check_dataset
     from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset
+    from sliplens.recordings.exporting import Export, export_lerobot, export_mcap
     from sliplens.recordings.importing import import_recordings, label_dataset
     from sliplens.recordings.labelling import Labelling
     from sliplens.recordings.options import LabelSettings, ReadOptions
+    from sliplens.recordings.splits import split_dataset
     from sliplens.recordings.trial import ContactState, GroundTruth, Labels, Recording, TrialFacts
 
 # where each name lives: asking for options alone, as the command line's help does, reads no file format
 _MODULES = {
     "ContactState": "trial",
     "Dataset": "dataset",
+    "Export": "exporting",
     "GroundTruth": "trial",
     "LabelSettings": "options",
     "Labelling": "labelling",
@@ -24,14 +27,18 @@ _MODULES = {
     "TrialFacts": "trial",
     "TrialInfo": "dataset",
     "check_dataset": "check",
+    "export_lerobot": "exporting",
+    "export_mcap": "exporting",
     "import_recordings": "importing",
     "label_dataset": "importing",
     "load_dataset": "dataset",
+    "split_dataset": "splits",
 }
 
 __all__ = [
     "ContactState",
     "Dataset",
+    "Export",
     "GroundTruth",
     "LabelSettings",
     "Labelling",
@@ -41,9 +48,12 @@ __all__ = [
     "TrialFacts",
     "TrialInfo",
     "check_dataset",
+    "export_lerobot",
+    "export_mcap",
     "import_recordings",
     "label_dataset",
     "load_dataset",
+    "split_dataset",
 ]
 
 

@@ -102,7 +102,7 @@ def import_recordings(
             name: _fingerprint(value) if isinstance(value, Path) else value for name, value in reading.given().items()
         },
         "labelling": labelling,
-        "splits": None if plan is None else [rule.as_table() for rule in plan.rules],
+        "splits": None if plan is None else plan.rules,
     }
     with output_folder(Path(out), stage="import", config=config, overwrite=overwrite) as output:
         if not output.complete:

@@ -6,7 +6,7 @@ import re
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from fnmatch import fnmatchcase
 from fractions import Fraction
 from glob import escape
@@ -15,9 +15,9 @@ from typing import Any
 
 from sliplens._version import __version__
 from sliplens.errors import InputError
-from sliplens.files import read_json, write_json
+from sliplens.files import write_json
 from sliplens.images.files import natural_key
-from sliplens.recordings.dataset import DATASET_FILE, Dataset
+from sliplens.recordings.dataset import Dataset, load_dataset, write_dataset_table
 from sliplens.recordings.trial import TrialFacts
 
 FACTS = ("trial", "day", "object", "condition", "sensor")
@@ -96,11 +96,6 @@ class SplitRule:
             f"{fact} {' or '.join(str(one) for one in getattr(self, fact))}" for fact in FACTS if getattr(self, fact)
         ]
         return ", ".join(asked) or "any trial"
-
-    def as_table(self) -> dict[str, Any]:
-        """Give the rule as its file would hold it, with what is left empty left out."""
-        unsaid = ("seed",) if self.name is not None else ()
-        return {key: one for key, one in asdict(self).items() if one not in ((), {}, None) and key not in unsaid}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -284,7 +279,7 @@ __all__ = [
     "SplitRule",
     "assign_splits",
     "read_splits",
-    "store_splits",
+    "split_dataset",
     "thesis_plan",
     "write_split_record",
 ]
@@ -376,16 +371,46 @@ def assign_splits(plan: SplitPlan, trials: Sequence[TrialFacts]) -> SplitResult:
     return SplitResult(splits=told, notes=(*notes, *_missing(told), *_shared(trials, told)))
 
 
-def store_splits(data: Dataset, plan: SplitPlan, result: SplitResult) -> None:
-    """Write splits into the table of a data set, and beside it the rules they come from."""
-    write_split_record(data.folder, plan, data.trials, result)
-    splits = dict(zip((info.trial for info in data.trials), result.splits, strict=True))
-    _recount(data, result.splits)
-    table = read_json(data.folder / DATASET_FILE)
-    for row in table["trials"]:
-        row["split"] = splits[row["trial"]]
-    # last: whoever sees the new splits finds the rules too
-    write_json(data.folder / DATASET_FILE, table)
+def split_dataset(data: Dataset | Path | str, rules: SplitPlan | Path | str, *, dry_run: bool = False) -> SplitResult:
+    """Deal the trials of a data set to splits, and keep the rules beside its table; nothing else of it changes.
+
+    Parameters
+    ----------
+    data
+        Data set, or its folder.
+    rules
+        Rules, their file (TOML), or the name of a preset (`PRESETS`).
+    dry_run
+        Say what would be done and write nothing.
+
+    Returns
+    -------
+    SplitResult
+        The split of every trial, in the order of the data set, and what is odd about it.
+
+    Raises
+    ------
+    InputError
+        If the data set or the rules cannot be read, or a trial fits no rule.
+    """
+    data = data if isinstance(data, Dataset) else load_dataset(data)
+    if isinstance(rules, SplitPlan):
+        plan = rules
+    else:
+        plan = PRESETS[str(rules)](data.trials) if rules in PRESETS else read_splits(Path(rules))
+    result = assign_splits(plan, data.trials)
+    if not dry_run:
+        write_split_record(data.folder, plan, data.trials, result)
+        trials = [replace(info, split=split) for info, split in zip(data.trials, result.splits, strict=True)]
+        # last: whoever sees the new splits finds the rules too
+        write_dataset_table(data.folder, trials, simulated=data.simulated)
+    return result
+
+
+def _as_table(rule: SplitRule) -> dict[str, Any]:
+    """Rule as its file would hold it, with what is left empty left out."""
+    unsaid = ("seed",) if rule.name is not None else ()
+    return {key: value for key, value in asdict(rule).items() if value not in ((), {}, None) and key not in unsaid}
 
 
 def write_split_record(folder: Path, plan: SplitPlan, trials: Sequence[TrialFacts], result: SplitResult) -> None:
@@ -393,24 +418,12 @@ def write_split_record(folder: Path, plan: SplitPlan, trials: Sequence[TrialFact
     splits = dict(zip((trial.trial for trial in trials), result.splits, strict=True))
     record = {
         "source": plan.source,
-        "rules": [rule.as_table() for rule in plan.rules],
+        "rules": [_as_table(rule) for rule in plan.rules],
         "splits": splits,
         "notes": result.notes,
         "sliplens": __version__,
     }
     write_json(folder / SPLITS_FILE, record)
-
-
-def _recount(data: Dataset, splits: Sequence[str]) -> None:
-    """Mend what `sliplens simulate` counted, which the report shows."""
-    path = data.folder / "result.json"
-    counted = read_json(path) if path.is_file() else {}
-    if "by_split" in counted:
-        frames: dict[str, list[int]] = {}
-        for info, split in zip(data.trials, splits, strict=True):
-            frames.setdefault(split, []).append(info.frames)
-        counted["by_split"] = {split: {"trials": len(of), "frames": sum(of)} for split, of in frames.items()}
-        write_json(path, counted)
 
 
 def _deal(rule: SplitRule, trials: Sequence[TrialFacts], *, where: str) -> tuple[dict[str, str], list[str]]:
