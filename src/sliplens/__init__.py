@@ -17,12 +17,14 @@ if TYPE_CHECKING:
     from sliplens.recordings.dataset import load_dataset
     from sliplens.recordings.exporting import export_lerobot, export_mcap
     from sliplens.recordings.importing import import_recordings, label_dataset
+    from sliplens.recordings.splits import split_dataset
     from sliplens.simulation.trials import simulate
     from sliplens.training.evaluate import evaluate
     from sliplens.training.fit import train
 
 # where each name lives: importing sliplens alone imports neither torch nor NumPy
 _MODULES = {
+    "SliplensError": "sliplens.errors",
     "check_dataset": "sliplens.recordings.check",
     "evaluate": "sliplens.training.evaluate",
     "explain": "sliplens.explainers.table",
@@ -36,7 +38,7 @@ _MODULES = {
     "predict": "sliplens.models.predictions",
     "score": "sliplens.faithfulness.scoring",
     "simulate": "sliplens.simulation.trials",
-    "SliplensError": "sliplens.errors",
+    "split_dataset": "sliplens.recordings.splits",
     "track": "sliplens.markers.tracking",
     "train": "sliplens.training.fit",
 }
@@ -57,6 +59,7 @@ __all__ = [
     "predict",
     "score",
     "simulate",
+    "split_dataset",
     "track",
     "train",
 ]
