@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from sliplens.recordings.importing import import_recordings, label_dataset
     from sliplens.recordings.splits import split_dataset
     from sliplens.simulation.trials import simulate
-    from sliplens.training.evaluate import evaluate
-    from sliplens.training.fit import train
+    from sliplens.training.evaluation import evaluate
+    from sliplens.training.fitting import train
 
 # where each name lives: importing sliplens alone imports neither torch nor NumPy
 _MODULES = {
     "SliplensError": "sliplens.errors",
     "check_dataset": "sliplens.recordings.check",
-    "evaluate": "sliplens.training.evaluate",
+    "evaluate": "sliplens.training.evaluation",
     "explain": "sliplens.explainers.table",
     "export_lerobot": "sliplens.recordings.exporting",
     "export_mcap": "sliplens.recordings.exporting",
@@ -40,7 +40,7 @@ _MODULES = {
     "simulate": "sliplens.simulation.trials",
     "split_dataset": "sliplens.recordings.splits",
     "track": "sliplens.markers.tracking",
-    "train": "sliplens.training.fit",
+    "train": "sliplens.training.fitting",
 }
 
 __all__ = [

@@ -245,7 +245,7 @@ def test_what_cannot_be_compared_is_refused_at_once(data: Dataset, network: Path
     assert "0 training trials are too few" in refused(capsys, *command, "all", "--baseline-trials", "0")
     assert "markers 'digit' are not known" in refused(capsys, *command, "all", "--markers", "digit")
     alone = Dataset(folder=data.folder, trials=data.select(split="test"))
-    monkeypatch.setattr("sliplens.training.evaluate.load_dataset", lambda _: alone)
+    monkeypatch.setattr("sliplens.training.evaluation.load_dataset", lambda _: alone)
     assert "has no training trials to fit baselines on" in refused(capsys, *command, "all")
     monkeypatch.undo()
     monkeypatch.setattr("sliplens.extras.find_spec", lambda _: None)

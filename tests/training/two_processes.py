@@ -50,7 +50,7 @@ def train(folder: Path, frames: tuple[FrameSet, FrameSet], config: TrainConfig, 
     """Fit the plain network."""
     folder.mkdir(exist_ok=True, parents=True)
     trainer = make_trainer(config, accelerator="cpu", devices=devices)
-    with patch("sliplens.training.fit.build_model", lambda *_, **__: Plain()):
+    with patch("sliplens.training.fitting.build_model", lambda *_, **__: Plain()):
         return fit(config, *frames, folder, frame_size=(48, 48), sensor="test", data_hash="none", trainer=trainer)
 
 

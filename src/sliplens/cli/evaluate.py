@@ -72,7 +72,8 @@ def _print_scores(evaluation: "Evaluation") -> None:
         say(f"  note: {known} of the {trials} trials trained or validated this network; its scores flatter it")
     print_table(
         f"{evaluation.input} images, {evaluation.split} trials",
-        ("condition", "frames", "MSE", "R2", "MAE", "in 90 % interval", "warns before slip", "false alarms/min"),
+        # so short that it fits into 80 columns
+        ("condition", "frames", "MSE", "R2", "MAE", "in 90 %", "warns\nbefore", "false\n/min"),
         [_row(name, evaluation) for name in evaluation.conditions],
     )
     if evaluation.wet_auroc is not None:
@@ -87,7 +88,7 @@ def _row(condition: str, evaluation: "Evaluation") -> tuple[str, ...]:
         f"{scores.frames:,}",
         *_errors(scores),
         "-" if held is None else f"{100 * held:.0f} %",
-        "-" if lead.median_ms is None else f"{lead.median_ms:.0f} ms ({lead.warned} of {lead.trials})",
+        "-" if lead.median_ms is None else f"{lead.median_ms:.0f} ms {lead.warned}/{lead.trials}",
         f"{lead.false_per_minute:.1f}",
     )
 

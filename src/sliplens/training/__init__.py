@@ -1,8 +1,8 @@
 """Train a network and measure how well it reads the safety margin."""
 
 from sliplens.training.config import RECIPES, TrainConfig, get_recipe
-from sliplens.training.evaluate import evaluate, evaluate_frames
-from sliplens.training.fit import fit, train
+from sliplens.training.evaluation import evaluate, evaluate_frames
+from sliplens.training.fitting import fit, train
 from sliplens.training.metrics import lead_times, regression_scores
 from sliplens.training.trainer import make_trainer
 

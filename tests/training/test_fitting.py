@@ -11,7 +11,7 @@ from sliplens.recordings import Dataset
 from sliplens.results.training import Training
 from sliplens.training import TrainConfig, evaluate_frames, fit
 from sliplens.training.data import EpochShuffle, FrameSet, load_frames
-from sliplens.training.fit import require_same_kind
+from sliplens.training.fitting import require_same_kind
 
 CONFIG = TrainConfig(image_size=32, epochs=3, batch_size=11, seed=3)
 
