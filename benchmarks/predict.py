@@ -124,7 +124,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     inputs = clouds(8, size=options.size, seed=3)
     engines, ready_s, missing = make_ready(options.engines, trained, inputs[:1])
     load = [os.getloadavg()[0]]
-    work = {name: partial(engine.estimate, trained, inputs[:1]) for name, engine in engines.items()}
+    work: dict[str, Callable[[], object]] = {
+        name: partial(engine.estimate, trained, inputs[:1]) for name, engine in engines.items()
+    }
     times = time_rounds(work, rounds=options.rounds)
     load.append(os.getloadavg()[0])
     encode_times = time_rounds(encoders(trained), rounds=options.rounds)

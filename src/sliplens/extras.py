@@ -94,7 +94,7 @@ class Table(Mapping[str, Row]):
 
 ONNX_PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 """What the extra `onnx` installs."""
-_NAMES = {"cv2": "OpenCV", "av": "PyAV"}
+_NAMES = {"cv2": "OpenCV", "rerun": "Rerun"}
 """Packages that people know by another name than Python does."""
 
 
@@ -110,7 +110,10 @@ def missing_packages(*names: str, extra: str) -> str | None:
     extra
         Extra of sliplens that installs them; several are divided by commas.
     """
-    missing = [_NAMES.get(name, name) for name in names if find_spec(name) is None]
+    # find_spec fails for what is known to be missing: None among the modules
+    missing = [
+        _NAMES.get(name, name) for name in names if sys.modules.get(name, ...) is None or find_spec(name) is None
+    ]
     if not missing:
         return None
     verb = "is" if len(missing) == 1 else "are"

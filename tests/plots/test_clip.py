@@ -1,4 +1,3 @@
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -267,12 +266,3 @@ def test_unwritable_place_is_told(trial, tmp_path):
 
     with pytest.raises(InputError, match=r"cannot write .* choose another file"):
         write_clip(trial, tmp_path / "file" / "trial.mp4")
-
-
-def test_missing_pyav_is_told_with_its_cure(trial, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "av", None)
-
-    with pytest.raises(InputError, match="needs PyAV, which is not installed; install it with `pip install av`"):
-        write_clip(trial, tmp_path / "trial.mp4")
-
-    assert not list(tmp_path.iterdir())

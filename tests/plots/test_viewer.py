@@ -347,14 +347,14 @@ def test_without_rerun_its_installation_is_told(
     monkeypatch: pytest.MonkeyPatch, small_dataset: Dataset, tmp_path: Path
 ):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    wanted = r'the Rerun viewer is not installed; install it with pip install "sliplens\[view\]"'
+    wanted = r'the viewer needs Rerun, which is not installed; install with `pip install "sliplens\[view\]"'
     with pytest.raises(InputError, match=wanted):
         write_rrd(small_dataset, small_dataset.trials[0], tmp_path / "a.rrd")
 
 
 def test_rerun_that_is_too_old_is_told(monkeypatch: pytest.MonkeyPatch, small_dataset: Dataset, tmp_path: Path):
     monkeypatch.delattr(rerun, "StateChange")
-    with pytest.raises(InputError, match=r"too old .*; upgrade it with pip install"):
+    with pytest.raises(InputError, match=r"too old .*; upgrade it with `pip install"):
         write_rrd(small_dataset, small_dataset.trials[0], tmp_path / "a.rrd")
 
 

@@ -80,7 +80,7 @@ def write_clip(
     Raises
     ------
     InputError
-        If the suffix is another one, PyAV is missing, the rate lies outside 1 to 120, or the file cannot be written.
+        If the suffix is another one, the rate lies outside 1 to 120, or the file cannot be written.
     """
     require_clip_path(path)
     rate = natural_rate(recording.time_s) if frames_per_s is None else frames_per_s
@@ -352,10 +352,8 @@ def _open_clip(path: Path, *, frames_per_s: float) -> Iterator[Callable[[tuple[i
     require_clip_path(path)
     if not 1 <= frames_per_s <= 120:
         raise InputError(f"{frames_per_s:g} frames a second cannot be watched; ask for {_SLOWEST} to {_FASTEST}")
-    try:
-        import av  # noqa: PLC0415 (it brings all of FFmpeg, and only clips need it)
-    except ImportError:
-        raise InputError("a clip needs PyAV, which is not installed; install it with `pip install av`") from None
+    import av  # noqa: PLC0415 (it brings all of FFmpeg, and only clips need it)
+
     with (
         written_whole(path) as part,
         # the index comes first, so that a browser plays before it has all

@@ -23,6 +23,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from matplotlib.colors import to_rgba
 
 from sliplens.errors import InputError
+from sliplens.extras import require_packages
 from sliplens.images import absolute_difference
 from sliplens.images.files import encode_png
 from sliplens.plots.audit import Fact, audit_facts
@@ -76,13 +77,14 @@ def require_rerun() -> ModuleType:
     InputError
         If it is not installed, or too old to show states over time.
     """
-    cure = 'install it with pip install "sliplens[view]"'
-    try:
-        import rerun  # noqa: PLC0415 (an extra, and large)
-    except ImportError:
-        raise InputError(f"the Rerun viewer is not installed; {cure}") from None
+    require_packages("rerun", extra="view", purpose="the viewer")
+    import rerun  # noqa: PLC0415 (an extra, and large)
+
     if not hasattr(rerun, "StateChange"):
-        raise InputError(f"the Rerun viewer is too old ({rerun.__version__}); {cure.replace('install', 'upgrade', 1)}")
+        raise InputError(
+            f"Rerun is too old for the viewer ({rerun.__version__}); upgrade it with "
+            '`pip install --upgrade "sliplens[view]"`'
+        )
     return rerun
 
 

@@ -4,13 +4,13 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 
 from sliplens.errors import InputError
+from sliplens.extras import missing_packages
 
 PROJECT = "sliplens"
 """Of the runs in Weights & Biases, and experiment of those in MLflow."""
@@ -76,12 +76,8 @@ def open_logger(name: str, folder: Path, *, run_name: str, recipe: Mapping[str, 
     if name not in LOGGERS:
         raise InputError(f"there is no logger named {name!r}; choose one of csv, {', '.join(LOGGERS)}")
     packages, make = LOGGERS[name]
-    missing = [package for package in packages if find_spec(package) is None]
-    if missing:
-        raise InputError(
-            f'--logger {name} needs {name}, which is not installed; install with `pip install "sliplens[tracking]"`, '
-            "or leave --logger away, for metrics.csv is always written"
-        )
+    if missing := missing_packages(*packages, extra="tracking"):
+        raise InputError(f"--logger {name} needs {missing}, or leave --logger away, for metrics.csv is always written")
     try:
         logger = make(folder, run_name)
         logger.log_hyperparams(dict(recipe))

@@ -450,7 +450,7 @@ def test_memory_does_not_grow_with_the_length_of_the_bag(tmp_path, rng):
 
 def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch, frames_of):
     path = write_bag(tmp_path / "trial", frames_of())
-    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(InputError, match=r'pip install "sliplens\[ros\]"'):
         read_rosbag(path)
 

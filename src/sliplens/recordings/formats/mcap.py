@@ -12,6 +12,7 @@ from jaxtyping import Float, Int64, UInt8
 
 from sliplens._version import __version__
 from sliplens.errors import InputError, RecordingError
+from sliplens.extras import require_packages
 from sliplens.files import require_folder
 from sliplens.images.files import encode_png
 from sliplens.progress import OnProgress
@@ -132,15 +133,10 @@ class _Bag:
     """An MCAP file that takes messages by topic and field; it appears when complete."""
 
     def __init__(self, path: Path) -> None:
-        try:
-            from mcap.writer import Writer  # noqa: PLC0415 (an extra)
+        require_packages("mcap", "rosbags", extra="ros", purpose="an MCAP file")
+        from mcap.writer import Writer  # noqa: PLC0415 (an extra)
 
-            self.types = trial_types()
-        except ImportError:
-            raise InputError(
-                "an MCAP file needs mcap and rosbags, which are not installed; install them with "
-                '`pip install "sliplens[ros]"`'
-            ) from None
+        self.types = trial_types()
         self.path, self.part = path, path.with_name(path.name + ".part")
         self.stream = self.part.open("wb")
         # chunks under Zstandard, with indexes and checksums

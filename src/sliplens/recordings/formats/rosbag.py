@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt8
 from PIL import Image
 
-from sliplens.errors import InputError, RecordingError, SliplensError
+from sliplens.errors import RecordingError, SliplensError
+from sliplens.extras import require_packages
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.formats.mcap import (
     IMAGE,
@@ -257,12 +258,7 @@ def bag_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, int
 @contextmanager
 def open_bag(path: Path) -> Iterator["Reader"]:
     """Open a bag to read it, as `bag_topics` and `bag_messages` do; they tell of its errors."""
-    try:
-        import rosbags.rosbag2  # noqa: F401, PLC0415 (an extra)
-    except ImportError:
-        raise InputError(
-            'a ROS 2 bag needs rosbags, which is not installed; install it with `pip install "sliplens[ros]"`'
-        ) from None
+    require_packages("rosbags", extra="ros", purpose="a ROS 2 bag")
     _require_bag(path)
     for file in path.glob("*.db3") if path.is_dir() else [path]:
         _require_whole_pages(file)
