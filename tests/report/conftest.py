@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from made_up import write_workspace
 
-from sliplens.report import Written, build_report
+from sliplens.report import Written, write_report
 
 from .study_results import Made, write_study
 
@@ -30,7 +30,7 @@ def pristine_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def study_report(pristine_study: Path, tmp_path_factory: pytest.TempPathFactory) -> Written:
     """The report of a whole study, drawn once: it takes a while."""
-    return build_report(pristine_study, tmp_path_factory.mktemp("report") / "report.html")
+    return write_report(pristine_study, tmp_path_factory.mktemp("report") / "report.html")
 
 
 @pytest.fixture(scope="session")

@@ -8,8 +8,9 @@ from made_up import write_run
 
 from sliplens.intervals import Difference
 from sliplens.report import load_results
-from sliplens.report.believing import _tell_lead, compare_gain, judge_study, rank_methods, share_of_strongest
 from sliplens.report.claims import all_of, judge_claims, judge_gap, most_of
+from sliplens.report.comparisons import compare_gain, share_of_strongest
+from sliplens.report.verdict import _tell_lead, judge, rank_methods
 
 from .study_results import (
     GAINS,
@@ -224,7 +225,7 @@ def test_a_gap_over_too_few_trials_decides_nothing():
 def test_the_method_to_believe_is_the_one_that_beats_the_controls(judged, tmp_path, rng):
     judged(Made(gains=GAINS | {"integrated-gradients": 0.4}))
 
-    statements = {one.topic: one for one in judge_study(load_results(tmp_path), rng=rng)}
+    statements = {one.topic: one for one in judge(load_results(tmp_path), rng=rng)}
 
     found = statements["Which to believe, difference images"]
     assert found.tone == "good"
@@ -256,7 +257,7 @@ def test_where_the_next_method_gains_more_it_is_told_with_both_means(judged, tmp
 def test_no_method_is_believed_where_a_control_wins(judged, tmp_path, rng):
     judged(Made(gains=GAINS | {"edges": 0.5}))
 
-    found = judge_study(load_results(tmp_path), rng=rng)[0]
+    found = judge(load_results(tmp_path), rng=rng)[0]
 
     assert found.tone == "caution"
     assert found.text.startswith("None: no method beats both chance and the best control under most fills.")
@@ -277,7 +278,7 @@ def test_a_fill_that_cannot_tell_the_truth_has_no_vote(judged, tmp_path, rng):
 def test_too_few_trials_believe_nothing(judged, tmp_path, rng):
     judged(Made(trials=3))
 
-    found = judge_study(load_results(tmp_path), rng=rng)[0]
+    found = judge(load_results(tmp_path), rng=rng)[0]
 
     assert found.text == "Not known: 3 trials are too few to tell a method from chance; 5 or more are needed."
 
@@ -296,6 +297,6 @@ def test_without_scores_nothing_is_believed(tmp_path, rng):
     origin = {"input": "raw", "source": "simulated"}
     write_run(tmp_path / "map-quality-raw", "map-quality", {}, {**origin, "frames": 1, "methods": {}})
 
-    statements = judge_study(load_results(tmp_path), rng=rng)
+    statements = judge(load_results(tmp_path), rng=rng)
 
     assert [one.text.split(":")[0] for one in statements] == ["Not known", "Not known"]

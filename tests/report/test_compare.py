@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sliplens.intervals import bootstrap_difference
-from sliplens.report.tables import agreement, compare_deletion, compare_errors
+from sliplens.report.comparisons import agreement, compare_deletion, compare_errors
 from sliplens.results.evaluation import Predictions
 from sliplens.results.faithfulness import DeletionCurve
 

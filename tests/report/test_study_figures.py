@@ -11,7 +11,7 @@ from sliplens.errors import InputError
 from sliplens.faithfulness.deletion import deletion_order
 from sliplens.plots.style import ORANGE, SKY
 from sliplens.report import load_results
-from sliplens.report.method_tables import table_scores
+from sliplens.report.pictures import plate_removal
 from sliplens.report.plates import (
     Cell,
     Plate,
@@ -24,8 +24,8 @@ from sliplens.report.plates import (
     told_frame,
     write_plates,
 )
-from sliplens.report.removal_figures import plate_removal
 from sliplens.report.state_figures import paint_effects
+from sliplens.report.tables import table_scores
 
 from .study_results import METHODS, Made, write_choice, write_faithfulness
 
@@ -155,7 +155,7 @@ def test_same_plate_makes_the_same_files(tmp_path):
     files = [write_plates([make_plate()], tmp_path / name)[0].read_bytes() for name in "ab"]
 
     assert files[0] == files[1]
-    assert show_plate(make_plate()).pictures == show_plate(make_plate()).pictures
+    assert show_plate(make_plate()).picture == show_plate(make_plate()).picture
 
 
 def test_figures_of_the_thesis_are_named_as_such():

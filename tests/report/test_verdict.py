@@ -6,7 +6,34 @@ import pyarrow.parquet as pq
 import pytest
 
 from sliplens.report import load_results
-from sliplens.report.verdict import judge
+from sliplens.report.verdict import count_alarms, group_alarms, judge
+
+
+def test_what_carries_comes_before_what_warns(verdict):
+    tones = [one.tone == "caution" for one in verdict().values()]
+
+    assert tones == sorted(tones)
+    assert list(verdict())[:2] == ["Accuracy, raw images", "Accuracy, difference images"]
+
+
+def test_alarms_of_one_kind_are_one_line_with_a_count():
+    alarms = ["grad-cam does not beat a random order: its symmetric gain is -0.1", "the network is asleep"]
+    alarms += ["under grey: occlusion does not beat a random order: its symmetric gain is -0.2", alarms[0]]
+
+    groups = group_alarms(alarms)
+
+    assert [(group.kind, len(group.sentences)) for group in groups] == [
+        ("Methods that do not beat a random order", 2),
+        ("The network is asleep.", 1),
+    ]
+    assert groups[0].sentences[0] == "Grad-CAM does not beat a random order: its symmetric gain is -0.1."
+
+
+def test_alarms_are_counted_by_network(workspace):
+    assert count_alarms(load_results(workspace)) == (
+        "Frames in which the fill decides, rather than the map: 1 (raw images 1)",
+        "Integrated Gradients, real touch: completeness gap 1.8 % on 2 frames: 1 (raw images 1)",
+    )
 
 
 @pytest.fixture
@@ -29,7 +56,7 @@ def replace(path, column, values):
 def test_accuracy_is_told_with_the_numbers(workspace, verdict):
     scores = load_results(workspace).evaluations["difference"].conditions
 
-    text = verdict()["Accuracy on test trials"].text
+    text = verdict()["Accuracy, difference images"].text
 
     assert f"R² {scores['dry'].r2:.2f} on dry and {scores['wet'].r2:.2f} on wet objects" in text
     assert f"{100 * scores['dry'].mae:.1f} and {100 * scores['wet'].mae:.1f} percentage points" in text
@@ -38,7 +65,7 @@ def test_accuracy_is_told_with_the_numbers(workspace, verdict):
 def test_a_network_that_reads_nothing_is_called_so(workspace, verdict):
     edit(workspace / "test-raw" / "result.json", lambda value: value["conditions"]["wet"].update(r2=-0.1))
 
-    found = verdict()["Accuracy on test trials"]
+    found = verdict()["Accuracy, raw images"]
 
     assert found.tone == "caution"
     assert "On wet objects that is no better than always answering the mean label." in found.text

@@ -13,7 +13,7 @@ from sliplens.cli.console import wrote
 class Report:
     """Draw one self-contained page from what the other commands wrote into a folder.
 
-    The figures of a study are written beside it too, in the folder figures: each as PDF, its numbers as CSV.
+    The figures are written beside it too, in the folder figures: each as PDF, its numbers as CSV.
     """
 
     workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="WORKSPACE")]
@@ -23,9 +23,9 @@ class Report:
 
     def run(self) -> None:
         """Draw and write the page."""
-        from sliplens.report import build_report
+        from sliplens.report import write_report
 
-        written = build_report(self.workspace, self.output or self.workspace / "report.html")
+        written = write_report(self.workspace, self.output)
         if written.figures:
             wrote(written.figures[0].parent, f"{len(written.figures) // 2} figures as PDF, their numbers as CSV")
         wrote(written.page, "open it in a browser")

@@ -2,20 +2,17 @@
 
 import base64
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
-import numpy as np
-from jaxtyping import UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
 from sliplens.errors import InputError
-from sliplens.images.files import encode_png
 from sliplens.plots.style import drawing_style
 
 # no dates: the same trials, the same file
@@ -96,40 +93,6 @@ class Picture:
     height: int
 
 
-@dataclass(frozen=True, kw_only=True)
-class Chart:
-    """Pictures that share one caption; `columns` of them stand side by side where the page is wide.
-
-    Attributes
-    ----------
-    files
-        Where the same is written too, as a reader finds it beside the page.
-    """
-
-    layout: ClassVar[str] = "chart"
-
-    pictures: tuple[Picture, ...]
-    caption: str
-    columns: int = 2
-    files: str = ""
-
-
-def draw_picture(plot: Callable[[Axes], object], *, alt: str, size_in: tuple[float, float] = (4.2, 3.1)) -> Picture:
-    """Draw one axes as SVG, in the style of the report and without touching matplotlib's settings.
-
-    Parameters
-    ----------
-    plot
-        Draws on the axes it is given.
-    alt
-        What the picture shows, in words.
-    """
-    with drawing_style():
-        figure = Figure(figsize=size_in, layout="constrained")
-        plot(figure.subplots())
-    return figure_picture(figure, alt=alt)
-
-
 def figure_picture(figure: Figure, *, alt: str, pixels: bool = False) -> Picture:
     """Hold a figure.
 
@@ -164,16 +127,6 @@ def _fewer_colours(png: io.BytesIO) -> io.BytesIO:
     reduced.putpalette([_WHITE if level > _NEARLY_WHITE else level for level in reduced.getpalette() or []])
     reduced.save(smaller, "png", optimize=True)
     return smaller
-
-
-def png_picture(pixels: UInt8[np.ndarray, "height width 3"], *, alt: str) -> Picture:
-    """Hold an image losslessly, at its own size."""
-    return Picture(
-        uri=_data_uri("png", encode_png(pixels, compress_level=9)),
-        alt=alt,
-        width=pixels.shape[1],
-        height=pixels.shape[0],
-    )
 
 
 def _data_uri(kind: str, data: bytes) -> str:

@@ -1,8 +1,6 @@
-"""Panels of saliency: the network's input above what each method made of it, from full stick to full slip."""
+"""Saliency over what the network saw, and the frames to show it on."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -11,9 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sliplens.arrays import require_saliency
-from sliplens.plots.layout import Picture, png_picture
-from sliplens.plots.style import in_order, input_name, method_name, methods_in_order, percent, source_name
-from sliplens.results.explanation import Explained, ExplainedFrame
+from sliplens.plots.style import in_order
+from sliplens.results.explanation import ExplainedFrame
 
 # perceptually uniform, rises in lightness, and read alike under every common colour blindness
 COLORMAP = "inferno"
@@ -137,62 +134,6 @@ NOMINAL_MARGINS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 _TOLERANCE = 0.1  # half the distance between two columns
 
 
-@dataclass(frozen=True, kw_only=True)
-class PanelColumn:
-    """Head of a column: what it stands for, the frame's label and the network's answer."""
-
-    head: str
-    label: str
-    prediction: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class PanelRow:
-    """A row of pictures, one a column; None where no frame has that margin."""
-
-    name: str
-    cells: tuple[Picture | None, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Panel:
-    """A table of pictures with its caption."""
-
-    layout: ClassVar[str] = "panel"
-
-    columns: tuple[PanelColumn, ...]
-    rows: tuple[PanelRow, ...]
-    caption: str
-
-
-def build_panel(explained: Explained) -> Panel:
-    """Lay out frames by safety margin (thesis, Figs. 8, 11 and 12).
-
-    Where there are few frames, all of them; otherwise those nearest to 100, 80, 60, 40, 20 and 0 %, of the condition
-    with the most frames; without labels, the first ones.
-    """
-    condition, chosen = choose_frames(explained.frames)
-    columns = tuple(_column(nominal, explained.frames, index) for nominal, index in chosen)
-    rows = [PanelRow(name="Input", cells=tuple(_input_picture(explained, index) for _, index in chosen))]
-    rows += [
-        PanelRow(
-            name=method_name(method), cells=tuple(_overlay_picture(explained, method, index) for _, index in chosen)
-        )
-        for method in methods_in_order(explained.methods)
-    ]
-    absent = [percent(nominal) for nominal, index in chosen if index is None and nominal is not None]
-    gap = f" No frame within 10 percentage points of {', '.join(absent)}." if absent else ""
-    ids = ", ".join(explained.frames[index].id for _, index in chosen if index is not None)
-    return Panel(
-        columns=columns,
-        rows=tuple(rows),
-        caption=f"{input_name(explained.input)}, {source_name(explained.source)}, {condition}: what the network saw, "
-        "and what each method holds to speak for the answer, rather than for that of the untouched sensor. Colours are "
-        f"relative to each picture's own saliency, so brightness does not compare between pictures.{gap}"
-        f"{_tell_blank(explained, chosen)} Frames: {ids}.",
-    )
-
-
 def choose_frames(frames: tuple[ExplainedFrame, ...]) -> tuple[str, list[tuple[float | None, int | None]]]:
     """Pick the condition, and a frame's index for each nominal margin (None where none is near).
 
@@ -212,41 +153,3 @@ def choose_frames(frames: tuple[ExplainedFrame, ...]) -> tuple[str, list[tuple[f
         near = abs(labels[nearest] - nominal) < _TOLERANCE
         chosen.append((nominal, nearest if near else None))
     return condition, chosen
-
-
-def _column(nominal: float | None, frames: tuple[ExplainedFrame, ...], index: int | None) -> PanelColumn:
-    frame = None if index is None else frames[index]
-    head = "Γ not known" if nominal is None else f"Γ {percent(nominal)}"
-    told = frame is not None and head == f"Γ {percent(frame.safety_margin)}"
-    return PanelColumn(
-        head=head,
-        # a label that the head gives already is not given twice
-        label="no frame" if frame is None else "" if told else f"true {percent(frame.safety_margin)}",
-        prediction="" if frame is None else f"read {percent(frame.prediction)}",
-    )
-
-
-def _input_picture(explained: Explained, index: int | None) -> Picture | None:
-    if index is None:
-        return None
-    return png_picture(explained.pictures[index], alt=f"Input of the network, frame {_told(explained.frames[index])}")
-
-
-def _overlay_picture(explained: Explained, method: str, index: int | None) -> Picture | None:
-    if index is None:
-        return None
-    pixels = overlay_saliency(explained.pictures[index], stretch_saliency(explained.saliency[method][index]))
-    return png_picture(pixels, alt=f"{method_name(method)} over frame {_told(explained.frames[index])}")
-
-
-def _tell_blank(explained: Explained, chosen: list[tuple[float | None, int | None]]) -> str:
-    rows = [index for _, index in chosen if index is not None]
-    blank = sum(not explained.saliency[method][index].any() for method in explained.methods for index in rows)
-    if not blank:
-        return ""
-    pictures = "1 picture has" if blank == 1 else f"{blank} pictures have"
-    return f" {pictures} no colour: there the method finds nothing that speaks for the answer."
-
-
-def _told(frame: ExplainedFrame) -> str:
-    return f"{frame.id}, true Γ {percent(frame.safety_margin)}, read {percent(frame.prediction)}"

@@ -1,7 +1,7 @@
-"""The report of a workspace: figures, tables and one page, from saved results only."""
+"""The report of a workspace or a study: figures, tables and one page, from saved results only."""
 
-from sliplens.report.page import Written, build_report
+from sliplens.report.page import Written, write_report
 from sliplens.report.results import load_results
 from sliplens.report.workspace import Results
 
-__all__ = ["Results", "Written", "build_report", "load_results"]
+__all__ = ["Results", "Written", "load_results", "write_report"]

@@ -22,7 +22,7 @@ from sliplens.plots.style import (
     method_name,
     percent,
 )
-from sliplens.report.believing import (
+from sliplens.report.comparisons import (
     best_control,
     compare_gain,
     compare_mean_gain,

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sliplens.plots.contact_sheet import TIMES, brighten, brightening
-from sliplens.plots.layout import Chart, figure_picture, place_axes, place_text, save_page, written_whole
+from sliplens.plots.layout import Picture, figure_picture, place_axes, place_text, save_page, written_whole
 from sliplens.plots.saliency import choose_frames, overlay_saliency, plot_colour_bar, stretch_saliency
 from sliplens.plots.style import GREY, drawing_style
 from sliplens.report.workspace import Results
@@ -159,15 +159,30 @@ class Plate:
     pixels: bool = False
 
 
-def show_plate(plate: Plate) -> Chart:
+def columns(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> dict[str, list]:
+    """Turn rows into named columns."""
+    return {name: [row[place] for row in rows] for place, name in enumerate(names)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShownPlate:
+    """A plate as the page holds it, and where its files are found."""
+
+    layout: ClassVar[str] = "plate"
+
+    picture: Picture
+    caption: str
+    files: str
+
+
+def show_plate(plate: Plate) -> ShownPlate:
     """Hold a plate for the page."""
     picture = figure_picture(plate.figure, alt=plate.alt, pixels=plate.pixels)
     # what was laid out stays: doing so again for the PDF takes longer than drawing
     plate.figure.set_layout_engine("none")
-    return Chart(
-        pictures=(picture,),
+    return ShownPlate(
+        picture=picture,
         caption=plate.caption,
-        columns=1,
         files=f"{_tell_thesis(plate.name)} {FOLDER}/{plate.name}.pdf, numbers in {plate.name}.csv.",
     )
 
@@ -209,9 +224,9 @@ THESIS_LEVEL = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class ShownFrame:
-    """A frame of a panel: the margin it stands for, and its place among the explained frames."""
+    """Frame of a plate: the margin it stands for (None if unknown), and its place among the explained frames."""
 
-    level: float
+    level: float | None
     index: int
 
 
@@ -227,10 +242,10 @@ def shown_frames(results: Results, explained: Explained) -> list[ShownFrame]:
     rows = [frame for frame in choice.frames if frame.shown and frame.id in places] if choice else []
     if rows:
         first = rows[0].trial
-        found = [ShownFrame(level=row.level, index=places[row.id]) for row in rows if row.trial == first]
-        return sorted(found, key=lambda one: -one.level)
+        ranked = sorted((row for row in rows if row.trial == first), key=lambda row: -row.level)
+        return [ShownFrame(level=row.level, index=places[row.id]) for row in ranked]
     _, chosen = choose_frames(explained.frames)
-    return [ShownFrame(level=level, index=index) for level, index in chosen if level is not None and index is not None]
+    return [ShownFrame(level=level, index=index) for level, index in chosen if index is not None]
 
 
 def bright_pictures(

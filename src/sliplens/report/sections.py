@@ -1,208 +1,68 @@
-"""Sections of the page: what each holds, and what is still missing of it."""
+"""Sections of the page: one list, from which those are taken whose results are there."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import numpy as np
-from matplotlib.axes import Axes
 
-from sliplens.plots.errors import (
-    plot_bins,
-    plot_faithfulness,
-    plot_learning_curves,
-    plot_margin_over_time,
-    plot_predictions,
+from sliplens.plots.style import input_name, inputs_in_order
+from sliplens.report.charts import (
+    plate_bins,
+    plate_each_frame,
+    plate_faithfulness,
+    plate_learning,
+    plate_over_time,
+    plate_predictions,
+    plate_randomisation,
+    plate_removal_curves,
 )
-from sliplens.plots.layout import Chart, draw_picture
-from sliplens.plots.saliency import Panel, build_panel
-from sliplens.plots.style import (
-    INPUT_COLOURS,
-    PURPLE,
-    conditions_in_order,
-    decimals,
-    in_order,
-    input_name,
-    inputs_in_order,
-    method_name,
-    methods_in_order,
-    percent,
-    source_name,
+from sliplens.report.claims import Claim, judge_claims
+from sliplens.report.pictures import (
+    plate_deletion,
+    plate_highlighted,
+    plate_methods,
+    plate_poly_cam,
+    plate_removal,
+    plate_states,
+    shown_methods,
 )
-from sliplens.report.blocks import Notes
-from sliplens.report.claims import Claim
+from sliplens.report.plates import Plate, explained_of
+from sliplens.report.state_figures import plate_contact_states, plate_fields_beside_saliency, plate_truth
 from sliplens.report.tables import (
     Table,
     table_accuracy,
+    table_agreement,
     table_deletion,
+    table_equal_areas,
+    table_localisation,
+    table_looks,
+    table_meta,
+    table_randomisation,
     table_real,
-    table_timing,
+    table_remedies,
+    table_scores,
+    table_seconds,
+    table_times,
     table_training,
+    table_trials,
 )
+from sliplens.report.verdict import AlarmGroup, alarms_of, group_alarms
 from sliplens.report.workspace import Results
-from sliplens.results.evaluation import Predictions
-from sliplens.results.faithfulness import DeletionScores
 
 
-def chart_bins(results: Results) -> Chart:
-    """Chart the MSE in bins of the safety margin, one picture a condition."""
-    evaluations = results.evaluations
-    scores = {
-        condition: {
-            name: evaluations[name].conditions[condition].bins
-            for name in inputs_in_order(evaluations)
-            if condition in evaluations[name].conditions
-        }
-        for condition in _conditions(results)
-    }
-    every = [row for bins in scores.values() for rows in bins.values() for row in rows if row.mse is not None]
-    top = 1.15 * max((row.mse or 0.0 for row in every), default=1.0)
-    pictures = []
-    for condition, bins in scores.items():
+@dataclass(frozen=True, kw_only=True)
+class Notes:
+    """Sentences under a head of their own: what to be wary of, or what was done; alarms of a kind are one."""
 
-        def plot(ax: Axes, condition: str = condition, bins: dict = bins) -> None:
-            # one scale for all conditions, or the eye compares bars that do not compare
-            plot_bins(bins, ax=ax).set(title=_title(condition.capitalize()), ylim=(0, top))
+    layout: ClassVar[str] = "notes"
 
-        pictures.append(draw_picture(plot, alt=f"Bars of the MSE in bins of Γ, {condition}; worst bin: {_worst(bins)}"))
-    worst = "; ".join(f"{condition}: {_worst(bins)}" for condition, bins in scores.items())
-    return Chart(
-        pictures=tuple(pictures),
-        caption=f"Mean squared error by bins of the true safety margin. Largest error, {worst}. "
-        "A bin without bars holds no test frame.",
-    )
+    title: str
+    groups: tuple[AlarmGroup, ...]
+    tone: Literal["plain", "caution"] = "plain"
 
 
-def chart_predictions(results: Results) -> Chart:
-    """Chart the answer against the label, one picture an input and condition."""
-    answers = np.concatenate([one.predictions.prediction for one in results.evaluations.values()])
-    # one scale for all, so that the scatter compares
-    low, high = min(0.0, 100 * float(answers.min())), max(100.0, 100 * float(answers.max()))
-    pictures = []
-    for condition in _conditions(results):
-        for name in inputs_in_order(results.evaluations):
-            evaluation = results.evaluations[name]
-            rows = evaluation.predictions.condition == condition
-            if not rows.any() or condition not in evaluation.conditions:
-                continue
-            title = f"{input_name(name)}, {_title(condition)} (R² {decimals(evaluation.conditions[condition].r2, 2)})"
-            shown, colour = evaluation.predictions.where(rows), INPUT_COLOURS.get(name, PURPLE)
-
-            def plot(ax: Axes, shown: Predictions = shown, colour: str = colour, title: str = title) -> None:
-                plot_predictions(shown, colour=colour, ax=ax).set(title=title, ylim=(low - 5, high + 5))
-
-            pictures.append(draw_picture(plot, alt=f"Predicted against true Γ: {title}, {rows.sum()} frames"))
-    frames = sum(len(one.predictions.trial) for one in results.evaluations.values())
-    return Chart(
-        pictures=tuple(pictures),
-        caption=f"Predicted against true safety margin, {frames} answers on frames of test trials. "
-        "A perfect network would put every dot on the dashed line.",
-    )
-
-
-def chart_over_time(results: Results) -> Chart:
-    """Chart label and answers through one typical test trial of each condition."""
-    pictures, chosen = [], []
-    for condition in _conditions(results):
-        trial = _typical_trial(results, condition)
-        if trial is None:
-            continue
-        shown = {}
-        for name, evaluation in results.evaluations.items():
-            rows = (evaluation.predictions.trial == trial) & (evaluation.predictions.condition == condition)
-            if rows.any():
-                shown[name] = evaluation.predictions.where(rows)
-
-        def plot(ax: Axes, shown: dict = shown, condition: str = condition) -> None:
-            plot_margin_over_time(shown, ax=ax).set_title(_title(condition.capitalize()))
-
-        pictures.append(
-            draw_picture(plot, alt=f"True and predicted Γ over time through test trial {trial}, {condition}")
-        )
-        chosen.append(f"{trial} ({condition})")
-    return Chart(
-        pictures=tuple(pictures),
-        caption="Safety margin through one test trial of each condition: the trial whose mean error is the median of "
-        f"all, neither the best nor the worst. Shown: {', '.join(chosen)}.",
-    )
-
-
-def chart_learning(results: Results) -> Chart:
-    """Chart the learning curves of all inputs in one picture."""
-    told = [
-        f"{input_name(name)}: best validation MSE {decimals(one.best_validation_mse, 4)} "
-        f"after {decimals(one.epochs, 1)} epochs (stopped by {one.stopped_by})"
-        for name in inputs_in_order(results.trainings)
-        for one in [results.trainings[name]]
-    ]
-    picture = draw_picture(
-        lambda ax: plot_learning_curves(results.trainings, ax=ax),
-        alt="Training and validation error by epoch. " + "; ".join(told),
-        size_in=(5.6, 3.2),
-    )
-    return Chart(pictures=(picture,), caption=f"Learning curves. {'; '.join(told)}.", columns=1)
-
-
-def chart_faithfulness(results: Results, scores: dict[str, DeletionScores]) -> Chart:
-    """Chart the deletion curves, one picture an input."""
-    pictures, frames = [], set()
-    for name in inputs_in_order(scores):
-        scored = scores[name]
-        explained = results.explanations.get((name, scored.source))
-        pixels = max(int(curve.pixels_removed.max()) for curve in scored.curves.values())
-        if explained is not None:
-            pixels = max(pixels, explained.image_size**2)
-        frames |= {len(curve.frame_ids) for curve in scored.curves.values()}
-        drawn = ", ".join(
-            f"{method_name(method)} mean {decimals(float(scored.curves[method].scores.mean()), 2)}"
-            for method in methods_in_order(scored.curves)
-        )
-
-        def plot(ax: Axes, scored: DeletionScores = scored, pixels: int = pixels, name: str = name) -> None:
-            plot_faithfulness(scored.curves, pixels=pixels, ax=ax).set_title(input_name(name))
-
-        pictures.append(draw_picture(plot, alt=f"Deletion curves of {input_name(name)}: {drawn}", size_in=(4.2, 3.4)))
-    sources = " and ".join(sorted({source_name(scored.source) for scored in scores.values()}))
-    fills = sorted({scored.fill for scored in scores.values()})
-    return Chart(
-        pictures=tuple(pictures),
-        caption=f"Deletion score D on {sources} while pixels become {' or '.join(fills)}, most salient first: mean of "
-        f"{' or '.join(str(count) for count in sorted(frames))} frames, the band holds the middle half of them. A "
-        "curve that falls early names pixels the network relies on; one above the dotted curve does worse than chance.",
-    )
-
-
-def _conditions(results: Results) -> list[str]:
-    return conditions_in_order(name for one in results.evaluations.values() for name in one.conditions)
-
-
-def _title(condition: str) -> str:
-    # matplotlib would read what stands between dollar signs as mathematics
-    return condition.replace("$", r"\$")
-
-
-def _worst(bins: dict) -> str:
-    rows = [(row.mse, row, name) for name, scores in bins.items() for row in scores if row.mse is not None]
-    if not rows:
-        return "no frame"
-    mse, row, name = max(rows, key=lambda one: one[0])
-    return f"{input_name(name).lower()} at {100 * row.low:.0f} to {percent(row.high)} (MSE {mse:.3f})"
-
-
-def _typical_trial(results: Results, condition: str) -> str | None:
-    # judged by the last input (difference where it was run), so that the choice favours neither curve by eye
-    name = inputs_in_order(results.evaluations)[-1]
-    shown = results.evaluations[name].predictions
-    shown = shown.where(shown.condition == condition)
-    trials = np.unique(shown.trial)
-    if len(trials) == 0:
-        return None
-    error = np.abs(shown.prediction - shown.safety_margin)
-    ranked = sorted(trials.tolist(), key=lambda trial: float(error[shown.trial == trial].mean()))
-    return ranked[(len(ranked) - 1) // 2]
-
-
-_INPUTS = ("raw", "difference")
-Block = Table | Chart | Panel | Claim | Notes
+Block = Table | Plate | Claim | Notes
 """Laid out by the template's macro of the name `layout`."""
 
 
@@ -214,111 +74,293 @@ class Section:
     title: str
     short_title: str
     intro: str
-    missing: tuple[str, ...] = ()
-    blocks: tuple[Block, ...] = ()
+    missing: tuple[str, ...]
+    blocks: tuple[Block, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outline:
+    """A section as it could be.
+
+    Attributes
+    ----------
+    command
+        Command that makes its results, in a workspace that is no study.
+    build
+        Makes its blocks; None for one that is not there. Without any, the section is left out.
+    needs
+        Inputs that its results are there for; one that is missing is named.
+    """
+
+    id: str
+    title: str
+    short_title: str
+    intro: str | Callable[[Results], str]
+    command: str
+    build: Callable[[Results, np.random.Generator], Iterable[Block | None]]
+    needs: Callable[[Results], Collection[str]] | None = None
 
 
 def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Section, ...]:
-    """Build all sections in the order they are read."""
-    return (
-        _accuracy_section(results),
-        _faithfulness_section(results, rng=rng),
-        _maps_section(results),
-        _real_section(results),
-        recipe_section(results),
-    )
+    """Build the sections whose results are there, in the order they are read; the last says what was not run."""
+    sections, absent = [], {}
+    for outline in OUTLINES:
+        blocks = tuple(block for block in outline.build(results, rng) if block is not None)
+        command = f"sliplens {'study' if results.study else outline.command}"
+        if not blocks:
+            absent.setdefault(command, []).append(outline.short_title)
+            continue
+        there = results.inputs if outline.needs is None else outline.needs(results)
+        sections.append(
+            Section(
+                id=outline.id,
+                title=outline.title,
+                short_title=outline.short_title,
+                intro=outline.intro if isinstance(outline.intro, str) else outline.intro(results),
+                missing=tuple(
+                    f"{input_name(name)}: not run yet; `{command}` makes it."
+                    for name in _names(results.inputs)
+                    if name not in there
+                ),
+                blocks=blocks,
+            )
+        )
+    return (*sections, _recipe(results, absent))
 
 
-def _accuracy_section(results: Results) -> Section:
-    charts = [chart_bins(results), chart_predictions(results), chart_over_time(results)] if results.evaluations else []
-    return Section(
-        id="accuracy",
-        title="How well the safety margin is read",
-        short_title="Accuracy",
-        intro="The networks answer on trials they were not trained on. A raw image is the camera's frame; a difference "
-        "image is that frame against the untouched sensor.",
-        missing=_missing("evaluate", results.evaluations),
-        blocks=(table_accuracy(results), *charts) if results.evaluations else (),
-    )
+def _accuracy(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
+    if results.evaluations:
+        yield table_accuracy(results)
+        yield plate_bins(results)
+        yield plate_predictions(results)
+        yield plate_over_time(results)
 
 
-def _faithfulness_section(results: Results, *, rng: np.random.Generator) -> Section:
+def _faithfulness(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
+    found = results.study.faithfulness
+    for name in _names(found):
+        yield table_scores(found[name], results.scores.get((name, results.study.source)))
+        yield _alarms(results, name, "faithfulness")
+        yield table_equal_areas(found[name])
+        yield table_agreement(found[name])
+        yield plate_removal_curves(found[name])
+
+
+def _deletion(results: Results, rng: np.random.Generator) -> Iterable[Block | None]:
     by_source = {
-        source: {name: scored for (name, other), scored in results.scores.items() if other == source}
-        for source in in_order({source for _, source in results.scores}, ("simulated", "real"))
+        source: {name: results.scores[name, source] for name in _names(results.scored_inputs(source))}
+        for source in ("simulated", "real")
+        if results.scored_inputs(source)
     }
-    return Section(
-        id="faithfulness",
-        title="How far the explanations can be believed",
-        short_title="Faithfulness",
-        intro="The pixels that a method calls important are removed first. If the answer moves at once, the network "
-        "did rely on them: D = (1 \N{MINUS SIGN} |change of Γ|)² falls from 1 towards 0. Removing pixels in random "
-        "order is the control that each method has to beat.",
-        missing=_missing("score", {name for name, _ in results.scores}),
-        blocks=(
-            *(table_deletion(scores, rng=rng) for scores in by_source.values()),
-            *(chart_faithfulness(results, scores) for scores in by_source.values()),
-        ),
-    )
+    # beside the sound scores stands D already
+    yield from (table_deletion(scores, rng=rng) for scores in by_source.values() if not results.study.faithfulness)
+    yield plate_deletion(results)
+    yield from (plate_faithfulness(scores) for scores in by_source.values())
+    remedies, own = results.study.remedies, by_source.get(results.study.source, {})
+    for name in _names({*own, *remedies}):
+        yield _alarms(results, name, "score")
+        if name in remedies:
+            yield table_remedies(remedies[name], own.get(name))
+            yield _alarms(results, name, "remedies")
+    yield plate_highlighted(results)
+    if own:
+        yield from (plate_removal(results, method) for method in shown_methods(results))
+    yield from (plate_each_frame(scored) for scored in own.values())
 
 
-def _maps_section(results: Results) -> Section:
-    shown = {key: one for key, one in results.explanations.items() if key[1] != "real"}
-    return Section(
-        id="maps",
-        title="Where the network looks",
-        short_title="Saliency maps",
-        intro="From full stick (Γ 100 %) on the left to the onset of full slip (Γ 0 %) on the right.",
-        missing=_missing("explain", {name for name, _ in shown}),
-        blocks=(
-            *(build_panel(shown[key]) for key in sorted(shown, key=lambda key: (key[0] != "raw", key))),
-            *((table_timing(results),) if results.explanations else ()),
-        ),
-    )
+def _randomisation(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
+    found = results.study.randomisation
+    if found:
+        yield plate_randomisation(results)
+        yield table_randomisation(found)
+        yield from (_alarms(results, name, "randomisation") for name in _names(found))
 
 
-def _real_section(results: Results) -> Section:
+def _maps(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
+    study = results.study
+    if study.states is not None:
+        yield plate_contact_states(study.states)
+        yield _notes("Markers that could not be followed", study.states.untracked, tone="caution")
+    yield plate_methods(results)
+    for name in _names(results.inputs):
+        explained = explained_of(results, name)
+        if explained is not None:
+            yield plate_states(results, explained)
+            yield _alarms(results, name, "explain")
+    yield plate_poly_cam(results) if study else None
+    yield plate_fields_beside_saliency(results)
+    yield table_looks(study.map_quality) if study.map_quality else None
+
+
+def _real(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
     shown = {name: one for (name, source), one in results.explanations.items() if source == "real"}
-    return Section(
-        id="real",
-        title="Real touch",
-        short_title="Real touch",
-        intro="Frames of a real sensor, shown to the same networks.",
-        # real frames may exist as difference images only, so one input is enough
-        missing=() if shown else ("Real frames: not run yet; `sliplens explain` makes it.",),
-        blocks=(
-            *((table_real(results),) if shown else ()),
-            *(build_panel(shown[name]) for name in inputs_in_order(shown)),
-        ),
-    )
+    if shown:
+        yield table_real(results)
+        if results.study.source != "real":
+            for name in _names(shown):
+                yield plate_states(results, shown[name])
+                yield _alarms(results, name, "explain") if explained_of(results, name) is None else None
 
 
-def recipe_section(results: Results) -> Section:
-    """Say how the results were made; the template adds versions and recipes."""
+def _cost(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
+    if results.study.timing:
+        yield table_times(results.study.timing)
+    elif results.explanations:
+        yield table_seconds(results)
+
+
+def _truth(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
+    found = results.study.truth
+    for name in _names(found):
+        yield plate_truth(results, name)
+        yield table_localisation(found[name])
+        yield table_meta(found[name])
+        yield _notes(f"How this was measured, {input_name(name).lower()}", [found[name].told])
+
+
+def _recipe(results: Results, absent: dict[str, list[str]]) -> Section:
     simulation = results.simulation
-    if simulation is None:
-        intro = "No simulation is recorded in this workspace."
-    else:
+    intro = (
+        "Every stage is kept in a folder of its own; `sliplens study` with the same options goes on where it stopped, "
+        "and `sliplens report` draws this page from the folders alone."
+        if results.study
+        else "Every stage is kept in a folder of its own; `sliplens report` draws this page from the folders alone."
+    )
+    if simulation is not None:
         counts = "; ".join(
             f"{name} {count.trials} trials, {count.frames} frames" for name, count in simulation.by_split.items()
         )
-        intro = f"Simulated: {simulation.trials} trials, {simulation.frames} frames ({counts})."
+        intro += f" Simulated: {simulation.trials} trials, {simulation.frames} frames ({counts})."
         intro += f" Objects: {', '.join(simulation.conditions)}."
     return Section(
         id="recipe",
         title="How these results were made",
         short_title="Recipe",
         intro=intro,
-        missing=(
-            *(() if simulation else ("Simulation: not run yet; `sliplens simulate` makes it.",)),
-            *_missing("train", results.trainings),
-        ),
-        blocks=(table_training(results), chart_learning(results)) if results.trainings else (),
+        missing=tuple(f"{', '.join(titles)}: not run yet; `{command}` makes it." for command, titles in absent.items()),
+        blocks=(table_training(results), plate_learning(results)) if results.trainings else (),
     )
 
 
-def _missing(stage: str, found: Iterable[str]) -> tuple[str, ...]:
-    there = set(found)
-    return tuple(
-        f"{input_name(name)}: not run yet; `sliplens {stage}` makes it." for name in _INPUTS if name not in there
-    )
+def _alarms(results: Results, name: str, stage: str) -> Notes | None:
+    alarms = alarms_of(results, name, stage)
+    title = "Warnings of the methods" if stage == "explain" else "Alarms"
+    return _notes(f"{title}, {input_name(name).lower()}", alarms, tone="caution")
+
+
+def _notes(title: str, sentences: Iterable[str], *, tone: Literal["plain", "caution"] = "plain") -> Notes | None:
+    groups = group_alarms([sentence for sentence in sentences if sentence])
+    return Notes(title=title, groups=groups, tone=tone) if groups else None
+
+
+def _names(found: Iterable[str]) -> list[str]:
+    """Difference before raw, as in the thesis's figures."""
+    return inputs_in_order(found)[::-1]
+
+
+OUTLINES: tuple[Outline, ...] = (
+    Outline(
+        id="claims",
+        title="The claims of the thesis, tested here",
+        short_title="Claims",
+        intro="Each claim holds, does not hold, or stays undecided. A fill is what removed parts become; intervals (95 "
+        "%) resample whole trials, of which fewer than five decide nothing. A claim holds for a network where it holds "
+        "under more than half of the fills and the opposite is sure under none.",
+        command="study",
+        build=lambda results, rng: judge_claims(results, rng=rng) if results.study else (),
+    ),
+    Outline(
+        id="accuracy",
+        title="How well the safety margin is read",
+        short_title="Accuracy",
+        intro="The networks answer on trials they were not trained on (Table 1 and Fig. 7 of the thesis, for this "
+        "data). A raw image is the camera's frame; a difference image is that frame against the untouched sensor.",
+        command="evaluate",
+        build=_accuracy,
+        needs=lambda results: results.evaluations,
+    ),
+    Outline(
+        id="faithfulness",
+        title="How far the explanations can be believed",
+        short_title="Faithfulness",
+        intro="Table 2 of the thesis beside scores that do not depend on one fill. Parts of a frame are removed: first "
+        "those that a map says speak for the answer, first those that speak least for it, and at random. With a "
+        "faithful map the answer goes back to that on the untouched sensor at once in the first case, and not in the "
+        "second. Controls are maps that know nothing of the trained network.",
+        command="study",
+        build=_faithfulness,
+        needs=lambda results: results.study.faithfulness,
+    ),
+    Outline(
+        id="deletion",
+        title="The thesis's score, step by step",
+        short_title="Deletion",
+        intro="D = (1 \N{MINUS SIGN} |change of Γ|)² while pixels go, the most salient first: 1 where nothing changed, "
+        "towards 0 if the network did rely on them. Removing pixels in random order is the control that each method "
+        "has to beat. With every pixel gone no map has a part in it.",
+        command="score",
+        build=_deletion,
+        needs=lambda results: {
+            name for name, _ in results.scores if not results.study.remedies or name in results.study.remedies
+        },
+    ),
+    Outline(
+        id="randomisation",
+        title="Does the explanation notice that the network forgot everything?",
+        short_title="New weights",
+        intro="The weights are drawn anew, layer by layer from the output. A map of what was learned has to change.",
+        command="study",
+        build=_randomisation,
+        needs=lambda results: results.study.randomisation,
+    ),
+    Outline(
+        id="maps",
+        title="Where the networks look, and what the maps look like",
+        short_title="Saliency maps",
+        intro="From full stick (Γ 100 %) to the onset of full slip (Γ 0 %): what each method holds to speak for the "
+        "answer, rather than for that on the untouched sensor. The thesis judged the maps by eye; a study measures "
+        "the same.",
+        command="explain",
+        build=_maps,
+        needs=lambda results: {name for name, source in results.explanations if source == results.study.source},
+    ),
+    Outline(
+        id="real",
+        title="Real touch",
+        short_title="Real touch",
+        intro="Frames of a real sensor, shown to the same networks.",
+        command="explain",
+        build=_real,
+        # real frames may exist as difference images only, so one input is enough
+    ),
+    Outline(
+        id="timing",
+        title="What an explanation costs",
+        short_title="Cost",
+        intro="Seconds a frame; a study measures them with warm-up, and waiting for the device to finish.",
+        command="explain",
+        build=_cost,
+        needs=lambda results: results.study.timing or {name for name, _ in results.explanations},
+    ),
+    Outline(
+        id="choice",
+        title="Which trials were taken",
+        short_title="Trials",
+        intro=lambda results: "" if results.study.choice is None else results.study.choice.told,
+        command="study",
+        build=lambda results, _: () if results.study.choice is None else (table_trials(results.study.choice),),
+    ),
+    Outline(
+        id="truth",
+        title="What the network should have looked at",
+        short_title="Truth",
+        intro="Simulated touch can be filmed again with one marker put back where it rested: what that does to the "
+        "network's answer is what a map should show. What it does to the best reading of the margin (linear in the "
+        "markers' displacements, exact for small ones) is where the network should look; stretched over a marker's "
+        "whole motion that reading may exceed the margin itself, and the markers cancel.",
+        command="study",
+        build=_truth,
+        needs=lambda results: results.study.truth,
+    ),
+)
+"""Sections in the order they are read."""

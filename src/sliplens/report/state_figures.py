@@ -22,7 +22,6 @@ from sliplens.plots.style import (
     percent,
     signed,
 )
-from sliplens.report.believing import rank_methods
 from sliplens.report.plates import (
     CELL_IN,
     Cell,
@@ -33,6 +32,7 @@ from sliplens.report.plates import (
     show_map,
     shown_frames,
 )
+from sliplens.report.verdict import rank_methods
 from sliplens.report.workspace import Results
 from sliplens.results.explanation import Explained
 from sliplens.results.study import StateFrame, States, Truth

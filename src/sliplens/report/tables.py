@@ -1,16 +1,22 @@
 """Tables of the page: cells as text, so that the template only lays them out."""
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
-from jaxtyping import Float
 
-from sliplens.intervals import Difference, bootstrap_difference
+from sliplens.intervals import Difference
 from sliplens.plots.style import (
     CONTROL,
+    CONTROLS,
+    FILL_NAMES,
+    UNIT_NAMES,
+    UNKNOWN,
     conditions_in_order,
     decimals,
+    fill_name,
+    in_order,
     input_name,
     inputs_in_order,
     method_name,
@@ -20,72 +26,23 @@ from sliplens.plots.style import (
     signed,
     source_name,
 )
-from sliplens.report.thesis import ACCURACY, DELETION, MARK, NETWORK_PIXELS, SECONDS
+from sliplens.report.comparisons import against_control, mean_at, settings, tell_bounds, tell_interval
+from sliplens.report.thesis import ACCURACY, DELETION, MARK, NETWORK_PIXELS, SECONDS, thesis_row
 from sliplens.report.workspace import Results
-from sliplens.results.evaluation import Predictions
-from sliplens.results.faithfulness import DeletionCurve, DeletionScores
-
-
-def compare_errors(first: Predictions, second: Predictions, *, rng: np.random.Generator) -> Difference | None:
-    """Difference in MSE of two networks, resampling trials; None unless both answered the very same frames."""
-    order_a, order_b = (np.lexsort((one.frame, one.trial)) for one in (first, second))
-    same = (
-        len(first.trial) == len(second.trial) > 0
-        and np.array_equal(first.trial[order_a], second.trial[order_b])
-        and np.array_equal(first.frame[order_a], second.frame[order_b])
-    )
-    if not same:
-        return None
-    trials, trial_at = np.unique(first.trial[order_a], return_inverse=True)
-    sums = np.zeros((3, len(trials)))
-    np.add.at(sums[0], trial_at, _squared_error(first)[order_a])
-    np.add.at(sums[1], trial_at, _squared_error(second)[order_b])
-    np.add.at(sums[2], trial_at, 1.0)
-    return bootstrap_difference(sums[0], sums[1], sums[2], rng=rng)
-
-
-def compare_deletion(first: DeletionCurve, second: DeletionCurve, *, rng: np.random.Generator) -> Difference | None:
-    """Difference in D_AUC of two deletion orders, resampling frames; None unless both hold the same frames."""
-    if first.frame_ids != second.frame_ids or not first.frame_ids:
-        return None
-    auc = [curve.scores.mean(axis=1) for curve in (first, second)]
-    return bootstrap_difference(auc[0], auc[1], np.ones(len(auc[0])), rng=rng)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Agreement:
-    """How answers stand to labels: mean absolute error, that of the best constant answer, and pairs in right order."""
-
-    frames: int
-    mae: float
-    constant_mae: float
-    pairs: int
-    ordered_pairs: int
-
-
-def agreement(labels: Float[np.ndarray, " frames"], predictions: Float[np.ndarray, " frames"]) -> Agreement:
-    """Compare answers with labels, in margin units.
-
-    The best constant answer is the median of the labels: a network that cannot beat it has read nothing. Pairs with
-    equal labels have no order and are left out.
-    """
-    first, second = np.triu_indices(len(labels), k=1)
-    rise, answer = labels[first] - labels[second], predictions[first] - predictions[second]
-    return Agreement(
-        frames=len(labels),
-        mae=float(np.abs(predictions - labels).mean()),
-        constant_mae=float(np.abs(labels - np.median(labels)).mean()),
-        pairs=int(np.count_nonzero(rise)),
-        ordered_pairs=int(np.count_nonzero(rise * answer > 0)),
-    )
-
-
-def _squared_error(predictions: Predictions) -> Float[np.ndarray, " frames"]:
-    return (predictions.prediction - predictions.safety_margin) ** 2
-
+from sliplens.results.faithfulness import DeletionScores, MethodScore, Remedies, RemovalScore, RemovalScores
+from sliplens.results.study import MAP_MEASURES, REGIONS, Choice, MapQuality, Randomisation, Timing, Truth
 
 Kind = Literal["name", "number", "best", "thesis"]
-Shade = Literal[0, 1, 2, 3, 4]
+_AREAS = (0.01, 0.02, 0.05, 0.1, 0.2)
+_LOOK_NAMES = {
+    "resolution": "Resolution",
+    "total_variation": "Total variation",
+    "gini": "Sparsity (Gini)",
+    "noise_stability": "Stable under noise",
+    "frame_stability": "Stable between frames",
+}
+_REGION_NAMES = {"markers": "markers", "slip_annulus": "slip annulus", "edges": "marker edges"}
+_TRUTHS = ("oracle", "degraded-oracle")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +57,7 @@ class Cell:
 
     text: str
     kind: Kind = "number"
-    shade: Shade = 0
+    shade: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,156 +71,31 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]
 
 
-def table_accuracy(results: Results) -> Table:
-    """Tabulate MSE, R2 and MAE by condition and input (thesis, Table 1)."""
-    rows = []
-    for condition in conditions_in_order(name for one in results.evaluations.values() for name in one.conditions):
-        scores = {
-            name: results.evaluations[name].conditions[condition]
-            for name in inputs_in_order(results.evaluations)
-            if condition in results.evaluations[name].conditions
-        }
-        lowest = min(score.mse for score in scores.values())
-        for name, score in scores.items():
-            thesis = ACCURACY.get((name, condition), (None, None))
-            kind: Kind = "best" if score.mse == lowest and len(scores) > 1 else "number"
-            rows.append(
-                (
-                    Cell(text=condition.capitalize(), kind="name"),
-                    Cell(text=input_name(name), kind="name"),
-                    Cell(text=decimals(score.mse, 4), kind=kind),
-                    Cell(text=decimals(thesis[0], 4), kind="thesis"),
-                    Cell(text=decimals(score.r2, 3)),
-                    Cell(text=decimals(thesis[1], 2), kind="thesis"),
-                    Cell(text=decimals(100 * score.mae, 1)),
-                    Cell(text=f"{score.frames} / {score.trials}"),
-                )
-            )
-    return Table(
-        caption="How well each network reads the safety margin on test trials. MSE in squared margin units (Γ from 0 "
-        "to 1), MAE in percentage points of Γ; the lower MSE of each condition is bold. Grey columns: the "
-        f"{MARK}.",
-        head=table_head(
-            "Objects", "Input", "MSE", "MSE, thesis", "R²", "R², thesis", "MAE (points)", "Frames / trials"
-        ),
-        rows=tuple(rows),
-    )
+def make_table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str | Cell]], *, names: int = 1) -> Table:
+    """Make a table of texts: names in the first columns, then numbers, the thesis's own where the head says so.
 
-
-def table_deletion(scores: dict[str, DeletionScores], *, rng: np.random.Generator) -> Table:
-    """Tabulate the deletion score by input and method, with the random control (thesis, Table 2)."""
-    rows = []
-    for name in inputs_in_order(scores):
-        scored = scores[name]
-        lowest = min((score.mean for method, score in scored.methods.items() if method != CONTROL), default=None)
-        for method in methods_in_order(scored.methods):
-            score = scored.methods[method]
-            thesis = DELETION.get((name, method))
-            rows.append(
-                (
-                    Cell(text=input_name(name), kind="name"),
-                    Cell(text=method_name(method), kind="name"),
-                    Cell(text=tell_spread(score.mean, score.sd), kind="best" if score.mean == lowest else "number"),
-                    Cell(text=_gap(against_control(scored, method, rng=rng))),
-                    Cell(text=decimals(score.last_step_mean, 3)),
-                    Cell(text=tell_spread(*thesis) if thesis else decimals(None, 3), kind="thesis"),
-                    Cell(text=str(score.frames)),
-                )
-            )
-    sources = " and ".join(sorted({source_name(scored.source) for scored in scores.values()}))
-    return Table(
-        caption=f"Deletion score D on {sources}, averaged over all steps, mean ± standard deviation over frames; "
-        "lower = more faithful, and the lowest of each input is bold. “Against random”: mean difference from the "
-        "random control with a 95 % interval (frames resampled); below zero = better than chance. “Last step”: D once "
-        f"every pixel is filled, which no map has a part in. Grey column: the {MARK}.",
-        head=table_head("Input", "Method", "Score D", "Against random", "Last step", "Score D, thesis", "Frames"),
-        rows=tuple(rows),
-    )
-
-
-def against_control(scored: DeletionScores, method: str, *, rng: np.random.Generator) -> Difference | None:
-    """Difference of a method's D_AUC from the random control's; None for the control itself or without one."""
-    if method == CONTROL or not {method, CONTROL} <= set(scored.curves):
-        return None
-    return compare_deletion(scored.curves[method], scored.curves[CONTROL], rng=rng)
-
-
-def table_timing(results: Results) -> Table:
-    """Tabulate the seconds a frame of each method, one column for each input and origin of the frames."""
-    keys = sorted(results.explanations, key=lambda key: (key[1] == "real", key[0] != "raw", key))
-    explained = {key: results.explanations[key] for key in keys}
-    sides = sorted({one.image_size for one in explained.values()})
-    rows = [
-        (
-            Cell(text=method_name(method), kind="name"),
-            *(
-                Cell(text=decimals(one.methods[method].seconds_per_frame if method in one.methods else None, 3))
-                for one in explained.values()
-            ),
-            Cell(text=decimals(SECONDS.get(method), 3), kind="thesis"),
-        )
-        for method in methods_in_order(name for one in explained.values() for name in one.methods)
+    Parameters
+    ----------
+    rows
+        Texts; a cell where it is more than that.
+    names
+        Columns that hold names.
+    """
+    heads = tuple(Cell(text=text, kind="thesis" if "thesis" in text.lower() else "name") for text in head)
+    kinds: list[Kind] = [
+        "name" if place < names else "thesis" if cell.kind == "thesis" else "number" for place, cell in enumerate(heads)
     ]
     return Table(
-        caption=f"Seconds to explain one frame, images of {' and '.join(map(str, sides))} px. The thesis timed images "
-        f"of {NETWORK_PIXELS} px on an RTX 3060 Ti and did not wait for the GPU to finish, so its seconds show the "
-        "order of magnitude only.",
-        head=table_head("Method", *(f"{short_input_name(name)}, {source}" for name, source in keys), "Thesis"),
-        rows=tuple(rows),
-    )
-
-
-def table_real(results: Results) -> Table:
-    """Tabulate label and answers of each real frame."""
-    explained = {name: one for (name, source), one in results.explanations.items() if source == "real"}
-    names = inputs_in_order(explained)
-    found = {name: {frame.id: frame for frame in explained[name].frames} for name in names}
-    frames = {frame.id: frame for name in names for frame in explained[name].frames}
-    rows = []
-    for frame in sorted(frames.values(), key=lambda one: (-(one.safety_margin or 0), one.id)):
-        answers = [found[name].get(frame.id) for name in names]
-        rows.append(
-            (
-                Cell(text=frame.id, kind="name"),
-                Cell(text=frame.condition.capitalize(), kind="name"),
-                Cell(text=percent(frame.safety_margin)),
-                *(Cell(text=percent(None if answer is None else answer.prediction)) for answer in answers),
-            )
-        )
-    return Table(
-        caption=f"{len(rows)} real frames: the recorded safety margin, and what each network reads.",
-        head=table_head("Frame", "Objects", "True Γ", *(f"Read from {input_name(name).lower()}" for name in names)),
-        rows=tuple(rows),
-    )
-
-
-def table_training(results: Results) -> Table:
-    """Tabulate how each network was trained."""
-    trainings = {name: results.trainings[name] for name in inputs_in_order(results.trainings)}
-    facts = {
-        "Backbone": lambda one: one.backbone,
-        "Image side (camera)": lambda one: f"{one.image_size} px ({' x '.join(map(str, one.frame_size)) or 'unknown'})",
-        "Frames: training / validation": lambda one: f"{_whole(one.train_frames)} / {_whole(one.validation_frames)}",
-        "Epochs": lambda one: decimals(one.epochs, 1),
-        "Minutes": lambda one: decimals(one.minutes, 1),
-        "Stopped by": lambda one: one.stopped_by,
-        "Best validation MSE": lambda one: decimals(one.best_validation_mse, 4),
-        "Parameters": lambda one: _whole(one.parameters),
-        "Seed": lambda one: _whole(one.seed),
-    }
-    return Table(
-        caption="How the networks were trained.",
-        head=table_head("", *(input_name(name) for name in trainings)),
+        caption=caption,
+        head=heads,
         rows=tuple(
-            (Cell(text=fact, kind="name"), *(Cell(text=tell(one)) for one in trainings.values()))
-            for fact, tell in facts.items()
+            tuple(
+                cell if isinstance(cell, Cell) else Cell(text=cell, kind=kind)
+                for cell, kind in zip(row, kinds, strict=True)
+            )
+            for row in rows
         ),
     )
-
-
-def table_head(*texts: str) -> tuple[Cell, ...]:
-    """Head of a table; what names the thesis is marked as its own."""
-    return tuple(Cell(text=text, kind="thesis" if "thesis" in text.lower() else "name") for text in texts)
 
 
 def tell_spread(mean: float, sd: float) -> str:
@@ -271,11 +103,435 @@ def tell_spread(mean: float, sd: float) -> str:
     return f"{mean:.3f} ± {sd:.3f}"
 
 
-def _gap(difference: Difference | None) -> str:
-    if difference is None:
-        return decimals(None, 3)
-    return f"{signed(difference.estimate, 3)} ({signed(difference.low, 3)} to {signed(difference.high, 3)})"
+def _best(text: str, best: bool) -> Cell:
+    return Cell(text=text, kind="best" if best else "number")
 
 
-def _whole(value: int | None) -> str:
-    return decimals(None, 0) if value is None else f"{value:,}".replace(",", " ")
+def table_accuracy(results: Results) -> Table:
+    """Tabulate MSE, R2 and MAE by condition and input (thesis, Table 1)."""
+    evaluations, rows = results.evaluations, []
+    for condition in conditions_in_order(name for one in evaluations.values() for name in one.conditions):
+        scores = {
+            name: evaluations[name].conditions[condition]
+            for name in inputs_in_order(evaluations)
+            if condition in evaluations[name].conditions
+        }
+        lowest = min(score.mse for score in scores.values())
+        for name, score in scores.items():
+            thesis = ACCURACY.get((name, condition), (None, None))
+            rows.append(
+                (
+                    condition.capitalize(),
+                    input_name(name),
+                    _best(decimals(score.mse, 4), score.mse == lowest and len(scores) > 1),
+                    decimals(thesis[0], 4),
+                    decimals(score.r2, 3),
+                    decimals(thesis[1], 2),
+                    decimals(100 * score.mae, 1),
+                    f"{score.frames} / {score.trials}",
+                )
+            )
+    return make_table(
+        "How well each network reads the safety margin on test trials. MSE in squared margin units (Γ from 0 to 1), "
+        "MAE in percentage points of Γ; the lower MSE of each condition is bold. Grey columns: the "
+        f"{MARK}.",
+        ("Objects", "Input", "MSE", "MSE, thesis", "R²", "R², thesis", "MAE (points)", "Frames / trials"),
+        rows,
+        names=2,
+    )
+
+
+def table_deletion(scores: Mapping[str, DeletionScores], *, rng: np.random.Generator) -> Table:
+    """Tabulate the deletion score by input and method, with the random control (thesis, Table 2)."""
+    rows = []
+    for name in inputs_in_order(scores):
+        scored = scores[name]
+        lowest = min((score.mean for method, score in scored.methods.items() if method != CONTROL), default=None)
+        for method in methods_in_order(scored.methods):
+            score = scored.methods[method]
+            rows.append(
+                (
+                    input_name(name),
+                    method_name(method),
+                    _best(tell_spread(score.mean, score.sd), score.mean == lowest),
+                    _interval(against_control(scored, method, rng=rng), digits=3),
+                    decimals(score.last_step_mean, 3),
+                    _thesis_score(name, method, scored.methods),
+                    str(score.frames),
+                )
+            )
+    sources = " and ".join(sorted({source_name(scored.source) for scored in scores.values()}))
+    return make_table(
+        f"Deletion score D on {sources}, averaged over all steps, mean ± standard deviation over frames; lower = more "
+        "faithful, and the lowest of each input is bold. “Against random”: mean difference from the random control "
+        "with a 95 % interval (frames resampled); below zero = better than chance. “Last step”: D once every pixel is "
+        f"filled, which no map has a part in. Grey column: the {MARK}.",
+        ("Input", "Method", "Score D", "Against random", "Last step", "Score D, thesis", "Frames"),
+        rows,
+        names=2,
+    )
+
+
+def table_seconds(results: Results) -> Table:
+    """Tabulate the seconds a frame that each method took, one column for each input and origin of the frames."""
+    keys = sorted(results.explanations, key=lambda key: (key[1] == "real", key[0] != "raw", key))
+    explained = {key: results.explanations[key] for key in keys}
+    methods = {name for one in explained.values() for name in one.methods}
+    sides = " and ".join(map(str, sorted({one.image_size for one in explained.values()})))
+    return make_table(
+        f"Seconds to explain one frame, images of {sides} px. The thesis timed images of {NETWORK_PIXELS} px on an RTX "
+        "3060 Ti and did not wait for the GPU to finish, so its seconds show the order of magnitude only.",
+        ("Method", *(f"{short_input_name(name)}, {source}" for name, source in keys), "Thesis"),
+        [
+            (
+                method_name(method),
+                *(
+                    decimals(one.methods[method].seconds_per_frame if method in one.methods else None, 3)
+                    for one in explained.values()
+                ),
+                decimals(SECONDS.get(thesis_row(method, methods) or ""), 3),
+            )
+            for method in methods_in_order(methods)
+        ],
+    )
+
+
+def table_real(results: Results) -> Table:
+    """Tabulate label and answers of each real frame."""
+    explained = {name: one for (name, source), one in results.explanations.items() if source == "real"}
+    names = inputs_in_order(explained)
+    answers = {(name, frame.id): frame.prediction for name in names for frame in explained[name].frames}
+    frames = {frame.id: frame for name in names for frame in explained[name].frames}
+    return make_table(
+        f"{len(frames)} real frames: the recorded safety margin, and what each network reads.",
+        ("Frame", "Objects", "True Γ", *(f"Read from {input_name(name).lower()}" for name in names)),
+        [
+            (
+                frame.id,
+                frame.condition.capitalize(),
+                percent(frame.safety_margin),
+                *(percent(answers.get((name, frame.id))) for name in names),
+            )
+            for frame in sorted(frames.values(), key=lambda one: (-(one.safety_margin or 0), one.id))
+        ],
+        names=2,
+    )
+
+
+def table_training(results: Results) -> Table:
+    """Tabulate how each network was trained."""
+    trainings = [results.trainings[name] for name in inputs_in_order(results.trainings)]
+    return make_table(
+        "How the networks were trained.",
+        ("", *(input_name(one.input) for one in trainings)),
+        zip(
+            (
+                "Backbone", "Image side (camera)", "Frames: training / validation", "Epochs", "Minutes", "Stopped by",
+                "Best validation MSE", "Parameters", "Seed",
+            ),
+            *(
+                (
+                    one.backbone,
+                    f"{one.image_size} px ({' x '.join(map(str, one.frame_size))})",
+                    f"{_whole(one.train_frames)} / {_whole(one.validation_frames)}",
+                    decimals(one.epochs, 1),
+                    decimals(one.minutes, 1),
+                    one.stopped_by,
+                    decimals(one.best_validation_mse, 4),
+                    _whole(one.parameters),
+                    str(one.seed),
+                )
+                for one in trainings
+            ),
+            strict=True,
+        ),
+    )  # fmt: skip
+
+
+def table_scores(faithful: RemovalScores, scored: DeletionScores | None) -> Table:
+    """Tabulate the thesis's deletion score (its Table 2) beside the symmetric gain under every fill."""
+    fills = settings(faithful)
+    scores = {score.key: score for score in faithful.scores}
+    top = {
+        fill: max(
+            (one.srg.estimate for key, one in scores.items() if key[:2] == fill and not one.control), default=None
+        )
+        for fill in fills
+    }
+    plain = {} if scored is None else scored.methods
+    methods = {*(score.method for score in faithful.scores), *plain}
+    lowest = min((one.mean for name, one in plain.items() if name not in CONTROLS), default=None)
+    fill = f", {scored.fill} fill" if scored else ""
+    return make_table(
+        f"{input_name(faithful.input)}: the deletion score D of the thesis{fill} (mean ± standard deviation over "
+        "frames; lower = more faithful) beside the symmetric relevance gain, SRG: the mean change of the answer with "
+        "the most supporting parts gone first, less that with the least supporting first, in margin units; 0 = a map "
+        f"that tells nothing. 95 % intervals over {faithful.trials} trials ({faithful.frames} frames); * = the "
+        f"interval leaves zero out. Bold: best of its column, controls left out. Grey column: the {MARK}.",
+        ("Method", "Score D", "Score D, thesis", *(f"SRG, {fill_name(*one)}" for one in fills)),
+        [
+            (
+                method_name(method),
+                _score_cell(plain.get(method), lowest),
+                _thesis_score(faithful.input, method, methods),
+                *(_gain_cell(scores.get((*one, method)), top[one]) for one in fills),
+            )
+            for method in methods_in_order(methods)
+        ],
+    )
+
+
+def table_equal_areas(faithful: RemovalScores) -> Table | None:
+    """Tabulate the change where equal areas are gone, under the most natural fill; None without scores."""
+    fills = settings(faithful)
+    if not fills:
+        return None
+    fill, unit = fills[0]
+    scores = {score.method: score for score in faithful.scores if score.key[:2] == (fill, unit)}
+    areas = [area for area in _AREAS if any(area in score.at for score in scores.values())]
+    top = {
+        area: max((one.at[area] for one in scores.values() if area in one.at and not one.control), default=None)
+        for area in areas
+    }
+    rows = [
+        (
+            method_name(method),
+            *(
+                _best(decimals(score.at.get(area), 3), not score.control and score.at.get(area, np.nan) == top[area])
+                for area in areas
+            ),
+        )
+        for method in methods_in_order(scores)
+        for score in [scores[method]]
+    ]
+    curve = next(curve for key, curve in faithful.curves.items() if key[:2] == (fill, unit))
+    chance = (f"{faithful.random_orders} random orders", *(decimals(mean_at(curve, area)[1], 3) for area in areas))
+    return make_table(
+        f"{input_name(faithful.input)}: mean evidence lost, in margin units, where equal shares of the image are gone, "
+        f"most supporting {UNIT_NAMES.get(unit, unit)} first (fill: {fill_name(fill)}). Bold: largest of the methods.",
+        ("Method", *(f"{percent(area)} gone" for area in areas)),
+        [*rows, chance],
+    )
+
+
+def table_agreement(faithful: RemovalScores) -> Table | None:
+    """Tabulate Kendall's tau between the fills' rankings of the methods as a map of heat; None where it is unknown."""
+    rows = [one for one in faithful.agreement if one.unit == "pixel"] or list(faithful.agreement)
+    if not rows:
+        return None
+    taus = {pair: one.tau for one in rows for pair in ((one.first, one.second), (one.second, one.first))}
+    fills = in_order({name for pair in taus for name in pair}, FILL_NAMES)
+    known = [one.tau for one in rows if one.tau is not None]
+    worst = f" The lowest is {signed(min(known), 2)}." if known else ""
+    return make_table(
+        f"{input_name(faithful.input)}: how far two fills agree on the order of the methods "
+        f"({UNIT_NAMES.get(rows[0].unit, rows[0].unit)}): Kendall's tau, 1 for the same order, 0 for unrelated ones; "
+        f"darker = closer.{worst}",
+        ("Fill", *(fill_name(fill) for fill in fills)),
+        [
+            (fill_name(fill), *("·" if fill == other else _tau_cell(taus.get((fill, other))) for other in fills))
+            for fill in fills
+        ],
+    )
+
+
+def table_remedies(remedies: Remedies, scored: DeletionScores | None) -> Table:
+    """Tabulate the thesis's own remedies for its score, and insertion, beside the score as it was."""
+    methods = methods_in_order({name for one in remedies.variants.values() for name in one.methods})
+    titles = {name: name.replace("-", " ").capitalize() for name in remedies.variants}
+    variants = [(titles[name], one.better, one.methods) for name, one in remedies.variants.items()]
+    if scored is not None:
+        variants.insert(0, (f"As in the thesis ({scored.fill})", "lower", scored.methods))
+    rows = []
+    for title, better, scores in variants:
+        means = [scores[name].mean for name in methods if name in scores and name not in CONTROLS]
+        best = (min if better == "lower" else max)(means, default=None)
+        rows.append((title, better, *(_score_cell(scores.get(name), best) for name in methods)))
+    told = " ".join(f"{titles[name]}: {one.told.rstrip('.')}." for name, one in remedies.variants.items())
+    return make_table(
+        f"{input_name(remedies.input)}: the score of the thesis with the remedies it proposes, and insertion; mean ± "
+        f"standard deviation over frames, the best method of each row bold. {told}",
+        ("Variant", "Better is", *(method_name(name) for name in methods)),
+        rows,
+        names=2,
+    )
+
+
+def table_looks(looks: Mapping[str, MapQuality]) -> Table:
+    """Tabulate what the eye judges of maps."""
+    return make_table(
+        f"Looks of the maps, means over {max(one.frames for one in looks.values())} frames. Resolution: depth of the "
+        "valley between neighbouring markers (1 = told apart). Total variation: mean step between pixels over the "
+        "map's range (noise has 1/3). Gini: 1 = one pixel has all. Stability: correlation of the map with that of the "
+        "frame under other sensor noise, and with that of the next frame.",
+        ("Input", "Method", *(_LOOK_NAMES[measure] for measure in MAP_MEASURES)),
+        [
+            (input_name(name), method_name(method), *(decimals(measures[one], 3) for one in MAP_MEASURES))
+            for name in inputs_in_order(looks)
+            for method in methods_in_order(looks[name].methods)
+            for measures in [looks[name].methods[method]]
+        ],
+        names=2,
+    )
+
+
+def table_randomisation(randomisation: Mapping[str, Randomisation]) -> Table:
+    """Tabulate what is left of a map once every layer has new weights, and how its complexity rises."""
+    counts = {one.layers[0] for found in randomisation.values() for one in found.methods.values() if one.layers}
+    first = f"{counts.pop()} layers new" if len(counts) == 1 else "First layers new"
+    return make_table(
+        "Weights drawn anew, layer by layer from the output: similarity of the map to the trained network's (1 = "
+        "unchanged: such a map does not depend on what was learned), and the rise of its complexity once all are new "
+        "(eMPRT), also after smoothing (sMPRT); more is better.",
+        ("Input", "Method", first, "All layers new", "eMPRT", "sMPRT"),
+        [
+            (
+                input_name(name),
+                method_name(method),
+                *(decimals(one.similarity[place] if one.similarity else None, 2) for place in (0, -1)),
+                decimals(one.complexity_rise, 2),
+                decimals(one.smooth_complexity_rise, 2),
+            )
+            for name in inputs_in_order(randomisation)
+            for method in methods_in_order(randomisation[name].methods)
+            for one in [randomisation[name].methods[method]]
+        ],
+        names=2,
+    )
+
+
+def table_times(timing: Mapping[str, Timing]) -> Table:
+    """Tabulate seconds a frame, with the forward pass and without it, beside those of the thesis."""
+    names = inputs_in_order(timing)
+    rows, methods = [], {one for name in names for one in timing[name].methods}
+    for method in methods_in_order(methods):
+        cells = []
+        for one in (timing[name].methods.get(method) for name in names):
+            spread = "" if one is None or one.low is None else f" ({_seconds(one.low)} to {_seconds(one.high)})"
+            cells.append(UNKNOWN if one is None else f"{_seconds(one.seconds)}{spread}")
+            cells.append(_seconds(None if one is None else one.seconds_without_forward))
+        rows.append((method_name(method), *cells, decimals(SECONDS.get(thesis_row(method, methods) or ""), 3)))
+    told = "; ".join(
+        f"{input_name(name).lower()}: {one.device}"
+        f"{f' with {one.threads} threads' if one.threads and one.device == 'cpu' else ''}, "
+        f"{one.repeats} repeats or more, a forward pass takes {_seconds(one.forward_seconds)} s"
+        for name in names
+        for one in [timing[name]]
+    )
+    heads = [f"{short_input_name(name)}, {what}" for name in names for what in ("with forward pass", "without")]
+    return make_table(
+        f"Seconds to explain one frame: median of the repeats after a warm-up, and their range ({told}). The thesis "
+        f"timed images of {NETWORK_PIXELS} px on an RTX 3060 Ti without waiting for the GPU, and left Grad-CAM's "
+        "forward pass out.",
+        ("Method", *heads, "Thesis"),
+        rows,
+    )
+
+
+def table_trials(choice: Choice) -> Table:
+    """Tabulate the trials of the study, and how far each network was off at worst."""
+    names = inputs_in_order({*choice.inputs, *(name for one in choice.trials for name in one.worst_error)})
+    return make_table(
+        f"The {len(choice.trials)} trials of the study ({choice.condition}): the worst error of each network at the "
+        f"chosen margins, in percentage points; within {percent(choice.tolerance)} at all of them it qualifies.",
+        ("Trial", "Qualified", *(f"Worst error, {short_input_name(name).lower()}" for name in names), "Frames scored"),
+        [
+            (
+                one.trial,
+                "yes" if one.qualified else "no",
+                *(percent(one.worst_error.get(name), digits=1) for name in names),
+                str(sum(frame.trial == one.trial and frame.scored for frame in choice.frames)),
+            )
+            for one in choice.trials
+        ],
+        names=2,
+    )
+
+
+def table_localisation(truth: Truth) -> Table:
+    """Tabulate where relevance lies, and how well maps rank the markers."""
+    names = [*methods_in_order(set(truth.methods) - set(_TRUTHS)), *(one for one in _TRUTHS if one in truth.methods)]
+    nothing = ("A map that knows nothing", *(percent(truth.areas[region]) for region in REGIONS * 2), "0", "0")
+    return make_table(
+        f"{input_name(truth.input)}, {truth.frames} simulated frames: share of the relevance, and of the strongest "
+        "pixels, in three regions; and Spearman's correlation of the map's mean on each marker with what putting that "
+        "marker back does to the network's answer and to the best reading of the margin (95 % interval over trials).",
+        (
+            "Method",
+            *(f"{what}, {_REGION_NAMES[region]}" for what in ("Mass", "Strongest") for region in REGIONS),
+            "With the answer",
+            "With the best reading",
+        ),
+        [
+            *(
+                (
+                    # here it is a map, not an order
+                    "Random map (control)" if name == CONTROL else method_name(name),
+                    *(percent(shares[region]) for shares in (found.mass, found.rank) for region in REGIONS),
+                    _interval(found.network, found.spearman_network),
+                    _interval(found.margin, found.spearman_margin),
+                )
+                for name in names
+                for found in [truth.methods[name]]
+            ),
+            nothing,
+        ],
+    )
+
+
+def table_meta(truth: Truth) -> Table | None:
+    """Tabulate whether the score itself ranks a perfect map above a damaged one above chance; None if not tested."""
+    if not truth.meta:
+        return None
+    return make_table(
+        f"{input_name(truth.input)}: the score put to the test. A map made from the truth must gain more than that map "
+        "damaged, and that more than chance; a fill where this fails cannot judge methods, and the verdict leaves it "
+        "out.",
+        ("Fill", "Holds", "SRG of the truth", "SRG, damaged", "SRG, random"),
+        [
+            (
+                FILL_NAMES.get(one.fill, one.fill),
+                "yes" if one.holds else "no",
+                *(decimals(value, 3) for value in (one.oracle, one.degraded, one.random)),
+            )
+            for one in truth.meta
+        ],
+        names=2,
+    )
+
+
+def _interval(gap: Difference | None, value: float | None = None, *, digits: int = 2) -> str:
+    """Write an interval; the value alone where none is known."""
+    return decimals(value, digits) if gap is None else tell_interval(gap, digits=digits)
+
+
+def _thesis_score(name: str, method: str, among: Iterable[str]) -> str:
+    row = thesis_row(method, set(among))
+    thesis = DELETION.get((name, row)) if row else None
+    return tell_spread(*thesis) if thesis else UNKNOWN
+
+
+def _score_cell(score: MethodScore | None, best: float | None) -> Cell:
+    return Cell(text=UNKNOWN) if score is None else _best(tell_spread(score.mean, score.sd), score.mean == best)
+
+
+def _gain_cell(score: RemovalScore | None, best: float | None) -> Cell:
+    if score is None:
+        return Cell(text=UNKNOWN)
+    # in two lines, so that every fill fits beside the others
+    text = f"{signed(score.srg.estimate, 3)}{'*' if score.srg.sure else ''}\n{tell_bounds(score.srg)}"
+    return _best(text, not score.control and score.srg.estimate == best)
+
+
+def _tau_cell(tau: float | None) -> Cell:
+    if tau is None:
+        return Cell(text=UNKNOWN)
+    return Cell(text=signed(tau, 2), shade=sum(tau >= step for step in (-1.0, 0.0, 0.4, 0.8)))
+
+
+def _seconds(value: float | None) -> str:
+    return decimals(value, 4 if value is not None and value < 0.1 else 2)
+
+
+def _whole(value: int) -> str:
+    return f"{value:,}".replace(",", " ")

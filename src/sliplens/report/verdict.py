@@ -1,27 +1,36 @@
-"""The verdict: sentences made from the numbers, which claim no more than these carry."""
+"""The verdict: what a person can rely on, then what to be careful with; no sentence claims more than its numbers."""
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from sliplens.intervals import FEWEST_UNITS
+from sliplens.intervals import FEWEST_UNITS, Difference
 from sliplens.plots.style import (
     CONTROL,
+    CONTROLS,
+    FILL_NAMES,
     conditions_in_order,
     decimals,
+    fill_name,
     input_name,
     inputs_in_order,
     listed,
     method_name,
+    methods_in_order,
+    name_methods,
     percent,
+    signed,
     source_name,
 )
-from sliplens.report.tables import against_control, agreement, compare_errors
+from sliplens.report.comparisons import against_control, agreement, compare_errors, controls, settings, tell_interval
 from sliplens.report.thesis import NETWORK_PIXELS
 from sliplens.report.workspace import Results
 from sliplens.results.explanation import Explained
-from sliplens.results.faithfulness import DeletionScores
+from sliplens.results.faithfulness import DeletionScores, RemovalScores
+from sliplens.results.study import Truth
 
 Tone = Literal["good", "plain", "caution"]
 
@@ -35,46 +44,53 @@ class Statement:
     tone: Tone = "plain"
 
 
-def judge_accuracy(results: Results, *, rng: np.random.Generator) -> list[Statement]:
-    """State how well each network reads the margin, and which input does better."""
-    return _accuracy(results) + _winners(results, rng=rng)
-
-
 def judge(results: Results, *, rng: np.random.Generator) -> tuple[Statement, ...]:
-    """State what the results show, from accuracy to real touch; what was not run is left out."""
-    statements = judge_accuracy(results, rng=rng)
-    statements += [
-        _faithfulness(results.scores[key], rng=rng)
-        for key in sorted(results.scores, key=lambda key: (key[1] == "real", key[0] != "raw", key))
-    ]
-    if results.scores:
-        statements.append(_what_deletion_measures(results))
+    """State what the results show: which network reads how well, which method to look at, and on which evidence.
+
+    What carries comes first, then what warns, each in that order; what was not run is left out.
+    """
+    study = results.study
+    statements = _accuracy(results)
+    for name in inputs_in_order(study.inputs)[::-1]:
+        if name in study.faithfulness:
+            statements.append(_believe(study.faithfulness[name], results))
+        elif study:
+            text = "Not known: the explanations were not scored; `sliplens study` does that."
+            statements.append(
+                Statement(topic=f"Which to believe, {input_name(name).lower()}", text=text, tone="caution")
+            )
+    statements += _winners(results, rng=rng)
+    # a study's sound scores say more than deletion does
+    if not study:
+        statements += [
+            _faithfulness(results.scores[key], rng=rng)
+            for key in sorted(results.scores, key=lambda key: (key[1] == "real", key[0] != "raw", key))
+        ]
+        if results.scores:
+            statements.append(_what_deletion_measures(results))
     real = {name: one for (name, source), one in results.explanations.items() if source == "real"}
     statements += [_real_touch(real[name]) for name in inputs_in_order(real)]
-    statements += tell_scale(results)
-    return tuple(statements)
+    statements += _tell_scale(results)
+    return tuple(sorted(statements, key=lambda one: one.tone == "caution"))
 
 
 def _accuracy(results: Results) -> list[Statement]:
-    if not results.evaluations:
-        return []
-    sentences, useless = [], False
+    statements = []
     for name in inputs_in_order(results.evaluations):
         scores = results.evaluations[name].conditions
         conditions = conditions_in_order(scores)
         r2 = [f"{decimals(scores[condition].r2, 2)} on {condition}" for condition in conditions]
         mae = [decimals(100 * scores[condition].mae, 1) for condition in conditions]
-        sentences.append(
-            f"From {input_name(name).lower()} the network reads the safety margin with R² {listed(r2)} objects; on "
-            f"average it is off by {listed(mae)} percentage points."
+        text = (
+            f"The network reads the safety margin with R² {listed(r2)} objects of test trials; on average it is off by "
+            f"{listed(mae)} percentage points."
         )
         poor = [condition for condition in conditions if (scores[condition].r2 or 0.0) <= 0]
         if poor:
-            sentences.append(f"On {listed(poor)} objects that is no better than always answering the mean label.")
-        useless = useless or bool(poor)
-    return [
-        Statement(topic="Accuracy on test trials", text=" ".join(sentences), tone="caution" if useless else "plain")
-    ]
+            text += f" On {listed(poor)} objects that is no better than always answering the mean label."
+        tone: Tone = "caution" if poor else "plain"
+        statements.append(Statement(topic=f"Accuracy, {input_name(name).lower()}", text=text, tone=tone))
+    return statements
 
 
 def _winners(results: Results, *, rng: np.random.Generator) -> list[Statement]:
@@ -191,7 +207,7 @@ def _real_touch(explained: Explained) -> Statement:
     return Statement(topic=topic, text=text, tone="plain" if useful else "caution")
 
 
-def tell_scale(results: Results) -> list[Statement]:
+def _tell_scale(results: Results) -> list[Statement]:
     """State how little or much the networks were trained on."""
     if not results.trainings:
         return []
@@ -210,3 +226,239 @@ def tell_scale(results: Results) -> list[Statement]:
         ". The thesis measured a real sensor, so its figures beside these show the scale of such errors, not a contest."
     )
     return [Statement(topic="What this run is", text=text)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Standing:
+    """How a method stands: settings (fill, unit) in which it gains for sure, against chance and the best control.
+
+    Attributes
+    ----------
+    beaten
+        Settings in which it does.
+    tested
+        Settings in which it was compared with a control.
+    mean_gain
+        Symmetric relevance gain, mean over those settings, in margin units.
+    """
+
+    method: str
+    beaten: tuple[tuple[str, str], ...]
+    tested: tuple[tuple[str, str], ...]
+    mean_gain: float
+
+    @property
+    def qualifies(self) -> bool:
+        """Whether it does so in most settings."""
+        return 2 * len(self.beaten) > len(self.tested)
+
+
+def rank_methods(faithful: RemovalScores, truth: Truth | None = None) -> list[Standing]:
+    """Rank the methods: those that beat the best control in most settings first, by their gain.
+
+    Parameters
+    ----------
+    faithful
+        Scores of the methods.
+    truth
+        What the simulation tells: fills under which even a map made from the truth does not win are left out.
+    """
+    unfit = _unfit_fills(truth)
+    known = controls(faithful)
+    gaps = {(one.fill, one.unit, one.first): one.gap for one in faithful.comparisons if one.second in known}
+    scores = {score.key: score for score in faithful.scores}
+    standings = []
+    for method in methods_in_order(score.method for score in faithful.scores if not score.control):
+        if method in CONTROLS:
+            continue
+        tested = [one for one in _votes(faithful, method) if (*one, method) in gaps and one[0] not in unfit]
+        beaten = [one for one in tested if _gains(gaps[*one, method]) and _gains(scores[*one, method].srg)]
+        gains = [scores[*one, method].srg.estimate for one in tested]
+        standings.append(
+            Standing(
+                method=method,
+                beaten=tuple(beaten),
+                tested=tuple(tested),
+                mean_gain=float(np.mean(gains)) if gains else float("-inf"),
+            )
+        )
+    return sorted(standings, key=lambda one: (not one.qualifies, -one.mean_gain))
+
+
+def _believe(faithful: RemovalScores, results: Results) -> Statement:
+    topic = f"Which to believe, {input_name(faithful.input).lower()}"
+    truth = results.study.truth.get(faithful.input)
+    ranked = rank_methods(faithful, truth)
+    if not any(one.tested for one in ranked):
+        return Statement(topic=topic, text="Not known: no method was compared with a control.", tone="caution")
+    best = ranked[0]
+    if faithful.trials < FEWEST_UNITS:
+        trials = f"{faithful.trials} trials are too few to tell a method from chance; {FEWEST_UNITS} or more are needed"
+        return Statement(topic=topic, text=f"Not known: {trials}.", tone="caution")
+    if not best.qualifies:
+        return Statement(topic=topic, text=_tell_none(ranked) + _tell_unfit(truth), tone="caution")
+    score = next(one for one in faithful.scores if one.key == (*best.beaten[0], best.method))
+    others = [one for one in ranked[1:] if one.qualifies]
+    text = (
+        f"Believe {method_name(best.method)}. Under {len(best.beaten)} of {len(best.tested)} fills it finds what "
+        "the answer rests on, better than chance and than the best map that knows nothing of the network, beyond the "
+        f"95 % interval{_tell_open(best)}. "
+        f"Under {fill_name(score.fill, score.unit)} its symmetric gain is {tell_interval(score.srg)} in margin units."
+    )
+    text += _tell_lead(faithful, best, others) + _tell_truth(results, faithful.input, best.method)
+    failing = [method_name(one.method) for one in ranked if not one.qualifies]
+    if failing:
+        text += f" {listed(failing)} {'does' if len(failing) == 1 else 'do'} not beat the controls under most fills."
+    text += _tell_unfit(truth)
+    if faithful.alarms:
+        count = len(faithful.alarms)
+        text += f" {count} {'alarm' if count == 1 else 'alarms'} about these scores: see beside their table."
+    return Statement(topic=topic, text=text, tone="good")
+
+
+def _tell_none(ranked: list[Standing]) -> str:
+    nearest = max(ranked, key=lambda one: (len(one.beaten), one.mean_gain))
+    return (
+        "None: no method beats both chance and the best control under most fills. "
+        f"{method_name(nearest.method)} comes nearest, under {len(nearest.beaten)} of {len(nearest.tested)}, its mean "
+        f"gain {signed(nearest.mean_gain, 3)} in margin units. Maps of this network show where a method looked, "
+        "not what the network used."
+    )
+
+
+def _tell_lead(faithful: RemovalScores, best: Standing, others: list[Standing]) -> str:
+    if not others:
+        return ""
+    rival = others[0]
+    gaps = _against(faithful, best.method, rival.method)
+    ahead, behind = (
+        [fill_name(*one) for one, gap in gaps.items() if one in best.tested and told(gap)]
+        for told in (_gains, lambda gap: gap.high < 0)
+    )
+    name = method_name(rival.method)
+    means = f"their mean gains are {signed(best.mean_gain, 3)} and {signed(rival.mean_gain, 3)}"
+    if not ahead and not behind:
+        return f" {name}, next by its mean gain, is not told apart from it under any fill."
+    if not ahead:
+        return f" {name}, next by its mean gain, is ahead of it under {listed(behind)}; {means}."
+    but = f", and behind it under {listed(behind)}; {means}" if behind else ""
+    return f" It is ahead of {name}, the next, under {listed(ahead)}{but}."
+
+
+def _against(faithful: RemovalScores, method: str, rival: str) -> dict[tuple[str, str], Difference]:
+    gaps = {}
+    for one in faithful.comparisons:
+        if (one.first, one.second) == (method, rival):
+            gaps[one.fill, one.unit] = one.gap
+        elif (one.first, one.second) == (rival, method):
+            gap = one.gap
+            gaps[one.fill, one.unit] = Difference(estimate=-gap.estimate, low=-gap.high, high=-gap.low, units=gap.units)
+    return gaps
+
+
+def _tell_open(best: Standing) -> str:
+    lost = [fill_name(*one) for one in best.tested if one not in best.beaten]
+    return f", but not under {listed(lost)}" if lost else ""
+
+
+def _unfit_fills(truth: Truth | None) -> list[str]:
+    return [] if truth is None else [one.fill for one in truth.meta if not one.holds]
+
+
+def _tell_unfit(truth: Truth | None) -> str:
+    unfit = [FILL_NAMES.get(fill, fill) for fill in _unfit_fills(truth)]
+    if not unfit:
+        return ""
+    return f" Left out: {listed(unfit)}, where even a map made from the truth does not win."
+
+
+def _tell_truth(results: Results, name: str, method: str) -> str:
+    truth = results.study.truth.get(name)
+    found = None if truth is None else truth.methods.get(method)
+    if found is None or found.network is None:
+        return ""
+    return (
+        f" Its map ranks the markers by what they do to the answer with a Spearman correlation of "
+        f"{tell_interval(found.network, digits=2)}, as the simulation tells (1 = alike, 0 = chance)."
+    )
+
+
+def _votes(faithful: RemovalScores, method: str) -> list[tuple[str, str]]:
+    """One setting a fill: by pixels where that was done, or a fill tried with several units would count twice."""
+    chosen: dict[str, tuple[str, str]] = {}
+    for fill, unit in settings(faithful):
+        if (fill, unit, method) in faithful.curves:
+            chosen.setdefault(fill, (fill, unit))
+    return list(chosen.values())
+
+
+def _gains(gap: Difference) -> bool:
+    return gap.sure and gap.estimate > 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlarmGroup:
+    """Alarms of one kind: what they have in common, and each in full."""
+
+    kind: str
+    sentences: tuple[str, ...]
+
+
+_KINDS = {
+    r"does not beat a random order": "Methods that do not beat a random order",
+    r"no more than the control": "Methods that gain no more than a map that knows nothing of the network",
+    r"fill decides|filled image is answered": "Frames in which the fill decides, rather than the map",
+    r"rank the methods differently": "Fills that rank the methods differently",
+    r"correlates with its last step": "Scores that measure the fill rather than the map",
+    r"at an end of the margin": "Answers at an end of the margin, which can move one way only",
+    r"still correlates": "Maps that stay alike when all weights are new",
+    r"rank nothing|NaN": "Maps that rank nothing",
+}
+
+
+def group_alarms(alarms: Sequence[str]) -> tuple[AlarmGroup, ...]:
+    """Group alarms by what they warn of; one of no known kind stands for itself."""
+    groups: dict[str, list[str]] = {}
+    for alarm in alarms:
+        shown = name_methods(alarm)
+        sentence = f"{shown[:1].upper()}{shown[1:].rstrip('.')}."
+        kind = next((kind for pattern, kind in _KINDS.items() if re.search(pattern, alarm)), sentence)
+        groups.setdefault(kind, []).append(sentence)
+    # the same fill can be found wanting by two scores
+    return tuple(AlarmGroup(kind=kind, sentences=tuple(dict.fromkeys(found))) for kind, found in groups.items())
+
+
+def alarms_of(results: Results, name: str, stage: str) -> tuple[str, ...]:
+    """Alarms of one network's `faithfulness`, `remedies`, `randomisation`, `score` or `explain`."""
+    if stage == "explain":
+        return tuple(
+            f"{method_name(method)}, {source_name(source)}: {warning}"
+            for (own, source), explained in results.explanations.items()
+            if own == name
+            for method, notes in explained.methods.items()
+            for warning in notes.warnings
+        )
+    if stage == "score":
+        return tuple(
+            alarm if source == results.study.source else f"{source_name(source)}: {alarm}"
+            for (own, source), scored in results.scores.items()
+            if own == name
+            for alarm in scored.alarms
+        )
+    found = getattr(results.study, stage).get(name)
+    return () if found is None else found.alarms
+
+
+def count_alarms(results: Results) -> tuple[str, ...]:
+    """Write a line for each kind of alarm: how often, and of which networks."""
+    counts: dict[str, dict[str, int]] = {}
+    for name in inputs_in_order(results.inputs)[::-1]:
+        for stage in ("score", "remedies", "faithfulness", "randomisation", "explain"):
+            for group in group_alarms(alarms_of(results, name, stage)):
+                own = counts.setdefault(group.kind, {})
+                own[name] = own.get(name, 0) + len(group.sentences)
+    told = {
+        kind: listed([f"{input_name(name).lower()} {count}" for name, count in own.items()])
+        for kind, own in counts.items()
+    }
+    return tuple(f"{kind.rstrip('.')}: {sum(own.values())} ({told[kind]})" for kind, own in counts.items())

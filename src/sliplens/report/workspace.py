@@ -39,3 +39,13 @@ class Results:
     scores: dict[tuple[str, str], DeletionScores] = field(default_factory=dict)
     study: Study = field(default_factory=Study)
     notes: tuple[str, ...] = ()
+
+    @property
+    def inputs(self) -> set[str]:
+        """Inputs that any stage tells of."""
+        named = {*self.trainings, *self.evaluations, *(name for name, _ in (*self.explanations, *self.scores))}
+        return named | self.study.inputs if self.study or not named else named
+
+    def scored_inputs(self, source: str) -> set[str]:
+        """Inputs that have deletion scores on frames of this source."""
+        return {name for name, own in self.scores if own == source}

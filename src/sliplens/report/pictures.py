@@ -1,27 +1,18 @@
-"""Figures of deletion: what is removed at a few steps, and what the answer does."""
+"""Plates made of pictures: maps beside each other, and what deletion removes."""
 
-from textwrap import fill as wrap
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from sliplens.plots.errors import MARGIN_LABEL
 from sliplens.plots.layout import place_axes
 from sliplens.plots.style import (
-    BLACK,
     BLUE,
     CONTROLS,
     GREY,
-    METHOD_COLOURS,
-    METHOD_LINES,
-    PURPLE,
     VERMILLION,
     drawing_style,
-    fill_name,
     input_name,
     inputs_in_order,
     listed,
@@ -30,28 +21,33 @@ from sliplens.plots.style import (
     percent,
     short_input_name,
     signed,
+    source_name,
 )
-from sliplens.report.believing import controls, settings
 from sliplens.report.plates import (
     CELL_IN,
+    THESIS_LEVEL,
     Cell,
     Plate,
+    ShownFrame,
     bright_pictures,
+    columns,
     draw_grid,
     explained_of,
     gone,
     show_map,
+    shown_frames,
     told_frame,
 )
 from sliplens.report.workspace import Results
 from sliplens.results.explanation import Explained
-from sliplens.results.faithfulness import DeletionCurve, DeletionScores, RemovalCurve, RemovalScores
+from sliplens.results.faithfulness import DeletionCurve, DeletionScores
 
 SHARES = (0.01, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Of the image, that are gone in the columns of a figure."""
 _TOLD_METHOD = "poly-cam"
 _TOLD = (0.05, 0.2, 1.0)
 _HALF = "stop-at-half"
+_STEP_COLUMNS = ("input", "method", "frame_id", "pixels_removed", "share_removed", "prediction", "score")
 _LEVELS = {"grey": 128, "black": 0, "white": 255}
 _FIGURES = {
     "grad-cam": "fig-19-removal-grad-cam",
@@ -59,11 +55,167 @@ _FIGURES = {
     "poly-cam": "fig-21-removal-poly-cam",
     "poly-cam-thesis": "fig-21-removal-poly-cam-thesis",
 }
+_STATE_FIGURES = {"difference": "fig-15-methods-difference", "raw": "fig-16-methods-raw"}
+
+
+def plate_methods(results: Results) -> Plate | None:
+    """Draw the methods beside each other at one margin, a row an input (thesis, Fig. 8); None without maps."""
+    rows, numbers, told = [], _Saliencies(), []
+    for name in inputs_in_order(results.inputs)[::-1]:
+        explained = explained_of(results, name)
+        frames = [] if explained is None else shown_frames(results, explained)
+        if explained is None or not frames:
+            continue
+        frame = min(frames, key=lambda one: abs(one.level - THESIS_LEVEL) if one.level is not None else 1.0)
+        own = explained.frames[frame.index]
+        pictures, called = bright_pictures(explained, [frame.index])
+        cells = [Cell(picture=pictures[frame.index], words=_answer(explained, frame.index))]
+        for method in shown_methods(results):
+            saliency = explained.saliency.get(method)
+            if saliency is None:
+                cells.append(Cell(picture=None))
+                continue
+            cells.append(Cell(picture=show_map(pictures[frame.index], saliency[frame.index])))
+            numbers.add(explained, method, frame)
+        rows.append((f"{short_input_name(name)}\n({called.lower()})", cells))
+        answer = f"true Γ {percent(own.safety_margin)}, read {percent(own.prediction)}"
+        told.append(f"{short_input_name(name).lower()} {own.id}, {answer}")
+    if not rows:
+        return None
+    heads = ["Input", *(method_name(method) for method in shown_methods(results))]
+    return Plate(
+        name="fig-08-methods",
+        figure=draw_grid(rows, heads=heads, bar=True).figure,
+        alt=f"Saliency maps of {listed(heads[1:])} side by side; {'; '.join(told)}",
+        caption=f"Methods beside each other on one frame near Γ {percent(THESIS_LEVEL)} ({'; '.join(told)}). Colours "
+        f"are relative to each map's own saliency. {numbers.tell_spread()}",
+        numbers=numbers.columns(),
+        pixels=True,
+    )
+
+
+def plate_states(results: Results, explained: Explained) -> Plate | None:
+    """Draw every method across the states of one trial (thesis, Figs. 15 and 16); None without frames to show."""
+    methods = [method for method in shown_methods(results) if method in explained.saliency]
+    real = explained.source == "real"
+    name = f"real-{explained.input}" if real else f"methods-{explained.input}"
+    return _plate(
+        explained,
+        shown_frames(results, explained),
+        methods,
+        name=name if real else _STATE_FIGURES.get(explained.input, name),
+        what=f"Methods across the contact states, {input_name(explained.input).lower()}, "
+        f"{source_name(explained.source)}",
+    )
+
+
+def plate_poly_cam(results: Results) -> Plate | None:
+    """Draw Poly-CAM across the states on difference images (thesis, Fig. 11); None without its maps."""
+    explained = explained_of(results, "difference")
+    if explained is None or "poly-cam" not in explained.saliency:
+        return None
+    return _plate(
+        explained,
+        shown_frames(results, explained),
+        ["poly-cam"],
+        name="fig-11-poly-cam-difference",
+        what="Poly-CAM across the contact states, difference images",
+    )
+
+
+def _plate(explained: Explained, frames: list[ShownFrame], methods: list[str], *, name: str, what: str) -> Plate | None:
+    if not frames:
+        return None
+    numbers = _Saliencies()
+    pictures, called = bright_pictures(explained, [one.index for one in frames])
+    rows = [(called, [Cell(picture=pictures[one.index], words=_answer(explained, one.index)) for one in frames])]
+    for method in methods:
+        maps = explained.saliency[method]
+        cells = [Cell(picture=show_map(pictures[one.index], maps[one.index])) for one in frames]
+        rows.append((method_name(method), cells))
+        for one in frames:
+            numbers.add(explained, method, one)
+    answers = [explained.frames[one.index] for one in frames]
+    errors = [abs(one.prediction - one.safety_margin) for one in answers if one.safety_margin is not None]
+    off = f" The network is off by at most {100 * max(errors):.1f} percentage points on these frames." if errors else ""
+    return Plate(
+        name=name,
+        figure=draw_grid(rows, heads=[f"Γ {percent(one.level)}" for one in frames], bar=True).figure,
+        alt=f"{what}: {listed([method_name(one) for one in methods])} at Γ "
+        f"{', '.join(percent(one.level) for one in frames)}",
+        caption=f"{what}: {'frames' if explained.source == 'real' else 'one trial'} from full stick to full slip.{off} "
+        "Colours are relative to each map's own saliency, so brightness does not compare between maps. "
+        f"{numbers.tell_travel(methods)}{_tell_blank(explained, frames, methods)}",
+        numbers=numbers.columns(),
+        pixels=True,
+    )
+
+
+def _tell_blank(explained: Explained, frames: list[ShownFrame], methods: list[str]) -> str:
+    blank = sum(not explained.saliency[method][one.index].any() for method in methods for one in frames)
+    if not blank:
+        return ""
+    maps = "1 map has" if blank == 1 else f"{blank} maps have"
+    return f" {maps} no colour: there the method finds nothing that speaks for the answer."
+
+
+class _Saliencies:
+    """Numbers of each map drawn: where its weight lies, and on how much of the image."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[str, str, str, float | None, float, float, float, float, float]] = []
+
+    def add(self, explained: Explained, method: str, frame: ShownFrame) -> None:
+        own = explained.frames[frame.index]
+        saliency = explained.saliency[method][frame.index].astype(np.float64)
+        high, wide = saliency.shape
+        total = saliency.sum()
+        y, x = np.mgrid[:high, :wide]
+        right, down = (float((saliency * axis).sum() / total) if total > 0 else float("nan") for axis in (x, y))
+        label = float("nan") if own.safety_margin is None else own.safety_margin
+        above = float((saliency > 0.5).mean())
+        row = (explained.input, method, own.id, frame.level, label, own.prediction, above, right, down)
+        self._rows.append(row)
+
+    def columns(self) -> dict[str, list]:
+        names = (
+            "input", "method", "frame_id", "level", "safety_margin", "prediction", "share_above_half", "centre_x_px",
+            "centre_y_px",
+        )  # fmt: skip
+        return columns(names, self._rows)
+
+    def tell_spread(self) -> str:
+        parts = [f"{method_name(row[1])} {percent(row[6])} ({short_input_name(row[0]).lower()})" for row in self._rows]
+        return f"Share of the image with a saliency above 0.5: {', '.join(parts)}."
+
+    def tell_travel(self, methods: list[str]) -> str:
+        parts = []
+        for method in methods:
+            rows = [row for row in self._rows if row[1] == method and np.isfinite(row[8])]
+            if len(rows) > 1:
+                parts.append(f"{method_name(method)} {signed(rows[-1][8] - rows[0][8], 0)}")
+        told = ", ".join(parts)
+        return (
+            f"From the first to the last frame the centre of the saliency moves down by, in pixels: {told}."
+            if told
+            else ""
+        )
+
+
+def _answer(explained: Explained, index: int) -> str:
+    frame = explained.frames[index]
+    return f"true {percent(frame.safety_margin)}, read {percent(frame.prediction)}"
+
+
+def shown_methods(results: Results) -> list[str]:
+    """Methods that have maps, the controls left out."""
+    found = {method for one in results.explanations.values() for method in one.saliency}
+    return methods_in_order(found - set(CONTROLS))
 
 
 def plate_deletion(results: Results) -> Plate | None:
     """Illustrate deletion on one frame, with the score below (thesis, Fig. 5); None without a scored map."""
-    for name in inputs_in_order(results.study.inputs)[::-1]:
+    for name in inputs_in_order(results.inputs)[::-1]:
         found = _material(results, name)
         if found is None:
             continue
@@ -77,34 +229,35 @@ def plate_deletion(results: Results) -> Plate | None:
 
 def plate_removal(results: Results, method: str) -> Plate | None:
     """Draw what one method has removed, with y and D at each step, a row an input (thesis, Figs. 19 to 21)."""
-    rows, numbers, told = [], _columns(), []
-    for name in inputs_in_order(results.study.inputs)[::-1]:
+    rows, numbers, told = [], [], []
+    for name in inputs_in_order(results.inputs)[::-1]:
         found = _material(results, name)
         if found is None or method not in found[0].saliency or method not in found[1].curves:
             continue
         explained, scored, index = found
         steps = _steps(scored.curves[method], explained, index)
         rows.append((short_input_name(name), _removed(explained, method, index, steps, fill=scored.fill)))
-        _note(numbers, explained, method, index, steps)
+        numbers += _steps_told(explained, method, index, steps)
         told.append(f"{input_name(name)}: {_tell_fall(explained, index, steps)}")
     if not rows:
         return None
+    fill = " or ".join(sorted({one.fill for one in results.scores.values()}))
     heads = ["Saliency", *(f"{percent(share)} gone" for share in SHARES)]
     return Plate(
         name=_FIGURES.get(method, f"removal-{method}"),
         figure=draw_grid(rows, heads=heads, bar=True, cell_in=1.3).figure,
         alt=f"What {method_name(method)} calls most important is removed step by step. {'. '.join(told)}",
         caption=f"{method_name(method)}: what is gone, the answer y and the score D at each step of the thesis's "
-        f"deletion ({_fills(results)} fill). {'. '.join(told)}.",
-        numbers=numbers,
+        f"deletion ({fill} fill). {'. '.join(told)}.",
+        numbers=columns(_STEP_COLUMNS, numbers),
         pixels=True,
     )
 
 
 def plate_highlighted(results: Results) -> Plate | None:
     """Draw the frame without all that has a saliency above 0.5, a row an input (thesis, Fig. 10)."""
-    rows, numbers, told, methods = [], _columns(), [], _all_methods(results)
-    for name in inputs_in_order(results.study.inputs)[::-1]:
+    rows, numbers, told, methods = [], [], [], shown_methods(results)
+    for name in inputs_in_order(results.inputs)[::-1]:
         found, remedies = _material(results, name), results.study.remedies.get(name)
         variant = None if remedies is None else remedies.variants.get(_HALF)
         if found is None or remedies is None or variant is None:
@@ -122,7 +275,7 @@ def plate_highlighted(results: Results) -> Plate | None:
             mask = gone(explained.saliency[method][index], step[0])
             words = f"{percent(mask.mean())} gone, y {percent(step[1])}, D {step[2]:.2f}"
             cells.append(Cell(picture=_without(picture, mask, variant.fill), words=words))
-            _note(numbers, explained, method, index, [step])
+            numbers += _steps_told(explained, method, index, [step])
             own_told.append(f"{method_name(method)} {words}")
         told += [f"{input_name(name)}: whole y {percent(own.prediction)}; {'; '.join(own_told)}"] if own_told else []
         rows.append((short_input_name(name), cells))
@@ -134,14 +287,9 @@ def plate_highlighted(results: Results) -> Plate | None:
         figure=draw_grid(rows, heads=heads, cell_in=1.25 * CELL_IN).figure,
         alt=f"One frame without what each method highlights. {'. '.join(told)}",
         caption=f"All pixels with a saliency above 0.5 removed, the answer y and the score D then. {'. '.join(told)}.",
-        numbers=numbers,
+        numbers=columns(_STEP_COLUMNS, numbers),
         pixels=True,
     )
-
-
-def removal_methods(results: Results) -> list[str]:
-    """Methods that the figures of removal can show."""
-    return _all_methods(results)
 
 
 def _illustrate(explained: Explained, scored: DeletionScores, method: str, index: int) -> Plate:
@@ -235,20 +383,14 @@ def _without(
     return np.where(mask[..., None], np.uint8(_LEVELS.get(fill, 128)), picture)
 
 
-def _columns() -> dict[str, list]:
-    return {
-        name: [] for name in ("input", "method", "frame_id", "pixels_removed", "share_removed", "prediction", "score")
-    }
-
-
-def _note(
-    numbers: dict[str, list], explained: Explained, method: str, index: int, steps: list[tuple[int, float, float]]
-) -> None:
+def _steps_told(
+    explained: Explained, method: str, index: int, steps: list[tuple[int, float, float]]
+) -> list[tuple[Any, ...]]:
     own = explained.frames[index]
-    for pixels, answer, score in [(0, own.prediction, 1.0), *steps]:
-        values = (explained.input, method, own.id, pixels, pixels / explained.image_size**2, answer, score)
-        for name, value in zip(numbers, values, strict=True):
-            numbers[name].append(value)
+    return [
+        (explained.input, method, own.id, pixels, pixels / explained.image_size**2, answer, score)
+        for pixels, answer, score in [(0, own.prediction, 1.0), *steps]
+    ]
 
 
 def _tell_fall(explained: Explained, index: int, steps: list[tuple[int, float, float]]) -> str:
@@ -258,144 +400,3 @@ def _tell_fall(explained: Explained, index: int, steps: list[tuple[int, float, f
         if share in _TOLD
     ]
     return "; ".join([f"whole y {percent(explained.frames[index].prediction)}", *parts])
-
-
-def _fills(results: Results) -> str:
-    return " or ".join(sorted({one.fill for one in results.scores.values()}))
-
-
-def _all_methods(results: Results) -> list[str]:
-    found = {method for one in results.explanations.values() for method in one.saliency}
-    return methods_in_order(found - set(CONTROLS))
-
-
-_LETTERS = 20
-"""Of a line beside a chart."""
-
-
-def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
-    """Draw change against area, most and least influential first and at random, by method and fill; None without."""
-    known = controls(faithful)
-    methods = methods_in_order({method for _, _, method in faithful.curves} - known - set(CONTROLS))
-    fills = settings(faithful)
-    if not methods or not fills:
-        return None
-    shown = [curve for key, curve in faithful.curves.items() if key[2] in methods]
-    top = max(float(curve.most_first.mean(axis=0).max()) for curve in shown)
-    # below zero where more speaks for the answer than before
-    bottom = min(float(line.mean(axis=0).min()) for one in shown for line in (one.most_first, one.least_first))
-    with drawing_style():
-        figure = Figure(figsize=(1.75 * len(fills) + 0.9, 1.55 * len(methods) + 0.9), layout="constrained")
-        axes = figure.subplots(len(methods), len(fills), squeeze=False, sharex=True, sharey=True)
-        for line, method in zip(axes, methods, strict=True):
-            for ax, (fill, unit) in zip(line, fills, strict=True):
-                curve = faithful.curves.get((fill, unit, method))
-                if curve is None:
-                    ax.set_axis_off()
-                    continue
-                _plot_removal(curve, method, ax=ax)
-            line[0].set_ylabel(wrap(method_name(method), _LETTERS), fontsize=8.5)
-        for ax, (fill, unit) in zip(axes[0], fills, strict=True):
-            ax.set_title(fill_name(fill, unit).capitalize().replace(" (", "\n("), fontsize=8.5)
-        axes[0, 0].set(ylim=(1.15 * min(bottom, 0.0), 1.15 * max(top, 1e-3)), xlim=(0, 100), xticks=[0, 50, 100])
-        kinds: dict[str, Any] = {"most supporting first": "-", "least supporting first": "--", "random orders": ":"}
-        handles = [Line2D([], [], color=BLACK, linestyle=line, label=label) for label, line in kinds.items()]
-        figure.legend(handles=handles, loc="outside upper left", ncols=3)
-        figure.supxlabel("Removed (% of the image)", fontsize=9)
-        figure.supylabel("Evidence lost (margin units)", fontsize=9)
-    return Plate(
-        name=f"sound-curves-{faithful.input}",
-        figure=figure,
-        alt=f"Evidence lost against the area removed, {input_name(faithful.input).lower()}, for "
-        f"{listed([method_name(one) for one in methods])}",
-        caption=f"{input_name(faithful.input)}: how much of the answer's change from the untouched sensor is lost "
-        "while parts go, most supporting first, "
-        f"least supporting first, and in {faithful.random_orders} random orders; the band holds the middle half of "
-        f"{faithful.frames} frames. The area between the first two is the symmetric gain. "
-        f"{_tell_gains(faithful, methods)}",
-        numbers=_removal_numbers(faithful),
-    )
-
-
-def _plot_removal(curve: RemovalCurve, method: str, *, ax: Axes) -> None:
-    share, colour = 100 * curve.areas, METHOD_COLOURS.get(method, PURPLE)
-    low, high = np.quantile(curve.most_first, [0.25, 0.75], axis=0)
-    ax.fill_between(share, low, high, color=colour, alpha=0.15, linewidth=0)
-    ax.plot(share, curve.most_first.mean(axis=0), color=colour, linewidth=1.6)
-    ax.plot(
-        share,
-        curve.least_first.mean(axis=0),
-        color=colour,
-        linestyle="--",
-        linewidth=1.3,
-    )
-    ax.plot(share, curve.random.mean(axis=0), color=BLACK, linestyle=":", linewidth=1.3)
-    ax.tick_params(labelsize=7.5)
-
-
-def plate_randomisation(results: Results) -> Plate | None:
-    """Draw how alike maps stay as layers get new weights, a chart an input; None where that was not tested."""
-    found = results.study.randomisation
-    names = inputs_in_order(found)[::-1]
-    if not names:
-        return None
-    rows, told = [], []
-    with drawing_style():
-        figure = Figure(figsize=(4.6 * len(names), 3.5), layout="constrained")
-        for ax, name in zip(figure.subplots(1, len(names), squeeze=False, sharey=True)[0], names, strict=True):
-            for method in methods_in_order(found[name].methods):
-                one = found[name].methods[method]
-                values = [np.nan if value is None else value for value in one.similarity]
-                ax.plot(
-                    one.layers,
-                    values,
-                    color=METHOD_COLOURS.get(method, PURPLE),
-                    linestyle=METHOD_LINES.get(method, "-"),
-                    marker="o",
-                    markersize=3.5,
-                    label=method_name(method),
-                )
-                rows += [(name, method, layer, value) for layer, value in zip(one.layers, one.similarity, strict=True)]
-                if one.similarity and one.similarity[-1] is not None:
-                    told.append(
-                        f"{method_name(method)} {signed(one.similarity[-1], 2)} ({short_input_name(name).lower()})"
-                    )
-            ax.axhline(0, color=BLACK, linewidth=0.8, linestyle=":")
-            ax.set(xlabel="Layers with new weights, from the output", ylabel="Similarity of the map (no unit)")
-            ax.set_title(input_name(name))
-        lines = {line.get_label(): line for ax in figure.axes for line in ax.get_lines() if line.get_marker() == "o"}
-        figure.legend(handles=list(lines.values()), loc="outside upper left", ncols=3)
-    columns = ("input", "method", "layers", "similarity")
-    return Plate(
-        name="randomisation",
-        figure=figure,
-        alt=f"Similarity of maps while layers get new weights; with all new: {', '.join(told)}",
-        caption="Similarity of each method's map to that of the trained network while layers get new weights: a map "
-        "that stays alike does not show what was learned. With the last layer tested new: "
-        f"{', '.join(told) or 'not defined'}.",
-        numbers={name: [row[place] for row in rows] for place, name in enumerate(columns)},
-    )
-
-
-def _tell_gains(faithful: RemovalScores, methods: list[str]) -> str:
-    fill, unit = settings(faithful)[0]
-    gains = {
-        method: float(faithful.curves[fill, unit, method].srg.mean())
-        for method in methods
-        if (fill, unit, method) in faithful.curves
-    }
-    ranked = sorted(gains, key=lambda one: -gains[one])
-    told = ", ".join(f"{method_name(one)} {signed(gains[one], 3)}" for one in ranked)
-    return f"Under {fill_name(fill, unit)} it is {told}."
-
-
-def _removal_numbers(faithful: RemovalScores) -> dict[str, list]:
-    kinds = ("most_first", "least_first", "random")
-    columns: dict[str, list] = {name: [] for name in ("fill", "unit", "method", "area", *kinds)}
-    for (fill, unit, method), curve in faithful.curves.items():
-        steps = len(curve.areas)
-        means = [getattr(curve, kind).mean(axis=0).tolist() for kind in kinds]
-        values = ([fill] * steps, [unit] * steps, [method] * steps, curve.areas.tolist(), *means)
-        for column, more in zip(columns.values(), values, strict=True):
-            column.extend(more)
-    return columns

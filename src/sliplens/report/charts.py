@@ -1,0 +1,409 @@
+"""Plates that are charts: errors by margin, deletion and removal curves, weights drawn anew."""
+
+from collections.abc import Mapping
+from textwrap import fill as wrap
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from sliplens.plots.errors import (
+    plot_bins,
+    plot_faithfulness,
+    plot_learning_curves,
+    plot_margin_over_time,
+    plot_predictions,
+)
+from sliplens.plots.style import (
+    BLACK,
+    CONTROLS,
+    INPUT_COLOURS,
+    METHOD_COLOURS,
+    METHOD_LINES,
+    PURPLE,
+    conditions_in_order,
+    decimals,
+    drawing_style,
+    fill_name,
+    input_name,
+    inputs_in_order,
+    listed,
+    method_name,
+    methods_in_order,
+    percent,
+    short_input_name,
+    signed,
+    source_name,
+)
+from sliplens.report.comparisons import controls, settings
+from sliplens.report.plates import Plate, columns
+from sliplens.report.workspace import Results
+from sliplens.results.faithfulness import DeletionScores, RemovalCurve, RemovalScores
+
+_EACH_FIGURES = {"difference": "fig-17-faithfulness-difference", "raw": "fig-18-faithfulness-raw"}
+_FEW = 4
+"""Charts in a row."""
+_LETTERS = 20
+"""Of a line beside a chart."""
+
+
+def plate_bins(results: Results) -> Plate:
+    """Draw the MSE by bins of the margin, a chart a condition (thesis, Fig. 7)."""
+    evaluations, conditions = results.evaluations, _conditions(results)
+    bins = {
+        condition: {
+            name: evaluations[name].conditions[condition].bins
+            for name in inputs_in_order(evaluations)
+            if condition in evaluations[name].conditions
+        }
+        for condition in conditions
+    }
+    rows = [
+        (condition, name, row.low, row.high, row.frames, row.mse)
+        for condition in conditions
+        for name, scores in bins[condition].items()
+        for row in scores
+    ]
+    # one scale for all conditions, or the eye compares bars that do not compare
+    top = 1.15 * max((row[5] for row in rows if row[5] is not None), default=1.0)
+    figure, axes = _charts(len(conditions), each=(4.4, 3.2))
+    told = []
+    with drawing_style():
+        for ax, condition in zip(axes, conditions, strict=True):
+            plot_bins(bins[condition], ax=ax).set(ylim=(0, top))
+            ax.set_title(f"{condition.capitalize()} objects", parse_math=False)
+    for condition in conditions:
+        known = [row for row in rows if row[0] == condition and row[5] is not None]
+        if known:
+            worst = max(known, key=lambda row: row[5] or 0.0)
+            place = f"{percent(worst[2])} to {percent(worst[3])}, {input_name(worst[1]).lower()}"
+            told.append(f"{condition}: {place}, MSE {worst[5]:.4f}")
+    return Plate(
+        name="fig-07-mse-by-bin",
+        figure=figure,
+        alt=f"Bars of the mean squared error in bins of Γ; largest, {'; '.join(told)}",
+        caption=f"Mean squared error by bins of the true safety margin. Largest error, {'; '.join(told)}. A bin "
+        "without bars holds no test frame.",
+        numbers=columns(("condition", "input", "low", "high", "frames", "mse"), rows),
+    )
+
+
+def plate_predictions(results: Results) -> Plate:
+    """Draw the answer against the label, a chart an input and condition."""
+    answers = np.concatenate([one.predictions.prediction for one in results.evaluations.values()])
+    # one scale for all, so that the scatter compares
+    low, high = min(0.0, 100 * float(answers.min())), max(100.0, 100 * float(answers.max()))
+    shown = [
+        (name, condition, one.predictions.where(one.predictions.condition == condition))
+        for condition in _conditions(results)
+        for name in inputs_in_order(results.evaluations)
+        for one in [results.evaluations[name]]
+        if condition in one.conditions and (one.predictions.condition == condition).any()
+    ]
+    figure, axes = _charts(len(shown), each=(3.4, 3.1))
+    rows = []
+    with drawing_style():
+        for ax, (name, condition, frames) in zip(axes, shown, strict=True):
+            r2 = decimals(results.evaluations[name].conditions[condition].r2, 2)
+            plot_predictions(frames, colour=INPUT_COLOURS.get(name, PURPLE), ax=ax).set(ylim=(low - 5, high + 5))
+            ax.set_title(f"{short_input_name(name)}, {condition} (R² {r2})", parse_math=False)
+            rows += [
+                (name, *values)
+                for values in zip(
+                    frames.trial.tolist(), frames.condition.tolist(), frames.frame.tolist(),
+                    frames.safety_margin.tolist(), frames.prediction.tolist(), strict=True,
+                )
+            ]  # fmt: skip
+    return Plate(
+        name="predictions",
+        figure=figure,
+        alt=f"Predicted against true Γ: {listed([f'{input_name(one[0])}, {one[1]}' for one in shown])}",
+        caption=f"Predicted against true safety margin, {len(answers)} answers on frames of test trials. A perfect "
+        "network would put every dot on the dashed line.",
+        numbers=columns(("input", "trial", "condition", "frame", "safety_margin", "prediction"), rows),
+    )
+
+
+def plate_over_time(results: Results) -> Plate | None:
+    """Draw label and answers through one typical test trial of each condition."""
+    chosen = {one: trial for one in _conditions(results) if (trial := _typical_trial(results, one)) is not None}
+    if not chosen:
+        return None
+    figure, axes = _charts(len(chosen), each=(4.6, 3.1))
+    rows = []
+    with drawing_style():
+        for ax, (condition, trial) in zip(axes, chosen.items(), strict=True):
+            shown = {
+                name: all_frames.where((all_frames.trial == trial) & (all_frames.condition == condition))
+                for name, one in results.evaluations.items()
+                for all_frames in [one.predictions]
+                if ((all_frames.trial == trial) & (all_frames.condition == condition)).any()
+            }
+            plot_margin_over_time(shown, ax=ax).set_title(condition.capitalize(), parse_math=False)
+            rows += [
+                (name, trial, *values)
+                for name, frames in shown.items()
+                for values in zip(
+                    frames.time_s.tolist(), frames.safety_margin.tolist(), frames.prediction.tolist(), strict=True
+                )
+            ]
+    told = ", ".join(f"{trial} ({condition})" for condition, trial in chosen.items())
+    return Plate(
+        name="over-time",
+        figure=figure,
+        alt=f"True and predicted Γ over time through the test trials {told}",
+        caption="Safety margin through one test trial of each condition: the trial whose mean error is the median of "
+        f"all, neither the best nor the worst. Shown: {told}.",
+        numbers=columns(("input", "trial", "time_s", "safety_margin", "prediction"), rows),
+    )
+
+
+def plate_learning(results: Results) -> Plate:
+    """Draw the learning curves of all inputs."""
+    trainings = {name: results.trainings[name] for name in inputs_in_order(results.trainings)}
+    told = "; ".join(
+        f"{input_name(name)}: best validation MSE {decimals(one.best_validation_mse, 4)} "
+        f"after {decimals(one.epochs, 1)} epochs (stopped by {one.stopped_by})"
+        for name, one in trainings.items()
+    )
+    figure, axes = _charts(1, each=(5.6, 3.2))
+    with drawing_style():
+        plot_learning_curves(trainings, ax=axes[0])
+    rows = [
+        (name, *values)
+        for name, one in trainings.items()
+        for values in zip(
+            one.curve.epoch.tolist(), one.curve.train_mse.tolist(), one.curve.validation_mse.tolist(), strict=True
+        )
+    ]
+    return Plate(
+        name="learning",
+        figure=figure,
+        alt=f"Training and validation error by epoch. {told}",
+        caption=f"Learning curves. {told}.",
+        numbers=columns(("input", "epoch", "train_mse", "validation_mse"), rows),
+    )
+
+
+def plate_faithfulness(scores: Mapping[str, DeletionScores]) -> Plate:
+    """Draw the mean deletion score while pixels go, a chart an input (thesis, Fig. 9).
+
+    Parameters
+    ----------
+    scores
+        By input, all of one source.
+    """
+    figure, axes = _charts(len(scores), each=(4.6, 3.5))
+    with drawing_style():
+        for ax, (name, one) in zip(axes, scores.items(), strict=True):
+            plot_faithfulness(one.curves, pixels=_pixels(one), ax=ax).set_title(input_name(name))
+    told = "; ".join(f"{input_name(name).lower()}: {_tell_order(one)}" for name, one in scores.items())
+    source = " or ".join(sorted({source_name(one.source) for one in scores.values()}))
+    fill = " or ".join(sorted({one.fill for one in scores.values()}))
+    real = "-real" if all(one.source == "real" for one in scores.values()) else ""
+    return Plate(
+        name=f"fig-09-faithfulness{real}",
+        figure=figure,
+        alt=f"Deletion score D against pixels removed. Mean over all steps, {told}",
+        caption=f"Deletion score D of the thesis on {source} while pixels become {fill}, most salient first; the line "
+        "is the mean over frames, the band holds the middle half of them. A curve that falls early names pixels the "
+        f"network relies on. Mean over all steps, lowest first, {told}.",
+        numbers=_deletion_numbers(scores),
+    )
+
+
+def plate_each_frame(scored: DeletionScores) -> Plate:
+    """Draw the thesis's curve of every frame, a chart a method (thesis, Figs. 17 and 18)."""
+    methods, name = methods_in_order(scored.curves), input_name(scored.input).lower()
+    figure, axes = _charts(len(methods), each=(2.9, 2.5))
+    told = []
+    with drawing_style():
+        for ax, method in zip(axes, methods, strict=True):
+            curve, colour = scored.curves[method], METHOD_COLOURS.get(method, PURPLE)
+            share = 100 * curve.pixels_removed / _pixels(scored)
+            # dozens of curves as vectors would swell the page
+            ax.plot(share, curve.scores.T, color=colour, alpha=0.3, linewidth=0.7, rasterized=True)
+            ax.plot(share, curve.scores.mean(axis=0), color=BLACK, linewidth=2)
+            ax.set(xlim=(0, 100), ylim=(0, 1.03), xlabel="Pixels removed (%)", ylabel="D (no unit)")
+            ax.set_title(method_name(method), fontsize=9.5)
+            means = curve.scores.mean(axis=1)
+            told.append(f"{method_name(method)} {means.mean():.3f} (standard deviation {means.std():.3f})")
+    frames = max(len(curve.frame_ids) for curve in scored.curves.values())
+    return Plate(
+        name=_EACH_FIGURES.get(scored.input, f"faithfulness-{scored.input}"),
+        figure=figure,
+        alt=f"Deletion score D of every frame, {name}: {'; '.join(told)}",
+        caption=f"Deletion score D of each of {frames} frames ({name}), in black their mean. Score: {'; '.join(told)}.",
+        numbers=_deletion_numbers({scored.input: scored}),
+    )
+
+
+def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
+    """Draw change against area, most and least influential first and at random, by method and fill; None without."""
+    known = controls(faithful)
+    methods = methods_in_order({method for _, _, method in faithful.curves} - known - set(CONTROLS))
+    fills = settings(faithful)
+    if not methods or not fills:
+        return None
+    shown = [curve for key, curve in faithful.curves.items() if key[2] in methods]
+    top = max(float(curve.most_first.mean(axis=0).max()) for curve in shown)
+    # below zero where more speaks for the answer than before
+    bottom = min(float(line.mean(axis=0).min()) for one in shown for line in (one.most_first, one.least_first))
+    with drawing_style():
+        figure = Figure(figsize=(1.75 * len(fills) + 0.9, 1.55 * len(methods) + 0.9), layout="constrained")
+        axes = figure.subplots(len(methods), len(fills), squeeze=False, sharex=True, sharey=True)
+        for line, method in zip(axes, methods, strict=True):
+            for ax, (fill, unit) in zip(line, fills, strict=True):
+                curve = faithful.curves.get((fill, unit, method))
+                if curve is None:
+                    ax.set_axis_off()
+                    continue
+                _plot_removal(curve, method, ax=ax)
+            line[0].set_ylabel(wrap(method_name(method), _LETTERS), fontsize=8.5)
+        for ax, (fill, unit) in zip(axes[0], fills, strict=True):
+            ax.set_title(fill_name(fill, unit).capitalize().replace(" (", "\n("), fontsize=8.5)
+        axes[0, 0].set(ylim=(1.15 * min(bottom, 0.0), 1.15 * max(top, 1e-3)), xlim=(0, 100), xticks=[0, 50, 100])
+        kinds: dict[str, Any] = {"most supporting first": "-", "least supporting first": "--", "random orders": ":"}
+        handles = [Line2D([], [], color=BLACK, linestyle=line, label=label) for label, line in kinds.items()]
+        figure.legend(handles=handles, loc="outside upper left", ncols=3)
+        figure.supxlabel("Removed (% of the image)", fontsize=9)
+        figure.supylabel("Evidence lost (margin units)", fontsize=9)
+    numbers = [
+        (*key, *values)
+        for key, curve in faithful.curves.items()
+        for values in zip(
+            curve.areas.tolist(),
+            *(line.mean(axis=0).tolist() for line in (curve.most_first, curve.least_first, curve.random)),
+            strict=True,
+        )
+    ]
+    return Plate(
+        name=f"sound-curves-{faithful.input}",
+        figure=figure,
+        alt=f"Evidence lost against the area removed, {input_name(faithful.input).lower()}, for "
+        f"{listed([method_name(one) for one in methods])}",
+        caption=f"{input_name(faithful.input)}: how much of the answer's change from the untouched sensor is lost "
+        "while parts go, most supporting first, "
+        f"least supporting first, and in {faithful.random_orders} random orders; the band holds the middle half of "
+        f"{faithful.frames} frames. The area between the first two is the symmetric gain. "
+        f"{_tell_gains(faithful, methods)}",
+        numbers=columns(("fill", "unit", "method", "area", "most_first", "least_first", "random"), numbers),
+    )
+
+
+def plate_randomisation(results: Results) -> Plate:
+    """Draw how alike maps stay as layers get new weights, a chart an input."""
+    found = results.study.randomisation
+    names = inputs_in_order(found)[::-1]
+    rows, told = [], []
+    figure, axes = _charts(len(names), each=(4.6, 3.5), sharey=True)
+    with drawing_style():
+        for ax, name in zip(axes, names, strict=True):
+            for method in methods_in_order(found[name].methods):
+                one = found[name].methods[method]
+                ax.plot(
+                    one.layers,
+                    [np.nan if value is None else value for value in one.similarity],
+                    color=METHOD_COLOURS.get(method, PURPLE),
+                    linestyle=METHOD_LINES.get(method, "-"),
+                    marker="o",
+                    markersize=3.5,
+                    label=method_name(method),
+                )
+                rows += [(name, method, layer, value) for layer, value in zip(one.layers, one.similarity, strict=True)]
+                if one.similarity and one.similarity[-1] is not None:
+                    told.append(
+                        f"{method_name(method)} {signed(one.similarity[-1], 2)} ({short_input_name(name).lower()})"
+                    )
+            ax.axhline(0, color=BLACK, linewidth=0.8, linestyle=":")
+            ax.set(xlabel="Layers with new weights, from the output", ylabel="Similarity of the map (no unit)")
+            ax.set_title(input_name(name))
+        lines = {line.get_label(): line for ax in axes for line in ax.get_lines() if line.get_marker() == "o"}
+        figure.legend(handles=list(lines.values()), loc="outside upper left", ncols=3)
+    return Plate(
+        name="randomisation",
+        figure=figure,
+        alt=f"Similarity of maps while layers get new weights; with all new: {', '.join(told)}",
+        caption="Similarity of each method's map to that of the trained network while layers get new weights: a map "
+        "that stays alike does not show what was learned. With the last layer tested new: "
+        f"{', '.join(told) or 'not defined'}.",
+        numbers=columns(("input", "method", "layers", "similarity"), rows),
+    )
+
+
+def _charts(count: int, *, each: tuple[float, float], sharey: bool = False) -> tuple[Figure, list[Axes]]:
+    """Make a figure of some charts, at most `_FEW` in a row."""
+    wide = min(count, _FEW)
+    high = -(-count // wide)
+    with drawing_style():
+        figure = Figure(figsize=(each[0] * wide, each[1] * high), layout="constrained")
+        axes = list(figure.subplots(high, wide, squeeze=False, sharey=sharey).ravel())
+    for ax in axes[count:]:
+        ax.set_axis_off()
+    return figure, axes[:count]
+
+
+def _conditions(results: Results) -> list[str]:
+    return conditions_in_order(name for one in results.evaluations.values() for name in one.conditions)
+
+
+def _typical_trial(results: Results, condition: str) -> str | None:
+    # judged by the last input (difference where it was run), so that the choice favours neither curve by eye
+    shown = results.evaluations[inputs_in_order(results.evaluations)[-1]].predictions
+    shown = shown.where(shown.condition == condition)
+    error = np.abs(shown.prediction - shown.safety_margin)
+    ranked = sorted(np.unique(shown.trial).tolist(), key=lambda trial: float(error[shown.trial == trial].mean()))
+    return ranked[(len(ranked) - 1) // 2] if ranked else None
+
+
+def _pixels(scored: DeletionScores) -> int:
+    return max(int(curve.pixels_removed.max()) for curve in scored.curves.values())
+
+
+def _tell_order(scored: DeletionScores) -> str:
+    means = {method: float(curve.scores.mean()) for method, curve in scored.curves.items()}
+    return ", ".join(f"{method_name(one)} {means[one]:.3f}" for one in sorted(means, key=lambda one: means[one]))
+
+
+def _deletion_numbers(scores: Mapping[str, DeletionScores]) -> dict[str, list]:
+    names = ("input", "method", "pixels_removed", "share_removed", "mean", "quartile_low", "quartile_high", "sd")
+    rows = [
+        (name, method, *values)
+        for name, one in scores.items()
+        for method in methods_in_order(one.curves)
+        for curve in [one.curves[method]]
+        for values in zip(
+            curve.pixels_removed.tolist(),
+            (curve.pixels_removed / _pixels(one)).tolist(),
+            curve.scores.mean(axis=0).tolist(),
+            *np.quantile(curve.scores, [0.25, 0.75], axis=0).tolist(),
+            curve.scores.std(axis=0).tolist(),
+            strict=True,
+        )
+    ]
+    return columns(names, rows)
+
+
+def _plot_removal(curve: RemovalCurve, method: str, *, ax: Axes) -> None:
+    share, colour = 100 * curve.areas, METHOD_COLOURS.get(method, PURPLE)
+    low, high = np.quantile(curve.most_first, [0.25, 0.75], axis=0)
+    ax.fill_between(share, low, high, color=colour, alpha=0.15, linewidth=0)
+    ax.plot(share, curve.most_first.mean(axis=0), color=colour, linewidth=1.6)
+    ax.plot(share, curve.least_first.mean(axis=0), color=colour, linestyle="--", linewidth=1.3)
+    ax.plot(share, curve.random.mean(axis=0), color=BLACK, linestyle=":", linewidth=1.3)
+    ax.tick_params(labelsize=7.5)
+
+
+def _tell_gains(faithful: RemovalScores, methods: list[str]) -> str:
+    fill, unit = settings(faithful)[0]
+    gains = {
+        method: float(faithful.curves[fill, unit, method].srg.mean())
+        for method in methods
+        if (fill, unit, method) in faithful.curves
+    }
+    told = ", ".join(
+        f"{method_name(one)} {signed(gains[one], 3)}" for one in sorted(gains, key=lambda one: -gains[one])
+    )
+    return f"Under {fill_name(fill, unit)} it is {told}."
