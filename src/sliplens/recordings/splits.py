@@ -313,8 +313,6 @@ def assign_splits(plan: SplitPlan, trials: Sequence[TrialFacts]) -> SplitResult:
 
     Parameters
     ----------
-    plan
-        The rules.
     trials
         What is known of each trial; no two have one name.
 

@@ -142,8 +142,6 @@ def share_of_strongest(effects: MarkerEffects, *, count: int, rng: np.random.Gen
     ----------
     effects
         Of every marker, in margin units.
-    count
-        How many markers are the strongest.
     """
     ids, first, member = np.unique(effects.frame_id, return_index=True, return_inverse=True)
     shares, kept = [], []

@@ -57,16 +57,10 @@ def draw_grid(
 
     Parameters
     ----------
-    rows
-        Name and cells of each.
-    heads
-        Of the columns, of up to two lines.
     below_in
         Inches to leave free below.
     bar
         Add the colours of saliency at the bottom.
-    cell_in
-        Width of a picture.
     least_width_in
         Of the figure.
     """
@@ -257,8 +251,6 @@ def bright_pictures(
     ----------
     explained
         Frames with their pictures.
-    indices
-        Which of them.
     """
     pictures = {index: explained.pictures[index] for index in indices}
     if explained.input != "difference":

@@ -258,8 +258,6 @@ def rank_methods(faithful: RemovalScores, truth: Truth | None = None) -> list[St
 
     Parameters
     ----------
-    faithful
-        Scores of the methods.
     truth
         What the simulation tells: fills under which even a map made from the truth does not win are left out.
     """
