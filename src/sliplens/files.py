@@ -22,6 +22,7 @@ from sliplens._version import __version__
 from sliplens.errors import InputError
 
 RUN_FILE = "run.json"
+"""Provenance of a folder."""
 _PACKAGES = ("numpy", "torch", "torchvision", "lightning", "captum", "matplotlib", "pyarrow", "pillow")
 
 
@@ -44,7 +45,7 @@ class Machine:
     processor: str
     cores: int | None
     implementation: str
-    """Of Python."""
+    """Implementation of Python."""
 
 
 def machine() -> Machine:
@@ -62,8 +63,8 @@ class Provenance:
     """Where a folder comes from: what its `run.json` says."""
 
     stage: str
-    config: Mapping[str, Any]
-    """All that shaped the result, as JSON."""
+    config: object
+    """All that shaped the result, as JSON holds it: to be shown and compared."""
     config_hash: str
     versions: Mapping[str, str]
     machine: Machine
@@ -170,7 +171,7 @@ def output_folder(
     target: Path,
     *,
     stage: str,
-    config: Mapping[str, Any],
+    config: object,
     overwrite: bool = False,
     run_file: str = RUN_FILE,
     resumable: bool = True,
