@@ -11,16 +11,12 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # must be set before torch is imported
 
-from sliplens.models import load_checkpoint
-from sliplens.models.encodings import get_encoding
 from sliplens.recordings import Dataset
 from sliplens.simulation import PRESETS, simulate_dataset
-from sliplens.training import evaluate_frames, fit, get_recipe
-from sliplens.training.data import load_frames
+from sliplens.training import evaluate, train
 
 INPUTS = ("difference", "raw")
 # what the thesis reports (Table 1)
@@ -29,37 +25,13 @@ THESIS = {"difference": {"dry_r2": 0.89, "wet_r2": 0.66}, "raw": {"dry_r2": 0.85
 
 def train_and_test(data: Dataset, folder: Path, *, name: str, options: argparse.Namespace) -> dict[str, float]:
     """Train one input and score it on the test trials, dry and wet."""
-    config = get_recipe(options.recipe)
-    changes = {"epochs": options.epochs, "image_size": options.image_size, "max_minutes": options.max_minutes}
-    config = replace(config, seed=options.seed, **{key: value for key, value in changes.items() if value is not None})
-    encoding, folder = get_encoding(name), folder / name
-    folder.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
-
-    def frames(split: str, untouched_share: float = 0.0) -> Any:
-        return load_frames(
-            data,
-            data.select(split=split),
-            encoding=encoding,
-            image_size=config.image_size,
-            untouched_share=untouched_share,
-            scratch=folder,
-        )
-
-    info = data.trials[0]
-    fit(
-        config,
-        frames("train", config.untouched_share),
-        frames("validation"),
-        folder,
-        frame_size=(info.height, info.width),
-        sensor=info.sensor,
-        data_hash=data.hash,
-    )
+    changes = {name: getattr(options, name) for name in ("epochs", "image_size", "max_minutes", "seed")}
+    run = train(data, folder / name, input=name, recipe=options.recipe, **changes)
     minutes = (time.perf_counter() - started) / 60
-    scores = evaluate_frames(load_checkpoint(folder), frames("test")).conditions
-    told = {f"{condition}_{key}": getattr(one, key) for condition, one in scores.items() for key in ("r2", "mse")}
-    return {**told, "minutes": minutes}
+    scores = evaluate(run, data).conditions
+    found = {f"{condition}_{key}": getattr(one, key) for condition, one in scores.items() for key in ("r2", "mse")}
+    return {**found, "minutes": minutes}
 
 
 def main() -> None:

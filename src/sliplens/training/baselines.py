@@ -95,7 +95,7 @@ def evaluate_baselines(
     """
     estimators = {name: get_estimator(name) for name in plan.estimators}
     tested = set(predictions.trial.tolist())
-    trials = {info.trial: info for info in (*plan.training, *(one for one in data.trials if one.trial in tested))}
+    trials = {info.trial: info for info in (*plan.training, *(info for info in data.trials if info.trial in tested))}
     fields: dict[str, _Followed] = {}
     failed: dict[str, str] = {}
     for done, info in enumerate(trials.values(), start=1):
@@ -128,7 +128,8 @@ def evaluate_baselines(
         known_trials=0,
         shared_trials=sum(info.trial in tested for info in plan.training),
         training_frames=sum(int(np.isfinite(margin).sum()) for margin in margins),
-        followed=sum(one.followed for one in fields.values()) / max(1, sum(one.in_view for one in fields.values())),
+        followed=sum(field.followed for field in fields.values())
+        / max(1, sum(field.in_view for field in fields.values())),
         failed=failed,
         estimators={name: _score(answer) for name, answer in answers.items()},
     )

@@ -104,8 +104,8 @@ def get_augmentation(name: str, *, neutral: float = 0.0) -> Augmentation | None:
     """
     if name not in AUGMENTATIONS:
         raise InputError(f"there is no augmentation named {name!r}; choose one of {', '.join(AUGMENTATIONS)}")
-    found = AUGMENTATIONS[name]
-    return None if found is None else replace(found, neutral=neutral)
+    augmentation = AUGMENTATIONS[name]
+    return None if augmentation is None else replace(augmentation, neutral=neutral)
 
 
 UNTOUCHED = -1

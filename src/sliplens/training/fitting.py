@@ -110,8 +110,8 @@ def train(
         raise SystemExit(0)  # what comes after a training is for one process
     with output_folder(out, stage="train", config=job.recipe, overwrite=overwrite) as output:
         if not output.complete:
-            told = {**asdict(config), **job.origin}
-            with open_logger(logger, output.folder, run_name=out.name, recipe=told) as opened:
+            settings = {**asdict(config), **job.origin}
+            with open_logger(logger, output.folder, run_name=out.name, recipe=settings) as opened:
                 training = job.run(output.folder, scratch=output.folder, logger=opened, on_progress=on_progress)
             save_result(training, output.folder)
     run = load_checkpoint(out)

@@ -87,11 +87,11 @@ class Regressor(lightning.LightningModule):
     def _refuse(self, loss: float, batch_idx: int, *, finite: bool) -> None:
         """Stop, and say which frames of which process brought a loss that is not finite."""
         mine: tuple[float, Sequence[str]] = (loss, () if finite else self.batch_rows(self.current_epoch, batch_idx))
-        found = [mine]
+        losses = [mine]
         if self.trainer.world_size > 1:
-            found = [mine] * self.trainer.world_size
-            distributed.all_gather_object(found, mine)
-        value, rows = next(one for one in found if one[1])
+            losses = [mine] * self.trainer.world_size
+            distributed.all_gather_object(losses, mine)
+        value, rows = next(shared for shared in losses if shared[1])
         more = f" and {len(rows) - _NAMED_ROWS} more" if len(rows) > _NAMED_ROWS else ""
         raise DivergedError(
             f"the training loss is {value} in epoch {self.current_epoch + 1}, at step {self.global_step}, for a batch "

@@ -1,0 +1,60 @@
+"""Training and evaluation as calls of the library, from a data set to a record."""
+
+import gc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sliplens as sl
+from sliplens.errors import InputError
+from sliplens.recordings import Dataset
+
+SMALL = {"image_size": 32, "epochs": 2, "batch_size": 11, "head": "point", "untouched_share": 0.0}
+
+
+def test_a_network_may_stay_in_memory(small_dataset: Dataset):
+    counts = []
+    run = sl.train(small_dataset, **SMALL, on_progress=lambda done, total: counts.append((done, total)))
+    assert run.training is not None
+    assert len(run.training.curve) == 2
+    assert run.training.best_validation_mse == min(run.training.curve.validation_mse)
+    # trials that were read, then steps of the two epochs: 44 frames and batches of 11
+    assert counts[-1] == (8, 8)
+    evaluation = sl.evaluate(run, small_dataset)
+    table = evaluation.frame().to_pydict()
+    assert set(table["trial"]) == set(evaluation.trials)
+    squares = (np.array(table["prediction"]) - np.array(table["safety_margin"])) ** 2
+    dry = np.array(table["condition"]) == "dry"
+    assert evaluation.conditions["dry"].mse == pytest.approx(squares[dry].mean())
+    assert evaluation.known_trials == 0
+    assert sl.evaluate(run, small_dataset, split="train").known_trials == 4
+
+
+def test_what_was_written_comes_back_as_it_was_returned(small_dataset: Dataset, tmp_path: Path):
+    run = sl.train(small_dataset.folder, tmp_path / "run", **SMALL)
+    again = sl.load(tmp_path / "run")
+    assert again.manifest == run.manifest
+    assert again.training is not None
+    assert run.training is not None
+    assert again.training.curve.table() == run.training.curve.table()
+    first = sl.evaluate(tmp_path / "run", small_dataset.folder, tmp_path / "scores")
+    kept = sl.evaluate(run, small_dataset, tmp_path / "scores")
+    assert kept.conditions == first.conditions
+    assert kept.lead_times == first.lead_times
+    for name in ("prediction", "low_90", "high_90", "sigma"):
+        np.testing.assert_array_equal(getattr(kept.predictions, name), getattr(first.predictions, name))
+
+
+def test_several_processes_need_a_folder(small_dataset: Dataset):
+    with pytest.raises(InputError, match="several processes need a folder that all can see; name one with out"):
+        sl.train(small_dataset, **SMALL | {"batch_size": 12}, accelerator="cpu", devices=2)
+
+
+def test_a_simulation_without_a_folder_lives_as_long_as_its_data_set():
+    data = sl.simulate(dry_trials=3, wet_trials=0, days=2, frames_per_trial=20)
+    folder = data.folder
+    assert len(data.load(data.trials[0]).frames) == 20
+    del data
+    gc.collect()
+    assert not folder.exists()
