@@ -2,6 +2,7 @@
 
 import gc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import sliplens as sl
 from sliplens.errors import InputError
 from sliplens.recordings import Dataset
 
-SMALL = {"image_size": 32, "epochs": 2, "batch_size": 11, "head": "point", "untouched_share": 0.0}
+SMALL: dict[str, Any] = {"image_size": 32, "epochs": 2, "batch_size": 11, "head": "point", "untouched_share": 0.0}
 
 
 def test_a_network_may_stay_in_memory(small_dataset: Dataset):
