@@ -21,11 +21,6 @@ def require_saliency(
     shape
         Height and width of the image that the map explains, in pixels.
 
-    Raises
-    ------
-    SaliencyError
-        If the map has another shape, or holds NaN or infinity.
-
     Examples
     --------
     >>> import numpy as np

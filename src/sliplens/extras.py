@@ -29,11 +29,6 @@ class Table(Mapping[str, Row]):
     rows
         Those of sliplens; no package replaces one.
 
-    Raises
-    ------
-    InputError
-        When rows of packages are asked for: if one cannot be imported, or has a name that is taken.
-
     Examples
     --------
     >>> from sliplens.extras import Table
@@ -61,13 +56,7 @@ class Table(Mapping[str, Row]):
         return len(self._rows) + len(self._added)
 
     def pick(self, name: str) -> Row:
-        """Row of a name that a user gave.
-
-        Raises
-        ------
-        InputError
-            If there is none; the message lists those there are.
-        """
+        """Row of a name that a user gave."""
         if name not in self:
             raise InputError(f"there is no {self.noun} named {name!r}; choose one of {', '.join(self)}")
         return self[name]
@@ -129,11 +118,6 @@ def require_packages(*names: str, extra: str, purpose: str) -> None:
         As `missing_packages` takes them.
     purpose
         What needs them, as the message begins.
-
-    Raises
-    ------
-    InputError
-        Naming those that are missing, and how to install them.
     """
     if missing := missing_packages(*names, extra=extra):
         raise InputError(f"{purpose} needs {missing}")
@@ -141,11 +125,6 @@ def require_packages(*names: str, extra: str, purpose: str) -> None:
 
 def import_onnxruntime() -> ModuleType:
     """ONNX Runtime, silenced: from 1.29 on it reports its use to Microsoft unless told not to before it is loaded.
-
-    Raises
-    ------
-    InputError
-        If it is not installed.
 
     References
     ----------
@@ -161,13 +140,7 @@ def import_onnxruntime() -> ModuleType:
 
 
 def import_openvino() -> ModuleType:
-    """OpenVINO, silenced: to import it reports that to Intel, unless its package for that cannot be found.
-
-    Raises
-    ------
-    InputError
-        If it is not installed.
-    """
+    """OpenVINO, silenced: to import it reports that to Intel, unless its package for that cannot be found."""
     require_packages("openvino", extra="openvino", purpose="OpenVINO")
     reporter = "openvino_telemetry"
     hide = "openvino" not in sys.modules and reporter not in sys.modules
@@ -182,13 +155,7 @@ def import_openvino() -> ModuleType:
 
 
 def require_device(name: str) -> None:
-    """Refuse a device that is not known or not there.
-
-    Raises
-    ------
-    InputError
-        Naming those that can be used.
-    """
+    """Refuse a device that is not known or not there."""
     torch = import_module("torch")  # takes seconds, and the floors below the networks do without
     try:
         device = torch.device(name)
@@ -201,13 +168,7 @@ def require_device(name: str) -> None:
 
 
 def import_cv2() -> ModuleType:
-    """OpenCV, imported where it is used: nothing else of sliplens needs it.
-
-    Raises
-    ------
-    InputError
-        If it is not installed.
-    """
+    """OpenCV, imported where it is used: nothing else of sliplens needs it."""
     require_packages("cv2", extra="markers", purpose="finding markers")
     import cv2  # noqa: PLC0415 (an extra)
 

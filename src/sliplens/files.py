@@ -114,13 +114,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or is not JSON.
-    """
+    """Read a JSON file."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -130,13 +124,7 @@ def read_json(path: Path) -> Any:
 
 
 def require_folder(path: Path, *, what: str) -> Path:
-    """Return the path when it is a folder.
-
-    Raises
-    ------
-    InputError
-        If it is missing or is a file.
-    """
+    """Return the path when it is a folder."""
     if not path.exists():
         raise InputError(f"{what} {path} does not exist; check the path")
     if not path.is_dir():
@@ -198,11 +186,6 @@ def output_folder(
     ------
     Output
         `complete` is True when the target already holds the result of this very configuration.
-
-    Raises
-    ------
-    InputError
-        If the target exists with another configuration, or is not a folder that sliplens made.
 
     Examples
     --------

@@ -153,11 +153,6 @@ def find_published_layers(model: nn.Module, images: Float[Tensor, "batch 3 heigh
     stage4.0.branch1 and stage4.0.branch2.2. The size goes down and up again inside a block with two branches, and
     the last layer is missed, since what follows it is no map.
 
-    Raises
-    ------
-    ModelError
-        If there is no such layer.
-
     References
     ----------
     Public code of Poly-CAM, `find_layer_list`.

@@ -75,13 +75,7 @@ class Method(ABC):
 
 
 def require_at_least_one(name: str, **options: int) -> None:
-    """Refuse options that count something and are below 1.
-
-    Raises
-    ------
-    InputError
-        Naming the method and the option.
-    """
+    """Refuse options that count something and are below 1."""
     for option, value in options.items():
         if value < 1:
             raise InputError(f"{name}'s {option} is {value}; give at least 1")

@@ -52,13 +52,7 @@ class FrozenModel:
     """Reference b, one for each image or one for all."""
 
     def predict(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, " batch"]:
-        """Run the network and return one margin an image, with the graph where gradients are on.
-
-        Raises
-        ------
-        ModelError
-            If the network does not return one number an image.
-        """
+        """Run the network and return one margin an image, with the graph where gradients are on."""
         output = self.model(images)
         if not isinstance(output, Tensor):
             raise ModelError(
@@ -74,13 +68,7 @@ class FrozenModel:
 
     @torch.no_grad()
     def compare(self) -> "Comparison":
-        """Predict the images and their references, without gradients.
-
-        Raises
-        ------
-        ModelError
-            If the network does not give one finite number an image.
-        """
+        """Predict the images and their references, without gradients."""
         predictions = (
             torch.cat([self.predict(part) for part in images.split(_FORWARD_BATCH)])
             for images in (self.images, self.references)
@@ -90,13 +78,7 @@ class FrozenModel:
     def compared(
         self, prediction: Float[Tensor, " batch"], reference_prediction: Float[Tensor, " batch_or_one"]
     ) -> "Comparison":
-        """Comparison with these predictions, checked.
-
-        Raises
-        ------
-        ModelError
-            If one of them is not finite.
-        """
+        """Comparison with these predictions, checked."""
         return Comparison(
             model=self.model,
             images=self.images,
@@ -200,11 +182,6 @@ def freeze(
         Images x, float in [0, 1], shape (batch, 3, height, width).
     reference
         Reference b, float in [0, 1], shape (3, height, width) or the images' own; None for zeros.
-
-    Raises
-    ------
-    ImageError
-        If the images or the reference cannot be used.
     """
     require_images(images)
     reference = _require_reference(reference, images=images)
@@ -221,13 +198,7 @@ def freeze(
 
 
 def require_images(images: Shaped[Tensor, "..."]) -> None:
-    """Refuse images that are not float, finite, in [0, 1] and shaped (batch, 3, height, width).
-
-    Raises
-    ------
-    ImageError
-        Naming what is wrong.
-    """
+    """Refuse images that are not float, finite, in [0, 1] and shaped (batch, 3, height, width)."""
     if images.ndim != 4:
         raise ImageError(
             f"images have shape {tuple(images.shape)}, which is not (batch, 3, height, width); "

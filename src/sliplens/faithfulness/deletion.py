@@ -208,13 +208,7 @@ def deletion_curves(
 
 
 def saliency_orders(saliency: Float[np.ndarray, "images height width"], shape: tuple[int, int]) -> np.ndarray:
-    """Deletion orders of several maps.
-
-    Raises
-    ------
-    SaliencyError
-        If a map has another shape than the image, or holds NaN.
-    """
+    """Deletion orders of several maps."""
     return np.stack(
         [
             deletion_order(require_saliency(each, shape, where=f"saliency map {index}"))

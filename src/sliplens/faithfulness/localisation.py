@@ -17,13 +17,6 @@ def relevance_mass(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "
     saliency
         Map of what matters, not negative.
 
-    Raises
-    ------
-    SaliencyError
-        If the map has another shape, or holds NaN.
-    InputError
-        If the truth is nowhere, or the map is negative somewhere.
-
     References
     ----------
     Arras, Osman and Samek, *CLEVR-XAI* (2022): relevance mass accuracy.

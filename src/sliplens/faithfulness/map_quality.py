@@ -63,11 +63,6 @@ def resolution(saliency: Float[np.ndarray, "height width"], markers_px: Float[np
         Map in [0, 1].
     markers_px
         Centres of the markers as x, y.
-
-    Raises
-    ------
-    InputError
-        If there are fewer than two markers.
     """
     if len(markers_px) < 2:
         raise InputError("resolution needs two markers or more")

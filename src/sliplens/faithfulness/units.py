@@ -20,11 +20,6 @@ def pixel_units(shape: tuple[int, int]) -> Units:
 def tile_units(shape: tuple[int, int], *, size: int) -> Units:
     """Square tiles; those at the right and lower border are smaller where the image does not divide.
 
-    Raises
-    ------
-    InputError
-        If the tiles have no size.
-
     Examples
     --------
     >>> from sliplens.faithfulness.units import tile_units
@@ -46,11 +41,6 @@ def marker_units(shape: tuple[int, int], centres_px: Float[np.ndarray, "markers 
         Height and width of the image.
     reach_px
         How far a marker's unit reaches: its radius, and as far as it moves.
-
-    Raises
-    ------
-    InputError
-        If there is no marker.
     """
     if not len(centres_px):
         raise InputError("there is no marker to remove; choose pixels or tiles")
@@ -77,11 +67,6 @@ def unit_order(
         Number of each pixel's unit.
     least_first
         From the least to the most influential.
-
-    Raises
-    ------
-    SaliencyError
-        If the map has another shape than the units, or holds NaN.
 
     Examples
     --------

@@ -87,13 +87,7 @@ def encode_png(pixels: UInt8[np.ndarray, "height width *channels"], *, compress_
 
 
 def decode_png(data: bytes, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Pixels of an RGB PNG held in memory.
-
-    Raises
-    ------
-    ImageError
-        If the bytes are damaged or no RGB image; the message begins with `where`.
-    """
+    """Pixels of an RGB PNG held in memory."""
     try:
         with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
             if image.mode != "RGB":

@@ -67,13 +67,7 @@ KINDS = {
 
 
 def get_kind(name: str) -> MarkerKind:
-    """Preset of a name.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
+    """Preset of a name."""
     if name not in KINDS:
         raise InputError(f"markers {name!r} are not known; choose {', '.join(KINDS)}")
     return KINDS[name]
@@ -104,11 +98,6 @@ def find_appearance(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind
     Spots are what passes Otsu's threshold over the local background; those that are round and of one size tell the
     colour in which markers differ from what surrounds them. Its direction is the weight of the channels, unless the
     kind names them.
-
-    Raises
-    ------
-    ImageError
-        If the frame is over- or underexposed, or fewer than 4 round spots are found.
     """
     _require_exposed(frame)
     tries: list[tuple[Contrast, _Spots]] = [

@@ -137,13 +137,7 @@ HEADS = {"point": 1, "histogram": BINS}
 
 
 def head_outputs(head: str) -> int:
-    """Outputs that a head needs of its backbone.
-
-    Raises
-    ------
-    ModelError
-        If there is no head of that name; the message lists those there are.
-    """
+    """Outputs that a head needs of its backbone."""
     if head not in HEADS:
         raise ModelError(f"there is no head named {head!r}; choose one of {', '.join(HEADS)}")
     return HEADS[head]

@@ -42,13 +42,7 @@ class Calibration:
             raise ModelError(f"the temperature of a calibration must be positive, got {self.temperature:g}")
 
     def offset(self, level: float) -> float:
-        """Offset of a level.
-
-        Raises
-        ------
-        ModelError
-            If the level is not one that was calibrated.
-        """
+        """Offset of a level."""
         if str(level) not in self.offsets:
             raise ModelError(f"there is no interval of level {level:g}; choose {', '.join(self.offsets)}")
         return self.offsets[str(level)]

@@ -272,13 +272,7 @@ def load(run: str | Path, *, device: str = "cpu") -> TrainedModel:
 
 
 def find_run(run: Path) -> Path:
-    """Folder of a network: the one that is named, else the one of that name that comes with the package.
-
-    Raises
-    ------
-    InputError
-        If there is neither.
-    """
+    """Folder of a network: the one that is named, else the one of that name that comes with the package."""
     if run.exists():
         return run
     if str(run) in shipped_names():

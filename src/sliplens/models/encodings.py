@@ -66,11 +66,6 @@ class Encoding:
         ----------
         image_size
             Height and width of the network's input, in pixels.
-
-        Raises
-        ------
-        ImageError
-            If frames and reference differ in size.
         """
         return self.normalise(self.resize(self.compare(frames, reference), image_size=image_size))
 
@@ -99,11 +94,6 @@ ENCODINGS = Table("input", "sliplens.encodings", _ROWS)
 
 def get_encoding(name: str) -> Encoding:
     """Look up an encoding by name.
-
-    Raises
-    ------
-    InputError
-        If there is none of that name; the message lists those there are.
 
     Examples
     --------

@@ -92,11 +92,6 @@ def convert_network(model: nn.Module, images: Float[Tensor, "batch 3 height widt
     ----------
     model
         In evaluation mode, one number an image; it stays as it is.
-
-    Raises
-    ------
-    ModelError
-        If torch cannot export it.
     """
     copied = deepcopy(model).to("cpu", memory_format=torch.contiguous_format)  # pyright: ignore[reportCallIssue]
     # two images: torch takes a batch of one for a constant
@@ -158,13 +153,7 @@ def _describe(proto: "ModelProto", trained: TrainedModel) -> None:
 
 @torch.no_grad()
 def check_parity(path: Path, trained: TrainedModel) -> None:
-    """Check that ONNX Runtime answers as the network does, on black, white and noise, alone and in a batch.
-
-    Raises
-    ------
-    ModelError
-        If an answer differs by more than `TOLERANCE`, or ONNX Runtime cannot run the file.
-    """
+    """Check that ONNX Runtime answers as the network does, on black, white and noise, alone and in a batch."""
     runtime = import_onnxruntime()
     names, differences = list(answer_names(trained.model)), []
     network = Answers(trained.model)
@@ -210,13 +199,7 @@ def trial_inputs(size: int) -> Iterator[Float[Tensor, "batch 3 size size"]]:
 
 
 def require_file_of(path: Path, trained: TrainedModel) -> None:
-    """Check that an ONNX file holds a network, and not another one.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, is none that `export_onnx` wrote, or was made of other weights.
-    """
+    """Check that an ONNX file holds a network, and not another one."""
     require_packages("onnx", extra="onnx", purpose="an ONNX file")
     import onnx  # noqa: PLC0415 (an extra)
     from google.protobuf.message import DecodeError  # noqa: PLC0415 (comes with it)

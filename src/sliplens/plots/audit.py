@@ -314,11 +314,6 @@ def write_audit(
         As `draw_audit` takes them.
     read_frames
         As `draw_audit` takes it.
-
-    Raises
-    ------
-    InputError
-        If the suffix is another one, or the file cannot be written.
     """
     require_picture_path(path, example="audit.png")
     save_page(draw_audit(recording, labelling, read_frames=read_frames), path)
@@ -338,11 +333,6 @@ def write_audits(data: Dataset, folder: Path, *, on_progress: OnProgress | None 
     -------
     int
         Number of pages drawn.
-
-    Raises
-    ------
-    InputError
-        If nothing tells how the labels of a trial were made.
     """
     for info in data.trials:
         if read_header(trial_path(data.folder, info.trial)).labelling is None:

@@ -76,11 +76,6 @@ def write_clip(
         File to write, .mp4 (H.264).
     frames_per_s
         Frames a second of the clip; by default the recording's own if between 25 and 30, otherwise 30.
-
-    Raises
-    ------
-    InputError
-        If the suffix is another one, the rate lies outside 1 to 120, or the file cannot be written.
     """
     require_clip_path(path)
     rate = natural_rate(recording.time_s) if frames_per_s is None else frames_per_s
@@ -94,13 +89,7 @@ def write_clip(
 
 
 def require_clip_path(path: Path) -> None:
-    """Check that a file is named as a clip.
-
-    Raises
-    ------
-    InputError
-        If its suffix is another one.
-    """
+    """Check that a file is named as a clip."""
     if path.suffix.lower() != ".mp4":
         raise InputError(f"{path} does not end in .mp4; name a clip, such as trial.mp4")
 
@@ -327,11 +316,6 @@ def clip_writer(
     ------
     Callable
         Takes a frame, its markers and where they were at rest.
-
-    Raises
-    ------
-    InputError
-        If the suffix is another one, the rate lies outside 1 to 120, or the file cannot be written.
     """
     scale = max(1, _LEAST_SIDE // max(size))
     # H.264 keeps one colour for two by two pixels

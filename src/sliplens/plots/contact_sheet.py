@@ -91,11 +91,6 @@ def draw_contact_sheet(recordings: Sequence[Recording], *, title: str | None = N
     A band shows the frames of `choose_untouched` and `choose_margins`, beneath each its absolute difference image,
     brightened by one factor for the whole sheet so that trials compare, and at the right forces and safety margin over
     time. Where a recording knows the true contact, its outline and that of its stick zone lie over the camera frames.
-
-    Raises
-    ------
-    InputError
-        If there is no trial.
     """
     if not recordings:
         raise InputError("a contact sheet needs a trial; name at least one recording")
@@ -130,11 +125,6 @@ def write_contact_sheet(recordings: Sequence[Recording], path: Path, *, title: s
     ----------
     recordings, title
         As `draw_contact_sheet` takes them.
-
-    Raises
-    ------
-    InputError
-        If there is no trial, the suffix is another one, or the file cannot be written.
     """
     require_picture_path(path, example="preview.png")
     save_page(draw_contact_sheet(recordings, title=title), path)

@@ -185,11 +185,6 @@ def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
     Answers against labels; mean squared error in ten bins of the margin (thesis, Fig. 7); bias of each trial; how often
     intervals hold; uncertainty by condition; the trial of median error over time. Below, R2 and mean absolute error of
     the network beside those of model-based estimators, where there are any.
-
-    Raises
-    ------
-    InputError
-        If the suffix is another one, or the file cannot be written.
     """
     require_picture_path(path, example="evaluation.png")
     conditions = conditions_in_order(evaluation.conditions)
@@ -364,11 +359,6 @@ def draw_learning_curve(training: Training, path: Path, *, title: str) -> None:
     ----------
     path
         File to write: .png, .pdf or .svg.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
     """
     curve = training.curve
     epoch, train, validation = curve.epoch, curve.train_mse, curve.validation_mse

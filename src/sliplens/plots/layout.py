@@ -20,25 +20,13 @@ _METADATA: dict[str, dict[str, Any]] = {".png": {}, ".pdf": {"CreationDate": Non
 
 
 def require_picture_path(path: Path, *, example: str) -> None:
-    """Check that a file is named as a picture that can be saved.
-
-    Raises
-    ------
-    InputError
-        If its suffix is another one.
-    """
+    """Check that a file is named as a picture that can be saved."""
     if path.suffix.lower() not in _METADATA:
         raise InputError(f"{path} does not end in {', '.join(_METADATA)}; name a picture, such as {example}")
 
 
 def save_page(figure: Figure, path: Path) -> None:
-    """Save a page as .png, .pdf or .svg; it appears when complete.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
+    """Save a page as .png, .pdf or .svg; it appears when complete."""
     suffix = path.suffix.lower()
     with written_whole(path) as part, drawing_style():
         # 150 dots an inch show frames of 224 pixels about pixel for pixel
@@ -47,13 +35,7 @@ def save_page(figure: Figure, path: Path) -> None:
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """Give a file beside the target to write to; it takes the target's name when all went well, else it is gone.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
+    """Give a file beside the target to write to; it takes the target's name when all went well, else it is gone."""
     part = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -133,11 +133,6 @@ def draw_contact_states(recording: Recording, tracks: Tracks) -> Figure:
     tracks
         Its markers, from the recording's own reference.
 
-    Raises
-    ------
-    InputError
-        If the tracks are of another trial, or no state is known.
-
     References
     ----------
     Polak, *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning*, Fig. 4.
@@ -173,13 +168,6 @@ def draw_contact_states(recording: Recording, tracks: Tracks) -> Figure:
 
 def draw_fields_beside_saliency(frames: Sequence[MarkedFrame]) -> Figure:
     """Draw each frame, its field and the saliency on it side by side, a row a frame (thesis, Fig. 12).
-
-    Raises
-    ------
-    InputError
-        If there is no frame.
-    SaliencyError
-        If a map has another size than its frame, or is not finite.
 
     References
     ----------

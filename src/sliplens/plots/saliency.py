@@ -34,11 +34,6 @@ def overlay_saliency(
         What the network saw, as RGB.
     saliency
         Importance of each pixel in [0, 1], of the picture's height and width.
-
-    Raises
-    ------
-    SaliencyError
-        If the map has another size than the picture, or is not finite.
     """
     value = np.clip(require_saliency(saliency, picture.shape[:2]), 0, 1)
     return np.round(255 * _blend(_DIM * _lightness(picture), value)).astype(np.uint8)

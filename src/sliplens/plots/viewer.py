@@ -58,25 +58,13 @@ _GRACE_S = 1.0
 
 
 def require_rrd_path(path: Path) -> None:
-    """Check that a file is named as one of the Rerun viewer.
-
-    Raises
-    ------
-    InputError
-        If its suffix is another one.
-    """
+    """Check that a file is named as one of the Rerun viewer."""
     if path.suffix.lower() != ".rrd":
         raise InputError(f"{path} does not end in .rrd; name a file of the Rerun viewer, such as trial.rrd")
 
 
 def require_rerun() -> ModuleType:
-    """Import Rerun, which only the viewer needs.
-
-    Raises
-    ------
-    InputError
-        If it is not installed, or too old to show states over time.
-    """
+    """Import Rerun, which only the viewer needs."""
     require_packages("rerun", extra="view", purpose="the viewer")
     import rerun  # noqa: PLC0415 (an extra, and large)
 
@@ -89,13 +77,7 @@ def require_rerun() -> ModuleType:
 
 
 def start_viewer() -> str:
-    """Start a viewer that outlives this process; give the address to which data are sent.
-
-    Raises
-    ------
-    InputError
-        If it does not start, as where there is no screen.
-    """
+    """Start a viewer that outlives this process; give the address to which data are sent."""
     with socket.socket() as one:
         one.bind((_LOOPBACK, 0))
         port = one.getsockname()[1]
@@ -463,13 +445,6 @@ def write_rrd(data: Dataset, info: TrialInfo, path: Path, *, on_progress: OnProg
     ----------
     path
         File to write, .rrd.
-
-    Raises
-    ------
-    InputError
-        If Rerun is not installed, the suffix is another one, or the file cannot be written.
-    RecordingError
-        If the trial is missing or damaged.
     """
     require_rrd_path(path)
     stream = _new_stream()
@@ -480,15 +455,7 @@ def write_rrd(data: Dataset, info: TrialInfo, path: Path, *, on_progress: OnProg
 
 
 def open_viewer(data: Dataset, info: TrialInfo, *, on_progress: OnProgress | None = None) -> None:
-    """Open a trial in a Rerun viewer of its own, which stays when this process ends.
-
-    Raises
-    ------
-    InputError
-        If Rerun is not installed, its viewer does not start, or is closed before it has the trial.
-    RecordingError
-        If the trial is missing or damaged.
-    """
+    """Open a trial in a Rerun viewer of its own, which stays when this process ends."""
     stream = _new_stream()
     read_header(trial_path(data.folder, info.trial))  # no window for a trial that is not there
     stream.connect_grpc(start_viewer())
@@ -501,13 +468,6 @@ def log_trial(
     """Log a trial and its layout to a Rerun stream, a few frames in memory at a time.
 
     Timelines are `time`, on the clock of the camera, and `frame`. What is not known is NaN: there a line breaks.
-
-    Raises
-    ------
-    InputError
-        If Rerun is not installed.
-    RecordingError
-        If the trial is missing or damaged.
     """
     rerun = require_rerun()
     path, samples = trial_path(data.folder, info.trial), forces_path(data.folder, info.trial)

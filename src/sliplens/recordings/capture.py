@@ -13,13 +13,7 @@ from sliplens.recordings.trial import Labels, TrialFacts
 
 @dataclass(frozen=True, kw_only=True)
 class Forces:
-    """Samples of a force sensor, on its own clock and axes.
-
-    Raises
-    ------
-    RecordingError
-        If there is no sample, lengths disagree, times do not rise, or a value is not finite.
-    """
+    """Samples of a force sensor, on its own clock and axes."""
 
     time_s: Float[np.ndarray, " _"]
     force_n: Float[np.ndarray, "_ 3"]
@@ -45,11 +39,6 @@ class Capture(TrialFacts):
     """One trial as recorded; facts that its source does not tell have their defaults.
 
     Frames are read one at a time, so that a long recording needs no more memory than a short.
-
-    Raises
-    ------
-    RecordingError
-        If there is no frame or times do not rise.
     """
 
     source: str

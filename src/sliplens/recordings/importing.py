@@ -270,12 +270,6 @@ def import_trial(
         What is known of axes, friction and lag, where labels are to be found.
     forces_file
         Where to keep the samples of the force sensor, from which labels can be made anew; not kept if None.
-
-    Raises
-    ------
-    RecordingError
-        If there are neither labels nor forces, nothing touches, the trial never slips and no friction is given, or no
-        frame is untouched and none is named.
     """
     settings = settings or LabelSettings()
     if capture.labels is None and capture.forces is None:

@@ -83,15 +83,6 @@ def open_source(
     options
         For the reader.
 
-    Raises
-    ------
-    InputError
-        If the source is missing or does not take what was given, or there is no such trial or frame.
-    ImageError
-        If the reference is of another size than the frames.
-    RecordingError
-        If the source cannot be read.
-
     Examples
     --------
     >>> import numpy as np

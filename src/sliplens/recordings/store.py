@@ -265,13 +265,6 @@ def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Re
     pixels
         Read the images too. Without them, and the truth, a trial of any length takes little memory: the reference
         stands for every frame, and `read_frames` reads those that are needed.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, damaged or empty, or its labels break a law.
-    ImageError
-        If an image inside is damaged.
     """
     without = (set() if pixels else {"image"}) | (set() if truth and pixels else _TRUTH_COLUMNS)
     header, table = _read_columns(path, without=without)
@@ -354,13 +347,6 @@ def read_frames(path: Path, places: Sequence[int]) -> UInt8[np.ndarray, "frames 
     ----------
     places
         Numbers of the frames.
-
-    Raises
-    ------
-    RecordingError
-        If the file is missing or damaged, or a frame is not there.
-    ImageError
-        If an image inside is damaged.
     """
     header, first = read_header(path), 0
     strange = [place for place in places if not 0 <= place < header.frames]

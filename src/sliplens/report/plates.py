@@ -187,13 +187,7 @@ def _tell_thesis(name: str) -> str:
 
 
 def write_plates(plates: Sequence[Plate], folder: Path) -> tuple[Path, ...]:
-    """Write each plate as PDF and CSV; every file appears when complete.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
-    """
+    """Write each plate as PDF and CSV; every file appears when complete."""
     written = []
     for plate in plates:
         page, table = folder / f"{plate.name}.pdf", folder / f"{plate.name}.csv"

@@ -176,11 +176,6 @@ def prepare_film(
     ----------
     noise
         The camera's noise; None films without it.
-
-    Raises
-    ------
-    ContactError
-        If the sensor cannot be moved so, or its markers would lie outside it.
     """
     motion = move_markers(
         sensor,

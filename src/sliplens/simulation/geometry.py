@@ -32,13 +32,7 @@ def _squared_distance(
 
 
 def require_positive(values: Mapping[str, float | int]) -> None:
-    """Check the lengths and counts of a shape.
-
-    Raises
-    ------
-    ContactError
-        Naming the first that is not positive.
-    """
+    """Check the lengths and counts of a shape."""
     for name, value in values.items():
         if not value > 0:
             raise ContactError(f"{name} must be positive, got {value:.3g}; check the sensor's sheet")
@@ -55,11 +49,6 @@ class Dome:
     """A dome pressed on a flat, seen by an equidistant fisheye (image radius = focal length x angle).
 
     The origin is the dome's centre. Markers stand in rings round the apex, each ring with one straight up.
-
-    Raises
-    ------
-    ContactError
-        If a length is not positive, the camera is outside the dome, or a marker is.
     """
 
     radius_m: float
@@ -113,13 +102,7 @@ class Dome:
         return np.repeat(self.ring_scale, self.ring_counts)
 
     def marker_positions(self, depth_m: float = 0.0) -> Float[np.ndarray, "markers 3"]:
-        """Places of the markers under the skin of the untouched dome, in metres.
-
-        Raises
-        ------
-        ContactError
-            If the depth is negative or reaches the dome's centre.
-        """
+        """Places of the markers under the skin of the untouched dome, in metres."""
         if not 0 <= depth_m < self.radius_m:
             raise ContactError(
                 f"markers {depth_m:.3g} m under the skin lie outside a dome of radius {self.radius_m:.3g} m; "
@@ -194,11 +177,6 @@ class FlatPad:
     """A flat gel pressed by a ball, its dots in a square grid, seen by a pinhole camera behind it.
 
     The origin is the middle of the skin.
-
-    Raises
-    ------
-    ContactError
-        If a length or a count is not positive.
     """
 
     ball_radius_m: float
@@ -238,13 +216,7 @@ class FlatPad:
         return np.ones(self.markers)
 
     def marker_positions(self, depth_m: float = 0.0) -> Float[np.ndarray, "markers 3"]:
-        """Places of the dots in the untouched gel, in metres.
-
-        Raises
-        ------
-        ContactError
-            If the depth is negative or reaches the camera.
-        """
+        """Places of the dots in the untouched gel, in metres."""
         if not 0 <= depth_m < self.camera_distance_m:
             raise ContactError(
                 f"dots {depth_m:.3g} m under the skin do not lie between it and the camera at "

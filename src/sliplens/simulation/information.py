@@ -88,11 +88,6 @@ def marker_sensitivity(
     ----------
     margins
         Safety margins to look at, inside (0, 1).
-
-    Raises
-    ------
-    ContactError
-        If a margin does not lie inside (0, 1), or the sensor cannot be moved so.
     """
     if not np.all((margins > 0) & (margins < 1)):
         raise ContactError("safety margins must lie inside (0, 1), where the derivative exists; leave out the ends")
@@ -162,11 +157,6 @@ def margin_bound(
     prior
         Standard deviation of each unknown before the frame is seen; infinite where nothing is known. A nuisance that is
         left out is known; a margin that is left out is not.
-
-    Raises
-    ------
-    ContactError
-        If the noise or a standard deviation is not positive, or a name is wrong.
 
     References
     ----------
@@ -244,11 +234,6 @@ def reading_gain(
     ----------
     jacobian, unknowns
         Derivatives of the coordinates, as in `Sensitivity`; the margin first.
-
-    Raises
-    ------
-    ContactError
-        If the noise or a standard deviation is not positive.
     """
     rows, scale = _observations(jacobian, unknowns, noise_px, prior)
     return np.linalg.pinv(rows / scale)[0, : len(jacobian)] / (scale[0] * noise_px)

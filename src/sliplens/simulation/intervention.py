@@ -69,13 +69,7 @@ class Outlines:
 
 
 def read_recipe(folder: Path) -> SimulationRecipe:
-    """Read the recipe of a data set from its `run.json`.
-
-    Raises
-    ------
-    InputError
-        If there is none that this version can follow.
-    """
+    """Read the recipe of a data set from its `run.json`."""
     path = folder / RUN_FILE
     try:
         stored = read_json(path)["config"]["recipe"]
@@ -104,12 +98,6 @@ def rebuild_trial(folder: Path, recording: Recording, *, recipe: SimulationRecip
     ----------
     recipe
         What simulated it; read from the folder if None.
-
-    Raises
-    ------
-    InputError
-        If the trial was not simulated, its recipe is not known or another one, or what is drawn differs from what is
-        stored.
     """
     name, truth = recording.trial, recording.truth
     if truth is None:
@@ -217,11 +205,6 @@ def marker_readings(
     -------
     markers, effects
         Numbers of the markers, and the reading as it is less the reading with that marker put back, in margin units.
-
-    Raises
-    ------
-    ContactError
-        If the frame has no contact.
     """
     margin = float(trial.loading.safety_margin[frame])
     if np.isnan(margin):

@@ -126,11 +126,6 @@ def load_grasp(grasp: Grasp, *, frames: int, rng: np.random.Generator, release: 
     release
         Let go at the end: the normal force falls to nothing while the object slides, and the last frames have no
         contact.
-
-    Raises
-    ------
-    ContactError
-        If the frames are too few for every phase to have one.
     """
     if frames < MINIMUM_FRAMES:
         raise ContactError(f"a trial of {frames} frames cannot hold all phases; ask for {MINIMUM_FRAMES} or more")
@@ -175,11 +170,6 @@ def load_at_margins(margins: Float[np.ndarray, " frames"], *, grasp: Grasp) -> L
         Gamma, 0 to 1.
     grasp
         Force and friction; drift, creep and the kinetic ratio are left out.
-
-    Raises
-    ------
-    ContactError
-        If a margin lies outside [0, 1].
     """
     if np.any((margins < 0) | (margins > 1)):
         raise ContactError("safety margins must lie in [0, 1]; give them as fractions, not in percent")

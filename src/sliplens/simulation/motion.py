@@ -91,11 +91,6 @@ def move_markers(
         Stiffness of the gel over the sensor's nominal one.
     marker_depth
         Depth of the markers under the skin, in radii of the contact's sphere.
-
-    Raises
-    ------
-    ContactError
-        If the sensor does not have that displacement, or the markers would lie outside it.
     """
     name = sensor.displacements[0] if displacement is None else displacement
     if name not in sensor.displacements:

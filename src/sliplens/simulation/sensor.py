@@ -95,13 +95,7 @@ _NONE: Rgb = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerLook:
-    """Markers of a sensor, by channel in the order of the image file.
-
-    Raises
-    ------
-    ContactError
-        If a radius or an edge is not positive.
-    """
+    """Markers of a sensor, by channel in the order of the image file."""
 
     radius_px: Rgb
     """Dye may bleed: a marker wider in red than in blue draws the orange rim of the ChromaTouch's difference images."""

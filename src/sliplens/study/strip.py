@@ -38,11 +38,6 @@ def explain_trial(
         Key of `EXPLAINERS`.
     levels
         Safety margins whose frames are explained, in [0, 1]; a frame that is nearest to two is shown once.
-
-    Raises
-    ------
-    RecordingError
-        If no frame has a label.
     """
     margin = np.where(recording.labelled, recording.safety_margin, np.nan)
     if not np.isfinite(margin).any():

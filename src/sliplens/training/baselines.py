@@ -56,13 +56,7 @@ def marker_kind(trials: Sequence[TrialInfo]) -> str:
 
 
 def choose_training(trials: Sequence[TrialInfo], count: int) -> tuple[TrialInfo, ...]:
-    """Take a number of trials spread evenly over the table, so that every day has its share.
-
-    Raises
-    ------
-    InputError
-        If the number is less than 1.
-    """
+    """Take a number of trials spread evenly over the table, so that every day has its share."""
     if count < 1:
         raise InputError(f"{count} training trials are too few to fit on; give --baseline-trials 1 or more")
     at = np.linspace(0, len(trials) - 1, min(count, len(trials))).round().astype(int)
@@ -87,11 +81,6 @@ def evaluate_baselines(
         The network's, for the trial, condition, frame, time and label of each frame.
     folder
         Keeps the field of each trial: those that are there are not followed again.
-
-    Raises
-    ------
-    InputError
-        If a name is not known, OpenCV is missing, or markers could be followed in none of the trials.
     """
     estimators = {name: get_estimator(name) for name in plan.estimators}
     tested = set(predictions.trial.tolist())

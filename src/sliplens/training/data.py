@@ -95,13 +95,7 @@ AUGMENTATIONS = {
 
 
 def get_augmentation(name: str, *, neutral: float = 0.0) -> Augmentation | None:
-    """Look up an augmentation by name, for inputs with a neutral level; None for none.
-
-    Raises
-    ------
-    InputError
-        If there is none of that name; the message lists those there are.
-    """
+    """Look up an augmentation by name, for inputs with a neutral level; None for none."""
     if name not in AUGMENTATIONS:
         raise InputError(f"there is no augmentation named {name!r}; choose one of {', '.join(AUGMENTATIONS)}")
     augmentation = AUGMENTATIONS[name]
@@ -176,11 +170,6 @@ def load_frames(
     scratch
         Folder for what does not fit into memory: frames that would take more than half of what is free go into a file
         there, which is read as needed and gone when the frames are. Always in memory if None.
-
-    Raises
-    ------
-    RecordingError
-        If no frame has a label, or the trials' frames differ in size.
     """
     sizes = {(info.height, info.width) for info in trials}
     if len(sizes) > 1:

@@ -416,13 +416,7 @@ def _check_frames(config: TrainConfig, train: FrameSet, validation: FrameSet, pr
 
 
 def require_same_kind(start: TrainedModel, config: TrainConfig, encoding: str) -> None:
-    """Refuse to start from a network whose weights would mean something else.
-
-    Raises
-    ------
-    ModelError
-        If its input, backbone or head is another.
-    """
+    """Refuse to start from a network whose weights would mean something else."""
     kept = start.manifest
     asked = {"input": encoding, "backbone": config.backbone, "head": config.head}
     for name, value in asked.items():

@@ -64,11 +64,6 @@ def open_logger(name: str, folder: Path, *, run_name: str, recipe: Mapping[str, 
         `csv` for none besides `metrics.csv`, or one of `LOGGERS`.
     run_name
         What the logger calls the run.
-
-    Raises
-    ------
-    InputError
-        If there is no such logger, its package is not installed, or it does not start.
     """
     if name == "csv":
         yield None

@@ -76,13 +76,7 @@ def make_trainer(
 
 
 def share_of_batch(batch_size: int, processes: int) -> int:
-    """Images of a batch that one process takes.
-
-    Raises
-    ------
-    InputError
-        If the batch does not divide, or a share is too small for batch normalisation.
-    """
+    """Images of a batch that one process takes."""
     share, rest = divmod(batch_size, processes)
     if rest:
         raise InputError(
@@ -103,13 +97,7 @@ class WholeCheckpoints(TorchCheckpointIO):
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Write a checkpoint.
-
-        Raises
-        ------
-        InputError
-            If it cannot be written.
-        """
+        """Write a checkpoint."""
         if storage_options is not None:
             raise TypeError("this way of saving takes no storage_options")
         target = Path(path)
@@ -135,17 +123,7 @@ class WholeCheckpoints(TorchCheckpointIO):
 def run_trainer(
     trainer: lightning.Trainer, module: Regressor, loaders: tuple[DataLoader, DataLoader], last: Path
 ) -> None:
-    """Train, going on from a checkpoint where there is one.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If interrupted or told to end; Lightning would exit.
-    DivergedError
-        If a loss is not finite, in every process.
-    ModelError
-        If the memory of a GPU is full, or another process was lost.
-    """
+    """Train, going on from a checkpoint where there is one."""
     on_interrupt = signal.getsignal(signal.SIGINT)
     with quiet_lightning():
         try:

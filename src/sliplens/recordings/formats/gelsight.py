@@ -31,11 +31,6 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
         Table of the data set; `labels.csv` two folders above the clip's own if None.
     frame_rate
         Frames per second that the times assume.
-
-    Raises
-    ------
-    RecordingError
-        If the table is missing or does not list the clip, or the clip cannot be read or has another number of frames.
     """
     table = path.absolute().parent.parent.parent / LABELS_FILE if labels is None else labels
     rows = _read_labels(table)
@@ -82,11 +77,6 @@ def read_gelsight(path: Path, *, frame_rate: float | None = None) -> list[Captur
         The data set's folder, for all clips that are there; the folder of a grasp; or a clip.
     frame_rate
         Frames per second that the times assume; roughly known if None.
-
-    Raises
-    ------
-    RecordingError
-        As `read_gelsight_clip`, or if a folder holds no clip.
     """
     if path.is_file():
         clips = [path]

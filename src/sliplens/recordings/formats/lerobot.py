@@ -524,11 +524,6 @@ def read_lerobot(
     -------
     list of Capture
         In the order of the episodes.
-
-    Raises
-    ------
-    RecordingError
-        If the folder is no such data set, it is damaged, or a feature or episode is missing or one of several.
     """
     layout = read_layout(folder)
     if camera_key is None and force_key is None and (kept := read_kept(layout)) is not None:

@@ -317,13 +317,6 @@ def write_lerobot(
     trials
         Rows of its table; all by default.
 
-    Raises
-    ------
-    InputError
-        If the folder is missing, or holds a data set.
-    RecordingError
-        If there is no trial, one is damaged or not named like a file, or sizes of frames or frame rates differ.
-
     References
     ----------
     https://huggingface.co/docs/lerobot/lerobot-dataset-v3

@@ -107,13 +107,6 @@ def write_mcap(
         An empty folder.
     trials
         Rows of its table; all by default.
-
-    Raises
-    ------
-    InputError
-        If `mcap` or `rosbags` is not installed, or the folder is missing or not empty.
-    RecordingError
-        If a trial is damaged, its name is not that of a file, or its times do not fit into stamps.
     """
     require_folder(folder, what="the folder to write to")
     if any(folder.iterdir()):

@@ -473,14 +473,6 @@ def read_rosbag(path: Path, *, image_topic: str | None = None, wrench_topic: str
         By default the only topic that holds images.
     wrench_topic
         By default the only topic that holds wrenches; there are no forces where there is none.
-
-    Raises
-    ------
-    InputError
-        If `rosbags` is not installed.
-    RecordingError
-        If the path is no bag, it is damaged, a topic is missing or could be one of several, an image has another
-        encoding or its size changes, or times do not rise.
     """
     topics = bag_topics(path)
     if image_topic is None and wrench_topic is None and (trial := read_trial_bag(path, topics)) is not None:

@@ -31,11 +31,6 @@ def read_stored(folder: Path) -> list[Capture]:
     ----------
     folder
         Folder with `dataset.json`.
-
-    Raises
-    ------
-    InputError
-        If the folder is no data set, or a trial is missing or damaged.
     """
     data = load_dataset(folder)
     return [read_stored_trial(data, info) for info in data.trials]

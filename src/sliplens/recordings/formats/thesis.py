@@ -128,11 +128,6 @@ def read_thesis(
     -------
     list of Capture
         A trial for each reference frame, in the order of the list, with the margins of the list as its labels.
-
-    Raises
-    ------
-    RecordingError
-        If a list is missing or empty, their lengths differ, a file is not found, sizes disagree, or a margin is none.
     """
     rate = _FRAME_RATE_HZ if frame_rate is None else frame_rate
     how = "assumed" if frame_rate is None else "declared"
