@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -15,13 +16,13 @@ from sliplens.images.files import list_images, read_image
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.formats.tables import (
     TIME_UNITS,
+    ForceColumns,
     TextTable,
     evenly_spaced,
     guess_time_column,
     guess_time_unit,
     open_table,
     place_on_clock,
-    read_force_table,
     require_rising,
     require_unit,
     to_number,
@@ -151,10 +152,7 @@ def read_image_folder(
     name_unit: str | None = None,
     start_s: float | None = None,
     name: str | None = None,
-    time_column: str | None = None,
-    force_columns: Sequence[str] | None = None,
-    time_unit: str | None = None,
-    force_unit: str | None = None,
+    **columns: Unpack[ForceColumns],
 ) -> Capture:
     """Open a folder of images, and a table of forces recorded beside it.
 
@@ -164,8 +162,7 @@ def read_image_folder(
     Parameters
     ----------
     forces
-        Table of forces; `read_force_table` tells of it and of `time_column`, `force_columns`, `time_unit` and
-        `force_unit`.
+        Table of forces; `read_force_table` tells of it and of `columns`.
     times
         Table with the name and the time of every image; frames are then ordered by time.
     name_unit
@@ -210,14 +207,7 @@ def read_image_folder(
             "record PNG or TIFF where you can."
         )
     size = common_size(paths)
-    table = None
-    if forces is not None:
-        table = read_force_table(
-            forces, time_column=time_column, force_columns=force_columns, time_unit=time_unit, force_unit=force_unit
-        )
-        notes.extend(table.notes)
-    measured = table.forces if table else None
-    clock = place_on_clock(time, forces=measured, start_s=start_s, source=folder.name)
+    clock = place_on_clock(time, forces=forces, start_s=start_s, source=folder.name, **columns)
 
     def read_frames() -> Iterator[UInt8[np.ndarray, "height width 3"]]:
         return (read_frame(path, size=size) for path in paths)
@@ -228,7 +218,7 @@ def read_image_folder(
         frame_time_s=clock.time_s,
         frame_size=size,
         read_frames=read_frames,
-        forces=measured,
+        forces=clock.forces,
         notes=(*notes, *clock.notes),
     )
 

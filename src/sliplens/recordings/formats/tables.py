@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from math import isfinite
 from pathlib import Path
+from typing import TypedDict, Unpack
 
 import numpy as np
 from jaxtyping import Float
@@ -349,35 +350,6 @@ def _only(found: Sequence[str], *, table: TextTable, what: str, option: str) -> 
     return found[0]
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameClock:
-    """Times of frames on the clock of the forces."""
-
-    time_s: Float[np.ndarray, " frames"]
-    notes: tuple[str, ...]
-
-
-def place_on_clock(
-    time_s: Float[np.ndarray, " frames"], *, forces: Forces | None, start_s: float | None, source: str
-) -> FrameClock:
-    """Put frames on the clock of forces that were recorded into another file."""
-    notes: tuple[str, ...] = ()
-    if start_s is not None:
-        if not isfinite(start_s):
-            raise RecordingError(f"the first frame cannot start at {start_s} s; give the time of the force clock")
-        time_s = time_s - time_s[0] + start_s
-        notes = (f"{source}: the first frame was declared to be taken at {start_s:.6g} s of the force clock.",)
-    elif forces is not None:
-        notes = (f"{source}: the times of its frames and of the forces were taken to count from the same zero.",)
-    if forces is not None and (time_s[-1] < forces.time_s[0] or time_s[0] > forces.time_s[-1]):
-        raise RecordingError(
-            f"the frames of {source} ({time_s[0]:.6g} to {time_s[-1]:.6g} s) and the forces of {forces.source} "
-            f"({forces.time_s[0]:.6g} to {forces.time_s[-1]:.6g} s) have no moment in common; "
-            "declare with start_s when the first frame was taken, on the clock of the forces"
-        )
-    return FrameClock(time_s=time_s, notes=notes)
-
-
 def evenly_spaced(count: int, *, frame_rate: float) -> Float[np.ndarray, " frames"]:
     """Times of frames taken at a declared rate, in seconds from the first."""
     if not (isfinite(frame_rate) and frame_rate > 0):
@@ -470,6 +442,55 @@ def read_force_table(
     return ForceTable(
         forces=Forces(time_s=time * TIME_UNITS[unit], force_n=_to_axes(forces), source=str(path)), notes=tuple(notes)
     )
+
+
+class ForceColumns(TypedDict, total=False):
+    """What `read_force_table` may be told of a table."""
+
+    time_column: str | None
+    force_columns: Sequence[str] | None
+    time_unit: str | None
+    force_unit: str | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameClock:
+    """Times of frames on the clock of the forces that were recorded into a table beside them."""
+
+    time_s: Float[np.ndarray, " frames"]
+    forces: Forces | None
+    notes: tuple[str, ...]
+
+
+def place_on_clock(
+    time_s: Float[np.ndarray, " frames"],
+    *,
+    forces: Path | None,
+    start_s: float | None,
+    source: str,
+    **columns: Unpack[ForceColumns],
+) -> FrameClock:
+    """Read the table of forces beside frames, if there is one, and put the frames on its clock.
+
+    The first frame was taken at `start_s` on the clock of the forces; where that is None, both count from one zero.
+    """
+    table = None if forces is None else read_force_table(forces, **columns)
+    notes = () if table is None else table.notes
+    if start_s is not None:
+        if not isfinite(start_s):
+            raise RecordingError(f"the first frame cannot start at {start_s} s; give the time of the force clock")
+        time_s = time_s - time_s[0] + start_s
+        notes += (f"{source}: the first frame was declared to be taken at {start_s:.6g} s of the force clock.",)
+    elif table is not None:
+        notes += (f"{source}: the times of its frames and of the forces were taken to count from the same zero.",)
+    samples = None if table is None else table.forces
+    if samples is not None and (time_s[-1] < samples.time_s[0] or time_s[0] > samples.time_s[-1]):
+        raise RecordingError(
+            f"the frames of {source} ({time_s[0]:.6g} to {time_s[-1]:.6g} s) and the forces of {samples.source} "
+            f"({samples.time_s[0]:.6g} to {samples.time_s[-1]:.6g} s) have no moment in common; "
+            "declare with start_s when the first frame was taken, on the clock of the forces"
+        )
+    return FrameClock(time_s=time_s, forces=samples, notes=notes)
 
 
 def _force_names(table: TextTable, declared: Sequence[str] | None) -> tuple[str, ...]:

@@ -1,10 +1,10 @@
 """Frames of a video file, with the presentation stamps of its container."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import av
 import numpy as np
@@ -17,7 +17,7 @@ from jaxtyping import Float, Float32, Int64, UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.formats.tables import evenly_spaced, place_on_clock, read_force_table, trial_name
+from sliplens.recordings.formats.tables import ForceColumns, evenly_spaced, place_on_clock, trial_name
 
 HEAD = 13
 """Frames at the start that may be stale."""
@@ -269,10 +269,7 @@ def read_video(
     skip_frames: int = 0,
     skip_stale: bool = False,
     name: str | None = None,
-    time_column: str | None = None,
-    force_columns: Sequence[str] | None = None,
-    time_unit: str | None = None,
-    force_unit: str | None = None,
+    **columns: Unpack[ForceColumns],
 ) -> Capture:
     """Open a video, and a table of forces recorded beside it.
 
@@ -283,8 +280,7 @@ def read_video(
     path
         Whatever FFmpeg reads: MP4, AVI, Matroska, ...
     forces
-        Table of forces; `read_force_table` tells of it and of `time_column`, `force_columns`, `time_unit` and
-        `force_unit`.
+        Table of forces; `read_force_table` tells of it and of `columns`.
     frame_rate
         True frames per second, where the stamps are missing or wrong; takes their place.
     start_s
@@ -312,18 +308,7 @@ def read_video(
         raise RecordingError(f"{path} has no presentation stamps; declare its frame_rate")
     else:
         time = file.time_s
-    table = None
-    if forces is not None:
-        table = read_force_table(
-            forces,
-            time_column=time_column,
-            force_columns=force_columns,
-            time_unit=time_unit,
-            force_unit=force_unit,
-        )
-        notes.extend(table.notes)
-    measured = table.forces if table else None
-    clock = place_on_clock(time, forces=measured, start_s=start_s, source=path.name)
+    clock = place_on_clock(time, forces=forces, start_s=start_s, source=path.name, **columns)
     notes.extend(clock.notes)
     skipped = _skipped(path, file, skip_frames=skip_frames, skip_stale=skip_stale)
     if skipped:
@@ -338,7 +323,7 @@ def read_video(
         frame_time_s=clock.time_s[skipped:],
         frame_size=file.frame_size,
         read_frames=read_frames,
-        forces=measured,
+        forces=clock.forces,
         notes=tuple(notes),
     )
 
