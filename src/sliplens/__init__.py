@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from sliplens.recordings.exporting import export_lerobot, export_mcap
     from sliplens.recordings.importing import import_recordings, label_dataset
     from sliplens.recordings.splits import split_dataset
+    from sliplens.report.page import write_report
     from sliplens.simulation.trials import simulate
     from sliplens.training.evaluation import evaluate
     from sliplens.training.fitting import train
@@ -41,6 +42,7 @@ _MODULES = {
     "split_dataset": "sliplens.recordings.splits",
     "track": "sliplens.markers.tracking",
     "train": "sliplens.training.fitting",
+    "write_report": "sliplens.report.page",
 }
 
 __all__ = [
@@ -62,6 +64,7 @@ __all__ = [
     "split_dataset",
     "track",
     "train",
+    "write_report",
 ]
 
 

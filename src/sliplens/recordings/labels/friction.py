@@ -170,7 +170,7 @@ class ImageMotion:
 def given_friction(
     mu: float, *, low: float | None = None, high: float | None = None, onset_s: float | None = None
 ) -> FrictionEstimate:
-    """Friction given by hand; without an interval it counts as exact.
+    """Static coefficient of friction given by hand; without an interval it counts as exact.
 
     Parameters
     ----------
