@@ -114,8 +114,6 @@ def require_packages(*names: str, extra: str, purpose: str) -> None:
 
     Parameters
     ----------
-    names, extra
-        As `missing_packages` takes them.
     purpose
         What needs them, as the message begins.
     """

@@ -33,8 +33,6 @@ def noisy_linear(
 
     Parameters
     ----------
-    images
-        Images in [0, 1].
     noise
         Standard normal numbers; scaled to ROAD's 0.01 and added where pixels were filled. None without noise.
     tolerance

@@ -132,8 +132,6 @@ def randomisation_scores(
     ----------
     model
         The trained network; left as it is.
-    seed, stages
-        See `cascade`.
     before
         Maps of the trained network, where they are there already.
 

@@ -37,8 +37,6 @@ def marker_units(shape: tuple[int, int], centres_px: Float[np.ndarray, "markers 
 
     Parameters
     ----------
-    shape
-        Height and width of the image.
     reach_px
         How far a marker's unit reaches: its radius, and as far as it moves.
     """
@@ -63,8 +61,6 @@ def unit_order(
     ----------
     influence
         Map to rank by: the mean of a unit counts, so that large units have no advantage.
-    units
-        Number of each pixel's unit.
     least_first
         From the least to the most influential.
 

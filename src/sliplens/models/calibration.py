@@ -53,8 +53,6 @@ def fit_temperature(logits: Float[Tensor, "frames bins"], targets: Float[Tensor,
 
     Parameters
     ----------
-    logits
-        Of validation frames, as trained.
     targets
         Their labels as `histogram_targets` gives them.
     """
@@ -110,8 +108,6 @@ def conformal_offset(
     ----------
     low, high
         Intervals of validation frames; equal for one number.
-    level
-        Share that is to hold.
 
     References
     ----------

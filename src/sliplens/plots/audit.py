@@ -280,8 +280,6 @@ def draw_audit(recording: Recording, labelling: Labelling, *, read_frames: ReadF
 
     Parameters
     ----------
-    labelling
-        How its labels were made.
     read_frames
         Gives the frames of these numbers, for a trial that was loaded without its pixels; its own if None.
     """
@@ -306,28 +304,13 @@ def draw_audit(recording: Recording, labelling: Labelling, *, read_frames: ReadF
 def write_audit(
     recording: Recording, labelling: Labelling, path: Path, *, read_frames: ReadFrames | None = None
 ) -> None:
-    """Save the audit of a trial as .png, .pdf or .svg; it appears when complete.
-
-    Parameters
-    ----------
-    recording, labelling
-        As `draw_audit` takes them.
-    read_frames
-        As `draw_audit` takes it.
-    """
+    """Save the audit of a trial as .png, .pdf or .svg; it appears when complete."""
     require_picture_path(path, example="audit.png")
     save_page(draw_audit(recording, labelling, read_frames=read_frames), path)
 
 
 def write_audits(data: Dataset, folder: Path, *, on_progress: OnProgress | None = None) -> int:
     """Draw the audit of every trial of a data set, `TRIAL.png`; pages newer than their trial stay.
-
-    Parameters
-    ----------
-    data
-        Data set whose trials were imported or labelled.
-    folder
-        Where to write, made if it is missing.
 
     Returns
     -------

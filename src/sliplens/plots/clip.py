@@ -72,8 +72,6 @@ def write_clip(
     ----------
     recording
         Trial of any frame size and rate; its frames are repeated or left out to keep time.
-    path
-        File to write, .mp4 (H.264).
     frames_per_s
         Frames a second of the clip; by default the recording's own if between 25 and 30, otherwise 30.
     """
@@ -305,8 +303,6 @@ def clip_writer(
 
     Parameters
     ----------
-    path
-        File to write, .mp4 (H.264).
     size
         Height and width of the frames, in pixels.
     frames_per_s

@@ -119,13 +119,7 @@ def draw_contact_sheet(recordings: Sequence[Recording], *, title: str | None = N
 
 
 def write_contact_sheet(recordings: Sequence[Recording], path: Path, *, title: str | None = None) -> None:
-    """Save a contact sheet as .png, .pdf or .svg; it appears when complete.
-
-    Parameters
-    ----------
-    recordings, title
-        As `draw_contact_sheet` takes them.
-    """
+    """Save a contact sheet as .png, .pdf or .svg; it appears when complete."""
     require_picture_path(path, example="preview.png")
     save_page(draw_contact_sheet(recordings, title=title), path)
 

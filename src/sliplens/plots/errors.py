@@ -353,13 +353,7 @@ _FEW = 40
 
 
 def draw_learning_curve(training: Training, path: Path, *, title: str) -> None:
-    """Save the errors of a training by epoch, on a logarithmic scale, with the epoch whose weights were kept.
-
-    Parameters
-    ----------
-    path
-        File to write: .png, .pdf or .svg.
-    """
+    """Save the errors of a training by epoch, on a logarithmic scale, with the epoch whose weights were kept."""
     curve = training.curve
     epoch, train, validation = curve.epoch, curve.train_mse, curve.validation_mse
     best = int(np.argmin(validation))

@@ -80,8 +80,6 @@ def figure_picture(figure: Figure, *, alt: str, pixels: bool = False) -> Picture
 
     Parameters
     ----------
-    alt
-        The same in words.
     pixels
         Hold it as PNG: smaller where it is made of photographs. As SVG otherwise.
     """

@@ -128,8 +128,6 @@ def draw_contact_states(recording: Recording, tracks: Tracks) -> Figure:
 
     Parameters
     ----------
-    recording
-        A trial with contact states.
     tracks
         Its markers, from the recording's own reference.
 

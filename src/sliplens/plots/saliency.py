@@ -108,8 +108,6 @@ def draw_panel(
     ----------
     rows
         Pictures by the name of their row; None leaves a cell empty.
-    titles
-        Of the columns.
     """
     figure = Figure(figsize=(_CELL_IN * len(titles) + 0.4, _CELL_IN * len(rows) + 0.5), dpi=120, layout="constrained")
     axes = figure.subplots(len(rows), len(titles), squeeze=False)

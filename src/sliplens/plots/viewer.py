@@ -439,13 +439,7 @@ _HIGHEST = 2.5  # times mu_s: where hardly anything presses, F_t / F_n goes anyw
 
 
 def write_rrd(data: Dataset, info: TrialInfo, path: Path, *, on_progress: OnProgress | None = None) -> None:
-    """Write a trial as a file of the Rerun viewer; it appears when complete.
-
-    Parameters
-    ----------
-    path
-        File to write, .rrd.
-    """
+    """Write a trial as a file of the Rerun viewer; it appears when complete."""
     require_rrd_path(path)
     stream = _new_stream()
     with written_whole(path) as part:

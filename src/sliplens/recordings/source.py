@@ -80,8 +80,6 @@ def open_source(
         Name of one trial; all if None.
     format
         Row of `FORMATS`; recognised if None.
-    options
-        For the reader.
 
     Examples
     --------

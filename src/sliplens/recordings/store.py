@@ -196,10 +196,6 @@ def write_trial(
         Encoded frames in chunks, a row group each; see `encode_frames`.
     facts
         Name of the trial, its sensor, day, condition and object.
-    labels
-        Labels of the frames, and how they were made.
-    truth
-        Truth of a simulated trial.
     """
     columns: dict[str, Any] = {"time_s": time_s, "contact_state": [str(state) for state in labels.contact_state]}
     columns |= {name: getattr(labels, name) for name in SIGNALS[1:]}
@@ -341,13 +337,7 @@ def stream_frames(path: Path) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
 
 
 def read_frames(path: Path, places: Sequence[int]) -> UInt8[np.ndarray, "frames height width 3"]:
-    """Some frames of a stored trial, in the order asked for, a row group in memory at a time.
-
-    Parameters
-    ----------
-    places
-        Numbers of the frames.
-    """
+    """Some frames of a stored trial, in the order asked for, a row group in memory at a time."""
     header, first = read_header(path), 0
     strange = [place for place in places if not 0 <= place < header.frames]
     if strange:

@@ -121,8 +121,6 @@ def compare_thesis_score(
     ----------
     first, second
         Of two methods, or of two inputs.
-    trials
-        Trial of each frame that counts.
     """
     ids, here, there = np.intersect1d(first.frame_ids, second.frame_ids, return_indices=True)
     known = np.array([name in trials for name in ids], dtype=bool)

@@ -53,17 +53,7 @@ def draw_grid(
     cell_in: float = CELL_IN,
     least_width_in: float = 0.0,
 ) -> Grid:
-    """Draw pictures in rows.
-
-    Parameters
-    ----------
-    below_in
-        Inches to leave free below.
-    bar
-        Add the colours of saliency at the bottom.
-    least_width_in
-        Of the figure.
-    """
+    """Draw pictures in rows."""
     columns = max(len(cells) for _, cells in rows)
     worded = [any(cell.words for cell in cells) for _, cells in rows]
     shape = next((cell.picture.shape for _, cells in rows for cell in cells if cell.picture is not None), (1, 1, 3))
@@ -239,13 +229,7 @@ def shown_frames(results: Results, explained: Explained) -> list[ShownFrame]:
 def bright_pictures(
     explained: Explained, indices: Sequence[int]
 ) -> tuple[dict[int, UInt8[np.ndarray, "height width 3"]], str]:
-    """Pictures of some frames, and what to call them: differences are made brighter all alike, or little would be seen.
-
-    Parameters
-    ----------
-    explained
-        Frames with their pictures.
-    """
+    """Pictures of some frames, and what to call them; differences are made brighter all alike, to be seen."""
     pictures = {index: explained.pictures[index] for index in indices}
     if explained.input != "difference":
         return pictures, "Input"

@@ -72,15 +72,7 @@ class Table:
 
 
 def make_table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str | Cell]], *, names: int = 1) -> Table:
-    """Make a table of texts: names in the first columns, then numbers, the thesis's own where the head says so.
-
-    Parameters
-    ----------
-    rows
-        Texts; a cell where it is more than that.
-    names
-        Columns that hold names.
-    """
+    """Make a table of texts: names in the first columns, then numbers, the thesis's own where the head says so."""
     heads = tuple(Cell(text=text, kind="thesis" if "thesis" in text.lower() else "name") for text in head)
     kinds: list[Kind] = [
         "name" if place < names else "thesis" if cell.kind == "thesis" else "number" for place, cell in enumerate(heads)

@@ -22,8 +22,6 @@ def thesis_row(method: str, among: Collection[str]) -> str | None:
 
     Parameters
     ----------
-    method
-        One of ours.
     among
         All that were run.
     """

@@ -166,8 +166,6 @@ def load_at_margins(margins: Float[np.ndarray, " frames"], *, grasp: Grasp) -> L
 
     Parameters
     ----------
-    margins
-        Gamma, 0 to 1.
     grasp
         Force and friction; drift, creep and the kinetic ratio are left out.
     """

@@ -30,8 +30,6 @@ def explain_trial(
 
     Parameters
     ----------
-    recording
-        Trial with labels.
     source
         `simulated` or `real`.
     method

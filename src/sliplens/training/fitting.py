@@ -217,15 +217,7 @@ def _choose_trials(data: Dataset, condition: str | None) -> tuple[tuple[TrialInf
 
 @torch.no_grad()
 def calibrate(model: nn.Module, validation: FrameSet, *, batch_size: int) -> Calibration:
-    """Fit the temperature of a distribution, which is set in the model, and the offsets of its intervals.
-
-    Parameters
-    ----------
-    model
-        Trained.
-    validation
-        Labelled frames of trials that did not train it.
-    """
+    """Fit the temperature of a distribution, which is set in the model, and the offsets of its intervals."""
     was_training, device = model.training, next(model.parameters()).device
     model.eval()
     network = model.backbone if isinstance(model, HistogramRegressor) else model

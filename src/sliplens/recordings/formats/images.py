@@ -171,15 +171,6 @@ def read_image_folder(
         When the first frame was taken, on the clock of the forces; None where both count from the same zero.
     name
         Of the trial; that of the folder if None.
-
-    Raises
-    ------
-    InputError
-        If the folder is missing or holds no image.
-    ImageError
-        If an image is damaged, is neither 8-bit RGB nor grey, or holds several images.
-    RecordingError
-        If sizes disagree, times are not given in exactly one way, or one is missing or twice there.
     """
     given = [option for option in (times, frame_rate, name_unit) if option is not None]
     if len(given) != 1:

@@ -400,8 +400,6 @@ def read_force_table(
 
     Parameters
     ----------
-    time_column
-        Name of the column with the times.
     force_columns
         Names of three columns, forces along x, y and z; or of two, the normal and the tangential force, which become
         z and x.
@@ -409,12 +407,6 @@ def read_force_table(
         s, ms, us or ns.
     force_unit
         N, mN, kN, gf, kgf or lbf.
-
-    Raises
-    ------
-    RecordingError
-        If the file is missing, empty or no text, lacks a column, holds what is no finite number, times do not rise,
-        or a force is too large to be one.
     """
     table = open_table(path)
     time_name = guess_time_column(table) if time_column is None else table.require(time_column, option="time_column")

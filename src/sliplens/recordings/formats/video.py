@@ -291,11 +291,6 @@ def read_video(
         Leave out what `stale_frames` finds at the start; reads the beginning of the video.
     name
         Of the trial; that of the file if None.
-
-    Raises
-    ------
-    RecordingError
-        If the file is missing, no video, truncated or damaged, holds no frame or absurdly large ones, or has no stamps.
     """
     file = inspect_video(path)
     notes = list(file.notes)

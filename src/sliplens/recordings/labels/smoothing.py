@@ -29,8 +29,6 @@ def mean_force(
     ----------
     at_s
         Where to have the force; beyond the samples it is that of the nearest.
-    window_s
-        Full length of the window.
     until_s
         A time that no window reaches over, from either side: the onset of slip, where the force breaks off.
     """
