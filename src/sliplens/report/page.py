@@ -1,6 +1,7 @@
 """The report: one page that needs nothing but itself, and its figures beside it."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -12,6 +13,7 @@ from sliplens.errors import InputError
 from sliplens.files import Provenance
 from sliplens.plots.layout import written_whole
 from sliplens.report.comparisons import tell_interval
+from sliplens.report.pictures import plate_strip
 from sliplens.report.plates import FOLDER, Plate, ShownPlate, show_plate, write_plates
 from sliplens.report.results import load_results
 from sliplens.report.sections import Block, Section, build_sections
@@ -28,6 +30,10 @@ class Page:
 
     name: str
     finished: str
+    waiting_for: tuple[str, ...]
+    """What is still being made; the page loads itself anew until nothing is."""
+    opening: ShownPlate | None
+    """Picture that says it all, above the verdict."""
     carrying: tuple[Statement, ...]
     """Statements to rely on."""
     warning: tuple[Statement, ...]
@@ -62,7 +68,9 @@ class Kept(Protocol):
         ...
 
 
-def write_report(workspace: str | Path | Kept, out: str | Path | None = None) -> Written:
+def write_report(
+    workspace: str | Path | Kept, out: str | Path | None = None, *, waiting_for: Sequence[str] = ()
+) -> Written:
     """Write the report of a workspace as one self-contained HTML file, and its figures beside it.
 
     Each figure is written as `figures/NAME.pdf`, and its numbers as `figures/NAME.csv`; other files there are left as
@@ -75,6 +83,8 @@ def write_report(workspace: str | Path | Kept, out: str | Path | None = None) ->
         named as missing on the page.
     out
         HTML file to write; it appears when complete. `report.html` in the workspace if not given.
+    waiting_for
+        What is still being made, in words; the page says so, and loads itself anew every few seconds.
 
     Returns
     -------
@@ -95,8 +105,10 @@ def write_report(workspace: str | Path | Kept, out: str | Path | None = None) ->
     rng = np.random.default_rng(0)
     statements = judge(results, rng=rng)
     sections = build_sections(results, rng=rng)
-    text = render_page(build_page(results, statements, sections))
-    plates = [block for section in sections for block in section.blocks if isinstance(block, Plate)]
+    opening = None if results.strip is None else plate_strip(results.strip)
+    text = render_page(build_page(results, statements, sections, opening=opening, waiting_for=tuple(waiting_for)))
+    plates = [] if opening is None else [opening]
+    plates += [block for section in sections for block in section.blocks if isinstance(block, Plate)]
     # the figures first: a page that is there has all that it names
     figures = write_plates(plates, page.parent / FOLDER)
     with written_whole(page) as part:
@@ -104,7 +116,14 @@ def write_report(workspace: str | Path | Kept, out: str | Path | None = None) ->
     return Written(page=page, figures=figures)
 
 
-def build_page(results: Results, statements: tuple[Statement, ...], sections: tuple[Section, ...]) -> Page:
+def build_page(
+    results: Results,
+    statements: tuple[Statement, ...],
+    sections: tuple[Section, ...],
+    *,
+    opening: Plate | None = None,
+    waiting_for: tuple[str, ...] = (),
+) -> Page:
     """Gather what the page shows of a workspace."""
     newest = list(results.runs.values())[-1]
     versions = {tuple(sorted(run.versions.items())) for run in results.runs.values()}
@@ -112,6 +131,8 @@ def build_page(results: Results, statements: tuple[Statement, ...], sections: tu
     return Page(
         name=results.workspace.resolve().name,
         finished=newest.finished[:16].replace("T", " at "),
+        waiting_for=waiting_for,
+        opening=None if opening is None else show_plate(opening),
         carrying=tuple(one for one in statements if one.tone != "caution"),
         warning=tuple(one for one in statements if one.tone == "caution"),
         alarms=(*results.notes, *((mixed,) if len(versions) > 1 else ()), *count_alarms(results)),

@@ -7,6 +7,7 @@ from jaxtyping import UInt8
 
 from sliplens.plots.errors import MARGIN_LABEL
 from sliplens.plots.layout import place_axes
+from sliplens.plots.strip import draw_strip
 from sliplens.plots.style import (
     BLUE,
     CONTROLS,
@@ -41,6 +42,7 @@ from sliplens.report.plates import (
 from sliplens.report.workspace import Results
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionCurve, DeletionScores
+from sliplens.results.strip import Strip
 
 SHARES = (0.01, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Of the image, that are gone in the columns of a figure."""
@@ -106,6 +108,24 @@ def plate_states(results: Results, explained: Explained) -> Plate | None:
         name=name if real else _STATE_FIGURES.get(explained.input, name),
         what=f"Methods across the contact states, {input_name(explained.input).lower()}, "
         f"{source_name(explained.source)}",
+    )
+
+
+def plate_strip(strip: Strip) -> Plate:
+    """Draw one trial from stick to slip, its true and read margin, and the maps of a few frames."""
+    readings = strip.readings
+    first, last = (percent(float(readings.prediction[strip.shown[place]])) for place in (0, -1))
+    return Plate(
+        name="strip",
+        figure=draw_strip(strip),
+        alt=f"Camera frames of a {strip.condition} grip from stick to slip under the maps of a network, and below them "
+        f"the true and the read safety margin over time; the network reads {first} at first and {last} at last.",
+        caption=f"One grip of {source_name(strip.source)} from stick to slip: the first {strip.condition} trial that "
+        f"tests, chosen by its place alone. Above: the camera's frames under the map of {method_name(strip.method)}, "
+        "one scale for all. Below: the margin that was true, the one that was read, and the interval that should hold "
+        "90 % of the labels.",
+        numbers=vars(readings),
+        pixels=True,
     )
 
 

@@ -8,6 +8,7 @@ from sliplens.results.evaluation import Evaluation
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionScores
 from sliplens.results.simulation import Simulation
+from sliplens.results.strip import Strip
 from sliplens.results.study import Study
 from sliplens.results.training import Training
 
@@ -24,6 +25,8 @@ class Results:
         By input ("raw", "difference").
     explanations, scores
         By input and source ("simulated", "real").
+    strip
+        One trial from stick to slip.
     study
         What a study adds; false where none was run.
     notes
@@ -37,6 +40,7 @@ class Results:
     evaluations: dict[str, Evaluation] = field(default_factory=dict)
     explanations: dict[tuple[str, str], Explained] = field(default_factory=dict)
     scores: dict[tuple[str, str], DeletionScores] = field(default_factory=dict)
+    strip: Strip | None = None
     study: Study = field(default_factory=Study)
     notes: tuple[str, ...] = ()
 
