@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from sliplens.models.checkpoint import load
     from sliplens.models.onnx import export_onnx
     from sliplens.models.predictions import predict
+    from sliplens.plots.figure import plot
     from sliplens.recordings.check import check_dataset
     from sliplens.recordings.dataset import load_dataset
     from sliplens.recordings.exporting import export_lerobot, export_mcap
@@ -36,6 +37,7 @@ _MODULES = {
     "label_dataset": "sliplens.recordings.importing",
     "load": "sliplens.models.checkpoint",
     "load_dataset": "sliplens.recordings.dataset",
+    "plot": "sliplens.plots.figure",
     "predict": "sliplens.models.predictions",
     "score": "sliplens.faithfulness.scoring",
     "simulate": "sliplens.simulation.trials",
@@ -58,6 +60,7 @@ __all__ = [
     "label_dataset",
     "load",
     "load_dataset",
+    "plot",
     "predict",
     "score",
     "simulate",

@@ -13,7 +13,7 @@ def test_what_carries_comes_before_what_warns(verdict):
     tones = [one.tone == "caution" for one in verdict().values()]
 
     assert tones == sorted(tones)
-    assert list(verdict())[:2] == ["Accuracy, raw images", "Accuracy, difference images"]
+    assert list(verdict())[:2] == ["Accuracy, difference images", "Accuracy, raw images"]
 
 
 def test_alarms_of_one_kind_are_one_line_with_a_count():

@@ -198,7 +198,7 @@ def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
             top = _TOP + row * (_CHART[1] + 1.05)
             charts.append(place_axes(figure, left, top, *_CHART))
         predictions = evaluation.predictions
-        _plot_answers(predictions, conditions, ax=charts[0])
+        plot_answers(predictions, conditions, ax=charts[0])
         _plot_bins(evaluation.conditions, conditions, ax=charts[1])
         _plot_trials(predictions, conditions, ax=charts[2])
         _plot_coverage(evaluation.reliability, conditions, ax=charts[3])
@@ -211,7 +211,8 @@ def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
     save_page(figure, path)
 
 
-def _plot_answers(predictions: Predictions, conditions: list[str], *, ax: Axes) -> None:
+def plot_answers(predictions: Predictions, conditions: list[str], *, ax: Axes) -> None:
+    """Draw the answer against the label of every frame, in percent, a colour a condition."""
     for name in conditions:
         rows = np.flatnonzero(predictions.condition == name)
         rows = rows[:: max(1, len(rows) // _MOST_DOTS)]

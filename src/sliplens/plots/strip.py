@@ -39,7 +39,7 @@ def draw_strip(strip: Strip) -> Figure:
         place_text(figure, 0.1, 0.36, _subtitle(strip), fontsize=9.5, color="#4B5563")
         for number, (frame, picture, relevance) in enumerate(zip(strip.shown, strip.pictures, points, strict=True)):
             ax = place_axes(figure, _MARGIN_IN + number * (cell + _GAP_IN), 1.05, cell, cell)
-            ax.imshow(_overlay(picture, relevance / limit))
+            ax.imshow(overlay_relevance(picture, relevance / limit))
             ax.set_axis_off()
             ax.set_title(
                 f"{number + 1}: {_percent(strip.readings.prediction[frame])} read\n"
@@ -92,7 +92,7 @@ def _percent(value: float) -> str:
     return f"{100 * value:.0f} %" if np.isfinite(value) else "-"
 
 
-def _overlay(
+def overlay_relevance(
     picture: UInt8[np.ndarray, "height width 3"], share: Float[np.ndarray, "rows columns"]
 ) -> Float[np.ndarray, "height width 3"]:
     """Picture in grey under a signed map in [-1, 1]; the stronger a pixel, the more colour."""

@@ -165,7 +165,8 @@ def _deletion(results: Results, rng: np.random.Generator) -> Iterable[Block | No
     yield plate_highlighted(results)
     if own:
         yield from (plate_removal(results, method) for method in shown_methods(results))
-    yield from (plate_each_frame(scored) for scored in own.values())
+    if results.study:
+        yield from (plate_each_frame(scored) for scored in own.values())
 
 
 def _randomisation(results: Results, _: np.random.Generator) -> Iterable[Block | None]:

@@ -76,7 +76,12 @@ def judge(results: Results, *, rng: np.random.Generator) -> tuple[Statement, ...
 
 def _accuracy(results: Results) -> list[Statement]:
     statements = []
-    for name in inputs_in_order(results.evaluations):
+    errors = {
+        name: float(np.mean([scores.mse for scores in results.evaluations[name].conditions.values()]))
+        for name in inputs_in_order(results.evaluations)
+    }
+    # the network that reads best first
+    for name in sorted(errors, key=lambda name: errors[name]):
         scores = results.evaluations[name].conditions
         conditions = conditions_in_order(scores)
         r2 = [f"{decimals(scores[condition].r2, 2)} on {condition}" for condition in conditions]

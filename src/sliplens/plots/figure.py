@@ -1,0 +1,225 @@
+"""One figure of a result, whatever it is."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from sliplens.codec import Columns
+from sliplens.errors import InputError
+from sliplens.plots.errors import MARGIN_LABEL, plot_answers, plot_faithfulness, plot_learning_curves
+from sliplens.plots.saliency import overlay_saliency, stretch_saliency
+from sliplens.plots.strip import overlay_relevance, plot_readings
+from sliplens.plots.style import (
+    BLACK,
+    BLUE,
+    CONTROLS,
+    GREY,
+    VERMILLION,
+    drawing_style,
+    fill_name,
+    input_name,
+    method_name,
+    methods_in_order,
+    percent,
+)
+from sliplens.results.evaluation import Evaluation
+from sliplens.results.explanation import Explained
+from sliplens.results.faithfulness import DeletionScores, RemovalScores
+from sliplens.results.strip import Strip
+from sliplens.results.study import Study
+from sliplens.results.training import Training
+
+__all__ = ["plot"]
+
+
+def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
+    """Draw what a person would look at first in a result.
+
+    An evaluation shows answers against labels; a training its learning curve; an explanation the map over the image;
+    scores of explanations their curves or gains; predictions the margin over time; tracked markers how far they moved;
+    a study the gain of each method with its 95 % interval. Margins are in percent, gains in margin units.
+
+    Parameters
+    ----------
+    result
+        What `evaluate`, `train`, `explain`, `score`, `predict`, `track` or `run_study` gave, or a record of
+        `sliplens.results`.
+    ax
+        Axes to draw on; a figure of its own if not given.
+    index
+        Which image of an explanation, or which trial of predictions and markers.
+
+    Returns
+    -------
+    Figure
+        `.savefig(path)` keeps it; a notebook shows it.
+
+    Raises
+    ------
+    InputError
+        If there is no picture of such a result, or it holds nothing to draw.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sliplens as sl
+    >>> from sliplens.faithfulness import Faithfulness
+    >>> curves = np.array([[[0, 0.4, 0.4]], [[0, 0.0, 0.4]], [[0, 0.2, 0.4]]])
+    >>> figure = sl.plot(Faithfulness(areas=np.array([0, 0.5, 1.0]), curves=curves))
+    >>> [line.get_label() for line in figure.axes[0].lines]
+    ['most influential first', 'least influential first', 'random orders']
+    """
+    # by name along the bases: records of networks live above, and drawing them needs no torch
+    drawer = next((DRAWERS[kind.__name__] for kind in type(result).__mro__ if kind.__name__ in DRAWERS), None)
+    if drawer is None:
+        raise InputError(f"there is no picture of a {type(result).__name__}; there is one of {', '.join(DRAWERS)}")
+    with drawing_style():
+        figure = Figure(figsize=(6.4, 4.2), layout="constrained") if ax is None else ax.get_figure(root=True)
+        assert figure is not None
+        drawer(result, figure.subplots() if ax is None else ax, index)
+    return figure
+
+
+def _evaluation(evaluation: Evaluation, ax: Axes, _: int) -> None:
+    plot_answers(evaluation.predictions, sorted(evaluation.conditions), ax=ax)
+
+
+def _training(training: Training, ax: Axes, _: int) -> None:
+    plot_learning_curves({training.input: training}, ax=ax)
+
+
+def _explanation(explanation: Any, ax: Axes, index: int) -> None:
+    # tensors answer NumPy's protocol once they are on the CPU and carry no gradient
+    image, relevance = (
+        _array(values)[_of(len(values), index)] for values in (explanation.images, explanation.relevance)
+    )
+    limit = float(np.percentile(np.abs(relevance), 99.5)) or 1.0
+    picture = np.round(255 * np.clip(image, 0, 1)).astype(np.uint8).transpose(1, 2, 0)
+    read, compared = (
+        percent(float(_array(values)[index])) for values in (explanation.prediction, explanation.reference_prediction)
+    )
+    ax.imshow(overlay_relevance(picture, relevance / limit))
+    ax.set_axis_off()
+    ax.set_title(f"{method_name(explanation.method)}: why {read} rather than {compared}\nred lowers, blue raises")
+
+
+def _explained(explained: Explained, ax: Axes, index: int) -> None:
+    method, place = methods_in_order(explained.saliency)[0], _of(len(explained.frames), index)
+    ax.imshow(overlay_saliency(explained.pictures[place], stretch_saliency(explained.saliency[method][place])))
+    ax.set_axis_off()
+    frame = explained.frames[place]
+    ax.set_title(f"{method_name(method)}: true {percent(frame.safety_margin)}, read {percent(frame.prediction)}")
+
+
+def _faithfulness(faithfulness: Any, ax: Axes, _: int) -> None:
+    names = ("most influential first", "least influential first", "random orders")
+    lines = ((BLUE, "-"), (BLUE, "--"), (BLACK, ":"))
+    for values, name, (colour, line) in zip(faithfulness.curves, names, lines, strict=True):
+        ax.plot(100 * faithfulness.areas, values.mean(axis=0), color=colour, linestyle=line, label=name)
+    ax.set(xlabel="Removed (% of the image)", ylabel="Change of the answer (margin units)", xlim=(0, 100))
+    ax.set_title(" ".join([method_name(faithfulness.method), f"({faithfulness.fill})" if faithfulness.fill else ""]))
+    ax.legend()
+
+
+def _deletion(scores: DeletionScores, ax: Axes, _: int) -> None:
+    pixels = max(int(curve.pixels_removed.max()) for curve in scores.curves.values())
+    plot_faithfulness(scores.curves, pixels=pixels, ax=ax).set_title(input_name(scores.input))
+
+
+def _removal(scores: RemovalScores, ax: Axes, _: int) -> None:
+    if not scores.scores:
+        raise InputError("these scores hold no method; score some explanations first")
+    fill, unit = scores.scores[0].fill, scores.scores[0].unit
+    own = {score.method: score for score in scores.scores if (score.fill, score.unit) == (fill, unit)}
+    names = methods_in_order(own)[::-1]
+    for place, name in enumerate(names):
+        gap, colour = own[name].srg, GREY if own[name].control or name in CONTROLS else BLUE
+        ax.plot([gap.low, gap.high], [place, place], color=colour)
+        ax.plot([gap.estimate], [place], color=colour, marker="o")
+    ax.axvline(0, color=BLACK, linewidth=0.8, linestyle=":")
+    ax.set_yticks(range(len(names)), [method_name(name) for name in names])
+    ax.set(xlabel=f"Symmetric gain under {fill_name(fill, unit)} (margin units, 95 % interval)")
+    ax.set_title(input_name(scores.input))
+
+
+def _study(study: Study, ax: Axes, index: int) -> None:
+    if not study.faithfulness:
+        raise InputError("this study holds no scores; run `sliplens study` on")
+    _removal(study.faithfulness[sorted(study.faithfulness)[0]], ax, index)
+
+
+def _predictions(predictions: Any, ax: Axes, index: int) -> None:
+    # an evaluation's are columns
+    table = predictions.table() if isinstance(predictions, Columns) else predictions.frame()
+    trials = np.array(table["trial"].to_pylist(), dtype=str)
+    names = list(dict.fromkeys(trials.tolist()))
+    shown = table.filter(trials == names[_of(len(names), index)])
+
+    def column(name: str) -> np.ndarray:
+        return np.array([np.nan if value is None else value for value in shown[name].to_pylist()], dtype=np.float64)
+
+    timed = "time_s" in shown.column_names and shown["time_s"].null_count == 0
+    across = column("time_s" if timed else "frame")
+    if "low_90" in shown.column_names:
+        low, high = 100 * column("low_90"), 100 * column("high_90")
+        ax.fill_between(across, low, high, color=BLUE, alpha=0.18, linewidth=0, label="90 % interval")
+    ax.plot(across, 100 * column("prediction"), color=BLUE, label="read")
+    if "safety_margin" in shown.column_names:
+        ax.plot(across, 100 * column("safety_margin"), color=BLACK, linestyle="--", label="true")
+    ax.set(xlabel="Time (s)" if timed else "Frame", ylabel=MARGIN_LABEL)
+    ax.set_title(names[index], parse_math=False)
+    ax.legend()
+
+
+def _tracking(tracking: Any, ax: Axes, index: int) -> None:
+    table = tracking.frame()
+    names = [trial.trial for trial in tracking.trials]
+    rows = np.array(table["trial"].to_pylist(), dtype=str) == names[_of(len(names), index)]
+    frame, right, down = (
+        table[name].to_numpy(zero_copy_only=False).astype(np.float64)[rows] for name in ("frame", "dx_px", "dy_px")
+    )
+    frames, length = np.unique(frame), np.hypot(right, down)
+    known = [length[(frame == one) & np.isfinite(length)] for one in frames]
+    for values, name, colour in (
+        ([np.median(one) if len(one) else np.nan for one in known], "median marker", BLUE),
+        ([one.max() if len(one) else np.nan for one in known], "marker that moved most", VERMILLION),
+    ):
+        ax.plot(frames, values, color=colour, label=name)
+    ax.set(xlabel="Frame", ylabel="Displacement (px)")
+    ax.set_title(names[index], parse_math=False)
+    ax.legend()
+
+
+def _strip(strip: Strip, ax: Axes, _: int) -> None:
+    plot_readings(strip, ax=ax)
+
+
+def _array(values: Any) -> np.ndarray:
+    # a tensor answers NumPy's protocol once it is on the CPU and carries no gradient
+    detached = values.detach().cpu() if hasattr(values, "detach") else values
+    return np.asarray(detached, dtype=np.float64)
+
+
+def _of(count: int, index: int) -> int:
+    if not -count <= index < count:
+        raise InputError(f"there is no number {index} among {count}; count from 0")
+    return index
+
+
+DRAWERS: dict[str, Callable[[Any, Axes, int], None]] = {
+    "Evaluation": _evaluation,
+    "Training": _training,
+    "Explanation": _explanation,
+    "Explained": _explained,
+    "Faithfulness": _faithfulness,
+    "DeletionScores": _deletion,
+    "RemovalScores": _removal,
+    "Study": _study,
+    "Predictions": _predictions,
+    "Tracking": _tracking,
+    "Strip": _strip,
+}
+"""What draws a record, by the name of its class."""

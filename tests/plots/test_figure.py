@@ -1,0 +1,84 @@
+"""One figure of whatever result."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from made_up import write_workspace
+from matplotlib.figure import Figure
+
+import sliplens as sl
+from sliplens.errors import InputError
+from sliplens.explainers import Explanation
+from sliplens.models.predictions import Predictions
+from sliplens.report import load_results
+from sliplens.results.evaluation import Predictions as EvaluatedPredictions
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    return load_results(write_workspace(tmp_path_factory.mktemp("made") / "runs"))
+
+
+@pytest.fixture
+def explanation() -> Explanation:
+    relevance = torch.zeros(2, 8, 8)
+    relevance[1, 2, 3], relevance[1, 6, 6] = 0.4, -0.4
+    return Explanation(
+        images=torch.full((2, 3, 8, 8), 0.5),
+        relevance=relevance.requires_grad_(),
+        method="grad-cam",
+        target="",
+        prediction=torch.tensor([0.3, 0.2]),
+        reference_prediction=torch.tensor([1.0, 1.0]),
+        seconds=0.1,
+    )
+
+
+def test_records_of_a_workspace_have_a_figure_each(results):
+    for record, label in (
+        (results.evaluations["raw"], "True Γ (%)"),
+        (results.trainings["raw"], "Epoch (passes over the training frames)"),
+        (results.scores["raw", "simulated"], "Pixels removed (%)"),
+        (results.evaluations["raw"].predictions, "Time (s)"),
+    ):
+        figure = sl.plot(record)
+
+        assert isinstance(figure, Figure)
+        assert figure.axes[0].get_xlabel() == label
+
+
+def test_what_raises_is_blue_and_what_lowers_is_red(explanation):
+    ax = sl.plot(explanation, index=1).axes[0]
+
+    pixels = np.asarray(ax.images[0].get_array())
+    assert pixels[2, 3, 2] > pixels[2, 3, 0]
+    assert pixels[6, 6, 0] > pixels[6, 6, 2]
+    assert "why 20" in ax.get_title(loc="left")
+
+
+def test_axes_of_ones_own_are_drawn_on(results):
+    figure = Figure()
+    first, second = figure.subplots(1, 2)
+
+    assert sl.plot(results.explanations["raw", "simulated"], second) is figure
+    assert not first.images
+    assert len(second.images) == 1
+
+
+def test_a_number_that_is_not_there_is_told(explanation):
+    with pytest.raises(InputError, match="there is no number 2 among 2; count from 0"):
+        sl.plot(explanation, index=2)
+
+
+def test_what_has_no_picture_is_told():
+    with pytest.raises(InputError, match="there is no picture of a SimpleNamespace; there is one of Evaluation"):
+        sl.plot(SimpleNamespace())
+
+
+def test_predictions_of_any_trial_are_drawn(results):
+    frames: EvaluatedPredictions = results.evaluations["raw"].predictions
+    predictions = Predictions(frames=len(frames.trial), engine="eager", path=None, rows=frames.table())
+
+    assert sl.plot(predictions, index=1).axes[0].get_title(loc="left") == "day4-dry-001"
