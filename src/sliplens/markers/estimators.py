@@ -173,8 +173,12 @@ def mean_shear(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
 
 def shear_over_divergence(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
     """Mean motion over divergence, in pixels: a pull for a press, as a ratio of forces is."""
-    spread = np.maximum(trial.spread, 0.1 * max(float(np.nanmax(trial.spread)), 1e-6))
-    return mean_shear(trial) / spread[:, None]
+    return mean_shear(trial) / _pressed(trial)[:, None]
+
+
+def _pressed(trial: FieldTrial) -> Float[np.ndarray, " frames"]:
+    """Divergence to divide by: no less than a tenth of the trial's largest."""
+    return np.maximum(trial.spread, 0.1 * max(float(np.nanmax(trial.spread)), 1e-6))
 
 
 def rigid_residual(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
@@ -443,12 +447,7 @@ class Eccentricity(MarginEstimator):
 
     @staticmethod
     def _ratio(trial: FieldTrial) -> Margins:
-        moved = trial.increment_px[:, trial.inner]
-        known = np.all(np.isfinite(moved), axis=-1)
-        count = known.sum(axis=1)
-        mean = np.where(known[..., None], moved, 0).sum(axis=1) / np.maximum(count, 1)[:, None]
-        pressed = np.maximum(trial.spread, 0.1 * max(float(np.nanmax(trial.spread)), 1e-6))
-        return np.where(count > 0, np.linalg.norm(mean, axis=1) / pressed, np.nan)
+        return np.linalg.norm(_mean(trial.increment_px[:, trial.inner]), axis=1) / _pressed(trial)
 
     @staticmethod
     def _margin(ratio: np.ndarray, full: float) -> np.ndarray:

@@ -334,11 +334,11 @@ def _run_in_streams(submit: Callable[[Tensor], Callable[[], tuple[Tensor, ...]]]
     """Begin a few batches at once; `submit` begins one and gives what waits for its answers."""
 
     def run(batches: Iterable[Tensor]) -> Iterator[tuple[Tensor, ...]]:
-        # more than can be worked on: the next ones are made while all cores are busy
+        # two a stream: whoever makes them may have to wait for a core, and the streams must not
         waiting: deque[Callable[[], tuple[Tensor, ...]]] = deque()
         for batch in batches:
             waiting.append(submit(batch))
-            if len(waiting) > streams:
+            if len(waiting) == 2 * streams:
                 yield waiting.popleft()()
         while waiting:
             yield waiting.popleft()()
@@ -384,14 +384,14 @@ def _openvino(model: nn.Module, job: EngineJob) -> RunBatches:
         "INFERENCE_PRECISION_HINT": "f32",  # where the processor knows bfloat16 that is the default, at 3 digits
     }
     network = core.compile_model(converted, "CPU", settings)
-    idle = [network.create_infer_request() for _ in range(job.streams + 1)]
+    idle = [network.create_infer_request() for _ in range(2 * job.streams)]
     outputs = len(answer_names(model))
 
     def submit(batch: Tensor) -> Callable[[], tuple[Tensor, ...]]:
         missing = job.batch_size - len(batch)
         full = torch.cat([batch, batch.new_zeros(missing, *batch.shape[1:])]) if missing else batch
         full = full.contiguous()
-        request = idle.pop() if idle else network.create_infer_request()
+        request = idle.pop() if idle else network.create_infer_request()  # a run that was broken off gives none back
         request.start_async({0: full.numpy()}, share_inputs=True)
 
         def answers(_: Tensor = full) -> tuple[Tensor, ...]:  # the tensor too: the request reads its memory
