@@ -54,17 +54,20 @@ Shape = tuple[int, int, int]
 """Channels, rows and columns of a map."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Layer:
     """A module whose output is a map."""
 
     name: str
     """Its name in `model.named_modules()`."""
-    channels: int
-    height: int
-    """Rows of the map."""
-    width: int
-    """Columns of the map."""
+    shape: Shape
+    """Channels, rows and columns of the map."""
+    has_parameters: bool = True
+
+    @property
+    def channels(self) -> int:
+        """Channels of the map."""
+        return self.shape[0]
 
 
 @dataclass
@@ -76,15 +79,6 @@ class _Call:
     input_shape: Shape | None
     output_shape: Shape | None = None
     inner: list["_Call"] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class _Step:
-    """A module on the network's main path."""
-
-    name: str
-    shape: Shape
-    has_parameters: bool
 
 
 def find_layers(
@@ -165,7 +159,7 @@ def find_published_layers(model: nn.Module, images: Float[Tensor, "batch 3 heigh
         if shape is None or following is None:
             break  # the public code stops at what flattens
         if following[1:] != shape[1:]:
-            layers[name] = _layer(name, shape)
+            layers[name] = Layer(name, shape)
             if following[1:] == (1, 1):
                 break
     if not layers:
@@ -212,12 +206,12 @@ def _is_spatial(shape: Shape | None) -> bool:
     return shape is not None and shape[1] * shape[2] > 1
 
 
-def _main_path(call: _Call) -> list[_Step]:
+def _main_path(call: _Call) -> list[Layer]:
     # the exact forward: a subclass that overrides it may do more than run its items in a row
     is_sequence = type(call.module).forward is nn.Sequential.forward
     if not (call.name == "" or is_sequence or call.output_shape is None or _shrinks_repeatedly(call)):
         has_parameters = next(call.module.parameters(), None) is not None
-        return [_Step(call.name, call.output_shape, has_parameters)]
+        return [Layer(call.name, call.output_shape, has_parameters)]
     steps = [step for inner in call.inner for step in _main_path(inner)]
     if steps and is_sequence and call.name and call.output_shape is not None:
         steps[-1] = replace(steps[-1], name=call.name)  # the same tensor under the name people know
@@ -230,17 +224,13 @@ def _shrinks_repeatedly(call: _Call) -> bool:
     return call.input_shape[1] > 2 * call.output_shape[1] + 1 or call.input_shape[2] > 2 * call.output_shape[2] + 1
 
 
-def _distinct(steps: list[_Step]) -> tuple[Layer, ...]:
+def _distinct(steps: list[Layer]) -> tuple[Layer, ...]:
     layers = []
     for shape, group in groupby(steps, key=lambda step: step.shape):
         members = list(group)
         if _is_spatial(shape) and any(step.has_parameters for step in members):
-            layers.append(_layer(members[-1].name, shape))
+            layers.append(Layer(members[-1].name, shape))
     return tuple(layers)
-
-
-def _layer(name: str, shape: Shape) -> Layer:
-    return Layer(name=name, channels=shape[0], height=shape[1], width=shape[2])
 
 
 def _named(model: nn.Module, root: _Call, names: Sequence[str], *, others: tuple[Layer, ...]) -> tuple[Layer, ...]:
@@ -261,7 +251,7 @@ def _named(model: nn.Module, root: _Call, names: Sequence[str], *, others: tuple
             raise ModelError(f"layer {name!r} gives no spatial map; choose among {choices or 'none'}")
     if not names:
         raise ModelError("the list of layers is empty; name at least one, or pass None to have them found")
-    return tuple(_layer(name, shape) for name, shape in shapes.items() if shape is not None and name in names)
+    return tuple(Layer(name, shape) for name, shape in shapes.items() if shape is not None and name in names)
 
 
 def _finished(call: _Call) -> Iterator[_Call]:

@@ -37,9 +37,7 @@ class IntegratedGradients(Method):
 
     The line is cut into pieces. Each has a completeness gap of its own, between its part of the integral and the change
     of f from its start to its end, which two forward passes tell. While the gaps add up to more than `tolerance` the
-    pieces with the largest are halved. A trained network needs that: its slope along the line is ten times the mean
-    where the contact appears and has a kink wherever a ReLU opens, so that nodes spread over the whole line miss the
-    sum by some percent even when there are 128.
+    pieces with the largest are halved: nodes spread over the whole line miss the sum of a trained network by percents.
 
     Each image is refined on its own, so a batch gives what its images alone would give.
 

@@ -31,13 +31,9 @@ class PolyCam(Method):
     and their mean is "+/-": 0 for the empty mask, f(x) - f(b) for the full one. A channel's weight is
     relu(effect / (f(x) - f(b))), the part that supports the change.
 
-    A layer's map is relu(sum of weight x activation). From the last layer to the first it is divided by itself
-    resized to the coarser result and back, then multiplied by that result. The finest product, normalised like a
-    mask, times how much the image differs from the reference thereabouts (`maps.local_change`), is the saliency: where
-    x equals b a mask neither shows nor hides anything, however active the channel.
-
-    The relevance is that saliency scaled to add up to f(x) - f(b). The scaling is a convention, not a property of the
-    method: it gives the map the sign and unit of the others, and says nothing about how much one pixel contributes.
+    The layers' maps are refined from the coarsest to the finest (`combine`). The finest, times how much the image
+    differs from the reference thereabouts (`local_change`), is the saliency; the relevance is that scaled to add up to
+    f(x) - f(b), which is a convention: it says nothing about how much one pixel contributes.
 
     Parameters
     ----------
