@@ -136,3 +136,12 @@ def test_a_record_alone_comes_back(tmp_path: Path):
     place = Place(folder=tmp_path, share=0.5)
     save_record(place, tmp_path / "place.json")
     assert load_record(tmp_path / "place.json", Place, command="sliplens x") == place
+
+
+def test_what_is_declared_as_any_object_comes_back_as_json_holds_it(tmp_path: Path):
+    @dataclass(frozen=True, kw_only=True)
+    class Loose:
+        config: object
+
+    save_record(Loose(config={"a": (1, 2)}), tmp_path / "loose.json")
+    assert load_record(tmp_path / "loose.json", Loose, command="sliplens x").config == {"a": [1, 2]}

@@ -353,6 +353,8 @@ def _default(field: Field[Any]) -> Any:
 
 
 def _decode(kind: Any, value: object) -> object:
+    if kind is object:  # whatever JSON holds
+        return value
     if kind is Path:
         return Path(str(value))
     raise NotImplementedError(f"{kind} has no form in JSON")
