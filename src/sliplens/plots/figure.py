@@ -141,7 +141,7 @@ def _removal(scores: RemovalScores, ax: Axes, _: int) -> None:
         ax.plot([gap.estimate], [place], color=colour, marker="o")
     ax.axvline(0, color=BLACK, linewidth=0.8, linestyle=":")
     ax.set_yticks(range(len(names)), [method_name(name) for name in names])
-    ax.set(xlabel=f"Symmetric gain under {fill_name(fill, unit)} (margin units, 95 % interval)")
+    ax.set(xlabel=f"Symmetric gain, {fill_name(fill, unit)} (margin units, 95 % interval)")
     ax.set_title(input_name(scores.input))
 
 
