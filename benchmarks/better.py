@@ -33,8 +33,8 @@ from sliplens.faithfulness.removal import faithfulness
 from sliplens.faithfulness.units import Units, pixel_units, tile_units
 from sliplens.files import machine, versions
 from sliplens.intervals import paired_difference
-from sliplens.models import TrainedModel, load_checkpoint
-from sliplens.models.checkpoint import find_run
+from sliplens.models import TrainedModel
+from sliplens.models.checkpoint import load
 from sliplens.models.engines import prepare
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.trial import SLIPS
@@ -222,7 +222,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         try:
             data = Dataset.open(options.data) if options.data else simulate_dataset(Path(scratch) / "data", RECIPE)
             for run in options.run:
-                trained, cases = load_checkpoint(find_run(run)), []
+                trained, cases = load(run), []
                 for case in find_cases(trained, data, options=options):
                     print(f"{run} {case.trial} at {case.margin:.2f}", flush=True)
                     cases.append((case, judge(trained, case, options=options)))

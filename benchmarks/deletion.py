@@ -19,8 +19,7 @@ import torch
 from busy import busy_process
 from sliplens.errors import SliplensError
 from sliplens.faithfulness import deletion_curves, get_fill, random_order
-from sliplens.models import load_checkpoint
-from sliplens.models.checkpoint import find_run
+from sliplens.models.checkpoint import load
 from sliplens.models.engines import prepare
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
@@ -37,7 +36,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     try:
-        trained = load_checkpoint(find_run(options.run))
+        trained = load(options.run)
     except SliplensError as error:
         sys.exit(f"{Path(__file__).name}: {error}")
     trial = simulate_trial(plan_trials(PRESETS["small"])[0])
@@ -63,7 +62,7 @@ def main() -> None:
         fast_s = (time.perf_counter() - started) / count
         return slow_s, fast_s, float(np.abs(found.predictions[:LOOPED] - slow).max())
 
-    load = os.getloadavg()[0]
+    load_average = os.getloadavg()[0]
     slow_s, fast_s, error = measure(IMAGES)
     with busy_process():
         slow_busy_s, fast_busy_s, _ = measure(BESIDE_BUSY)
@@ -77,14 +76,14 @@ def main() -> None:
         "seconds_an_image": {"one by one": slow_s, "in batches": fast_s},
         "seconds_an_image_beside_busy": {"one by one": slow_busy_s, "in batches": fast_busy_s},
         "preparation_s": prepared_s,
-        "load_average": load,
+        "load_average": load_average,
     }
     if options.json:
         print(json.dumps(result))
         return
     print(
         f"{result['speedup']:.1f} times as fast ({ready.name}), beside a busy process "
-        f"{result['speedup_beside_busy']:.1f} times, largest difference {error:.1e}, load average before {load:.1f}"
+        f"{result['speedup_beside_busy']:.1f} times, largest difference {error:.1e}, load average {load_average:.1f}"
     )
 
 

@@ -27,8 +27,8 @@ from sliplens.errors import SliplensError
 from sliplens.explainers import Explanation, PolyCam, capture, find_layers
 from sliplens.explainers.maps import pearson_r, resize, to_masks, top_overlap
 from sliplens.files import machine, versions
-from sliplens.models import TrainedModel, load_checkpoint
-from sliplens.models.checkpoint import find_run
+from sliplens.models import TrainedModel
+from sliplens.models.checkpoint import load
 from sliplens.recordings import Dataset
 from sliplens.simulation import SimulationRecipe, simulate_dataset
 from sliplens.study import frames_from_dataset, frames_from_folder
@@ -163,7 +163,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--json", action="store_true", help="end with one line of JSON")
     options = parser.parse_args(arguments)
-    load = os.getloadavg()[0]
+    load_average = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as scratch:
         try:
             if options.data is None:
@@ -172,7 +172,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 data = Dataset.open(options.data)
             found, gpu = {}, []
             for run in options.run:
-                trained = load_checkpoint(find_run(run))
+                trained = load(run)
                 images, references = choose_frames(trained, data, real=options.real, count=options.frames)
                 found[str(run)] = measure(trained, images, references, options=options)
                 gpu.append(
@@ -196,8 +196,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for key, value in result.items():
         print(f"{key:20} {'not measured' if value is None else format(value, '.4g')}")
     if options.json:
-        more = {"budget": options.budget, "threads": torch.get_num_threads(), "networks": found}
-        print(json.dumps({**result, **more, "load_average": load, "machine": vars(machine()), "versions": versions()}))
+        more = {"budget": options.budget, "threads": torch.get_num_threads(), "load_average": load_average}
+        print(json.dumps({**result, **more, "networks": found, "machine": vars(machine()), "versions": versions()}))
 
 
 if __name__ == "__main__":

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from sliplens.errors import SliplensError
-from sliplens.models import load_checkpoint
-from sliplens.models.checkpoint import find_run
+from sliplens.models.checkpoint import load
 from sliplens.study import frames_from_folder
 
 NETWORK = "chromatouch-difference"
@@ -24,7 +23,7 @@ FRAMES = Path(os.environ.get("SLIPLENS_REFERENCE", "../shared/reference")) / "ch
 
 def read_real_frames(run: Path, frames: Path) -> dict[str, Any]:
     """Answers of a network to real frames, their mean absolute error, and whether their order is right."""
-    trained = load_checkpoint(find_run(run))
+    trained = load(run)
     chosen = frames_from_folder(trained, frames, labels_in_names=True)
     estimate = trained.estimate(trained.encoding.normalise(chosen.images))
     labels = chosen.safety_margin.astype(np.float64)

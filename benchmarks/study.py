@@ -19,8 +19,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # the study inherits it
 
 import torch
 
-from sliplens.models import load_checkpoint
-from sliplens.models.checkpoint import find_run
+from sliplens.models.checkpoint import load
 from sliplens.models.engines import prepare
 
 _INTERRUPTED = 130
@@ -74,7 +73,7 @@ def main() -> None:
 
 def measure_passes(count: int = 1000) -> float:
     """Forward passes a second of the difference network, by the engine that the study uses."""
-    trained = load_checkpoint(find_run(Path("chromatouch-difference")))
+    trained = load("chromatouch-difference")
     size = trained.manifest.image_size
     images = torch.rand(16, 3, size, size, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():

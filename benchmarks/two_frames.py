@@ -26,8 +26,8 @@ from jaxtyping import Float
 from torch import nn
 
 from sliplens.errors import SliplensError
-from sliplens.models import TrainedModel, load_checkpoint
-from sliplens.models.checkpoint import find_run
+from sliplens.models import TrainedModel
+from sliplens.models.checkpoint import load
 from sliplens.simulation import PRESETS, SimulationRecipe, simulate_dataset
 from sliplens.training import evaluate_frames
 from sliplens.training.data import load_frames
@@ -109,7 +109,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     try:
-        trained = load_checkpoint(find_run(options.run))
+        trained = load(options.run)
     except SliplensError as error:
         sys.exit(f"{Path(__file__).name}: {error}")
     varied, days = PRESETS["varied"], options.days

@@ -34,6 +34,7 @@ def test_a_folder_and_an_array_give_the_same_frames(folder):
 
 def test_images_have_times_where_their_rate_is_told(folder):
     (trial,) = open_source(folder[0], options=ReadOptions(frame_rate=4.0))
+    assert trial.time_s is not None
     np.testing.assert_allclose(trial.time_s, [0, 0.25, 0.5])
     assert trial.frame_rate_hz == pytest.approx(4.0)
 
@@ -45,6 +46,7 @@ def test_a_data_set_brings_references_times_and_trusted_labels(small_dataset: Da
     assert trials[0].read_reference is not None
     np.testing.assert_array_equal(trials[0].read_reference(), recording.reference)
     np.testing.assert_array_equal(next(trials[0].read_frames()), recording.frames[0])
+    assert trials[0].time_s is not None
     np.testing.assert_array_equal(trials[0].time_s, recording.time_s)
     assert trials[0].safety_margin is not None
     np.testing.assert_array_equal(np.isfinite(trials[0].safety_margin), recording.labelled)

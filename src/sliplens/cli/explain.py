@@ -66,8 +66,7 @@ class Explain:
 
     def run(self) -> None:
         """Explain and write the maps."""
-        from sliplens.models import load_checkpoint
-        from sliplens.models.checkpoint import find_run
+        from sliplens.models.checkpoint import load
         from sliplens.study import explain_frames
         from sliplens.study.explaining import require_methods
 
@@ -82,7 +81,7 @@ class Explain:
             raise InputError(f"--trials must be at least 1, got {self.trials}")
         require_methods(self.method)
         require_device(self.device)
-        trained = load_checkpoint(find_run(self.model), device=self.device)
+        trained = load(self.model, device=self.device)
         chosen = self._choose(trained)
         recipe = {
             "weights_sha256": trained.manifest.weights_sha256,

@@ -39,14 +39,13 @@ class Score:
     def run(self) -> None:
         """Score and write the curves."""
         from sliplens.faithfulness import get_fill
-        from sliplens.models import load_checkpoint
-        from sliplens.models.checkpoint import find_run
+        from sliplens.models.checkpoint import load
         from sliplens.study import load_explained, score_explanations
         from sliplens.study.scoring import require_same_network
 
         get_fill(self.fill)
         require_device(self.device)
-        trained = load_checkpoint(find_run(self.model), device=self.device)
+        trained = load(self.model, device=self.device)
         explained = load_explained(self.explanations)
         require_same_network(trained, explained)
         recipe = {

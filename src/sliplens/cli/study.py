@@ -136,10 +136,9 @@ class Study:
         InputError
             If it was trained on another input.
         """
-        from sliplens.models import load_checkpoint
-        from sliplens.models.checkpoint import find_run
+        from sliplens.models.checkpoint import load
 
-        trained = load_checkpoint(find_run(self._named()[name]), device=self.device)
+        trained = load(self._named()[name], device=self.device)
         if trained.manifest.input != name:
             raise InputError(
                 f"--{name} names a network on {trained.manifest.input} images; give one that was trained on {name}"
