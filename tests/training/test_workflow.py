@@ -48,8 +48,9 @@ def test_what_was_written_comes_back_as_it_was_returned(small_dataset: Dataset, 
 
 
 def test_several_processes_need_a_folder(small_dataset: Dataset):
+    options: dict[str, Any] = SMALL | {"batch_size": 12}
     with pytest.raises(InputError, match="several processes need a folder that all can see; name one with out"):
-        sl.train(small_dataset, **SMALL | {"batch_size": 12}, accelerator="cpu", devices=2)
+        sl.train(small_dataset, **options, accelerator="cpu", devices=2)
 
 
 def test_a_simulation_without_a_folder_lives_as_long_as_its_data_set():

@@ -64,7 +64,7 @@ class Track:
         )
         clip = nullcontext()
         if self.video is not None:
-            if len(trials) > 1:
+            if len(trials) != 1:
                 raise InputError(f"a clip shows one trial and {self.source} has {len(trials)}; name one with --trial")
             (trial,) = trials
             if self.video.exists() and not self.overwrite:
