@@ -176,7 +176,7 @@ def test_an_interrupted_import_goes_on_where_it_stopped(
             ("--format", "papyrus"),
             "there is no format named 'papyrus'; choose one of sliplens, rosbag, lerobot",
         ),
-        (("--image-topic", "/camera"), "is read as video, which does not take image_topic"),
+        (("--image-topic", "/camera"), "is read as video, which does not take --image-topic"),
         (("--forces", "TABLE", "--test-trials", "2"), "2 to test are more than the 1 there are; give fewer"),
         (("--forces", "TABLE", "--test-trials", "-1"), "numbers of trials are not negative"),
         (("--forces", "TABLE", "--reference-frame", "999"), "the reference is frame 999 of 240"),

@@ -189,11 +189,13 @@ def test_what_is_missing_or_too_much_is_told(
     refused(video, trained, InputError, "no frame 12; name one from 0 to 11", reference_frame=12)
     refused(tmp_path / "nothing", trained, InputError, "nothing does not exist")
     refused(small_dataset.folder, trained, InputError, "bring their reference frames", reference=image)
-    refused(small_dataset.folder, trained, InputError, "does not take frame_rate", options=ReadOptions(frame_rate=30.0))
+    refused(
+        small_dataset.folder, trained, InputError, "does not take --frame-rate", options=ReadOptions(frame_rate=30.0)
+    )
     refused(small_dataset.folder, trained, RecordingError, "no trial with split exam", split="exam")
     frames = write_frames(tmp_path / "frames", wet.frames)
     refused(frames, trained, InputError, "no frame 12; name one from 0 to 11", reference_frame=12)
-    refused(frames, trained, InputError, "does not take image_topic", options=ReadOptions(image_topic="/image"))
+    refused(frames, trained, InputError, "does not take --image-topic", options=ReadOptions(image_topic="/image"))
 
 
 def test_frames_of_another_size_are_refused(trained: TrainedModel, wet: Recording, tmp_path: Path):

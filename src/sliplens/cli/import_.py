@@ -93,12 +93,12 @@ def show_labelling(title: str, data: "Dataset") -> None:
         labels = data.read_labels(info)
         counts = labels.count()
         kept = labels.labelling
-        rows.append((info.trial, str(info.frames), str(counts.get("valid", 0)), *_basis(kept, counts)))
+        rows.append((info.trial, f"{counts.get('valid', 0)} of {info.frames}", *_basis(kept, counts)))
         if kept is not None:
             notes += [*kept.notes, *(kept.basis.axes.notes if kept.basis else ())]
         why = ", ".join(f"{count} {reason}" for reason, count in counts.items() if reason != "valid")
         lost.append(f"  {info.trial}: frames without a valid label: {why or 'none'}")
-    print_table(title, ("trial", "frames", "valid", "mu", "lag, ms", "reference"), rows)
+    print_table(title, ("trial", "valid", "mu", "lag, ms", "reference"), rows)
     for line in (*(f"  note: {note}" for note in dict.fromkeys(notes)), *lost):
         say(line)
 
@@ -108,12 +108,11 @@ def _basis(labelling: "Labelling | None", counts: dict[str, int]) -> Sequence[st
     friction, lag, reference = "came with it" if counts.get("valid") else "-", "-", "its own"
     if labelling is not None and labelling.basis is not None:
         basis = labelling.basis
-        estimate = basis.friction
-        friction = f"{estimate.mu:.3f} [{estimate.low:.3f}, {estimate.high:.3f}] {estimate.found}"
+        mu, low, high = basis.friction.mu, basis.friction.low, basis.friction.high
+        friction = f"{mu:.3f} given" if low == high else f"{mu:.3f} [{low:.3f}, {high:.3f}]"
         if basis.lag is not None:
             sure = f"{1e3 * basis.lag.lag_s:+.1f} +- {1e3 * basis.lag.sigma_s:.1f}"
             lag = ("not told" if basis.lag.doubt else sure) + (" (applied)" if basis.lag_applied else "")
     if labelling is not None and labelling.reference.index is not None:
-        drift = "not told" if labelling.reference.drift is None else f"{labelling.reference.drift:.1f}"
-        reference = f"frame {labelling.reference.index}, drift {drift}"
+        reference = f"frame {labelling.reference.index}"
     return friction, lag, reference

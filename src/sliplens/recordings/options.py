@@ -1,10 +1,16 @@
 """Options of reading and labelling recordings: arguments of the library, and of the command line."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
 REFERENCE_METHODS = ("least contact energy", "first still")
+
+
+def spoken(names: Iterable[str]) -> str:
+    """Fields of options as the command line writes them."""
+    return ", ".join(f"--{name.replace('_', '-')}" for name in names)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from sliplens.recordings.dataset import DATASET_FILE, Dataset, TrialInfo, trial_
 from sliplens.recordings.formats import open_captures, recognise
 from sliplens.recordings.formats.images import frame_size, read_frame
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
-from sliplens.recordings.options import ReadOptions
+from sliplens.recordings.options import ReadOptions, spoken
 from sliplens.recordings.store import load_recording, read_reference, stream_frames
 
 Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
@@ -123,7 +123,7 @@ def _require_nothing_given(
     if reference is not None or reference_frame is not None:
         raise InputError(f"the trials of {data.folder} bring their reference frames; leave out --reference")
     if options.given():
-        raise InputError(f"{data.folder} is a data set of sliplens, which does not take {', '.join(options.given())}")
+        raise InputError(f"{data.folder} is a data set of sliplens, which does not take {spoken(options.given())}")
 
 
 def _chosen(trials: list, names: list[str], trial: str | None, source: Path | Frames) -> list:

@@ -185,7 +185,7 @@ def test_what_is_no_text_is_refused(tmp_path: Path, rng: np.random.Generator):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"time_column": "when"}, r"no column 'when', it has 'time_s', 'fx', 'fy', 'fz'; name one of them with time_c"),
+        ({"time_column": "when"}, r"no column 'when', it has 'time_s', 'fx', 'fy', 'fz'; name one of them with"),
         ({"force_columns": ["fx", "fy", "fw"]}, "no column 'fw'"),
         ({"force_columns": ["fx"]}, "1 force columns were named"),
         ({"force_columns": ["fx", "fx", "fz"]}, "the force columns fx, fx, fz repeat"),

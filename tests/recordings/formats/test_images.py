@@ -83,12 +83,12 @@ def test_forces_lie_beside_the_frames(folder: Path, tmp_path: Path):
     assert capture.forces is not None
     np.testing.assert_allclose(capture.forces.time_s, [100, 100.1])
     np.testing.assert_allclose(capture.frame_time_s, 100 + np.arange(12) / 30)
-    with pytest.raises(RecordingError, match=r"have no moment in common; declare with start_s"):
+    with pytest.raises(RecordingError, match=r"have no moment in common; declare with --start-s"):
         read_image_folder(folder, frame_rate=30.0, forces=table, time_unit="s")
 
 
 def test_times_must_be_given_in_one_way(folder: Path):
-    with pytest.raises(RecordingError, match="trial 7 have no times; give exactly one of times, frame_rate and name_"):
+    with pytest.raises(RecordingError, match="trial 7 have no times; give exactly one of --times, --frame-rate and"):
         read_image_folder(folder)
     with pytest.raises(RecordingError, match="more than one source of times"):
         read_image_folder(folder, frame_rate=30.0, name_unit="s")

@@ -245,7 +245,7 @@ def test_a_camera_is_found_by_its_name_or_named(dataset, frames):
     (capture,) = read_lerobot(dataset, episode=0)
     assert capture.notes[0] == f"{SCENE} was taken for the tactile camera, for there is no other."
     write_info(dataset, lambda info: info["features"].update(gelsight=info["features"][CAMERA]))
-    with pytest.raises(RecordingError, match=rf"of which {CAMERA}, gelsight could be tactile; name the camera_key"):
+    with pytest.raises(RecordingError, match=rf"of which {CAMERA}, gelsight could be tactile; name one with"):
         read_lerobot(dataset)
     write_info(dataset, lambda info: info["features"][CAMERA].update(info={"is_depth_map": True}))
     assert SCENE in read_lerobot(dataset, episode=0)[0].source
@@ -256,7 +256,7 @@ def test_a_camera_is_found_by_its_name_or_named(dataset, frames):
 
 def test_a_force_is_found_by_its_name_or_named(dataset, wrenches):
     write_info(dataset, lambda info: info["features"].update(ft=info["features"][FORCE]))
-    with pytest.raises(RecordingError, match=rf"has forces {FORCE}, ft; name the force_key"):
+    with pytest.raises(RecordingError, match=rf"has forces {FORCE}, ft; name one with --force-key"):
         read_lerobot(dataset)
     assert read_lerobot(dataset, force_key=FORCE, episode=0)[0].forces is not None
     with pytest.raises(RecordingError, match=rf"has no feature load; 3 or 6 numbers have {FORCE}, action.wrench, ft"):

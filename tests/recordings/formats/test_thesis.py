@@ -158,7 +158,12 @@ def test_the_folder_of_one_list_is_enough(data: Path):
         ([*FRAMES[:2], FRAMES[0]], REFERENCE, MARGINS, "twice with one reference"),
         ([*FRAMES[:2], "../../etc/passwd"], REFERENCE, MARGINS, "line 3: .* leads out of"),
         ([*FRAMES[:2], "x" * 5000], REFERENCE, MARGINS, "line 3: .* is not there"),
-        ([*FRAMES[:2], HOME + FRAMES[0]], REFERENCE, MARGINS, "both lead to .*; give as root a folder in which they"),
+        (
+            [*FRAMES[:2], HOME + FRAMES[0]],
+            REFERENCE,
+            MARGINS,
+            "both lead to .*; give with --image-root a folder",
+        ),
     ],
 )
 def test_lists_that_do_not_fit_are_refused(

@@ -126,7 +126,7 @@ def test_a_declared_rate_takes_the_place_of_the_stamps(tmp_path: Path):
 
 def test_a_stream_without_stamps_needs_a_declared_rate(tmp_path: Path):
     path = write_video(tmp_path / "a.h264", brightening(6), codec="libx264", pixels="yuv420p")
-    with pytest.raises(RecordingError, match=r"a\.h264 has no presentation stamps; declare its frame_rate"):
+    with pytest.raises(RecordingError, match=r"a\.h264 has no presentation stamps; declare its rate with --frame-rate"):
         read_video(path)
     capture = read_video(path, frame_rate=25.0)
     np.testing.assert_allclose([frame.mean() for frame in capture.read_frames()], 20 + 6 * np.arange(6), atol=2.5)
@@ -159,7 +159,7 @@ def test_forces_lie_beside_the_video(tmp_path: Path):
     np.testing.assert_array_equal(capture.forces.force_n, [[1, 2, 3], [4, 5, 6]])
     np.testing.assert_allclose(capture.frame_time_s, 10 + np.arange(1, 6) / 25, atol=1e-3)
     assert "a.mkv: the first frame was declared to be taken at 10 s of the force clock." in capture.notes
-    with pytest.raises(RecordingError, match=r"have no moment in common; declare with start_s when the first frame"):
+    with pytest.raises(RecordingError, match=r"have no moment in common; declare with --start-s when the first frame"):
         read_video(path, forces=table)
     table.write_text("t_s,fx,fy,fz\n0,1,2,3\n0.1,4,5,6\n")
     assert "taken to count from the same zero" in read_video(path, forces=table).notes[-1]

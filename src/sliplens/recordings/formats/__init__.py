@@ -20,7 +20,7 @@ from sliplens.recordings.formats.rosbag import read_rosbag
 from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.formats.thesis import is_thesis_list, read_thesis
 from sliplens.recordings.formats.video import read_video
-from sliplens.recordings.options import ReadOptions
+from sliplens.recordings.options import ReadOptions, spoken
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +123,7 @@ def open_captures(path: Path, *, format: str | None = None, options: ReadOptions
     strange = [option for option in given if option not in reader.takes]
     if strange:
         raise InputError(
-            f"{path} is read as {name}, which does not take {', '.join(strange)}; leave it out or name another format"
+            f"{path} is read as {name}, which does not take {spoken(strange)}; leave it out or name another format"
         )
     captures = reader.read(path, **given)
     return (captures,) if isinstance(captures, Capture) else tuple(captures)

@@ -176,7 +176,7 @@ def read_image_folder(
     if len(given) != 1:
         raise RecordingError(
             f"the images of {folder} have {'no times' if not given else 'more than one source of times'}; "
-            "give exactly one of times, frame_rate and name_unit"
+            "give exactly one of --times, --frame-rate and --name-unit"
         )
     paths = tuple(list_images(folder))
     notes = []
@@ -219,6 +219,6 @@ def _numbers_in_names(paths: Sequence[Path]) -> Float[np.ndarray, " frames"]:
     for path in paths:
         found = re.findall(r"\d+(?:\.\d+)?", path.stem)
         if not found:
-            raise RecordingError(f"{path} has no number in its name; give its time in a table (times) instead")
+            raise RecordingError(f"{path} has no number in its name; give its time in a table (--times) instead")
         numbers.append(float(found[-1]))
     return np.array(numbers)

@@ -603,7 +603,7 @@ def _choose_camera(layout: Layout, named: str | None) -> tuple[str, list[str]]:
         raise RecordingError(f"{layout.folder} has no camera; record one, as video or images")
     raise RecordingError(
         f"{layout.folder} has cameras {_listed(cameras)}, of which {_listed(tactile)} could be tactile; "
-        "name the camera_key"
+        "name one with --camera-key"
     )
 
 
@@ -627,7 +627,7 @@ def _choose_force(layout: Layout, named: str | None) -> str | None:
         # what was commanded is not what was felt
         found = [key for key in fitting if _FORCE.search(key) and not key.startswith("action")]
         if len(found) > 1:
-            raise RecordingError(f"{layout.folder} has forces {_listed(found)}; name the force_key")
+            raise RecordingError(f"{layout.folder} has forces {_listed(found)}; name one with --force-key")
     if not found:
         return None
     first = _names(layout.features[found[0]].get("names"))[:3]

@@ -251,7 +251,7 @@ def unit_of(name: str, *, quantity: str, path: str) -> str | None:
         if unit is None:
             raise RecordingError(
                 f"{path}: {name!r} is in {bracket[1]!r}, which is no known unit of {quantity} "
-                f"({', '.join(spellings)}); declare the right one with {quantity}_unit"
+                f"({', '.join(spellings)}); declare the right one with --{quantity}-unit"
             )
         return unit
     words = _words(name)
@@ -278,7 +278,7 @@ def guess_time_column(table: TextTable) -> str:
         named = bool(_TIME_WORDS & set(words)) and _axis(words) is None  # "f_t" is a tangential force
         if named or (len(words) == 1 and words[0] in units):
             found.append(name)
-    return _only(found, table=table, what="the time", option="time_column")
+    return _only(found, table=table, what="the time", option="--time-column")
 
 
 def guess_force_columns(table: TextTable) -> tuple[str, ...]:
@@ -292,11 +292,11 @@ def guess_force_columns(table: TextTable) -> tuple[str, ...]:
     for axes in (("x", "y", "z"), ("normal", "tangential")):
         if all(found[axis] for axis in axes):
             return tuple(
-                _only(found[axis], table=table, what=f"the force ({axis})", option="force_columns") for axis in axes
+                _only(found[axis], table=table, what=f"the force ({axis})", option="--force-columns") for axis in axes
             )
     raise RecordingError(
         f"{table.path} has no columns that look like forces (fx, fy, fz or fn, ft) among "
-        f"{', '.join(map(repr, table.header))}; name them with force_columns"
+        f"{', '.join(map(repr, table.header))}; name them with --force-columns"
     )
 
 
@@ -409,7 +409,7 @@ def read_force_table(
         N, mN, kN, gf, kgf or lbf.
     """
     table = open_table(path)
-    time_name = guess_time_column(table) if time_column is None else table.require(time_column, option="time_column")
+    time_name = guess_time_column(table) if time_column is None else table.require(time_column, option="--time-column")
     names = _force_names(table, force_columns)
     numbers = read_numbers(table, [time_name, *names])
     time = numbers.values[:, 0]
@@ -422,7 +422,7 @@ def read_force_table(
         at = int(np.argmax(large))
         raise RecordingError(
             f"{path}, line {numbers.lines[at]}: {np.abs(forces[at]).max():.4g} N is no force of a fingertip; "
-            "declare the right force_unit"
+            "declare the right one with --force-unit"
         )
     declared = "declared" if time_column is not None else "by its name"
     notes = [
@@ -480,7 +480,7 @@ def place_on_clock(
         raise RecordingError(
             f"the frames of {source} ({time_s[0]:.6g} to {time_s[-1]:.6g} s) and the forces of {samples.source} "
             f"({samples.time_s[0]:.6g} to {samples.time_s[-1]:.6g} s) have no moment in common; "
-            "declare with start_s when the first frame was taken, on the clock of the forces"
+            "declare with --start-s when the first frame was taken, on the clock of the forces"
         )
     return FrameClock(time_s=time_s, forces=samples, notes=notes)
 
@@ -492,7 +492,7 @@ def _force_names(table: TextTable, declared: Sequence[str] | None) -> tuple[str,
         raise RecordingError(
             f"{len(declared)} force columns were named; name three (x, y, z) or two (normal, tangential)"
         )
-    names = tuple(table.require(name, option="force_columns") for name in declared)
+    names = tuple(table.require(name, option="--force-columns") for name in declared)
     if len(set(names)) < len(names):
         raise RecordingError(f"the force columns {', '.join(names)} repeat; name each once")
     return names

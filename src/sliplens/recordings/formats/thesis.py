@@ -60,7 +60,8 @@ class ListedFiles:
         before = self._found.setdefault(path, listed)
         if before != listed:
             raise RecordingError(
-                f"{where}: {listed!r} and {before!r} both lead to {path}; give as root a folder in which they differ"
+                f"{where}: {listed!r} and {before!r} both lead to {path}; give with --image-root a folder in which "
+                "they differ"
             )
         return path
 
@@ -78,14 +79,17 @@ class ListedFiles:
                 if _is_file(inside):
                     return inside
             elif ".." in parts:
-                raise RecordingError(f"{where}: {listed!r} leads out of {self.root}; give the folder of all as root")
+                raise RecordingError(
+                    f"{where}: {listed!r} leads out of {self.root}; give the folder of all with --image-root"
+                )
         parts = tuple(part for part in parts if part != "..")
         for dropped in range(len(parts)):
             moved = self.root.joinpath(*parts[dropped:])
             if _is_file(moved):
                 return moved
         raise RecordingError(
-            f"{where}: {listed[:200]!r} is not there, nor under {self.root}; give the folder of the images as root"
+            f"{where}: {listed[:200]!r} is not there, nor under {self.root}; give the folder of the images with "
+            "--image-root"
         )
 
 

@@ -300,7 +300,7 @@ def read_video(
             f"{path.name}: frames were declared to be taken {frame_rate:g} times a second, whatever its stamps say."
         )
     elif file.time_s is None:
-        raise RecordingError(f"{path} has no presentation stamps; declare its frame_rate")
+        raise RecordingError(f"{path} has no presentation stamps; declare its rate with --frame-rate")
     else:
         time = file.time_s
     clock = place_on_clock(time, forces=forces, start_s=start_s, source=path.name, **columns)
