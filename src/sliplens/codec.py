@@ -5,7 +5,7 @@ not finite is told in one sentence with its place and its cure, by msgspec for J
 """
 
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from pathlib import Path
 from types import NoneType
@@ -48,6 +48,24 @@ class Columns:
     def table(self) -> pa.Table:
         """Arrow table with a column a field; NaN stays NaN. `.to_pandas()` where pandas is installed."""
         return pa.table({field.name: getattr(self, field.name) for field in fields(self)})
+
+    def groups(self: _Columns, *names: str) -> dict[tuple[str, ...], _Columns]:
+        """Rows of each combination of values of some text columns, in the order in which these first appear."""
+        codes = np.zeros(len(self), dtype=np.int64)
+        for name in names:
+            known, place = np.unique(getattr(self, name), return_inverse=True)
+            codes = codes * len(known) + place
+        order = np.argsort(codes, kind="stable")
+        pieces = np.split(order, np.flatnonzero(np.diff(codes[order])) + 1) if len(order) else []
+        pieces.sort(key=lambda rows: rows[0])
+        return {tuple(str(getattr(self, name)[rows[0]]) for name in names): self.where(rows) for rows in pieces}
+
+    @classmethod
+    def joined(cls: type[_Columns], pieces: Sequence[_Columns]) -> _Columns:
+        """One table of the rows of several."""
+        return cls(
+            **{field.name: np.concatenate([getattr(one, field.name) for one in pieces]) for field in fields(cls)}
+        )
 
 
 def save_record(record: object, path: Path) -> None:
@@ -118,7 +136,7 @@ def from_builtins(values: object, kind: type[Record], *, where: Path | str, comm
     sliplens.errors.InputError: grip.json is not what was written: expected `float`, got `str` at normal_force_n; ...
     """
     try:
-        return msgspec.convert(values, kind, dec_hook=_decode)
+        return msgspec.convert(values, kind, dec_hook=_decode, str_keys=True)
     except msgspec.ValidationError as error:
         raise InputError(f"{where} {_told(error)}; make it again with `{command}`") from None
 
@@ -186,9 +204,44 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
     given |= {name: load_columns(folder / f"{name}.parquet", table, command=command) for name, table in tables.items()}
     if beside:
         arrays = load_arrays(folder / ARRAYS_FILE, command=command)
-        where = folder / ARRAYS_FILE
-        given |= {name: _pick_arrays(arrays, name, declared[name], path=where, command=command) for name in beside}
-    return kind(**given)
+        with jaxtyped("context"):  # "frames" of one array are as many as "frames" of another
+            for name in (field.name for field in fields(kind) if field.name in beside):  # pyright: ignore[reportArgumentType]
+                picked, array_kind = _pick_arrays(arrays, name, declared[name])
+                for key, array in picked.items():
+                    if array is None:
+                        raise InputError(f"{folder / ARRAYS_FILE} lacks {key!r}; make it again with `{command}`")
+                    if not isinstance(array, array_kind):
+                        raise InputError(
+                            f"{folder / ARRAYS_FILE} holds {array.dtype} of shape {array.shape} as {key!r} where "
+                            f"{_shown(array_kind)} belongs; make it again with `{command}`"
+                        )
+                whole = {key.removeprefix(f"{name}/"): array for key, array in picked.items()}
+                given[name] = picked[name] if _is_array(declared[name]) else whole
+    try:
+        return kind(**given)
+    except ValueError as error:  # of a record that checks what its fields have to do with one another
+        raise InputError(f"{folder} {error}; make it again with `{command}`") from None
+
+
+def keep_part(part: Path | None, kind: type[Record], make: Callable[[], Record]) -> Record:
+    """Make a piece of long work, or read it where an interrupted run has made it.
+
+    Parameters
+    ----------
+    part
+        Folder of the piece, made here; None to keep it in memory alone.
+    kind
+        Dataclass of the piece.
+    make
+        Makes it.
+    """
+    if part is None:
+        return make()
+    if not (part / RESULT_FILE).is_file():
+        piece = make()
+        part.mkdir(parents=True, exist_ok=True)
+        save_result(piece, part)
+    return load_result(part, kind, command="sliplens")
 
 
 def save_columns(columns: Columns, path: Path) -> None:
@@ -226,7 +279,10 @@ def load_columns(path: Path, kind: type[_Columns], *, command: str) -> _Columns:
             value = np.array(column.to_pylist(), dtype=str)
         else:
             value = column.to_numpy()
-        if _is_array(hint) and not _is_of(value, hint):
+        # a context of its own: "rows" of one table need not be as many as "rows" of another
+        with jaxtyped("context"):
+            fits = not _is_array(hint) or isinstance(value, hint)
+        if not fits:
             raise InputError(f"{path} holds {column.type} as {name!r} where {_shown(hint)} belongs; {cure}")
         if (hint is np.ndarray or _shown(hint).startswith("Shaped")) and value.dtype.kind != "U":
             raise InputError(f"{path} holds {column.type} as {name!r} where texts belong; {cure}")
@@ -292,7 +348,7 @@ def load_arrays(path: Path, *, command: str) -> dict[str, np.ndarray]:
     """
     cure = f"make it again with `{command}`"
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive}
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; {cure}") from None
@@ -300,22 +356,11 @@ def load_arrays(path: Path, *, command: str) -> dict[str, np.ndarray]:
         raise InputError(f"{path} cannot be read as arrays ({_one_line(error)}); {cure}") from None
 
 
-def _pick_arrays(arrays: Mapping[str, np.ndarray], name: str, hint: Any, *, path: Path, command: str) -> object:
-    start = f"{name}/"
+def _pick_arrays(arrays: Mapping[str, np.ndarray], name: str, hint: Any) -> tuple[dict[str, np.ndarray | None], Any]:
+    """Arrays of a field by their names in the file, None where one is missing, and what each has to be."""
     if _is_array(hint):
-        picked, kind = {name: arrays.get(name)}, hint
-    else:
-        picked = {key: array for key, array in arrays.items() if key.startswith(start)}
-        kind = get_args(hint)[1]
-    for key, array in picked.items():
-        if array is None:
-            raise InputError(f"{path} lacks {key!r}; make it again with `{command}`")
-        if not _is_of(array, kind):
-            raise InputError(
-                f"{path} holds {array.dtype} of shape {array.shape} as {key!r} where {_shown(kind)} belongs; "
-                f"make it again with `{command}`"
-            )
-    return picked[name] if _is_array(hint) else {key.removeprefix(start): array for key, array in picked.items()}
+        return {name: arrays.get(name)}, hint
+    return {key: array for key, array in arrays.items() if key.startswith(f"{name}/")}, get_args(hint)[1]
 
 
 def _columns_type(hint: object) -> type[Columns] | None:
@@ -334,12 +379,6 @@ def _is_array_mapping_type(hint: object) -> bool:
 
 def _is_array_mapping(value: object) -> bool:
     return isinstance(value, Mapping) and bool(value) and all(isinstance(item, np.ndarray) for item in value.values())
-
-
-def _is_of(array: np.ndarray, kind: Any) -> bool:
-    # a context of its own: "rows" of one array need not be as many as "rows" of another
-    with jaxtyped("context"):
-        return isinstance(array, kind)
 
 
 def _shown(hint: Any) -> str:
@@ -385,6 +424,7 @@ __all__ = [
     "RESULT_FILE",
     "Columns",
     "from_builtins",
+    "keep_part",
     "load_arrays",
     "load_columns",
     "load_record",

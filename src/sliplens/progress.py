@@ -66,8 +66,13 @@ def note(on_progress: OnProgress | None, message: str) -> None:
         on_progress.note(message)
 
 
+def continued(on_progress: OnProgress | None, *, before: int, total: int) -> OnProgress | None:
+    """Callback for a part of longer work, which comes after `before` of `total`; None where nobody listens."""
+    return None if on_progress is None else lambda done, _: on_progress(before + done, total)
+
+
 def _ignore(done: int, total: int) -> None:
     """Show nothing."""
 
 
-__all__ = ["OnProgress", "Stages", "note", "stage", "wrote"]
+__all__ = ["OnProgress", "Stages", "continued", "note", "stage", "wrote"]

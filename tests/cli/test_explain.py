@@ -70,7 +70,7 @@ def test_colours_of_the_thesis(difference_run: Path, difference_folder: Path, tm
 def test_a_budget_reaches_poly_cam(difference_run: Path, difference_folder: Path, tmp_path: Path, monkeypatch):
     seen = []
 
-    def explain(trained, chosen, folder, *, methods, explainers, on_map):
+    def explain(trained, chosen, *, methods, explainers, parts, on_progress):
         seen.append(explainers["poly-cam"].budget)
         raise KeyboardInterrupt
 

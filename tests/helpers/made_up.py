@@ -6,15 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
-from PIL import Image
 
 from sliplens.codec import save_record, save_result
 from sliplens.files import Machine, Provenance
 from sliplens.recordings import TrialInfo
 from sliplens.recordings.dataset import write_dataset_table
 from sliplens.results.evaluation import Evaluation, Predictions, Reliability
+from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
+from sliplens.results.faithfulness import DeletionScores, DeletionTable, MethodScore
 from sliplens.results.training import LearningCurve, Training
 from sliplens.training.metrics import find_lead_times, score_predictions
 
@@ -179,90 +178,112 @@ def write_explanation(
         f"{'day4' if source == 'simulated' else 'real'}-dry-{place:03d}-f{int(40 * (1 - m)):03d}"
         for place, m in enumerate(margins)
     ]
-    frames = [
-        {
-            "id": frame_id,
-            "condition": condition,
-            "safety_margin": margin,
-            "prediction": float(np.clip(margin + rng.normal(0, noise), 0, 1.05)),
-            "reference_prediction": 1.0,
-        }
+    frames = tuple(
+        ExplainedFrame(
+            id=frame_id,
+            trial=frame_id.rpartition("-")[0],
+            condition=condition,
+            safety_margin=margin,
+            prediction=float(np.clip(margin + rng.normal(0, noise), 0, 1.05)),
+            reference_prediction=1.0,
+        )
         for frame_id, margin in zip(ids, margins, strict=True)
-    ]
+    )
     seconds = {"grad-cam": 0.031, "integrated-gradients": 0.42, "poly-cam": 3.1}
     warned = (
-        {"integrated-gradients": ["completeness gap 1.8 % on 2 frames"]} if name == "raw" and source == "real" else {}
+        {"integrated-gradients": ("completeness gap 1.8 % on 2 frames",)} if name == "raw" and source == "real" else {}
     )
-    folder = write_run(
+    drawn = [picture_and_maps(margin, name, size=size, rng=rng) for margin in margins]
+    saliency = {key: np.stack([maps[key] for _, maps in drawn]).astype(np.float32) for key in METHODS}
+    return write_run(
         workspace / f"maps-{name}-{source}",
         "explain",
         {"input": name, "source": source, "methods": list(METHODS)},
-        {
-            "input": name,
-            "source": source,
-            "image_size": size,
-            "frames": frames,
-            "methods": {key: {"seconds_per_frame": seconds[key], "warnings": warned.get(key, [])} for key in METHODS},
-        },
+        explained(
+            name,
+            frames,
+            {key: MethodNotes(seconds_per_frame=seconds[key], warnings=warned.get(key, ())) for key in METHODS},
+            np.stack([picture for picture, _ in drawn]),
+            saliency,
+            source=source,
+        ),
         minute=12,
     )
-    (folder / "frames").mkdir()
-    found: dict[str, list[np.ndarray]] = {key: [] for key in METHODS}
-    for frame_id, margin in zip(ids, margins, strict=True):
-        picture, maps = picture_and_maps(margin, name, size=size, rng=rng)
-        Image.fromarray(picture).save(folder / "frames" / f"{frame_id}.png")
-        for key in METHODS:
-            found[key].append(maps[key])
-    arrays = {key: 0.01 * np.stack(found[key]).astype(np.float32) for key in METHODS}
-    arrays |= {f"{key}.saliency": np.stack(found[key]).astype(np.float32) for key in METHODS}
-    np.savez_compressed(folder / "maps.npz", allow_pickle=False, **arrays)
-    return folder
+
+
+def explained(
+    name: str,
+    frames: tuple[ExplainedFrame, ...],
+    methods: dict[str, MethodNotes],
+    pictures: np.ndarray,
+    saliency: dict[str, np.ndarray],
+    *,
+    source: str = "simulated",
+) -> Explained:
+    return Explained(
+        input=name,
+        source=source,
+        weights_sha256="none",
+        frames=frames,
+        methods=methods,
+        images=np.moveaxis(pictures, -1, 1),
+        pictures=pictures,
+        relevance={key: np.float32(0.01) * maps for key, maps in saliency.items()},
+        saliency=saliency,
+    )
 
 
 def write_score(workspace: Path, name: str, *, size: int, rng: np.random.Generator) -> Path:
-    columns: dict[str, list] = {
-        key: [] for key in ("frame_id", "method", "step", "pixels_removed", "prediction", "score")
-    }
     last = 0.25 if name == "difference" else 0.45
     removed = np.arange(1, size + 1) * size
-    methods = {}
+    curves = {}
     for method, fall in FALL.items():
-        curves = []
+        curves[method] = []
         for frame in range(12):
             rate = fall * rng.uniform(0.7, 1.3) * (1 if name == "difference" else 2)
             fallen = (1 - np.exp(-removed / size**2 / rate)) / (1 - np.exp(-1 / rate))
             score = np.clip(1 - (1 - last) * fallen + 0.01 * rng.normal(size=size) * (fallen < 1), 0, 1)
-            curves.append(score)
-            columns["frame_id"] += [f"f{frame:03d}"] * size
-            columns["method"] += [method] * size
-            columns["step"] += list(range(size))
-            columns["pixels_removed"] += removed.tolist()
-            columns["prediction"] += (1 - np.sqrt(score)).tolist()
-            columns["score"] += score.tolist()
-        auc = np.mean(curves, axis=1)
-        methods[method] = {
-            "mean": float(auc.mean()),
-            "sd": float(auc.std()),
-            "last_step_mean": float(np.mean([curve[-1] for curve in curves])),
-            "frames": 12,
-        }
-    folder = write_run(
+            curves[method].append((f"f{frame:03d}", removed, 1 - np.sqrt(score), score))
+    return write_run(
         workspace / f"score-{name}",
         "score",
         {"input": name, "fill": "grey"},
-        {
-            "input": name,
-            "source": "simulated",
-            "fill": "grey",
-            "steps": size,
-            "pixels_per_step": size,
-            "methods": methods,
-            "alarms": ["on 3 frames the filled image is answered like the frame itself"] if name == "raw" else [],
-        },
+        DeletionScores(
+            input=name,
+            source="simulated",
+            fill="grey",
+            steps=size,
+            pixels_per_step=size,
+            methods={method: method_score([score for *_, score in rows]) for method, rows in curves.items()},
+            alarms=("on 3 frames the filled image is answered like the frame itself",) if name == "raw" else (),
+            table=deletion_table(curves),
+        ),
         minute=20,
     )
-    pq.write_table(pa.table(columns), folder / "deletion.parquet")
-    return folder
+
+
+def deletion_table(curves: dict[str, list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]]) -> DeletionTable:
+    """Of each method the frames, with the pixels removed, answers and scores of their steps."""
+    return DeletionTable.joined(
+        [
+            DeletionTable(
+                method=np.repeat(method, len(removed)),
+                frame_id=np.repeat(frame, len(removed)),
+                step=np.arange(len(removed)),
+                pixels_removed=np.asarray(removed, dtype=np.int64),
+                prediction=answers,
+                score=scores,
+            )
+            for method, rows in curves.items()
+            for frame, removed, answers, scores in rows
+        ]
+    )
+
+
+def method_score(scores: list[np.ndarray]) -> MethodScore:
+    auc = np.array([score.mean() for score in scores])
+    last = float(np.mean([score[-1] for score in scores]))
+    return MethodScore(mean=float(auc.mean()), sd=float(auc.std()), last_step_mean=last, frames=len(auc))
 
 
 def write_workspace(workspace: Path, *, size: int = 24, trials: int = 6, seed: int = 20261121) -> Path:

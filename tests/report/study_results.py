@@ -1,19 +1,48 @@
 """A made-up study: the files that its stages write, with numbers that tests choose and nothing measured."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
-from made_up import picture_and_maps, write_evaluation, write_run
-from PIL import Image
+from made_up import deletion_table, explained, method_score, picture_and_maps, write_evaluation, write_run
 from scipy.stats import kendalltau
 
 from sliplens.intervals import Difference, paired_difference
+from sliplens.results.explanation import ExplainedFrame, MethodNotes
+from sliplens.results.faithfulness import (
+    Agreement,
+    Comparison,
+    DeletionScores,
+    Remedies,
+    RemovalScore,
+    RemovalScores,
+    RemovalTable,
+    Variant,
+    VariantTable,
+)
+from sliplens.results.study import (
+    Choice,
+    ChosenFrame,
+    ChosenTrial,
+    Localisation,
+    MapMeasures,
+    MapQuality,
+    MarkerEffects,
+    MarkerTable,
+    MetaTest,
+    MethodTime,
+    OracleTest,
+    Randomisation,
+    RandomisedMethod,
+    Roughness,
+    ShownFrame,
+    States,
+    Timing,
+    Truth,
+)
 
 INPUTS = ("difference", "raw")
 METHODS = ("grad-cam", "integrated-gradients", "poly-cam")
@@ -52,7 +81,7 @@ class Made:
     edge_mass: float = 0.3
 
 
-def frames_of(made: Made) -> list[dict[str, Any]]:
+def frames_of(made: Made) -> list[ChosenFrame]:
     rows = []
     for trial in range(made.trials):
         for level in LEVELS:
@@ -60,21 +89,21 @@ def frames_of(made: Made) -> list[dict[str, Any]]:
                 continue
             frame = round(40 * (1 - level))
             rows.append(
-                {
-                    "id": f"t{trial:02d}-f{frame:04d}",
-                    "trial": f"t{trial:02d}",
-                    "frame": frame,
-                    "level": level,
-                    "safety_margin": min(1.0, max(0.0, level + 0.002)),
-                    "scored": level in SCORED,
-                    "shown": trial == 0,
-                }
+                ChosenFrame(
+                    id=f"t{trial:02d}-f{frame:04d}",
+                    trial=f"t{trial:02d}",
+                    frame=frame,
+                    level=level,
+                    safety_margin=min(1.0, max(0.0, level + 0.002)),
+                    scored=level in SCORED,
+                    shown=trial == 0,
+                )
             )
     return rows
 
 
-def scored_frames(made: Made) -> list[dict[str, Any]]:
-    return [row for row in frames_of(made) if row["scored"]]
+def scored_frames(made: Made) -> list[ChosenFrame]:
+    return [frame for frame in frames_of(made) if frame.scored]
 
 
 def write_study(workspace: Path, made: Made | None = None, *, seed: int = 7) -> Path:
@@ -95,110 +124,102 @@ def write_study(workspace: Path, made: Made | None = None, *, seed: int = 7) -> 
 
 
 def write_choice(workspace: Path, made: Made) -> Path:
-    trials = [
-        {
-            "trial": f"t{index:02d}",
-            "qualified": index != 1,
-            "worst_error": dict.fromkeys(made.inputs, 0.01 + 0.005 * index),
-        }
+    trials = tuple(
+        ChosenTrial(
+            trial=f"t{index:02d}",
+            qualified=index != 1,
+            worst_error=dict.fromkeys(made.inputs, 0.01 + 0.005 * index),
+        )
         for index in range(made.trials)
-    ]
+    )
     return write_run(
         workspace / "choice",
         "choice",
         {"trials": made.trials},
-        {
-            "trials_wanted": made.trials,
-            "tolerance": 0.03,
-            "considered": 60,
-            "qualified": made.trials - 1,
-            "told": f"{made.trials - 1} of 60 dry test trials lie within 3 %, so the nearest other was taken too.",
-            "source": "simulated",
-            "condition": "dry",
-            "inputs": list(made.inputs),
-            "levels": list(LEVELS),
-            "scored_levels": list(SCORED),
-            "trials": trials,
-            "frames": frames_of(made),
-        },
+        Choice(
+            trials_wanted=made.trials,
+            tolerance=0.03,
+            considered=60,
+            qualified=made.trials - 1,
+            summary=f"{made.trials - 1} of 60 dry test trials lie within 3 %, so the nearest other was taken too.",
+            source="simulated",
+            condition="dry",
+            inputs=made.inputs,
+            levels=LEVELS,
+            scored_levels=SCORED,
+            trials=trials,
+            frames=tuple(frames_of(made)),
+        ),
     )
 
 
 def write_states(workspace: Path, made: Made) -> Path:
     rng = np.random.default_rng(1)
     size = made.size
-    names = {1.0: "contact", 0.0: "full_slip"}
-    shown = [row for row in frames_of(made) if row["shown"]]
-    folder = write_run(
+    names = {1.0: "contact", 0.0: "full slip"}
+    shown = [frame for frame in frames_of(made) if frame.shown]
+    pictures = {name: [] for name in ("raw", "difference")}
+    tables = []
+    x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0.14, 0.86, 6)] * 2))
+    for frame in shown:
+        for name, stack in pictures.items():
+            stack.append(picture_and_maps(frame.safety_margin, name, size=size, rng=rng)[0])
+        shift = 0.08 * (1 - frame.safety_margin) * np.exp(-8 * ((y - 0.55) ** 2 + (x - 0.5) ** 2))
+        now_x, now_y = size * x, size * (y + shift)
+        now_x[0] = now_y[0] = np.nan  # one marker was not followed
+        tables.append(
+            MarkerTable(
+                frame_id=np.repeat(frame.id, len(x)),
+                marker=np.arange(len(x)),
+                rest_x_px=size * x,
+                rest_y_px=size * y,
+                x_px=now_x,
+                y_px=now_y,
+            )
+        )
+    return write_run(
         workspace / "states",
         "states",
         {},
-        {
-            "trial": "t00",
-            "markers_from": "simulation",
-            "frame_size": [size, size],
-            "frames": [
-                {key: row[key] for key in ("id", "level", "safety_margin")}
-                | {"contact_state": names.get(row["level"], "incipient_slip")}
-                for row in shown
-            ],
-        },
+        States(
+            trial="t00",
+            markers_from="simulation",
+            shown=tuple(
+                ShownFrame(
+                    id=frame.id,
+                    level=frame.level,
+                    safety_margin=frame.safety_margin,
+                    contact_state=names.get(frame.level, "incipient slip"),
+                )
+                for frame in shown
+            ),
+            untracked=(),
+            raw=np.stack(pictures["raw"]),
+            difference=np.stack(pictures["difference"]),
+            table=MarkerTable.joined(tables),
+        ),
     )
-    (folder / "frames").mkdir()
-    columns: dict[str, list] = {name: [] for name in ("frame_id", "marker", "rest_x_px", "rest_y_px", "x_px", "y_px")}
-    for row in shown:
-        for name in ("raw", "difference"):
-            picture, _ = picture_and_maps(row["safety_margin"], name, size=size, rng=rng)
-            Image.fromarray(picture).save(folder / "frames" / f"{row['id']}.{name}.png")
-        x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0.14, 0.86, 6)] * 2))
-        shift = 0.08 * (1 - row["safety_margin"]) * np.exp(-8 * ((y - 0.55) ** 2 + (x - 0.5) ** 2))
-        columns["frame_id"] += [row["id"]] * len(x)
-        columns["marker"] += list(range(len(x)))
-        columns["rest_x_px"] += (size * x).tolist()
-        columns["rest_y_px"] += (size * y).tolist()
-        columns["x_px"] += [float("nan"), *(size * x[1:]).tolist()]
-        columns["y_px"] += [float("nan"), *(size * (y + shift)[1:]).tolist()]
-    pq.write_table(pa.table(columns), folder / "markers.parquet")
-    return folder
 
 
 def write_maps(workspace: Path, name: str, made: Made, *, rng: np.random.Generator) -> dict[str, np.ndarray]:
     rows = frames_of(made)
-    folder = write_run(
-        workspace / f"explain-{name}",
-        "explain",
-        {"input": name},
-        {
-            "input": name,
-            "source": "simulated",
-            "image_size": made.size,
-            "frames": [
-                {
-                    "id": row["id"],
-                    "condition": "dry",
-                    "safety_margin": row["safety_margin"],
-                    "prediction": row["safety_margin"] + 0.01,
-                    "reference_prediction": 1.0,
-                }
-                for row in rows
-            ],
-            "methods": {method: {"seconds_per_frame": 0.1, "warnings": []} for method in METHODS},
-        },
+    drawn = [picture_and_maps(row.safety_margin, name, size=made.size, rng=rng) for row in rows]
+    stacked = {method: np.stack([maps[method] for _, maps in drawn]).astype(np.float32) for method in METHODS}
+    frames = tuple(
+        ExplainedFrame(
+            id=row.id,
+            trial=row.trial,
+            condition="dry",
+            safety_margin=row.safety_margin,
+            prediction=row.safety_margin + 0.01,
+            reference_prediction=1.0,
+        )
+        for row in rows
     )
-    (folder / "frames").mkdir()
-    found: dict[str, list[np.ndarray]] = {method: [] for method in METHODS}
-    for row in rows:
-        picture, maps = picture_and_maps(row["safety_margin"], name, size=made.size, rng=rng)
-        Image.fromarray(picture).save(folder / "frames" / f"{row['id']}.png")
-        for method in METHODS:
-            found[method].append(maps[method])
-    stacked = {method: np.stack(maps).astype(np.float32) for method, maps in found.items()}
-    np.savez_compressed(
-        folder / "maps.npz",
-        allow_pickle=False,
-        **stacked,
-        **{f"{method}.saliency": maps for method, maps in stacked.items()},
-    )
+    notes: dict[str, MethodNotes] = dict.fromkeys(METHODS, MethodNotes(seconds_per_frame=0.1, warnings=()))
+    pictures = np.stack([picture for picture, _ in drawn])
+    found = explained(name, frames, notes, pictures, stacked)
+    write_run(workspace / f"explain-{name}", "explain", {"input": name}, found)
     return stacked
 
 
@@ -212,86 +233,73 @@ def thesis_curve(gain: float, size: int, *, rng: np.random.Generator) -> tuple[n
 def write_thesis_scores(
     workspace: Path, name: str, made: Made, maps: Mapping[str, np.ndarray], *, rng: np.random.Generator
 ) -> Path:
-    columns = {key: [] for key in ("frame_id", "method", "step", "pixels_removed", "prediction", "score")}
-    methods, size = {}, made.size
-    for method in [*maps, "random"]:
-        curves = []
-        for row in frames_of(made):
-            answer, score = thesis_curve(gain_of(made, name, method), size, rng=rng)
-            curves.append(score)
-            columns["frame_id"] += [row["id"]] * size
-            columns["method"] += [method] * size
-            columns["step"] += list(range(size))
-            columns["pixels_removed"] += (size * np.arange(1, size + 1)).tolist()
-            columns["prediction"] += answer.tolist()
-            columns["score"] += score.tolist()
-        auc = np.mean(curves, axis=1)
-        last = float(np.mean([curve[-1] for curve in curves]))
-        methods[method] = {
-            "mean": float(auc.mean()),
-            "sd": float(auc.std()),
-            "last_step_mean": last,
-            "frames": len(auc),
-        }
-    folder = write_run(
+    size = made.size
+    removed = size * np.arange(1, size + 1)
+    curves = {
+        method: [
+            (row.id, removed, *thesis_curve(gain_of(made, name, method), size, rng=rng)) for row in frames_of(made)
+        ]
+        for method in [*maps, "random"]
+    }
+    return write_run(
         workspace / f"score-{name}",
         "score",
         {"fill": "grey"},
-        {
-            "input": name,
-            "source": "simulated",
-            "fill": "grey",
-            "methods": methods,
-            "alarms": ["the fill decides in 2 of 18 frames"],
-        },
+        DeletionScores(
+            input=name,
+            source="simulated",
+            fill="grey",
+            steps=size,
+            pixels_per_step=size,
+            methods={method: method_score([score for *_, score in rows]) for method, rows in curves.items()},
+            alarms=("the fill decides in 2 of 18 frames",),
+            table=deletion_table(curves),
+        ),
     )
-    pq.write_table(pa.table(columns), folder / "deletion.parquet")
-    return folder
 
 
 def write_remedies(
     workspace: Path, name: str, made: Made, maps: Mapping[str, np.ndarray], *, rng: np.random.Generator
 ) -> Path:
-    columns: dict[str, list] = {
-        key: [] for key in ("variant", "frame_id", "method", "step", "pixels_removed", "prediction", "score")
+    plan: dict[str, tuple[Literal["deletion", "insertion"], float | None, Literal["lower", "higher"]]] = {
+        "stop-at-half": ("deletion", 0.5, "lower"),
+        "insertion": ("insertion", None, "higher"),
     }
-    plan = {"stop-at-half": ("grey", "deletion", 0.5, "lower"), "insertion": ("grey", "insertion", None, "higher")}
-    variants: dict[str, Any] = {}
-    size, ids = made.size, [row["id"] for row in frames_of(made)]
-    for variant, (fill, mode, stop, better) in plan.items():
-        methods = {}
+    variants, tables = {}, []
+    size, ids = made.size, [row.id for row in frames_of(made)]
+    for variant, (mode, stop, better) in plan.items():
+        curves = {}
         for method, saliency in maps.items():
-            means = []
+            curves[method] = []
             for row in scored_frames(made):
                 answer, score = thesis_curve(gain_of(made, name, method), size, rng=rng)
-                above = int((saliency[ids.index(row["id"])] > 0.5).sum())
+                above = int((saliency[ids.index(row.id)] > 0.5).sum())
                 steps = size if stop is None else max(1, -(-above // size))
                 removed = np.minimum(size * np.arange(1, steps + 1), size * size if stop is None else max(above, 1))
-                means.append(score[:steps].mean())
-                columns["variant"] += [variant] * steps
-                columns["frame_id"] += [row["id"]] * steps
-                columns["method"] += [method] * steps
-                columns["step"] += list(range(steps))
-                columns["pixels_removed"] += removed.tolist()
-                columns["prediction"] += answer[:steps].tolist()
-                columns["score"] += score[:steps].tolist()
-            methods[method] = {
-                "mean": float(np.mean(means)),
-                "sd": float(np.std(means)),
-                "last_step_mean": 0.3,
-                "frames": len(means),
-            }
-        variants[variant] = {
-            "told": f"{mode}, {fill}", "fill": fill, "mode": mode, "stop": stop, "better": better, "methods": methods,
-        }  # fmt: skip
-    folder = write_run(
+                curves[method].append((row.id, removed, answer[:steps], score[:steps]))
+        table = deletion_table(curves)
+        tables.append(VariantTable(variant=np.repeat(variant, len(table)), **vars(table)))
+        variants[variant] = Variant(
+            summary=f"{mode}, grey",
+            fill="grey",
+            mode=mode,
+            stop=stop,
+            better=better,
+            methods={method: method_score([score for *_, score in rows]) for method, rows in curves.items()},
+        )
+    return write_run(
         workspace / f"remedies-{name}",
         "remedies",
         {},
-        {"input": name, "source": "simulated", "variants": variants, "alarms": []},
+        Remedies(
+            input=name,
+            source="simulated",
+            steps=size,
+            variants=variants,
+            alarms=(),
+            table=VariantTable.joined(tables),
+        ),
     )
-    pq.write_table(pa.table(columns), folder / "deletion.parquet")
-    return folder
 
 
 def gain_of(made: Made, name: str, method: str) -> float:
@@ -305,143 +313,146 @@ def write_faithfulness(workspace: Path, name: str, made: Made, *, rng: np.random
     bump = 6 * areas * (1 - areas)
     bump /= np.trapezoid(bump, areas)
     rows = scored_frames(made)
-    trials = np.array([row["trial"] for row in rows])
-    columns: dict[str, list] = {
-        key: []
-        for key in (
-            "fill", "unit", "method", "frame_id", "trial", "safety_margin", "area", "most_first", "least_first",
-            "random",
-        )
-    }  # fmt: skip
-    scores, comparisons, ranks = [], [], {}
+    trials = np.array([row.trial for row in rows])
+    scores, comparisons, tables, ranks = [], [], [], {}
     chance = 0.4 * areas
     for fill, unit in FILLS:
         gains = {}
         for method in [*made.methods, *CONTROLS]:
             of_trial = rng.normal(0, made.spread, made.trials)
-            gains[method] = np.array([gain_of(made, name, method) + of_trial[int(row["trial"][1:])] for row in rows])
+            gains[method] = np.array([gain_of(made, name, method) + of_trial[int(row.trial[1:])] for row in rows])
             most = chance + gains[method][:, None] / 2 * bump
             least = chance - gains[method][:, None] / 2 * bump
-            for row, one, other in zip(rows, most, least, strict=True):
-                for key, value in (("fill", fill), ("unit", unit), ("method", method), ("frame_id", row["id"])):
-                    columns[key] += [value] * len(areas)
-                columns["trial"] += [row["trial"]] * len(areas)
-                columns["safety_margin"] += [row["safety_margin"]] * len(areas)
-                columns["area"] += areas.tolist()
-                columns["most_first"] += one.tolist()
-                columns["least_first"] += other.tolist()
-                columns["random"] += chance.tolist()
+            tables.append(
+                RemovalTable(
+                    fill=np.repeat(fill, most.size),
+                    unit=np.repeat(unit, most.size),
+                    method=np.repeat(method, most.size),
+                    frame_id=np.repeat([row.id for row in rows], len(areas)),
+                    trial=np.repeat(trials, len(areas)),
+                    safety_margin=np.repeat([row.safety_margin for row in rows], len(areas)),
+                    area=np.tile(areas, len(rows)),
+                    most_first=most.ravel(),
+                    least_first=least.ravel(),
+                    random=np.tile(chance, len(rows)),
+                )
+            )
             zero = np.zeros(len(rows))
             scores.append(
-                {
-                    "fill": fill,
-                    "unit": unit,
-                    "method": method,
-                    "control": method in CONTROLS,
-                    "srg": told(paired_difference(gains[method], zero, trials=trials, rng=rng)),
-                    "gain_over_random": told(paired_difference(gains[method] / 2, zero, trials=trials, rng=rng)),
-                    "most_first": float(np.trapezoid(most, areas).mean()),
-                    "least_first": float(np.trapezoid(least, areas).mean()),
-                    "random": 0.2,
-                    "at": {
-                        f"{area:g}": float(np.interp(area, areas, most.mean(axis=0)))
-                        for area in (0.01, 0.02, 0.05, 0.1, 0.2)
-                    },
-                }
+                RemovalScore(
+                    fill=fill,
+                    unit=unit,
+                    method=method,
+                    control=method in CONTROLS,
+                    srg=paired_difference(gains[method], zero, trials=trials, rng=rng),
+                    gain_over_random=paired_difference(gains[method] / 2, zero, trials=trials, rng=rng),
+                    most_first=float(np.trapezoid(most, areas).mean()),
+                    least_first=float(np.trapezoid(least, areas).mean()),
+                    random=0.2,
+                    at={area: float(np.interp(area, areas, most.mean(axis=0))) for area in EQUAL_AREAS},
+                )
             )
         best = max(CONTROLS, key=lambda control, gains=gains: gains[control].mean())
         pairs = [*combinations(made.methods, 2), *((method, best) for method in made.methods)]
         comparisons += [
-            {"fill": fill, "unit": unit, "first": first, "second": second, "measure": "srg"}
-            | told(paired_difference(gains[first], gains[second], trials=trials, rng=rng))
+            Comparison(
+                fill=fill,
+                unit=unit,
+                first=first,
+                second=second,
+                gap=paired_difference(gains[first], gains[second], trials=trials, rng=rng),
+            )
             for first, second in pairs
         ]
         ranks[fill, unit] = [float(gains[method].mean()) for method in made.methods]
-    agreement = [
-        {
-            "unit": "pixel",
-            "first": one[0],
-            "second": other[0],
-            "tau": float(np.asarray(kendalltau(ranks[one], ranks[other]))[0]),
-        }
+    agreement = tuple(
+        Agreement(
+            unit="pixel",
+            first=one[0],
+            second=other[0],
+            tau=float(np.asarray(kendalltau(ranks[one], ranks[other]))[0]),
+        )
         for one, other in combinations([key for key in FILLS if key[1] == "pixel"], 2)
-    ]
-    folder = write_run(
+    )
+    return write_run(
         workspace / f"faithfulness-{name}",
         "faithfulness",
         {},
-        {
-            "input": name,
-            "source": "simulated",
-            "frames": len(rows),
-            "trials": made.trials,
-            "random_orders": 20,
-            "fills": list(dict.fromkeys(fill for fill, _ in FILLS)),
-            "units": ["pixel", "marker"],
-            "areas": areas.tolist(),
-            "scores": scores,
-            "comparisons": comparisons,
-            "agreement": agreement,
-            "alarms": ["grad-cam does not beat a random order: its symmetric gain is -0.050"],
-        },
+        RemovalScores(
+            input=name,
+            source="simulated",
+            frames=len(rows),
+            trials=made.trials,
+            random_orders=20,
+            fills=tuple(dict.fromkeys(fill for fill, _ in FILLS)),
+            units=("pixel", "marker"),
+            areas=tuple(areas.tolist()),
+            scores=tuple(scores),
+            comparisons=tuple(comparisons),
+            agreement=agreement,
+            alarms=("grad-cam does not beat a random order: its symmetric gain is -0.050",),
+            table=RemovalTable.joined(tables),
+        ),
     )
-    pq.write_table(pa.table(columns), folder / "curves.parquet")
-    return folder
-
-
-def told(gap: Difference) -> dict[str, Any]:
-    return {"estimate": gap.estimate, "low": gap.low, "high": gap.high, "units": gap.units, "sure": gap.sure}
 
 
 def write_others(workspace: Path, name: str, made: Made) -> None:
-    origin = {"input": name, "source": "simulated"}
-    layers = [1, 4, 8, 16]
-    methods: dict[str, Any] = {
-        method: {
-            "layers": layers,
-            "similarity": [0.9 / (1 + index * (0.1 if method == "grad-cam" else 1.0)) for index in range(len(layers))],
-            "complexity_rise": 0.3,
-            "smooth_complexity_rise": None,
-        }
+    layers = (1, 4, 8, 16)
+    randomised = {
+        method: RandomisedMethod(
+            layers=layers,
+            similarity=tuple(
+                0.9 / (1 + index * (0.1 if method == "grad-cam" else 1.0)) for index in range(len(layers))
+            ),
+            complexity_rise=0.3,
+            smooth_complexity_rise=None,
+        )
         for method in METHODS
     }
     write_run(
         workspace / f"randomisation-{name}",
         "randomisation",
         {},
-        {**origin, "frames": 6, "methods": methods, "alarms": []},
+        Randomisation(input=name, source="simulated", frames=6, methods=randomised, alarms=()),
     )
-    looks = {method: {"frame_stability": 0.9, **values} for method, values in made.looks.items()}
     rougher = [
-        {"measure": "total_variation", "first": first, "second": second, **interval(gap, made.trials, half=0.001)}
-        for first, second in combinations(looks, 2)
-        for gap in [looks[first]["total_variation"] - looks[second]["total_variation"]]
+        Roughness(first=first, second=second, gap=interval(gap, made.trials, half=0.001))
+        for first, second in combinations(made.looks, 2)
+        for gap in [made.looks[first]["total_variation"] - made.looks[second]["total_variation"]]
     ]
-    told = {**origin, "frames": 42, "methods": looks, "comparisons": rougher if made.rougher_told else []}
-    write_run(workspace / f"map-quality-{name}", "map-quality", {}, told)
+    write_quality(workspace, name, made.looks, rougher if made.rougher_told else [])
     seconds = {"grad-cam": 0.02, "integrated-gradients": 0.4, "poly-cam": 3.0}
     timed = {
-        method: {"seconds": one, "seconds_without_forward": one - 0.01, "low": one * 0.9, "high": one * 1.1}
+        method: MethodTime(seconds=one, seconds_without_forward=one - 0.01, low=one * 0.9, high=one * 1.1)
         for method, one in seconds.items()
     }
     write_run(
         workspace / f"timing-{name}",
         "timing",
         {},
-        {**origin, "device": "cpu", "threads": 2, "repeats": 5, "forward_seconds": 0.01, "methods": timed},
+        Timing(input=name, source="simulated", device="cpu", threads=2, repeats=5, forward_seconds=0.01, methods=timed),
     )
+
+
+def write_quality(
+    workspace: Path, name: str, looks: Mapping[str, Mapping[str, float]], rougher: Sequence[Roughness] = ()
+) -> Path:
+    quality = MapQuality(
+        input=name,
+        source="simulated",
+        frames=42,
+        repeated_frames=3,
+        noise_sd=1.0,
+        methods={method: MapMeasures(frame_stability=0.9, **values) for method, values in looks.items()},
+        comparisons=tuple(rougher),
+    )
+    return write_run(workspace / f"map-quality-{name}", "map-quality", {}, quality)
 
 
 def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Generator) -> Path:
     rows, size = scored_frames(made), made.size
     x, y = (size * axis.ravel() for axis in np.meshgrid(*[np.linspace(0.14, 0.86, 6)] * 2))
-    columns: dict[str, list] = {
-        key: []
-        for key in (
-            "frame_id", "trial", "safety_margin", "marker", "x_px", "y_px", "network_effect", "margin_effect", "state",
-        )
-    }  # fmt: skip
-    maps: dict[str, list[np.ndarray]] = {"network": [], "margin": []}
+    tables, maps = [], {"network": [], "margin": []}
     grid_y, grid_x = np.mgrid[:size, :size]
     for row in rows:
         network = np.full(len(x), (1 - made.top_share) / (len(x) - 2))
@@ -449,14 +460,19 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
         margin = 0.05 * np.exp(-((x - size / 2) ** 2 + (y - 0.6 * size) ** 2) / (0.1 * size**2))
         # a little of its own in each trial, so that an interval has a width
         network = 0.3 * network * (1 + 0.02 * rng.random(len(x)))
-        for key in ("frame_id", "trial", "safety_margin"):
-            columns[key] += [row["id" if key == "frame_id" else key]] * len(x)
-        columns["marker"] += list(range(len(x)))
-        columns["x_px"] += x.tolist()
-        columns["y_px"] += y.tolist()
-        columns["network_effect"] += network.tolist()
-        columns["margin_effect"] += (-margin).tolist()
-        columns["state"] += [1] * len(x)
+        tables.append(
+            MarkerEffects(
+                frame_id=np.repeat(row.id, len(x)),
+                trial=np.repeat(row.trial, len(x)),
+                safety_margin=np.full(len(x), row.safety_margin),
+                marker=np.arange(len(x)),
+                x_px=x,
+                y_px=y,
+                network=network,
+                margin=-margin,
+                state=np.ones(len(x), dtype=np.int64),
+            )
+        )
         for key, effects in (("network", network), ("margin", -margin)):
             spots = np.exp(-((grid_x - x[:, None, None]) ** 2 + (grid_y - y[:, None, None]) ** 2) / (0.002 * size**2))
             maps[key].append((effects[:, None, None] * (spots > 0.4)).sum(axis=0).astype(np.float32))
@@ -468,40 +484,38 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
         "oracle": 1.0,
         "degraded-oracle": 0.8,
     }
-    mass = {"markers": 0.5, "slip_annulus": 0.4, "edges": made.edge_mass}
-    folder = write_run(
+    mass: dict[str, float | None] = {"markers": 0.5, "slip_annulus": 0.4, "edges": made.edge_mass}
+    held = {"holds": True, "oracle": 0.3, "degraded": 0.2, "random": 0.0, "gap": None}
+    return write_run(
         workspace / f"truth-{name}",
         "truth",
         {},
-        {
-            "input": name,
-            "source": "simulated",
-            "frames": len(rows),
-            "areas": {"markers": 0.18, "slip_annulus": 0.2, "edges": 0.07},
-            "methods": {
-                method: {"mass": mass, "rank": mass, "spearman_network": value, "spearman_margin": value / 2}
+        Truth(
+            input=name,
+            source="simulated",
+            frames=len(rows),
+            areas={"markers": 0.18, "slip_annulus": 0.2, "edges": 0.07},
+            methods={
+                method: Localisation(
+                    mass=mass,
+                    rank=mass,
+                    spearman_network=value,
+                    spearman_margin=value / 2,
+                    network=interval(value, made.trials),
+                    margin=interval(value / 2, made.trials),
+                    edges=interval(made.edge_mass - 0.07, made.trials, half=0.01),
+                )
                 for method, value in spearman.items()
             },
-            "intervals": {
-                method: {
-                    "spearman_network": interval(value, made.trials),
-                    "spearman_margin": interval(value / 2, made.trials),
-                    "edges_over_chance": interval(made.edge_mass - 0.07, made.trials, half=0.01),
-                }
-                for method, value in spearman.items()
-            },
-            "network_against_margin": interval(0.5, made.trials),
-            "meta": [{"fill": "true", "holds": True, "oracle": 0.3, "degraded": 0.2, "random": 0.0}],
-            "told": "Each marker was put back where it rested.",
-        },
+            network_against_margin=interval(0.5, made.trials),
+            meta=(MetaTest(fill="true", by_size=OracleTest(**held), **held),),
+            summary="Each marker was put back where it rested.",
+            effects=MarkerEffects.joined(tables),
+            network_maps=np.stack(maps["network"]),
+            margin_maps=np.stack(maps["margin"]),
+        ),
     )
-    pq.write_table(pa.table(columns), folder / "effects.parquet")
-    np.savez_compressed(
-        folder / "maps.npz", allow_pickle=False, **{key: np.stack(found) for key, found in maps.items()}
-    )
-    return folder
 
 
-def interval(value: float, units: int, *, half: float = 0.05) -> dict[str, Any]:
-    sure = abs(value) > half and units >= 5
-    return {"estimate": value, "low": value - half, "high": value + half, "units": units, "sure": sure}
+def interval(value: float, units: int, *, half: float = 0.05) -> Difference:
+    return Difference(estimate=value, low=value - half, high=value + half, units=units)

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_up import write_run
 
 from sliplens.intervals import Difference
 from sliplens.report import load_results
@@ -21,6 +20,7 @@ from .study_results import (
     write_faithfulness,
     write_maps,
     write_others,
+    write_quality,
     write_thesis_scores,
     write_truth,
 )
@@ -294,8 +294,7 @@ def test_a_fill_counts_once_whatever_the_units(judged, tmp_path):
 
 def test_without_scores_nothing_is_believed(tmp_path, rng):
     write_choice(tmp_path, Made())
-    origin = {"input": "raw", "source": "simulated"}
-    write_run(tmp_path / "map-quality-raw", "map-quality", {}, {**origin, "frames": 1, "methods": {}})
+    write_quality(tmp_path, "raw", {})
 
     statements = judge(load_results(tmp_path), rng=rng)
 

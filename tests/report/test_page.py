@@ -168,12 +168,11 @@ def test_hostile_names_are_escaped(build, workspace):
     pq.write_table(table.set_column(0, "trial", pa.array([HOSTILE] * table.num_rows)), path)
     folder = workspace / "maps-raw-real"
     value = json.loads((folder / "result.json").read_text())
-    old, value["frames"][0]["id"] = value["frames"][0]["id"], '"><img src=x onerror=alert(1)>'
+    value["frames"][0]["id"] = '"><img src=x onerror=alert(1)>'
     value["methods"]["grad-cam"]["warnings"] = [HOSTILE]
     for frame in value["frames"]:
         frame["condition"] = "<b>$dry$"
     (folder / "result.json").write_text(json.dumps(value))
-    (folder / "frames" / f"{old}.png").rename(folder / "frames" / '"><img src=x onerror=alert(1)>.png')
     run = json.loads((workspace / "data" / "run.json").read_text())
     (workspace / "data" / "run.json").write_text(json.dumps(run | {"config": {HOSTILE: HOSTILE}, "finished": HOSTILE}))
 
@@ -222,7 +221,9 @@ def test_output_that_cannot_be_written_is_told(workspace, tmp_path):
 
 
 def frame(name: str, margin: float | None, condition: str = "dry") -> ExplainedFrame:
-    return ExplainedFrame(id=name, condition=condition, safety_margin=margin, prediction=0.5, reference_prediction=None)
+    return ExplainedFrame(
+        id=name, trial="t", condition=condition, safety_margin=margin, prediction=0.5, reference_prediction=1.0
+    )
 
 
 def test_panel_takes_the_nearest_labels_of_one_condition():

@@ -282,7 +282,7 @@ def test_nothing_is_written_where_a_result_is_malformed(pristine_study, tmp_path
 
     told = refused(capsys, "report", tmp_path)
 
-    assert "lacks" in told
+    assert "missing required field" in told
     assert [path.name for path in Path(tmp_path).iterdir()] == ["randomisation-raw"]
 
 

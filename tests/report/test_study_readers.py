@@ -1,13 +1,13 @@
 """What a study saved is read whole, and refused in one sentence where it is malformed."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from PIL import Image
 
 from sliplens.errors import InputError
 from sliplens.report import load_results
@@ -54,7 +54,7 @@ def test_curves_and_scores_tell_the_same(study):
 
 
 def test_rows_may_stand_in_any_order(study):
-    path = study / "faithfulness-raw" / "curves.parquet"
+    path = study / "faithfulness-raw" / "table.parquet"
     before = load_results(study).study.faithfulness["raw"].curves
     table = pq.read_table(path)
     pq.write_table(table.take(np.random.default_rng(0).permutation(table.num_rows)), path)
@@ -83,22 +83,22 @@ def test_markers_keep_their_places(study):
     assert states is not None
     assert [frame.contact_state for frame in states.frames] == ["contact", *["incipient slip"] * 4, "full slip"]
     for frame in states.frames:
-        assert frame.rest_px.shape == frame.position_px.shape == (36, 2)
+        assert frame.rest_px.shape == frame.now_px.shape == (36, 2)
         # one marker was not followed
-        assert np.isnan(frame.position_px[0]).all()
-        assert np.isfinite(frame.position_px[1:]).all()
+        assert np.isnan(frame.now_px[0]).all()
+        assert np.isfinite(frame.now_px[1:]).all()
 
 
 def test_null_is_unknown(study):
     change(study / "map-quality-raw" / "result.json", ("methods", "poly-cam", "resolution"), None)
     change(study / "truth-raw" / "result.json", ("network_against_margin",), None)
-    change(study / "truth-raw" / "result.json", ("intervals", "poly-cam", "spearman_margin"), None)
+    change(study / "truth-raw" / "result.json", ("methods", "poly-cam", "margin"), None)
     change(study / "randomisation-raw" / "result.json", ("methods", "poly-cam", "similarity", 1), None)
     change(study / "faithfulness-raw" / "result.json", ("agreement", 0, "tau"), None)
 
     found = load_results(study).study
 
-    assert found.map_quality["raw"].methods["poly-cam"]["resolution"] is None
+    assert found.map_quality["raw"].methods["poly-cam"].resolution is None
     assert found.truth["raw"].network_against_margin is None
     assert found.truth["raw"].methods["poly-cam"].margin is None
     assert found.randomisation["raw"].methods["poly-cam"].similarity[1] is None
@@ -108,22 +108,27 @@ def test_null_is_unknown(study):
 @pytest.mark.parametrize(
     ("file", "place", "value", "message"),
     [
-        ("choice", ("trials", 0, "qualified"), "yes", r"at trials\[0\] has 'yes' as 'qualified' where true or false"),
-        ("choice", ("told",), None, r"choice/result.json lacks 'told'; make the folder again with `sliplens study`"),
-        ("states", ("frame_size",), [24], r"has 1 numbers as 'frame_size'"),
-        ("states", ("frames",), [], r"states/result.json names no frame"),
-        ("states", ("frames", 0, "id"), "../x", r"'../x.raw.png' in .*states is no file name"),
-        ("remedies-raw", ("variants", "insertion", "mode"), "up", r"has 'up' as 'mode' where deletion or insertion"),
-        ("faithfulness-raw", ("scores", 0, "srg"), 0.1, r"has 0.1 as 'srg' where an object belongs"),
-        ("faithfulness-raw", ("scores", 0, "srg", "low"), "x", r"at scores\[0\] at srg has 'x' as 'low'"),
-        ("faithfulness-raw", ("scores", 0, "at"), {"all": 1.0}, r"names an area under 'at' that is no number"),
+        ("choice", ("trials", 0, "qualified"), "yes", r"expected `bool`, got `str` at trials\[0\].qualified"),
+        ("choice", ("summary",), None, r"choice/result.json .*expected `str`, got `null` at summary"),
+        ("states", ("shown",), [], r"states names no frame"),
+        (
+            "states",
+            ("shown",),
+            [{"id": "a", "level": 1, "safety_margin": 1, "contact_state": "x"}],
+            r"holds 6 and 6 pic",
+        ),
+        ("remedies-raw", ("variants", "insertion", "mode"), "up", r"invalid enum value 'up' at variants"),
+        ("faithfulness-raw", ("scores", 0, "srg"), 0.1, r"expected `object`, got `float` at scores\[0\].srg"),
+        ("faithfulness-raw", ("scores", 0, "srg", "low"), "x", r"expected `float`, got `str` at scores\[0\].srg.low"),
+        ("faithfulness-raw", ("scores", 0, "at"), {"all": 1.0}, r"expected `float`, got `str` at .*scores\[0\].at"),
         ("faithfulness-raw", ("scores", 0, "method"), "none", r"lacks the curves of reference / pixel / none"),
+        ("score-raw", ("methods", "none"), {"mean": 0, "sd": 0, "last_step_mean": 0, "frames": 1}, r"curves of none"),
         ("randomisation-raw", ("methods", "poly-cam", "layers"), [1], r"has 1 layers but 4 similarities"),
-        ("randomisation-raw", ("methods", "poly-cam", "similarity"), 1, r"'similarity' where a list of numbers"),
-        ("map-quality-raw", ("methods", "poly-cam", "gini"), "much", r"has 'much' as 'gini' where a finite number"),
-        ("timing-raw", ("methods", "poly-cam", "seconds"), None, r"lacks 'seconds'"),
-        ("truth-raw", ("areas",), [], r"has \[\] as 'areas' where an object belongs"),
-        ("truth-raw", ("meta", 0, "holds"), 1, r"has 1 as 'holds' where true or false belongs"),
+        ("randomisation-raw", ("methods", "poly-cam", "similarity"), 1, r"expected `array`, got `int`"),
+        ("map-quality-raw", ("methods", "poly-cam", "gini"), "much", r"expected `float \| null`, got `str`"),
+        ("timing-raw", ("methods", "poly-cam", "seconds"), None, r"expected `float`, got `null`"),
+        ("truth-raw", ("areas",), [], r"expected `object`, got `array` at areas"),
+        ("truth-raw", ("meta", 0, "holds"), 1, r"expected `bool`, got `int` at meta\[0\].holds"),
     ],
 )
 def test_malformed_fields_are_told_in_one_sentence(study, file, place, value, message):
@@ -133,18 +138,18 @@ def test_malformed_fields_are_told_in_one_sentence(study, file, place, value, me
         load_results(study)
 
     assert "\n" not in str(caught.value)
-    assert "`sliplens study`" in str(caught.value)
+    assert re.search("again with `sliplens (study|score)`", str(caught.value))
 
 
 @pytest.mark.parametrize(
     ("file", "message"),
     [
-        ("faithfulness-raw/curves.parquet", r"curves.parquet does not exist"),
-        ("remedies-raw/deletion.parquet", r"deletion.parquet does not exist"),
+        ("faithfulness-raw/table.parquet", r"table.parquet does not exist"),
+        ("remedies-raw/table.parquet", r"table.parquet does not exist"),
         ("truth-raw/effects.parquet", r"effects.parquet does not exist"),
-        ("truth-raw/maps.npz", r"maps.npz does not exist"),
-        ("states/markers.parquet", r"markers.parquet does not exist"),
-        ("states/frames/t00-f0000.raw.png", r"t00-f0000.raw.png does not exist"),
+        ("truth-raw/arrays.npz", r"arrays.npz does not exist"),
+        ("states/table.parquet", r"table.parquet does not exist"),
+        ("states/arrays.npz", r"arrays.npz does not exist"),
     ],
 )
 def test_missing_files_are_told(study, file, message):
@@ -155,7 +160,7 @@ def test_missing_files_are_told(study, file, message):
 
 
 def test_a_curve_without_all_its_areas_is_told(study):
-    path = study / "faithfulness-raw" / "curves.parquet"
+    path = study / "faithfulness-raw" / "table.parquet"
     pq.write_table(pq.read_table(path).slice(1), path)
 
     with pytest.raises(InputError, match=r"lacks areas of some frames under reference / pixel / grad-cam"):
@@ -164,30 +169,31 @@ def test_a_curve_without_all_its_areas_is_told(study):
 
 def test_a_table_without_a_column_is_told(study):
     path = study / "truth-raw" / "effects.parquet"
-    pq.write_table(pq.read_table(path).drop_columns(["margin_effect"]), path)
+    pq.write_table(pq.read_table(path).drop_columns(["margin"]), path)
 
-    with pytest.raises(InputError, match=r"effects.parquet lacks the column margin_effect"):
+    with pytest.raises(InputError, match=r"effects.parquet lacks the column 'margin'"):
         load_results(study)
 
 
 def test_maps_of_other_frames_are_told(study):
-    np.savez(
-        study / "truth-raw" / "maps.npz", allow_pickle=False, network=np.zeros((2, 4, 4)), margin=np.zeros((2, 4, 4))
-    )
+    maps = np.zeros((2, 4, 4), dtype=np.float32)
+    np.savez(study / "truth-raw" / "arrays.npz", allow_pickle=False, network_maps=maps, margin_maps=maps)
 
     with pytest.raises(InputError, match=r"holds maps of shape \(2, 4, 4\) where 18 finite ones belong"):
         load_results(study)
 
 
-def test_a_picture_of_another_size_is_told(study):
-    Image.new("RGB", (10, 10)).save(study / "states" / "frames" / "t00-f0000.difference.png")
+def test_pictures_of_another_size_are_told(study):
+    path = study / "states" / "arrays.npz"
+    arrays = dict(np.load(path))
+    np.savez(path, allow_pickle=False, raw=arrays["raw"], difference=arrays["difference"][:, :10])
 
-    with pytest.raises(InputError, match=r"is 10 x 10 pixels, 24 x 24 are needed"):
+    with pytest.raises(InputError, match=r"holds uint8 of shape \(6, 10, 24, 3\) as 'difference' where UInt8"):
         load_results(study)
 
 
 def test_methods_unknown_to_the_report_are_kept(study):
-    path = study / "faithfulness-raw" / "curves.parquet"
+    path = study / "faithfulness-raw" / "table.parquet"
     table = pq.read_table(path)
     own = table.filter(pa.array([name == "poly-cam" for name in table["method"].to_pylist()]))
     named = own.set_column(own.column_names.index("method"), "method", pa.array(["my-cam"] * own.num_rows))

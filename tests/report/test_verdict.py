@@ -104,10 +104,10 @@ def test_the_best_method_is_named_with_its_control(workspace, verdict):
 
 def test_methods_that_lose_to_chance_are_called_so(workspace, verdict):
     folder = workspace / "score-raw"
-    table = pq.read_table(folder / "deletion.parquet")
+    table = pq.read_table(folder / "table.parquet")
     method, score = np.array(table["method"].to_pylist()), table["score"].to_numpy().copy()
     score[method == "random"] = 0.1
-    replace(folder / "deletion.parquet", "score", score)
+    replace(folder / "table.parquet", "score", score)
     edit(folder / "result.json", lambda value: value["methods"]["random"].update(mean=0.1, sd=0.0))
 
     found = verdict()["Faithfulness, raw images"]

@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -8,7 +6,8 @@ from torch import Tensor, nn
 from sliplens.errors import InputError, RecordingError
 from sliplens.models import TrainedModel
 from sliplens.recordings import Dataset
-from sliplens.study.choice import Choice, choose_frames, load_choice, save_choice
+from sliplens.results.study import Choice
+from sliplens.study.choice import choose_frames
 
 
 class Says(nn.Module):
@@ -63,17 +62,12 @@ def test_of_two_networks_the_worse_decides(network: TrainedModel, fine_dataset: 
 
 def test_where_too_few_qualify_the_text_says_what_was_done(network: TrainedModel, fine_dataset: Dataset):
     found = choose_frames({"difference": says(network, 0.5)}, fine_dataset, trials=5, tolerance=0.01)
-    assert "in 0 of those" in found.told
-    assert "the 3 read best among the others were taken too" in found.told
-    assert "3 instead of 5" in found.told
+    assert "in 0 of those" in found.summary
+    assert "the 3 read best among the others were taken too" in found.summary
+    assert "3 instead of 5" in found.summary
     enough = choose_frames({"difference": says(network, 0.5)}, fine_dataset, trials=2, tolerance=0.9)
     assert [one.trial for one in enough.trials] == ["test-dry-0", "test-dry-1"]
-    assert "The first 2 were taken" in enough.told
-
-
-def test_a_choice_comes_back_as_it_was(choice: Choice, tmp_path: Path):
-    save_choice(choice, tmp_path)
-    assert load_choice(tmp_path) == choice
+    assert "The first 2 were taken" in enough.summary
 
 
 @pytest.mark.parametrize(

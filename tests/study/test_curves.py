@@ -1,24 +1,24 @@
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 import torch
 
-from sliplens.faithfulness import get_fill
+from sliplens.codec import load_result, save_result
 from sliplens.faithfulness.removal import Faithfulness
 from sliplens.intervals import paired_difference
+from sliplens.results.faithfulness import RemovalScores
 from sliplens.study.curves import (
     EQUAL_AREAS,
     RANDOMISED,
     STUDY_AREAS,
     Setting,
+    compare_fills,
     influences,
     judge_curves,
     ranking_alarms,
-    score_curves,
+    score_removal,
 )
 from sliplens.study.material import Material
 
@@ -36,14 +36,11 @@ def straight(most: float, least: float, *, frames: int = 8) -> Faithfulness:
 
 
 @pytest.fixture(scope="module")
-def scored(material: Material, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("curves")
-    score_curves(material, folder, maps=influences(material), settings=(PIXELS, MARKERS), random_orders=2)
-    return folder
+def scored(material: Material) -> RemovalScores:
+    return score_removal(material, maps=influences(material), settings=(PIXELS, MARKERS), random_orders=2)
 
 
-def test_removing_by_hand_gives_the_same_change(material: Material, scored: Path):
-    table = pq.read_table(scored / "curves.parquet").to_pylist()
+def test_removing_by_hand_gives_the_same_change(material: Material, scored: RemovalScores):
     frame, area = material.explained.frames[0], 0.2
     relevance = material.explained.relevance["grad-cam"][0]
     towards = np.sign(frame.prediction - frame.reference_prediction)
@@ -55,38 +52,29 @@ def test_removing_by_hand_gives_the_same_change(material: Material, scored: Path
     image[:, torch.from_numpy(gone.reshape(side, side))] = 0.5
     # what spoke for the target and is gone
     expected = towards * (frame.prediction - float(material.trained.predict(image[None])[0]))
-    found = [
-        row["most_first"]
-        for row in table
-        if (row["fill"], row["method"], row["frame_id"]) == ("grey", "grad-cam", frame.id) and row["area"] == area
-    ]
-    assert found == pytest.approx([expected], abs=1e-5)
+    curve = scored.curves["grey", "pixel", "grad-cam"]
+    found = curve.most_first[curve.frame_ids.index(frame.id), STUDY_AREAS.index(area)]
+    assert found == pytest.approx(expected, abs=1e-5)
 
 
-def test_every_method_and_control_is_scored_under_every_setting(material: Material, scored: Path):
-    told = json.loads((scored / "result.json").read_text())
+def test_every_method_and_control_is_scored_under_every_setting(material: Material, scored: RemovalScores):
     names = {*material.explainers, "edges", "input", "centre"}
-    assert {(one["fill"], one["unit"], one["method"]) for one in told["scores"]} == {
-        (setting.fill, setting.unit, name) for setting in (PIXELS, MARKERS) for name in names
-    }
-    assert {one["method"] for one in told["scores"] if not one["control"]} == set(material.explainers)
-    assert (told["frames"], told["trials"], told["random_orders"]) == (6, 2, 2)
-    assert told["areas"] == list(STUDY_AREAS)
-    assert set(told["scores"][0]["at"]) == {str(area) for area in EQUAL_AREAS}
+    keys = {(setting.fill, setting.unit, name) for setting in (PIXELS, MARKERS) for name in names}
+    assert {score.key for score in scored.scores} == set(scored.curves) == keys
+    assert {score.method for score in scored.scores if not score.control} == set(material.explainers)
+    assert (scored.frames, scored.trials, scored.random_orders) == (6, 2, 2)
+    assert scored.areas == STUDY_AREAS
+    assert set(scored.scores[0].at) == set(EQUAL_AREAS)
 
 
-def test_scores_are_the_areas_under_the_stored_curves(scored: Path):
-    table = pq.read_table(scored / "curves.parquet")
-    columns = {name: np.array(table[name].to_pylist()) for name in table.column_names}
-    for one in json.loads((scored / "result.json").read_text())["scores"]:
-        rows = np.ones(table.num_rows, dtype=bool)
-        for name in ("fill", "unit", "method"):
-            rows &= columns[name] == one[name]
-        shape = (-1, len(STUDY_AREAS))
-        gain = np.trapezoid(
-            (columns["most_first"] - columns["least_first"])[rows].reshape(shape), np.array(STUDY_AREAS), axis=-1
-        )
-        assert one["srg"]["estimate"] == pytest.approx(gain.mean())
+def test_scores_are_the_areas_under_the_stored_curves(scored: RemovalScores, tmp_path: Path):
+    save_result(scored, tmp_path)
+    back = load_result(tmp_path, RemovalScores, command="sliplens study")
+    assert back.scores == scored.scores
+    for score in back.scores:
+        curve = back.curves[score.key]
+        gain = np.trapezoid(curve.most_first - curve.least_first, np.array(STUDY_AREAS), axis=-1)
+        assert score.srg.estimate == pytest.approx(gain.mean())
 
 
 def test_markers_that_are_not_known_everywhere_are_no_unit(material: Material):
@@ -96,12 +84,11 @@ def test_markers_that_are_not_known_everywhere_are_no_unit(material: Material):
 
 def test_a_fill_that_is_unknown_is_refused_before_anything_is_made(material: Material, tmp_path: Path):
     with pytest.raises(Exception, match="no fill named 'pink'"):
-        score_curves(material, tmp_path, maps={}, settings=(Setting(fill="pink", unit="pixel"),))
+        score_removal(material, maps={}, settings=(Setting(fill="pink", unit="pixel"),), parts=tmp_path)
     assert not list(tmp_path.iterdir())
-    assert get_fill("grey")
 
 
-def test_an_interrupted_run_goes_on_after_the_last_setting(material: Material, tmp_path: Path, scored: Path):
+def test_an_interrupted_run_goes_on_after_the_last_setting(material: Material, tmp_path: Path, scored: RemovalScores):
     calls = []
 
     def interrupt(done: int, total: int) -> None:
@@ -111,33 +98,34 @@ def test_an_interrupted_run_goes_on_after_the_last_setting(material: Material, t
 
     settings = {"maps": influences(material), "settings": (PIXELS, MARKERS), "random_orders": 2}
     with pytest.raises(KeyboardInterrupt):
-        score_curves(material, tmp_path, on_frame=interrupt, **settings)
-    assert {path.name for path in (tmp_path / "parts").iterdir()} == {"grey-pixel.npz"}
+        score_removal(material, parts=tmp_path, on_progress=interrupt, **settings)
+    assert {path.name for path in tmp_path.iterdir()} == {"grey-pixel"}
     before = len(calls)
-    score_curves(material, tmp_path, on_frame=lambda done, total: calls.append((done, total)), **settings)
+    again = score_removal(
+        material, parts=tmp_path, on_progress=lambda done, total: calls.append((done, total)), **settings
+    )
     assert all(done >= len(material.inputs) for done, _ in calls[before:])
-    assert (tmp_path / "result.json").read_text() == (scored / "result.json").read_text()
+    assert again.scores == scored.scores
+    assert again.comparisons == scored.comparisons
 
 
 def test_curves_found_in_another_way_are_kept_over_an_interruption(material: Material, tmp_path: Path):
     count, asked = len(material.inputs), []
 
-    def draw(report) -> dict[str, Faithfulness]:
+    def draw(on_frames) -> dict[str, Faithfulness]:
         asked.append("drawn")
-        report(count, count)
         return {name: straight(0.2, 0.1, frames=count) for name in influences(material)}
 
-    def stop(report) -> dict[str, Faithfulness]:
+    def stop(on_frames) -> dict[str, Faithfulness]:
         raise KeyboardInterrupt
 
     true, other = Setting(fill="true", unit="marker"), Setting(fill="other", unit="marker")
     settings = {"maps": influences(material), "settings": (), "random_orders": 2}
     with pytest.raises(KeyboardInterrupt):
-        score_curves(material, tmp_path, further={true: draw, other: stop}, **settings)
-    score_curves(material, tmp_path, further={true: draw, other: draw}, **settings)
+        score_removal(material, parts=tmp_path, further={true: draw, other: stop}, **settings)
+    found = score_removal(material, parts=tmp_path, further={true: draw, other: draw}, **settings)
     assert asked == ["drawn", "drawn"]  # the first setting once, the second once
-    told = json.loads((tmp_path / "result.json").read_text())
-    by_fill = {one["fill"]: one["srg"]["estimate"] for one in told["scores"] if one["method"] == "grad-cam"}
+    by_fill = {score.fill: score.srg.estimate for score in found.scores if score.method == "grad-cam"}
     assert by_fill == pytest.approx({"true": 0.075, "other": 0.075})
 
 
@@ -149,12 +137,12 @@ def test_a_method_is_better_only_when_the_interval_leaves_zero_out():
         curves=np.stack([value[:, None] * np.array([0.0, 1.0, 1.0]) for value in (level, np.zeros(8), np.zeros(8))]),
     )
     found = {PIXELS: {"poly-cam": noisy, "grad-cam": straight(0.1, 0.0), "occlusion": noisy, "edges": straight(0, 0)}}
-    told = judge_curves(found, trials=np.arange(8), seed=0)
-    by_pair = {(one["first"], one["second"]): one for one in told["comparisons"]}
-    assert by_pair["poly-cam", "grad-cam"]["sure"]
-    assert by_pair["poly-cam", "grad-cam"]["estimate"] == pytest.approx(0.75 * (level.mean() - 0.1))
-    assert not by_pair["poly-cam", "occlusion"]["sure"]
-    assert by_pair["poly-cam", "edges"]["sure"]
+    _, comparisons = judge_curves(found, trials=np.arange(8), seed=0)
+    by_pair = {(one.first, one.second): one.gap for one in comparisons}
+    assert by_pair["poly-cam", "grad-cam"].sure
+    assert by_pair["poly-cam", "grad-cam"].estimate == pytest.approx(0.75 * (level.mean() - 0.1))
+    assert not by_pair["poly-cam", "occlusion"].sure
+    assert by_pair["poly-cam", "edges"].sure
     assert ("edges", "edges") not in by_pair
 
 
@@ -174,8 +162,9 @@ def test_fills_that_rank_the_methods_backwards_are_named():
         PIXELS: {name: straight(level, 0) for name, level in methods.items()},
         other: {name: straight(0.4 - level, 0) for name, level in methods.items()},
     }
-    told = judge_curves(found, trials=np.arange(8), seed=0)
-    assert told["agreement"] == [{"unit": "pixel", "first": "grey", "second": "blur", "tau": pytest.approx(-1)}]
+    (agreement,) = compare_fills(found)
+    assert (agreement.unit, agreement.first, agreement.second) == ("pixel", "grey", "blur")
+    assert agreement.tau == pytest.approx(-1)
     assert any("rank the methods differently" in alarm for alarm in ranking_alarms(found))
     same = {PIXELS: found[PIXELS], other: found[PIXELS]}
     assert not any("rank the methods differently" in alarm for alarm in ranking_alarms(same))

@@ -1,18 +1,19 @@
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 import torch
 
+from sliplens.codec import load_result, save_result
 from sliplens.errors import CheckpointError, InputError, SaliencyError
 from sliplens.files import output_folder
 from sliplens.models import TrainedModel, load_checkpoint
 from sliplens.recordings import Dataset
+from sliplens.results.faithfulness import DeletionScores
 from sliplens.study import Explained, explain_frames, frames_from_dataset, load_explained, score_explanations
+from sliplens.study.explaining import network_inputs
 
 METHODS = ("grad-cam", "integrated-gradients")
 
@@ -26,7 +27,11 @@ def explain(trained: TrainedModel, data: Dataset, target: Path, **more: object) 
     chosen = frames_from_dataset(trained, data, levels=(1.0, 0.0))
     config = {"weights_sha256": trained.manifest.weights_sha256}
     with output_folder(target, stage="explain", config=config) as out:
-        return explain_frames(trained, chosen, out.folder, methods=METHODS, **more)  # pyright: ignore[reportArgumentType]
+        parts = out.folder / "parts"
+        found = explain_frames(trained, chosen, methods=METHODS, parts=parts, **more)  # pyright: ignore[reportArgumentType]
+        shutil.rmtree(parts)
+        save_result(found, out.folder)
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -40,16 +45,17 @@ def test_explanations_come_back_without_loss(trained: TrainedModel, small_datase
     written = explain(trained, small_dataset, tmp_path / "maps")
     back = load_explained(tmp_path / "maps")
     assert back.frames == written.frames
-    assert torch.equal(back.images, written.images)
+    np.testing.assert_array_equal(back.images, written.images)
+    np.testing.assert_array_equal(back.pictures, written.pictures)
+    assert back.methods == written.methods
     for method in METHODS:
         np.testing.assert_array_equal(back.relevance[method], written.relevance[method])
         np.testing.assert_array_equal(back.saliency[method], written.saliency[method])
-    assert {path.stem for path in (tmp_path / "maps" / "frames").iterdir()} == {frame.id for frame in back.frames}
 
 
 def test_the_table_holds_the_networks_answers(trained: TrainedModel, explanations: Path):
     back = load_explained(explanations)
-    answers = trained.predict(trained.encoding.normalise(back.images))
+    answers = trained.predict(network_inputs(trained, back))
     np.testing.assert_allclose([frame.prediction for frame in back.frames], answers.numpy(), atol=1e-6)
 
 
@@ -62,16 +68,16 @@ def test_an_interrupted_explanation_goes_on_after_the_last_map(
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        explain(trained, small_dataset, tmp_path / "maps", on_map=interrupt)
+        explain(trained, small_dataset, tmp_path / "maps", on_progress=interrupt)
     parts = tmp_path / ".maps.partial" / "parts"
-    before = {path.name: path.stat().st_mtime_ns for path in parts.iterdir()}
+    before = {path.name: (path / "arrays.npz").stat().st_mtime_ns for path in parts.iterdir()}
     assert len(before) == 3
     seen: dict[str, int] = {}
 
     def look(done: int, total: int) -> None:
-        seen.update({path.name: path.stat().st_mtime_ns for path in parts.iterdir()})
+        seen.update({path.name: (path / "arrays.npz").stat().st_mtime_ns for path in parts.iterdir()})
 
-    explain(trained, small_dataset, tmp_path / "maps", on_map=look)
+    explain(trained, small_dataset, tmp_path / "maps", on_progress=look)
     assert before.items() <= seen.items()  # the three maps were not made again
     first, second = load_explained(explanations), load_explained(tmp_path / "maps")
     for method in METHODS:
@@ -79,44 +85,47 @@ def test_an_interrupted_explanation_goes_on_after_the_last_map(
         np.testing.assert_allclose(first.relevance[method], second.relevance[method], atol=1e-6)
 
 
-def test_an_unknown_method_lists_those_there_are(trained: TrainedModel, small_dataset: Dataset, tmp_path: Path):
+def test_an_unknown_method_lists_those_there_are(trained: TrainedModel, small_dataset: Dataset):
     chosen = frames_from_dataset(trained, small_dataset)
     with pytest.raises(InputError, match="no explainer named 'lime'; choose from grad-cam, integrated-gradients, poly"):
-        explain_frames(trained, chosen, tmp_path, methods=("lime",))
+        explain_frames(trained, chosen, methods=("lime",))
 
 
 def change_maps(explanations: Path, tmp_path: Path, **changes: np.ndarray) -> Path:
     folder = tmp_path / "changed"
     shutil.copytree(explanations, folder)
-    maps = dict(np.load(folder / "maps.npz"))
-    np.savez(folder / "maps.npz", **(maps | changes))  # pyright: ignore[reportArgumentType]
+    maps = dict(np.load(folder / "arrays.npz"))
+    np.savez(folder / "arrays.npz", **(maps | changes))  # pyright: ignore[reportArgumentType]
     return folder
 
 
 def test_a_map_of_another_shape_is_refused(explanations: Path, tmp_path: Path):
-    folder = change_maps(explanations, tmp_path, **{"grad-cam": np.zeros((2, 32, 31), np.float32)})
-    with pytest.raises(SaliencyError, match=r"the grad-cam map of .* has shape \(32, 31\) but its image is 32 x 32"):
+    folder = change_maps(explanations, tmp_path, **{"relevance/grad-cam": np.zeros((2, 32, 31), np.float32)})
+    with pytest.raises(InputError, match=r"holds float32 of shape \(2, 32, 31\) as 'relevance/grad-cam' where"):
         load_explained(folder)
 
 
 def test_nan_in_a_map_is_refused(explanations: Path, tmp_path: Path):
     maps = np.zeros((2, 32, 32), np.float32)
     maps[1, 3, 3] = np.nan
-    folder = change_maps(explanations, tmp_path, **{"grad-cam.saliency": maps})
-    with pytest.raises(SaliencyError, match=r"the grad-cam\.saliency map of .* holds NaN or infinity in 1 of 1024"):
+    folder = change_maps(explanations, tmp_path, **{"saliency/grad-cam": maps})
+    with pytest.raises(SaliencyError, match=r"the grad-cam saliency of .* holds NaN or infinity in 1 of 1024"):
         load_explained(folder)
 
 
 def test_a_missing_map_is_refused(explanations: Path, tmp_path: Path):
-    folder = change_maps(explanations, tmp_path, **{"grad-cam": np.zeros((1, 32, 32), np.float32)})
-    with pytest.raises(InputError, match=r"maps\.npz has 1 grad-cam maps for 2 frames; explain again"):
+    folder = change_maps(explanations, tmp_path, **{"relevance/grad-cam": np.zeros((1, 32, 32), np.float32)})
+    with pytest.raises(
+        InputError,
+        match=r"holds float32 of shape \(1, 32, 32\) as 'relevance/grad-cam' where",
+    ):
         load_explained(folder)
 
 
 def test_truncated_maps_are_refused(explanations: Path, tmp_path: Path):
     folder = change_maps(explanations, tmp_path)
-    (folder / "maps.npz").write_bytes((folder / "maps.npz").read_bytes()[:500])
-    with pytest.raises(InputError, match=r"maps\.npz is damaged .*; explain the frames again"):
+    (folder / "arrays.npz").write_bytes((folder / "arrays.npz").read_bytes()[:500])
+    with pytest.raises(InputError, match=r"arrays\.npz cannot be read as arrays .*; .*`sliplens explain`"):
         load_explained(folder)
 
 
@@ -128,34 +137,30 @@ def test_a_folder_of_another_stage_is_refused(tmp_path: Path):
 
 
 def test_scores_follow_from_the_stored_curves(trained: TrainedModel, explanations: Path, tmp_path: Path):
-    result = score_explanations(trained, load_explained(explanations), tmp_path, steps=8)
-    assert set(result.methods) == {*METHODS, "random"}
-    rows = pq.read_table(tmp_path / "deletion.parquet").to_pylist()
-    written = json.loads((tmp_path / "result.json").read_text())
-    frames = {frame.id: frame.prediction for frame in load_explained(explanations).frames}
-    for method, score in result.methods.items():
-        auc = []
-        for name, base in frames.items():
-            answers = [row["prediction"] for row in rows if row["method"] == method and row["frame_id"] == name]
+    explained = load_explained(explanations)
+    save_result(score_explanations(trained, explained, steps=8), tmp_path)
+    scored = load_result(tmp_path, DeletionScores, command="sliplens score")
+    assert set(scored.methods) == {*METHODS, "random"}
+    for method, score in scored.methods.items():
+        curve, auc = scored.curves[method], []
+        for frame in explained.frames:
+            answers = curve.predictions[curve.frame_ids.index(frame.id)]
             assert len(answers) == 8
-            auc.append(np.mean([(1 - abs(base - answer)) ** 2 for answer in answers]))
+            auc.append(np.mean([(1 - abs(frame.prediction - answer)) ** 2 for answer in answers]))
         assert score.mean == pytest.approx(np.mean(auc), abs=1e-6)
         assert score.sd == pytest.approx(np.std(auc), abs=1e-6)
-        assert written["methods"][method]["mean"] == score.mean
 
 
-def test_explanations_of_another_network_are_refused(raw_run: Path, explanations: Path, tmp_path: Path):
+def test_explanations_of_another_network_are_refused(raw_run: Path, explanations: Path):
     with pytest.raises(CheckpointError, match="made with another network; explain the frames again with this run"):
-        score_explanations(load_checkpoint(raw_run), load_explained(explanations), tmp_path)
+        score_explanations(load_checkpoint(raw_run), load_explained(explanations))
 
 
-def test_alarms_say_when_the_fill_decides_and_when_no_method_beats_chance(
-    trained: TrainedModel, explanations: Path, tmp_path: Path
-):
+def test_alarms_say_when_the_fill_decides_and_when_no_method_beats_chance(trained: TrainedModel, explanations: Path):
     class Stubborn(torch.nn.Module):
         def forward(self, images: torch.Tensor) -> torch.Tensor:
             return torch.full((len(images), 1), 0.7)
 
-    result = score_explanations(replace(trained, model=Stubborn()), load_explained(explanations), tmp_path, steps=4)
+    result = score_explanations(replace(trained, model=Stubborn()), load_explained(explanations), steps=4)
     assert "the fill decides in 2 of 2 frames" in result.alarms[0]
     assert "grad-cam does not beat a random order (1.000 against 1.000)" in result.alarms

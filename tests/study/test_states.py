@@ -1,42 +1,45 @@
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from sliplens.images import absolute_difference, read_image
+from sliplens.codec import load_result, save_result
+from sliplens.images import absolute_difference
 from sliplens.recordings import Dataset
-from sliplens.study.choice import Choice
-from sliplens.study.states import MarkedFrame, load_markers, network_places, save_states
+from sliplens.results.study import Choice, MarkedFrame, States
+from sliplens.study.states import network_places, show_states
 
 
-def test_pictures_are_those_of_the_camera(choice: Choice, fine_dataset: Dataset, tmp_path: Path):
-    save_states(choice, fine_dataset, tmp_path)
+@pytest.fixture(scope="module")
+def states(choice: Choice, fine_dataset: Dataset) -> States:
+    return show_states(choice, fine_dataset)
+
+
+def test_pictures_are_those_of_the_camera(choice: Choice, fine_dataset: Dataset, states: States):
     recordings = {info.trial: fine_dataset.load(info) for info in fine_dataset.trials}
-    for pick in choice.frames:
-        raw = tmp_path / "frames" / f"{pick.id}.raw.png"
-        assert raw.exists() == pick.shown
-        if pick.shown:
-            recording = recordings[pick.trial]
-            np.testing.assert_array_equal(read_image(raw), recording.frames[pick.frame])
-            difference = absolute_difference(recording.frames[pick.frame][None], recording.reference)[0]
-            np.testing.assert_array_equal(read_image(tmp_path / "frames" / f"{pick.id}.difference.png"), difference)
+    shown = [frame for frame in choice.frames if frame.shown]
+    assert [frame.id for frame in states.frames] == [frame.id for frame in shown]
+    for frame, picture in zip(shown, states.frames, strict=True):
+        recording = recordings[frame.trial]
+        np.testing.assert_array_equal(picture.raw, recording.frames[frame.frame])
+        difference = absolute_difference(recording.frames[frame.frame][None], recording.reference)[0]
+        np.testing.assert_array_equal(picture.difference, difference)
 
 
-def test_a_trial_without_markers_is_named(choice: Choice, fine_dataset: Dataset, tmp_path: Path):
-    save_states(choice, fine_dataset, tmp_path)
-    told = json.loads((tmp_path / "result.json").read_text())
-    assert len(told["untracked"]) == 2
-    assert load_markers(tmp_path) == {}
-    assert told["markers_from"] == "tracking"
+def test_a_trial_without_markers_is_named_and_the_result_comes_back(states: States, tmp_path):
+    save_result(states, tmp_path)
+    back = load_result(tmp_path, States, command="sliplens study")
+    for one in (states, back):
+        assert len(one.untracked) == 2
+        assert one.markers == {}
+        assert one.markers_from == "tracking"
+        assert one.frames[0].rest_px.shape == (0, 2)
 
 
 def test_a_marker_stands_halfway_and_scales_with_the_image():
     # a grid of pitch 20 that moved by 4 to the right, seen at half the size: edges stay edges, centres by half a pixel
     x, y = np.meshgrid(np.arange(10, 100, 20.0), np.arange(10, 100, 20.0))
     rest = np.stack([x.ravel(), y.ravel()], axis=1)
-    found = MarkedFrame(rest_px=rest, now_px=rest + np.array([4.0, 0.0]))
-    centres, reach = network_places(found, frame_size=(100, 100), image_size=50)
+    marked = MarkedFrame(rest_px=rest, now_px=rest + np.array([4.0, 0.0]))
+    centres, reach = network_places(marked, frame_size=(100, 100), image_size=50)
     np.testing.assert_allclose(centres, (rest + np.array([2.0, 0.0]) + 0.5) / 2 - 0.5)
     assert reach == pytest.approx(5.0)
 

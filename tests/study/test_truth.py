@@ -1,16 +1,15 @@
 """Maps held against what each marker does: with a network that adds up how far the pixels changed."""
 
-import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 import torch
 from torch import Tensor, nn
 
+from sliplens.codec import load_result, save_result
 from sliplens.errors import CheckpointError, InputError
 from sliplens.faithfulness.controls import CONTROLS
 from sliplens.faithfulness.true_fill import SHARES
@@ -18,10 +17,13 @@ from sliplens.faithfulness.units import unit_means
 from sliplens.files import output_folder
 from sliplens.models import Manifest, TrainedModel
 from sliplens.recordings import Dataset
+from sliplens.results.explanation import MethodNotes
+from sliplens.results.study import Truth
 from sliplens.simulation import CHROMATOUCH, SimulationRecipe, simulate_dataset
 from sliplens.simulation.information import visible_markers
 from sliplens.simulation.intervention import draw_with_markers_back, marker_readings
 from sliplens.study import Explained, ExplainedFrame, frames_from_dataset
+from sliplens.study.explaining import network_inputs
 from sliplens.study.scenes import find_places, redrawing, stage_frames
 from sliplens.study.truth import judge_by_truth, shuffle_half, true_curves
 
@@ -76,7 +78,7 @@ def explained(trained: TrainedModel, data: Dataset) -> Explained:
     inputs = trained.encoding.normalise(chosen.images)
     assert isinstance(trained.model, Linear)
     # what each pixel adds to the answer
-    told = (inputs * trained.model.weight).sum(dim=1).detach().numpy()
+    attribution = (inputs * trained.model.weight).sum(dim=1).detach().numpy()
     answers, empty = trained.predict(inputs), trained.predict(chosen.references)
     return Explained(
         input="amplitude",
@@ -92,9 +94,11 @@ def explained(trained: TrainedModel, data: Dataset) -> Explained:
             )
             for index in range(len(chosen.ids))
         ),
-        images=chosen.images,
-        relevance={"attribution": told},
-        saliency={"attribution": np.abs(told)},
+        methods={"attribution": MethodNotes(seconds_per_frame=0.0, warnings=())},
+        images=chosen.images.numpy(),
+        pictures=(255 * inputs).byte().permute(0, 2, 3, 1).numpy(),
+        relevance={"attribution": attribution},
+        saliency={"attribution": np.abs(attribution)},
         weights_sha256="of these weights",
     )
 
@@ -106,22 +110,21 @@ def given(trained: TrainedModel, explained: Explained, data: Dataset) -> tuple[T
 
 @pytest.fixture(scope="module")
 def maps(trained: TrainedModel, explained: Explained) -> dict[str, np.ndarray]:
-    towards = np.array([np.sign(frame.prediction - frame.reference_prediction) for frame in explained.frames])
-    inputs = trained.encoding.normalise(explained.images)
-    return {"attribution": explained.relevance["attribution"] * towards[:, None, None]} | {
+    inputs = network_inputs(trained, explained)
+    return {"attribution": explained.relevance["attribution"] * explained.towards[:, None, None]} | {
         name: control(inputs).double().numpy() for name, control in CONTROLS.items()
     }
 
 
 @pytest.fixture(scope="module")
-def judged(trained, explained, data, maps, tmp_path_factory) -> Path:
+def judged(trained, explained, data, maps, tmp_path_factory) -> Truth:
     folder = tmp_path_factory.mktemp("truth")
-    judge_by_truth(trained, explained, data, folder, maps=maps, fills=("reference", "grey"))
-    return folder
+    save_result(judge_by_truth(trained, explained, data, maps=maps, fills=("reference", "grey")), folder)
+    return load_result(folder, Truth, command="sliplens study")
 
 
-def rows_of(folder: Path, frame: str) -> list[dict]:
-    return [row for row in pq.read_table(folder / "effects.parquet").to_pylist() if row["frame_id"] == frame]
+def rows_of(truth: Truth, frame: str) -> list[dict]:
+    return truth.effects.groups("frame_id")[frame,].table().to_pylist()
 
 
 def test_effects_are_what_putting_one_marker_back_changes(trained, explained, data, judged):
@@ -138,48 +141,44 @@ def test_effects_are_what_putting_one_marker_back_changes(trained, explained, da
             drawn = draw_with_markers_back(film, frame.number, back).numpy()
             changed = trained.predict(trained.encode(drawn, frame.reference))[0]
             # float32 sums of 37,632 terms, in another order
-            assert row["network_effect"] == pytest.approx(float(whole - changed), abs=1e-6)
+            assert row["network"] == pytest.approx(float(whole - changed), abs=1e-6)
             # one pixel of the network is two of the camera
             x, y = film.marker_px[frame.number, row["marker"]]
             assert (row["x_px"], row["y_px"]) == pytest.approx(((x + 0.5) / 2 - 0.5, (y + 0.5) / 2 - 0.5))
             assert row["state"] == frame.contact_map[round(y), round(x)]
-        np.testing.assert_array_equal(
-            [row["margin_effect"] for row in rows], marker_readings(frame.scene, frame.number)[1]
-        )
+        np.testing.assert_array_equal([row["margin"] for row in rows], marker_readings(frame.scene, frame.number)[1])
 
 
 def test_maps_show_the_effects_on_the_markers(judged, explained):
-    with np.load(judged / "maps.npz") as archive:
-        painted = dict(archive)
+    painted = {"network": judged.network_maps, "margin": judged.margin_maps}
     for index, frame in enumerate(explained.frames):
         for name in ("network", "margin"):
             assert painted[name].shape == (len(LEVELS), SIZE, SIZE)
             assert painted[name].dtype == np.float32
-            values = {np.float32(row[f"{name}_effect"]) for row in rows_of(judged, frame.id)}
+            values = {np.float32(row[name]) for row in rows_of(judged, frame.id)}
             assert set(painted[name][index].ravel()) <= values | {np.float32(0)}
             for row in rows_of(judged, frame.id):
                 # where the marker is, the map has its effect
                 x, y = round(row["x_px"]), round(row["y_px"])
-                assert painted[name][index, y, x] == np.float32(row[f"{name}_effect"])
+                assert painted[name][index, y, x] == np.float32(row[name])
 
 
 def test_the_oracle_is_right_and_chance_knows_nothing(judged, explained):
-    result = json.loads((judged / "result.json").read_text())
-    assert result["frames"] == len(explained.frames)
-    methods = result["methods"]
+    assert judged.frames == len(explained.frames)
+    methods = judged.methods
     assert set(methods) == {"attribution", "edges", "input", "centre", "random", "oracle", "degraded-oracle"}
-    assert methods["oracle"]["spearman_network"] == pytest.approx(1)
-    assert methods["oracle"]["mass"]["markers"] == pytest.approx(1)
-    assert 0 < methods["degraded-oracle"]["spearman_network"] < 1
+    assert methods["oracle"].spearman_network == pytest.approx(1)
+    assert methods["oracle"].mass["markers"] == pytest.approx(1)
+    assert 0 < methods["degraded-oracle"].spearman_network < 1
     # exact for a linear network, but for rounding to grey levels and for what of a marker lies beyond its rim
-    assert methods["attribution"]["spearman_network"] > 0.9
+    assert methods["attribution"].spearman_network > 0.9
     for measure in ("mass", "rank"):
         # of 12,544 pixels a frame: 2 % is four deviations of a share; where nothing slips, nothing is to be found
         for area in ("markers", "edges", "slip_annulus"):
-            assert methods["random"][measure][area] == pytest.approx(result["areas"][area], abs=0.02)
+            assert getattr(methods["random"], measure)[area] == pytest.approx(judged.areas[area], abs=0.02)
     # the effects on the reading, as the oracle ranks them: what the network does against what it should
-    assert methods["oracle"]["spearman_margin"] == pytest.approx(result["network_against_margin"]["estimate"])
-    assert result["intervals"]["oracle"]["spearman_network"]["units"] == 1
+    assert methods["oracle"].spearman_margin == pytest.approx(judged.network_against_margin.estimate)
+    assert methods["oracle"].network.units == 1
 
 
 def test_markers_areas_and_rims_are_where_they_are(trained, explained, data):
@@ -197,41 +196,39 @@ def test_markers_areas_and_rims_are_where_they_are(trained, explained, data):
 
 
 def test_the_meta_test_tells_fills_apart(judged):
-    meta = {row["fill"]: row for row in json.loads((judged / "result.json").read_text())["meta"]}
+    meta = {test.fill: test for test in judged.meta}
     assert set(meta) == {"reference", "grey", "true"}
-    for row in meta.values():
-        for one in (row, row["by_size"]):
-            assert one["random"] == 0
-            assert one["holds"] == (one["oracle"] > one["degraded"] > 0)
-            assert one["gap"]["estimate"] == pytest.approx(one["oracle"] - one["degraded"])
+    for test in meta.values():
+        for one in (test, test.by_size):
+            assert one.random == 0
+            assert one.holds == (one.oracle > one.degraded > 0)
+            assert one.gap is not None
+            assert one.gap.estimate == pytest.approx(one.oracle - one.degraded)
     # each marker of this network counts for itself and all one way: the oracle's order is the best there is
-    assert meta["true"]["holds"]
-    assert meta["true"]["gap"]["low"] > 0
+    assert meta["true"].holds
+    assert meta["true"].gap.low > 0
     # and what is put back moves the answer towards the target only, so that the sign tells nothing more
-    assert meta["true"]["by_size"]["oracle"] == pytest.approx(meta["true"]["oracle"], abs=1e-6)
+    assert meta["true"].by_size.oracle == pytest.approx(meta["true"].oracle, abs=1e-6)
 
 
 def test_an_interrupted_judgement_goes_on_after_the_last_frame(
-    given: tuple[TrainedModel, Explained, Dataset], maps: dict[str, np.ndarray], judged: Path, tmp_path: Path
+    given: tuple[TrainedModel, Explained, Dataset], maps: dict[str, np.ndarray], judged: Truth, tmp_path: Path
 ):
     def interrupt(done: int, total: int) -> None:
         assert total == len(LEVELS)
         raise KeyboardInterrupt
 
-    judge = partial(judge_by_truth, *given, tmp_path, maps=maps, fills=("reference", "grey"))
+    judge = partial(judge_by_truth, *given, parts=tmp_path, maps=maps, fills=("reference", "grey"))
     with pytest.raises(KeyboardInterrupt):
-        judge(on_frame=interrupt)
-    first = tmp_path / "parts" / "00000.npz"
+        judge(on_progress=interrupt)
+    first = tmp_path / "00000" / "arrays.npz"
     before = first.stat().st_mtime_ns
     kept = []
-    judge(on_frame=lambda *_: kept.append(first.stat().st_mtime_ns))
+    again = judge(on_progress=lambda *_: kept.append(first.stat().st_mtime_ns))
     assert kept == [before] * len(LEVELS)
-    assert not (tmp_path / "parts").exists()
-    ours, theirs = (json.loads((folder / "result.json").read_text()) for folder in (tmp_path, judged))
-    assert ours["methods"].keys() == theirs["methods"].keys()
-    for one, other in zip(ours["meta"], theirs["meta"], strict=True):
-        for name in ("oracle", "degraded"):
-            assert one[name] == pytest.approx(other[name], abs=1e-6)
+    assert again.methods.keys() == judged.methods.keys()
+    for one, other in zip(again.meta, judged.meta, strict=True):
+        assert (one.oracle, one.degraded) == pytest.approx((other.oracle, other.degraded), abs=1e-6)
 
 
 def test_curves_under_the_true_fill_know_the_oracle(trained, explained, data, maps, judged):
@@ -239,9 +236,8 @@ def test_curves_under_the_true_fill_know_the_oracle(trained, explained, data, ma
     places = [find_places(frame, image_size=SIZE) for frame in frames]
     oracle = np.stack(
         [
-            np.sign(told.prediction - told.reference_prediction)
-            * one.paint(np.array([row["network_effect"] for row in rows_of(judged, told.id)]))
-            for one, told in zip(places, explained.frames, strict=True)
+            sign * one.paint(np.array([row["network"] for row in rows_of(judged, frame.id)]))
+            for sign, one, frame in zip(explained.towards, places, explained.frames, strict=True)
         ]
     )
     rng = np.random.default_rng(0)
@@ -257,7 +253,7 @@ def test_curves_under_the_true_fill_know_the_oracle(trained, explained, data, ma
 def test_redrawn_inputs_are_those_that_were_explained(trained, explained, data):
     frames = stage_frames(trained, explained, data)
     redraw = redrawing(trained, frames)
-    inputs = trained.encoding.normalise(explained.images)
+    inputs = network_inputs(trained, explained)
     for index, frame in enumerate(frames):
         nobody = np.zeros((2, len(frame.markers)), dtype=bool)
         assert torch.equal(redraw(index, nobody), inputs[index : index + 1].expand(2, -1, -1, -1))
@@ -272,11 +268,11 @@ def test_half_of_the_effects_are_shuffled(rng):
     assert 14 <= len(moved) <= 20
 
 
-def test_frames_of_other_data_are_refused(given, maps, small_dataset, tmp_path):
+def test_frames_of_other_data_are_refused(given, maps, small_dataset):
     trained, explained, data = given
 
     def judge(explained: Explained, data: Dataset = data) -> None:
-        judge_by_truth(trained, explained, data, tmp_path, maps=maps)
+        judge_by_truth(trained, explained, data, maps=maps)
 
     with pytest.raises(InputError, match="was recorded: what each marker does is known of simulated frames alone"):
         judge(explained, replace(data, simulated=False))
@@ -289,4 +285,4 @@ def test_frames_of_other_data_are_refused(given, maps, small_dataset, tmp_path):
     with pytest.raises(CheckpointError, match="made with another network"):
         judge(replace(explained, weights_sha256="of others"))
     with pytest.raises(InputError, match="no fill named 'pink'"):
-        judge_by_truth(trained, explained, data, tmp_path, maps=maps, fills=("pink",))
+        judge_by_truth(trained, explained, data, maps=maps, fills=("pink",))

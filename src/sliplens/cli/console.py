@@ -61,37 +61,6 @@ def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-class Bar:
-    """One of several progress bars that are shown at the same time; there while it is begun."""
-
-    def __init__(self, progress: Progress) -> None:
-        self._progress = progress
-        self._task: TaskID | None = None
-
-    def begin(self, title: str) -> None:
-        """Show it, from nothing."""
-        self.finish()
-        self._task = self._progress.add_task(title, total=None)
-
-    def count(self, done: int, total: int) -> None:
-        """Show how many are done, and how many there are."""
-        if self._task is not None:
-            self._progress.update(self._task, completed=done, total=total)
-
-    def finish(self) -> None:
-        """Take it away."""
-        if self._task is not None:
-            self._progress.remove_task(self._task)
-            self._task = None
-
-
-@contextmanager
-def progress_bars() -> Iterator[Callable[[], Bar]]:
-    """Show progress bars under each other; yields what makes one more."""
-    with _progress() as progress:
-        yield lambda: Bar(progress)
-
-
 def _progress() -> Progress:
     return Progress(
         TextColumn("{task.description}"),

@@ -1,5 +1,6 @@
 """`sliplens explain`."""
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sliplens.cli.console import print_table, progress_bar, say, unchanged, wrote
+from sliplens.codec import save_result
 from sliplens.errors import InputError
 from sliplens.extras import require_device
-from sliplens.files import output_folder, read_json
+from sliplens.files import output_folder
 
 if TYPE_CHECKING:
     from sliplens.explainers import Explainer
@@ -27,7 +29,7 @@ class Explain:
     """Show which parts of a frame made the network answer as it did, rather than as for the untouched sensor.
 
     Explains frames of a data set along the safety margin, or a folder of images (`--frames`). The folder holds the maps
-    without loss (maps.npz), an overlay of each (overlays/METHOD/FRAME.png) and all of them side by side (panel.png).
+    without loss (arrays.npz), an overlay of each (overlays/METHOD/FRAME.png) and all of them side by side (panel.png).
     """
 
     model: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="RUN")] = None
@@ -102,11 +104,18 @@ class Explain:
                 f"Explaining {len(chosen.ids)} frames ({trained.manifest.input}, {chosen.source})"
             ) as bar:
                 explained = explain_frames(
-                    trained, chosen, out.folder, methods=self.method, explainers=explainers, on_map=bar
+                    trained,
+                    chosen,
+                    methods=self.method,
+                    explainers=explainers,
+                    parts=out.folder / "parts",
+                    on_progress=bar,
                 )
-            self._draw(explained, trained, out.folder)
-        for name, notes in read_json(self.output / "result.json")["methods"].items():
-            for warning in notes["warnings"]:
+            shutil.rmtree(out.folder / "parts")
+            self._draw(explained, out.folder)
+            save_result(explained, out.folder)
+        for name, notes in explained.methods.items():
+            for warning in notes.warnings:
                 say(f"  note, {name}: {warning}")
         wrote(self.output, f"{len(self.method)} maps of each of {len(chosen.ids)} frames, panel.png")
 
@@ -149,7 +158,7 @@ class Explain:
             )
         return [Occlusion(markers_px=one) for one in places]
 
-    def _draw(self, explained: "Explained", trained: "TrainedModel", folder: Path) -> None:
+    def _draw(self, explained: "Explained", folder: Path) -> None:
         import numpy as np
 
         from sliplens.images import write_png
@@ -157,13 +166,13 @@ class Explain:
         from sliplens.plots.style import drawing_style, method_name, percent
 
         lay = overlay_jet if self.colours == "jet" else lambda one, two: overlay_saliency(one, stretch_saliency(two))
-        inputs = 255 * trained.encoding.normalise(explained.images)
-        pictures = list(inputs.round().byte().permute(0, 2, 3, 1).contiguous().numpy())
-        rows = {"Input": pictures}
+        rows = {"Input": list(explained.pictures)}
         for method in self.method:
             (overlays := folder / "overlays" / method).mkdir(parents=True, exist_ok=True)
             row = rows[method_name(method)] = []
-            for frame, picture, saliency in zip(explained.frames, pictures, explained.saliency[method], strict=True):
+            for frame, picture, saliency in zip(
+                explained.frames, explained.pictures, explained.saliency[method], strict=True
+            ):
                 # a map that holds NaN is named in the notes, and is not shown
                 row.append(lay(picture, saliency) if np.isfinite(saliency).all() else None)
                 if row[-1] is not None:

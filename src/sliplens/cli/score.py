@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from sliplens.cli.console import print_table, progress_bar, say, unchanged, wrote
+from sliplens.codec import ARRAYS_FILE, save_result
 from sliplens.extras import require_device
 from sliplens.files import hash_file, output_folder
 
@@ -50,7 +51,7 @@ class Score:
         require_same_network(trained, explained)
         recipe = {
             "weights_sha256": trained.manifest.weights_sha256,
-            "maps_sha256": hash_file(self.explanations / "maps.npz"),
+            "maps_sha256": hash_file(self.explanations / ARRAYS_FILE),
             "input": explained.input,
             "source": explained.source,
             "fill": self.fill,
@@ -65,12 +66,12 @@ class Score:
                 result = score_explanations(
                     trained,
                     explained,
-                    out.folder,
                     fill=self.fill,
                     steps=self.steps,
                     seed=self.seed,
-                    on_curve=bar,
+                    on_progress=bar,
                 )
+            save_result(result, out.folder)
         print_table(
             f"deletion score, {explained.input} images ({explained.source}), fill {self.fill}: lower is more faithful",
             ("method", "D_AUC", "+-", "last step", "frames"),

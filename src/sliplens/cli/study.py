@@ -1,24 +1,17 @@
 """`sliplens study`."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
+from sliplens.cli.console import Terminal
 from sliplens.cli.evaluate import Evaluate
 from sliplens.cli.report import Report
-from sliplens.cli.screen import Screen, Terminal
 from sliplens.cli.simulate import Simulate
-from sliplens.cli.together import run_together
 from sliplens.errors import InputError
 from sliplens.extras import require_device
-
-if TYPE_CHECKING:
-    from sliplens.cli.study_stages import Stages
-    from sliplens.models import TrainedModel
 
 _PRESET_FRAMES = 80
 """Frames of each simulated trial; the thesis has about 800, which takes ten times as long and says the same."""
@@ -73,103 +66,46 @@ class Study:
     def run(self) -> None:
         """Run every stage that is not there yet, and draw the report."""
         from sliplens.study.material import STUDY_METHODS, study_explainers
+        from sliplens.study.run import load_network, run_study
 
         if (self.data is None) == (self.preset is None):
             raise InputError("name a data set, or --preset thesis to simulate one")
-        if self.jobs is not None and self.jobs < 1:
-            raise InputError(f"--jobs must be at least 1, got {self.jobs}")
-        if self.random_orders < 1:
-            raise InputError(f"--random-orders must be at least 1, got {self.random_orders}")
         require_device(self.device)
-        study_explainers(self.method or STUDY_METHODS, budget=self.budget)  # a mistake is told before all else
-        networks = self._load_networks()
-        folder = self.data or self._simulate()
-        for name, model in self._named().items():
-            Evaluate(
-                model=model,
-                data=folder,
-                output=self.output / f"evaluate-{name}",
-                device=self.device,
-                overwrite=self.overwrite,
-            ).run()
-        stages = self.stages(folder, networks)
-        stages.choose(
+        given = {name: run for name, run in (("difference", self.difference), ("raw", self.raw)) if run != _NONE}
+        # a mistake is told before a data set is simulated
+        networks = {name: load_network(run, name, device=self.device) for name, run in given.items()}
+        study_explainers(methods := self.method or STUDY_METHODS, budget=self.budget)
+        data = self.data or self._simulate()
+        run_study(
+            data,
+            difference=networks.get("difference"),
+            raw=networks.get("raw"),
+            out=self.output,
+            methods=methods,
             split=self.split or ("train" if self.preset else "test"),
             condition=self.condition,
             trials=self.trials,
             tolerance=self.tolerance,
-        )
-        threads = self._threads(len(networks))
-        if threads is None:
-            for name in networks:
-                stages.judge(name)
-        else:
-            run_together(partial(_judge, self, folder), list(networks), threads=threads)
-        for name in networks:
-            stages.time(name)
-        Report(workspace=self.output).run()
-
-    def stages(self, folder: Path, networks: "Mapping[str, TrainedModel]", screen: Screen | None = None) -> "Stages":
-        """The stages of this study on a data set, with some of its networks."""
-        from sliplens.cli.study_stages import Stages
-        from sliplens.recordings import Dataset
-        from sliplens.study.material import STUDY_METHODS, method_options, study_explainers
-
-        explainers = study_explainers(self.method or STUDY_METHODS, budget=self.budget)
-        return Stages(
-            output=self.output,
-            data=Dataset.open(folder),
-            networks=networks,
-            explainers=explainers,
-            settings={"methods": method_options(explainers), "seed": self.seed},
+            budget=self.budget,
             random_orders=self.random_orders,
+            device=self.device,
+            jobs=self.jobs,
             seed=self.seed,
             overwrite=self.overwrite,
-            screen=screen or Terminal(),
+            on_progress=Terminal(),
         )
-
-    def load_network(self, name: str) -> "TrainedModel":
-        """One of the networks, by its input.
-
-        Raises
-        ------
-        InputError
-            If it was trained on another input.
-        """
-        from sliplens.models.checkpoint import load
-
-        trained = load(self._named()[name], device=self.device)
-        if trained.manifest.input != name:
-            raise InputError(
-                f"--{name} names a network on {trained.manifest.input} images; give one that was trained on {name}"
-            )
-        return trained
-
-    def _threads(self, networks: int) -> int | None:
-        """Threads of each network's process, or None to judge them one after the other in this one."""
-        import torch
-
-        jobs = self.jobs if self.jobs is not None else (networks if self.device == "cpu" else 1)
-        cores = torch.get_num_threads()
-        return None if min(jobs, networks, cores) < 2 else cores // networks
+        for name, run in given.items():
+            Evaluate(
+                model=Path(run),
+                data=data,
+                output=self.output / f"evaluate-{name}",
+                device=self.device,
+                overwrite=self.overwrite,
+            ).run()
+        Report(workspace=self.output).run()
 
     def _simulate(self) -> Path:
         folder = self.output / "data"
         assert self.preset is not None  # one of the two is given
         Simulate(output=folder, preset=self.preset, frames_per_trial=_PRESET_FRAMES, overwrite=self.overwrite).run()
         return folder
-
-    def _named(self) -> dict[str, Path]:
-        return {
-            name: Path(given) for name, given in (("difference", self.difference), ("raw", self.raw)) if given != _NONE
-        }
-
-    def _load_networks(self) -> "dict[str, TrainedModel]":
-        networks = {name: self.load_network(name) for name in self._named()}
-        if not networks:
-            raise InputError("a study needs a network; leave out --difference none or --raw none")
-        return networks
-
-
-def _judge(study: Study, folder: Path, name: str, screen: Screen) -> None:
-    study.stages(folder, {name: study.load_network(name)}, screen).judge(name)

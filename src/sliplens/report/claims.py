@@ -258,7 +258,7 @@ def _noisiest(looks: MapQuality) -> Answer:
         values = {
             name: value
             for name, found in looks.methods.items()
-            if name not in CONTROLS and (value := found[measure]) is not None
+            if name not in CONTROLS and (value := getattr(found, measure)) is not None
         }
         own = values.pop(_NOISY, None)
         if own is None or not values:

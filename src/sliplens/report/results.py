@@ -1,29 +1,39 @@
 """Load the results that a workspace holds, whatever its folders are called."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from sliplens.codec import load_record, load_result
 from sliplens.errors import InputError
-from sliplens.files import RUN_FILE, Provenance, read_json, require_folder
+from sliplens.files import RUN_FILE, Provenance, require_folder
 from sliplens.recordings.dataset import load_dataset
-from sliplens.report.study.readers import STUDY_READERS, gather_study
 from sliplens.report.workspace import Results
 from sliplens.results.evaluation import Evaluation
-from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
-from sliplens.results.faithfulness import DeletionScores, MethodScore
-from sliplens.results.fields import Fields
-from sliplens.results.files import (
-    read_deletion,
-    read_pictures,
-    read_saliency,
-)
-from sliplens.results.records import Run
-from sliplens.results.simulation import describe_simulation
+from sliplens.results.explanation import Explained, load_explained
+from sliplens.results.faithfulness import DeletionScores, Remedies, RemovalScores
+from sliplens.results.simulation import Simulation, describe_simulation
+from sliplens.results.study import Choice, MapQuality, Randomisation, States, Study, Timing, Truth
 from sliplens.results.training import Training
 
-RESULT_FILE = "result.json"
+_OF_A_STUDY: dict[str, type] = {
+    "choice": Choice,
+    "states": States,
+    "remedies": Remedies,
+    "faithfulness": RemovalScores,
+    "randomisation": Randomisation,
+    "map-quality": MapQuality,
+    "timing": Timing,
+    "truth": Truth,
+}
+RECORDS: dict[str, type] = {
+    "simulate": Simulation,
+    "train": Training,
+    "evaluate": Evaluation,
+    "explain": Explained,
+    "score": DeletionScores,
+    **_OF_A_STUDY,
+}
+"""Record of each stage."""
 
 
 def load_results(workspace: Path) -> Results:
@@ -53,14 +63,15 @@ def load_results(workspace: Path) -> Results:
     for folder, run in runs.items():
         if run.stage == "simulate":
             result = describe_simulation(load_dataset(folder))
+        elif run.stage == "explain":
+            result = load_explained(folder)
         elif run.stage in RECORDS:
-            result = load_result(folder, RECORDS[run.stage], command=f"sliplens {run.stage}")
-        elif run.stage in READERS:
-            own = Run(folder=folder, stage=run.stage)
-            result = READERS[run.stage](own, _read_result(own))
+            command = f"sliplens {'study' if run.stage in _OF_A_STUDY else run.stage}"
+            result = load_result(folder, RECORDS[run.stage], command=command)
         else:
             continue
-        key = (run.stage, getattr(result, "input", ""), getattr(result, "source", ""))
+        name = getattr(result, "input", "")
+        key = (run.stage, name, getattr(result, "source", "") if name else "")
         if key in found:
             kind = " ".join(part for part in key if part)
             notes.append(
@@ -80,77 +91,24 @@ def load_results(workspace: Path) -> Results:
         evaluations={key[1]: value for key, value in found.items() if key[0] == "evaluate"},
         explanations={key[1:]: value for key, value in found.items() if key[0] == "explain"},
         scores={key[1:]: value for key, value in found.items() if key[0] == "score"},
-        study=gather_study(found),
+        study=_gather_study(workspace, found),
         notes=tuple(notes),
     )
 
 
-def _read_object(path: Path, *, command: str) -> Fields:
-    value = read_json(path)
-    if not isinstance(value, dict):
-        raise InputError(f"{path} holds no JSON object; make the folder again with `{command}`")
-    return Fields(values=value, where=str(path), command=command)
-
-
-def _read_result(run: Run) -> Fields:
-    command = "study" if run.stage in STUDY_READERS else run.stage
-    return _read_object(run.folder / RESULT_FILE, command=f"sliplens {command}")
-
-
-def _read_explained(run: Run, fields: Fields) -> Explained:
-    size = fields.integer("image_size")
-    frames = tuple(
-        ExplainedFrame(
-            id=row.text("id"),
-            condition=row.text("condition", default="unknown"),
-            safety_margin=row.optional_number("safety_margin"),
-            prediction=row.number("prediction"),
-            reference_prediction=row.optional_number("reference_prediction"),
+def _gather_study(workspace: Path, found: dict[tuple[str, str, str], Any]) -> Study:
+    by_input = {
+        field: {name: value for (own, name, _), value in found.items() if own == stage}
+        for stage, field in (
+            ("explain", "explanations"),
+            ("score", "deletion"),
+            ("remedies", "remedies"),
+            ("faithfulness", "faithfulness"),
+            ("randomisation", "randomisation"),
+            ("map-quality", "map_quality"),
+            ("timing", "timing"),
+            ("truth", "truth"),
         )
-        for row in fields.rows("frames")
-    )
-    if not frames:
-        raise InputError(f"{fields.where} names no frame; explain some with `{fields.command}`")
-    methods = fields.inner("methods")
-    return Explained(
-        run=run,
-        input=fields.text("input"),
-        source=fields.text("source"),
-        image_size=size,
-        frames=frames,
-        methods={
-            name: MethodNotes(
-                seconds_per_frame=inner.optional_number("seconds_per_frame"), warnings=inner.texts("warnings")
-            )
-            for name, inner in methods.items()
-        },
-        pictures=read_pictures(run.folder / "frames", frames, size=size, command=fields.command),
-        saliency=read_saliency(
-            run.folder / "maps.npz", tuple(methods), (len(frames), size, size), command=fields.command
-        ),
-    )
-
-
-def _read_scored(run: Run, fields: Fields) -> DeletionScores:
-    return DeletionScores(
-        run=run,
-        input=fields.text("input"),
-        source=fields.text("source"),
-        fill=fields.text("fill"),
-        methods={
-            name: MethodScore(
-                mean=inner.number("mean"),
-                sd=inner.number("sd"),
-                last_step_mean=inner.optional_number("last_step_mean"),
-                frames=inner.integer("frames"),
-            )
-            for name, inner in fields.inner("methods").items()
-        },
-        alarms=fields.texts("alarms"),
-        curves=read_deletion(run.folder / "deletion.parquet", command=fields.command),
-    )
-
-
-RECORDS: dict[str, type] = {"train": Training, "evaluate": Evaluation}
-"""Record of each stage."""
-READERS: dict[str, Callable[[Run, Fields], Any]] = {"explain": _read_explained, "score": _read_scored, **STUDY_READERS}
+    }
+    choice, states = (found.get((stage, "", "")) for stage in ("choice", "states"))
+    return Study(folder=workspace, choice=choice, states=states, **by_input)  # pyright: ignore[reportArgumentType]

@@ -68,7 +68,7 @@ def plate_contact_states(states: States) -> Plate | None:
     mappable = None
     with drawing_style():
         for column, frame in enumerate(chosen):
-            _bare(plot_arrows(frame.raw, frame.rest_px, frame.position_px - frame.rest_px, ax=grid.axes[0][column]))
+            _bare(plot_arrows(frame.raw, frame.rest_px, frame.now_px - frame.rest_px, ax=grid.axes[0][column]))
             field = fields[frame.id]
             if field is not None:
                 grid.axes[1][column].clear()
@@ -136,7 +136,7 @@ def _one_a_state(states: States) -> list[StateFrame]:
 def _field(frame: StateFrame) -> DisplacementField | None:
     try:
         return interpolate_field(
-            frame.rest_px, frame.position_px - frame.rest_px, size=(frame.raw.shape[0], frame.raw.shape[1])
+            frame.rest_px, frame.now_px - frame.rest_px, size=(frame.raw.shape[0], frame.raw.shape[1])
         )
     except InputError:
         return None  # too few markers were followed into this frame
@@ -173,7 +173,7 @@ def _tell_motion(frame: StateFrame, field: DisplacementField | None) -> str:
 def _marker_numbers(frames: list[StateFrame]) -> dict[str, np.ndarray]:
     counts = [len(frame.rest_px) for frame in frames]
     rest = np.concatenate([frame.rest_px for frame in frames])
-    now = np.concatenate([frame.position_px for frame in frames])
+    now = np.concatenate([frame.now_px for frame in frames])
     return {
         "frame_id": np.repeat([frame.id for frame in frames], counts),
         "contact_state": np.repeat([frame.contact_state for frame in frames], counts),

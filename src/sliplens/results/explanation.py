@@ -1,41 +1,117 @@
 """Saved explanations: frames, what was answered on them, and a map of each by every method."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float32, Float64, UInt8
 
-from sliplens.results.records import Run
+from sliplens.arrays import require_saliency
+from sliplens.codec import load_result
+from sliplens.errors import InputError
+from sliplens.files import RUN_FILE, read_json, require_folder
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExplainedFrame:
-    """A frame that was explained: label (None if unknown), answer, and the answer on its reference, in margin units."""
+    """Frame that was explained: label (None if unknown), answer, and the answer on its reference, in margin units."""
 
     id: str
+    trial: str
     condition: str
     safety_margin: float | None
     prediction: float
-    reference_prediction: float | None
+    reference_prediction: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class MethodNotes:
     """Cost of a method in seconds a frame, and what it complained about."""
 
-    seconds_per_frame: float | None
+    seconds_per_frame: float
     warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Explained:
-    """Frames, their pictures as the network saw them, and the saliency of each method."""
+    """Explanations of some frames by several methods.
 
-    run: Run
+    Attributes
+    ----------
+    weights_sha256
+        Hash of the network that was explained.
+    images
+        Inputs of the network before normalisation, 8 bits.
+    pictures
+        The normalised inputs, 8 bits, for people to look at.
+    relevance, saliency
+        By method: signed maps in margin units, and the same in [0, 1] for viewing and for ranking pixels.
+    """
+
     input: str
     source: str
-    image_size: int
+    weights_sha256: str
     frames: tuple[ExplainedFrame, ...]
     methods: dict[str, MethodNotes]
-    pictures: UInt8[np.ndarray, "frames height width 3"]
-    saliency: dict[str, Float[np.ndarray, "frames height width"]]
+    images: UInt8[np.ndarray, "frames 3 size size"]
+    pictures: UInt8[np.ndarray, "frames size size 3"]
+    relevance: dict[str, Float32[np.ndarray, "frames size size"]]
+    saliency: dict[str, Float32[np.ndarray, "frames size size"]]
+
+    def __post_init__(self) -> None:
+        """Hold the arrays against the frames that they are of."""
+        if not self.frames:
+            raise ValueError("names no frame")
+        if len(self.images) != len(self.frames):
+            raise ValueError(f"holds {len(self.images)} images of {len(self.frames)} frames")
+        for kind, maps in (("relevance", self.relevance), ("saliency", self.saliency)):
+            absent = [name for name in self.methods if name not in maps]
+            if absent:
+                raise ValueError(f"holds no {kind} of {', '.join(absent)}")
+
+    @property
+    def image_size(self) -> int:
+        """Side of the images, in pixels."""
+        return self.images.shape[-1]
+
+    @property
+    def towards(self) -> Float64[np.ndarray, " frames"]:
+        """Sign of each answer's change from that on the untouched sensor, which the maps explain."""
+        return np.array([np.sign(frame.prediction - frame.reference_prediction) for frame in self.frames])
+
+    def take(self, rows: Sequence[int]) -> "Explained":
+        """Explanations of some of the frames, by their numbers."""
+        chosen = list(rows)
+        return replace(
+            self,
+            frames=tuple(self.frames[row] for row in chosen),
+            images=self.images[chosen],
+            pictures=self.pictures[chosen],
+            relevance={name: maps[chosen] for name, maps in self.relevance.items()},
+            saliency={name: maps[chosen] for name, maps in self.saliency.items()},
+        )
+
+
+def load_explained(folder: Path) -> Explained:
+    """Read a folder that `sliplens explain` wrote.
+
+    Raises
+    ------
+    InputError
+        If the folder or one of its files is missing or damaged, or holds something else.
+    SaliencyError
+        If a map is not finite.
+    """
+    require_folder(folder, what="the explanations")
+    if read_json(folder / RUN_FILE).get("stage") != "explain":
+        raise InputError(f"{folder} holds no explanations; make them with sliplens explain")
+    explained = load_result(folder, Explained, command="sliplens explain")
+    for kind, maps in (("map", explained.relevance), ("saliency", explained.saliency)):
+        for method, stack in maps.items():
+            for frame, values in zip(explained.frames, stack, strict=True):
+                require_saliency(values, values.shape, where=f"the {method} {kind} of {frame.id} in {folder}")
+    return explained
+
+
+__all__ = ["Explained", "ExplainedFrame", "MethodNotes", "load_explained"]

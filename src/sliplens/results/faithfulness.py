@@ -1,13 +1,15 @@
 """Scores of explanations: by deletion as the thesis does, and by removal against controls."""
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float64, Int
+from jaxtyping import Float64, Int, Int64, Shaped
 
+from sliplens.codec import Columns
 from sliplens.intervals import Difference
-from sliplens.results.records import Run
 
 Key = tuple[str, str, str]
 """Fill, unit and method."""
@@ -19,8 +21,20 @@ class MethodScore:
 
     mean: float
     sd: float
-    last_step_mean: float | None
+    last_step_mean: float
     frames: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeletionTable(Columns):
+    """Deletion score D and answer (in margin units) of each frame, method and step."""
+
+    method: Shaped[np.ndarray, " rows"]
+    frame_id: Shaped[np.ndarray, " rows"]
+    step: Int64[np.ndarray, " rows"]
+    pixels_removed: Int64[np.ndarray, " rows"]
+    prediction: Float64[np.ndarray, " rows"]
+    score: Float64[np.ndarray, " rows"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,22 +49,32 @@ class DeletionCurve:
 
 @dataclass(frozen=True, kw_only=True)
 class DeletionScores:
-    """How far the explanations of one network can be believed."""
+    """Deletion score of the thesis of one network's explanations, a random order among the methods."""
 
-    run: Run
     input: str
     source: str
     fill: str
+    steps: int
+    pixels_per_step: int
     methods: dict[str, MethodScore]
     alarms: tuple[str, ...]
-    curves: dict[str, DeletionCurve]
+    table: DeletionTable
+
+    def __post_init__(self) -> None:
+        """Hold the scores against the curves."""
+        _require_curves(self.methods, self.curves)
+
+    @cached_property
+    def curves(self) -> dict[str, DeletionCurve]:
+        """Curves by method, frames sorted by their ids."""
+        return {method: _deletion_curve(rows, method) for (method,), rows in self.table.groups("method").items()}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """A change of the thesis's score: what removed pixels become, which way it goes, where it stops."""
+    """Change of the thesis's score: what removed pixels become, which way it goes, where it stops."""
 
-    told: str
+    summary: str
     fill: str
     mode: Literal["deletion", "insertion"]
     stop: float | None
@@ -59,16 +83,32 @@ class Variant:
 
 
 @dataclass(frozen=True, kw_only=True)
+class VariantTable(DeletionTable):
+    """Deletion or insertion score of each frame, variant, method and step."""
+
+    variant: Shaped[np.ndarray, " rows"]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Remedies:
     """The thesis's own remedies for its score, and insertion."""
 
-    run: Run
     input: str
     source: str
+    steps: int
     variants: dict[str, Variant]
     alarms: tuple[str, ...]
-    curves: dict[tuple[str, str], dict[str, DeletionCurve]]
-    """By variant and method, then by frame: a curve that stops at a saliency has as many steps as it needs."""
+    table: VariantTable
+
+    @cached_property
+    def curves(self) -> dict[tuple[str, str], dict[str, DeletionCurve]]:
+        """Curves by variant and method, then by frame: one that stops at a saliency has as many steps as it needs."""
+        return {
+            (variant, method): {
+                frame: _deletion_curve(own, method) for (frame,), own in rows.groups("frame_id").items()
+            }
+            for (variant, method), rows in self.table.groups("variant", "method").items()
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,17 +172,107 @@ class RemovalCurve:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RemovalScores:
-    """The sound scores of one network's explanations."""
+class RemovalTable(Columns):
+    """Change of the answer (in margin units) of each frame, fill, unit, method and share of the image removed."""
 
-    run: Run
+    fill: Shaped[np.ndarray, " rows"]
+    unit: Shaped[np.ndarray, " rows"]
+    method: Shaped[np.ndarray, " rows"]
+    frame_id: Shaped[np.ndarray, " rows"]
+    trial: Shaped[np.ndarray, " rows"]
+    safety_margin: Float64[np.ndarray, " rows"]
+    area: Float64[np.ndarray, " rows"]
+    most_first: Float64[np.ndarray, " rows"]
+    least_first: Float64[np.ndarray, " rows"]
+    random: Float64[np.ndarray, " rows"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RemovalScores:
+    """Sound scores of one network's explanations: what is lost by removal, against controls."""
+
     input: str
     source: str
     frames: int
     trials: int
     random_orders: int
+    fills: tuple[str, ...]
+    units: tuple[str, ...]
+    areas: tuple[float, ...]
     scores: tuple[RemovalScore, ...]
     comparisons: tuple[Comparison, ...]
     agreement: tuple[Agreement, ...]
     alarms: tuple[str, ...]
-    curves: dict[Key, RemovalCurve]
+    table: RemovalTable
+
+    def __post_init__(self) -> None:
+        """Hold the scores against the curves."""
+        _require_curves([score.key for score in self.scores], self.curves)
+
+    @cached_property
+    def curves(self) -> dict[Key, RemovalCurve]:
+        """Curves by fill, unit and method, frames sorted by their ids."""
+        return {
+            (fill, unit, method): _removal_curve(rows, f"{fill} / {unit} / {method}")
+            for (fill, unit, method), rows in self.table.groups("fill", "unit", "method").items()
+        }
+
+
+def _deletion_curve(rows: DeletionTable, name: str) -> DeletionCurve:
+    ids, _, order = _sort_by_frame(rows.frame_id, rows.step, f"lacks steps of some frames under {name!r}")
+    ordered, shape = rows.where(order), (len(ids), -1)
+    return DeletionCurve(
+        frame_ids=ids,
+        pixels_removed=ordered.pixels_removed.reshape(shape)[0],
+        scores=ordered.score.reshape(shape),
+        predictions=ordered.prediction.reshape(shape),
+    )
+
+
+def _removal_curve(rows: RemovalTable, name: str) -> RemovalCurve:
+    ids, areas, order = _sort_by_frame(rows.frame_id, rows.area, f"lacks areas of some frames under {name}")
+    ordered, shape = rows.where(order), (len(ids), -1)
+    return RemovalCurve(
+        frame_ids=ids,
+        trials=ordered.trial.reshape(shape)[:, 0],
+        areas=areas,
+        most_first=ordered.most_first.reshape(shape),
+        least_first=ordered.least_first.reshape(shape),
+        random=ordered.random.reshape(shape),
+    )
+
+
+def _sort_by_frame(
+    frame_id: np.ndarray, step: np.ndarray, complaint: str
+) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    """Frames, steps, and the rows sorted by both, each pair of which must be there once."""
+    ids, frame_at = np.unique(frame_id, return_inverse=True)
+    steps, step_at = np.unique(step, return_inverse=True)
+    cells = frame_at * len(steps) + step_at
+    if len(cells) != len(ids) * len(steps) or len(np.unique(cells)) != len(cells):
+        raise ValueError(complaint)
+    return tuple(ids.tolist()), steps, np.argsort(cells)
+
+
+def _require_curves(names: Iterable[str | Key], curves: Mapping[Any, object]) -> None:
+    for name in names:
+        if name not in curves:
+            raise ValueError(f"lacks the curves of {name if isinstance(name, str) else ' / '.join(name)}")
+
+
+__all__ = [
+    "Agreement",
+    "Comparison",
+    "DeletionCurve",
+    "DeletionScores",
+    "DeletionTable",
+    "Key",
+    "MethodScore",
+    "Remedies",
+    "RemovalCurve",
+    "RemovalScore",
+    "RemovalScores",
+    "RemovalTable",
+    "Variant",
+    "VariantTable",
+]

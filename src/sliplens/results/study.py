@@ -1,13 +1,18 @@
 """Stages of a study: what was chosen, what the camera saw, and how the explanations were tested."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
-from jaxtyping import Float, Float64, Int, UInt8
+from jaxtyping import Float32, Float64, Int64, Shaped, UInt8
 
+from sliplens.codec import Columns
 from sliplens.intervals import Difference
-from sliplens.results.faithfulness import Remedies, RemovalScores
-from sliplens.results.records import Run
+from sliplens.results.explanation import Explained
+from sliplens.results.faithfulness import DeletionScores, Remedies, RemovalScores
 
 REGIONS = ("markers", "slip_annulus", "edges")
 """Areas in which a map may lie."""
@@ -17,16 +22,17 @@ MAP_MEASURES = ("resolution", "total_variation", "gini", "noise_stability", "fra
 
 @dataclass(frozen=True, kw_only=True)
 class ChosenTrial:
-    """A trial of the study: whether every answer lay within the tolerance, and each network's worst error."""
+    """Trial of a study: whether every answer lay within the tolerance, and each network's worst error."""
 
     trial: str
     qualified: bool
     worst_error: dict[str, float]
+    """Largest error over the chosen frames in margin units, by input."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ChosenFrame:
-    """A frame of the study and what it is for; the level is the margin that was looked for."""
+    """Frame of a study and what it is for; the level is the margin that was looked for."""
 
     id: str
     trial: str
@@ -34,66 +40,156 @@ class ChosenFrame:
     level: float
     safety_margin: float
     scored: bool
+    """Whether it counts in the scores."""
     shown: bool
+    """Whether the panels show it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """Which trials and frames were taken, and how many could have been."""
+    """Trials and frames of a study, and how they came to be chosen."""
 
-    run: Run
     trials_wanted: int
     tolerance: float
     considered: int
+    """Trials that have a frame near every level."""
     qualified: int
-    told: str
+    summary: str
+    """What was done, in a sentence or two."""
     source: str
     condition: str
     inputs: tuple[str, ...]
+    levels: tuple[float, ...]
+    scored_levels: tuple[float, ...]
     trials: tuple[ChosenTrial, ...]
     frames: tuple[ChosenFrame, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
-class StateFrame:
-    """A frame with its markers, in camera pixels: at rest, and now (NaN where one was not followed)."""
+class MarkerTable(Columns):
+    """Markers of each frame in camera pixels: at rest, and now (NaN where one was not followed)."""
+
+    frame_id: Shaped[np.ndarray, " rows"]
+    marker: Int64[np.ndarray, " rows"]
+    rest_x_px: Float64[np.ndarray, " rows"]
+    rest_y_px: Float64[np.ndarray, " rows"]
+    x_px: Float64[np.ndarray, " rows"]
+    y_px: Float64[np.ndarray, " rows"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkedFrame:
+    """Places of a frame's markers in camera pixels, x and y; NaN for one that was not followed."""
+
+    rest_px: Float64[np.ndarray, "markers 2"]
+    now_px: Float64[np.ndarray, "markers 2"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShownFrame:
+    """Frame of the trial that is shown, its contact state in words."""
 
     id: str
     level: float
     safety_margin: float
     contact_state: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class StateFrame(ShownFrame, MarkedFrame):
+    """The same with its picture, its absolute difference from the untouched sensor, and its markers."""
+
     raw: UInt8[np.ndarray, "height width 3"]
     difference: UInt8[np.ndarray, "height width 3"]
-    rest_px: Float64[np.ndarray, "markers 2"]
-    position_px: Float64[np.ndarray, "markers 2"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class States:
-    """One trial from full stick to full slip; `untracked` says of which trials the markers could not be followed."""
+    """Trial from full stick to full slip as the camera saw it, and the markers of all chosen frames.
 
-    run: Run
+    Attributes
+    ----------
+    markers_from
+        "simulation", or "tracking".
+    untracked
+        Trials in which the markers could not be followed, and why.
+    raw, difference
+        Pictures of `shown`, and their absolute differences from the untouched sensor.
+    table
+        Markers of every chosen frame in which they are known.
+    """
+
     trial: str
     markers_from: str
+    shown: tuple[ShownFrame, ...]
     untracked: tuple[str, ...]
-    frames: tuple[StateFrame, ...]
+    raw: UInt8[np.ndarray, "frames height width 3"]
+    difference: UInt8[np.ndarray, "frames height width 3"]
+    table: MarkerTable
+
+    def __post_init__(self) -> None:
+        """Hold the pictures against the frames."""
+        if not self.shown:
+            raise ValueError("names no frame")
+        if not len(self.shown) == len(self.raw) == len(self.difference):
+            raise ValueError(f"holds {len(self.raw)} and {len(self.difference)} pictures of {len(self.shown)} frames")
+
+    @cached_property
+    def frames(self) -> tuple[StateFrame, ...]:
+        """The frames that are shown, with their pictures and markers."""
+        none = MarkedFrame(rest_px=np.empty((0, 2)), now_px=np.empty((0, 2)))
+        return tuple(
+            StateFrame(**vars(shown), **vars(self.markers.get(shown.id, none)), raw=raw, difference=difference)
+            for shown, raw, difference in zip(self.shown, self.raw, self.difference, strict=True)
+        )
+
+    @cached_property
+    def markers(self) -> dict[str, MarkedFrame]:
+        """Markers by frame, in the order of their numbers; frames in which none could be followed are absent."""
+        return {
+            frame: MarkedFrame(
+                rest_px=np.stack([rows.rest_x_px, rows.rest_y_px], axis=1),
+                now_px=np.stack([rows.x_px, rows.y_px], axis=1),
+            )
+            for (frame,), unsorted in self.table.groups("frame_id").items()
+            for rows in [unsorted.where(np.argsort(unsorted.marker, kind="stable"))]
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class UntrainedMaps:
+    """Maps of a network whose weights were drawn anew: a control that every map has to beat.
+
+    Attributes
+    ----------
+    maps
+        Part of the relevance that works towards that network's own target, in margin units.
+    """
+
+    input: str
+    source: str
+    maps: Float64[np.ndarray, "frames size size"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomisedMethod:
-    """How a method's maps change as layers get new weights; None where the maps cannot be compared."""
+    """Change of a method's maps as layers get new weights; None where the maps cannot be compared."""
 
     layers: tuple[int, ...]
     similarity: tuple[float | None, ...]
     complexity_rise: float | None
     smooth_complexity_rise: float | None
 
+    def __post_init__(self) -> None:
+        """Hold the layers against the similarities."""
+        if len(self.layers) != len(self.similarity):
+            raise ValueError(f"has {len(self.layers)} layers but {len(self.similarity)} similarities")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Randomisation:
     """Whether explanations notice that the network's weights were drawn anew."""
 
-    run: Run
     input: str
     source: str
     frames: int
@@ -102,16 +198,49 @@ class Randomisation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MapQuality:
-    """What the eye judges of maps, as means over frames, by method and measure (`LOOKS`); None where undefined."""
+class MapMeasures:
+    """What the eye judges of a method's maps, as means over frames; None where undefined."""
 
-    run: Run
+    resolution: float | None
+    total_variation: float | None
+    gini: float | None
+    noise_stability: float | None
+    frame_stability: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Roughness:
+    """Total variation of the first method's maps less that of the second's."""
+
+    first: str
+    second: str
+    gap: Difference
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapQuality:
+    """What the eye judges of maps, by method.
+
+    Attributes
+    ----------
+    repeated_frames
+        Frames that were explained again for the stability.
+    noise_sd
+        Camera noise that was added for it, in grey levels.
+    """
+
     input: str
     source: str
     frames: int
-    methods: dict[str, dict[str, float | None]]
-    rougher: dict[tuple[str, str], Difference]
-    """Total variation of the first method's maps less that of the second's; empty where it was not compared."""
+    repeated_frames: int
+    noise_sd: float
+    methods: dict[str, MapMeasures]
+    comparisons: tuple[Roughness, ...]
+
+    @property
+    def rougher(self) -> dict[tuple[str, str], Difference]:
+        """Differences of the total variation by the two methods compared."""
+        return {(one.first, one.second): one.gap for one in self.comparisons}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,29 +248,38 @@ class MethodTime:
     """Seconds a frame: median with the forward pass and without it, and the range of the repeats."""
 
     seconds: float
-    seconds_without_forward: float | None
-    low: float | None
-    high: float | None
+    seconds_without_forward: float
+    low: float
+    high: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """What explanations cost on one machine."""
+    """Cost of explanations on one machine."""
 
-    run: Run
     input: str
     source: str
     device: str
-    threads: int | None
+    threads: int
     repeats: int
-    forward_seconds: float | None
+    forward_seconds: float
     methods: dict[str, MethodTime]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Localisation:
-    """Where a method's relevance lies (share of its mass, share of its strongest pixels, by `REGIONS`), and how well it
-    ranks the markers as the network's answer and the true margin do.
+    """Where a method's relevance lies, and how well it ranks the markers as the network and the true margin do.
+
+    Attributes
+    ----------
+    mass, rank
+        Share of the relevance, and of its strongest pixels, by `REGIONS`.
+    spearman_network, spearman_margin
+        Mean rank correlation, marker by marker, with the effects on the answer and on the true margin.
+    network, margin
+        The two with their intervals.
+    edges
+        Mass on the edges of markers less the share of the image that they cover.
     """
 
     mass: dict[str, float | None]
@@ -149,43 +287,69 @@ class Localisation:
     spearman_network: float | None
     spearman_margin: float | None
     network: Difference | None
-    """Interval of `spearman_network`."""
     margin: Difference | None
-    """Interval of `spearman_margin`."""
     edges: Difference | None
-    """Mass on the edges of markers less the share of the image that they cover."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class MetaTest:
-    """Whether a score ranks a perfect map above a damaged one above chance, under one fill."""
+class OracleTest:
+    """Whether a gain ranks a perfect map above a damaged one, and that above chance."""
 
-    fill: str
     holds: bool
     oracle: float
     degraded: float
     random: float
+    gap: Difference | None
+    """Gain of the perfect map less that of the damaged one."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class MarkerEffects:
-    """What putting one marker back does to the network's answer and to the true margin, a row a marker and frame."""
+class MetaTest(OracleTest):
+    """The test of a gain under one fill, counted along the answer's change and by the size of changes."""
 
-    frame_id: np.ndarray
-    trial: np.ndarray
-    marker: Int[np.ndarray, " rows"]
+    fill: str
+    by_size: OracleTest
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkerEffects(Columns):
+    """What putting one marker back does to the network's answer and to the true margin, a row a marker and frame.
+
+    Attributes
+    ----------
+    x_px, y_px
+        Place in pixels of the network's input.
+    network, margin
+        Answer and best reading as they are less those with the marker put back, in margin units.
+    state
+        Slips (1), sticks (2), or lies outside of the contact (0).
+    """
+
+    frame_id: Shaped[np.ndarray, " rows"]
+    trial: Shaped[np.ndarray, " rows"]
+    safety_margin: Float64[np.ndarray, " rows"]
+    marker: Int64[np.ndarray, " rows"]
     x_px: Float64[np.ndarray, " rows"]
     y_px: Float64[np.ndarray, " rows"]
     network: Float64[np.ndarray, " rows"]
     margin: Float64[np.ndarray, " rows"]
-    state: Int[np.ndarray, " rows"]
+    state: Int64[np.ndarray, " rows"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Truth:
-    """What a network should have looked at, which only a simulation tells."""
+    """What a network should have looked at, which only a simulation tells.
 
-    run: Run
+    Attributes
+    ----------
+    areas
+        Share of the image that each of `REGIONS` covers, None where no frame has it.
+    network_against_margin
+        Rank correlation of the effects on the answer with those on the best reading of the margin.
+    network_maps, margin_maps
+        `effects` painted on the markers, a map a frame.
+    """
+
     input: str
     source: str
     frames: int
@@ -193,19 +357,45 @@ class Truth:
     methods: dict[str, Localisation]
     network_against_margin: Difference | None
     meta: tuple[MetaTest, ...]
-    told: str
+    summary: str
     effects: MarkerEffects
-    frame_ids: tuple[str, ...]
-    network_maps: Float[np.ndarray, "frames height width"]
-    margin_maps: Float[np.ndarray, "frames height width"]
+    network_maps: Float32[np.ndarray, "frames size size"]
+    margin_maps: Float32[np.ndarray, "frames size size"]
+
+    def __post_init__(self) -> None:
+        """Hold the maps against the frames."""
+        count = len(self.frame_ids)
+        for maps in (self.network_maps, self.margin_maps):
+            if len(maps) != count or not np.isfinite(maps).all():
+                raise ValueError(f"holds maps of shape {maps.shape} where {count} finite ones belong")
+
+    @cached_property
+    def frame_ids(self) -> tuple[str, ...]:
+        """Frames of the maps."""
+        return tuple(dict.fromkeys(self.effects.frame_id.tolist()))
+
+
+_Test = Remedies | RemovalScores | Randomisation | MapQuality | Timing | Truth
 
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """All that a study adds to a workspace; tables are by input, and empty where a stage was not run."""
+    """A study, stage by stage; tables are by input, and empty where a stage was not run.
 
+    Attributes
+    ----------
+    folder
+        Workspace that holds the stages.
+    scratch
+        Keeps a temporary workspace as long as the study lives.
+    """
+
+    folder: Path | None = None
+    scratch: TemporaryDirectory[str] | None = field(default=None, repr=False, compare=False)
     choice: Choice | None = None
     states: States | None = None
+    explanations: dict[str, Explained] = field(default_factory=dict)
+    deletion: dict[str, DeletionScores] = field(default_factory=dict)
     remedies: dict[str, Remedies] = field(default_factory=dict)
     faithfulness: dict[str, RemovalScores] = field(default_factory=dict)
     randomisation: dict[str, Randomisation] = field(default_factory=dict)
@@ -216,19 +406,48 @@ class Study:
     @property
     def inputs(self) -> set[str]:
         """Inputs that some stage tells of; both where none does."""
-        tables = (self.remedies, self.faithfulness, self.randomisation, self.map_quality, self.timing, self.truth)
-        found = {name for table in tables for name in table} | set(self.choice.inputs if self.choice else ())
+        found = {name for table in self._tests for name in table} | set(self.choice.inputs if self.choice else ())
         return found or {"difference", "raw"}
 
     @property
     def source(self) -> str:
-        """Where the study's frames come from."""
+        """Where the study's frames come from: "simulated" or "real"."""
         if self.choice is not None:
             return self.choice.source
-        tables = (self.remedies, self.faithfulness, self.randomisation, self.map_quality, self.timing, self.truth)
-        return next((one.source for table in tables for one in table.values()), "simulated")
+        return next((test.source for table in self._tests for test in table.values()), "simulated")
 
     def __bool__(self) -> bool:
         """Whether anything of a study was run."""
-        tables = (self.remedies, self.faithfulness, self.randomisation, self.map_quality, self.timing, self.truth)
-        return any(tables) or self.choice is not None or self.states is not None
+        return any(self._tests) or self.choice is not None or self.states is not None
+
+    @property
+    def _tests(self) -> tuple[Mapping[str, _Test], ...]:
+        return self.remedies, self.faithfulness, self.randomisation, self.map_quality, self.timing, self.truth
+
+
+__all__ = [
+    "MAP_MEASURES",
+    "REGIONS",
+    "Choice",
+    "ChosenFrame",
+    "ChosenTrial",
+    "Localisation",
+    "MapMeasures",
+    "MapQuality",
+    "MarkedFrame",
+    "MarkerEffects",
+    "MarkerTable",
+    "MetaTest",
+    "MethodTime",
+    "OracleTest",
+    "Randomisation",
+    "RandomisedMethod",
+    "Roughness",
+    "ShownFrame",
+    "StateFrame",
+    "States",
+    "Study",
+    "Timing",
+    "Truth",
+    "UntrainedMaps",
+]

@@ -1,26 +1,23 @@
 """The experiment: pick frames, explain them, score the explanations, keep what was found."""
 
+from sliplens.results.explanation import Explained, ExplainedFrame, load_explained
 from sliplens.study.explaining import (
     ChosenFrames,
-    Explained,
-    ExplainedFrame,
-    Progress,
     explain_frames,
     frames_from_dataset,
     frames_from_folder,
-    load_explained,
 )
-from sliplens.study.scoring import ScoreResult, score_explanations
+from sliplens.study.run import run_study
+from sliplens.study.scoring import score_explanations
 
 __all__ = [
     "ChosenFrames",
     "Explained",
     "ExplainedFrame",
-    "Progress",
-    "ScoreResult",
     "explain_frames",
     "frames_from_dataset",
     "frames_from_folder",
     "load_explained",
+    "run_study",
     "score_explanations",
 ]

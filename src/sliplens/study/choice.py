@@ -1,68 +1,20 @@
 """Choose what a study looks at: trials that the networks read well, and in each the frames along the margin."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from sliplens.errors import InputError, RecordingError
-from sliplens.files import read_json, write_json
 from sliplens.models import TrainedModel
+from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset
-from sliplens.study.explaining import DEFAULT_LEVELS, RESULT_FILE, nearest_frame
+from sliplens.results.study import Choice, ChosenFrame, ChosenTrial
+from sliplens.study.explaining import DEFAULT_LEVELS, nearest_frame
 
 SCORED_LEVELS = (0.4, 0.2, 0.0)
 """Margins at which the thesis scores: near slip, where there is much to explain."""
 _REACH = 0.05
 """How far the frame nearest to a level may lie from it, in margin units."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ChosenTrial:
-    """A trial that the study looks at."""
-
-    trial: str
-    qualified: bool
-    """Whether every network reads every chosen frame of it within the tolerance."""
-    worst_error: Mapping[str, float]
-    """By input: the largest error over the chosen frames, in margin units."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Pick:
-    """A frame that the study looks at."""
-
-    id: str
-    trial: str
-    frame: int
-    level: float
-    safety_margin: float
-    scored: bool
-    """Whether it counts in the scores."""
-    shown: bool
-    """Whether the panels show it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Choice:
-    """Trials and frames of a study, and how they came to be chosen."""
-
-    trials_wanted: int
-    tolerance: float
-    considered: int
-    """Trials that have a frame near every level."""
-    qualified: int
-    told: str
-    """What was done, for people."""
-    source: str
-    condition: str
-    inputs: tuple[str, ...]
-    levels: tuple[float, ...]
-    scored_levels: tuple[float, ...]
-    trials: tuple[ChosenTrial, ...]
-    frames: tuple[Pick, ...]
 
 
 def choose_frames(
@@ -76,7 +28,7 @@ def choose_frames(
     levels: Sequence[float] = DEFAULT_LEVELS,
     scored_levels: Sequence[float] = SCORED_LEVELS,
     shown_trials: int = 1,
-    on_trial: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> Choice:
     """Choose trials in which every network reads the frames along the margin within a tolerance.
 
@@ -99,8 +51,8 @@ def choose_frames(
         Those of them that count in the scores.
     shown_trials
         How many trials the panels show, the best read first.
-    on_trial
-        Called with the trials looked at and the number of all.
+    on_progress
+        Takes the trials looked at and the number of all.
 
     Raises
     ------
@@ -115,7 +67,7 @@ def choose_frames(
     """
     _check(networks, trials=trials, tolerance=tolerance, levels=levels, scored_levels=scored_levels)
     infos = data.select(split=split, condition=condition)
-    found: list[tuple[ChosenTrial, list[tuple[int, float]]]] = []
+    candidates: list[tuple[ChosenTrial, list[tuple[int, float]]]] = []
     for number, info in enumerate(infos, start=1):
         recording = data.load(info, truth=False)
         margin = np.where(recording.labelled, recording.safety_margin, np.nan)
@@ -126,44 +78,46 @@ def choose_frames(
             for name, trained in networks.items():
                 answers = trained.predict(trained.encode(recording.frames[rows], recording.reference)).numpy()
                 worst[name] = float(np.abs(answers - margin[rows]).max())
-            one = ChosenTrial(trial=info.trial, qualified=max(worst.values()) <= tolerance, worst_error=worst)
-            found.append((one, [(row, float(margin[row])) for row in rows]))
-        if on_trial is not None:
-            on_trial(number, len(infos))
-    if not found:
+            trial = ChosenTrial(trial=info.trial, qualified=max(worst.values()) <= tolerance, worst_error=worst)
+            candidates.append((trial, [(row, float(margin[row])) for row in rows]))
+        if on_progress is not None:
+            on_progress(number, len(infos))
+    if not candidates:
         raise RecordingError(
             f"none of the {len(infos)} {condition} trials of split {split!r} has a labelled frame within {_REACH:.0%} "
             f"of each of {', '.join(f'{level:.0%}' for level in levels)}; choose other levels or another split"
         )
     # sorting is stable: those that qualify keep the data set's order, so that none is picked for its looks
-    taken = sorted(found, key=lambda item: 0.0 if item[0].qualified else max(item[0].worst_error.values()))[:trials]
+    taken = sorted(candidates, key=lambda item: 0.0 if item[0].qualified else max(item[0].worst_error.values()))[
+        :trials
+    ]
     best_read = sorted(taken, key=lambda item: max(item[0].worst_error.values()))[:shown_trials]
-    shown = {one.trial for one, _ in best_read}
-    picks = [
-        Pick(
-            id=f"{one.trial}-f{row:04d}",
-            trial=one.trial,
+    shown = {trial.trial for trial, _ in best_read}
+    frames = tuple(
+        ChosenFrame(
+            id=f"{trial.trial}-f{row:04d}",
+            trial=trial.trial,
             frame=row,
             level=float(level),
             safety_margin=label,
             scored=level in scored_levels,
-            shown=one.trial in shown,
+            shown=trial.trial in shown,
         )
-        for one, rows in taken
+        for trial, rows in taken
         for level, (row, label) in zip(levels, rows, strict=True)
-        if level in scored_levels or one.trial in shown
-    ]
-    qualified = sum(one.qualified for one, _ in found)
+        if level in scored_levels or trial.trial in shown
+    )
+    qualified = sum(trial.qualified for trial, _ in candidates)
     return Choice(
         trials_wanted=trials,
         tolerance=tolerance,
-        considered=len(found),
+        considered=len(candidates),
         qualified=qualified,
-        told=_tell(
-            infos=len(infos),
-            found=len(found),
+        summary=_summarise(
+            trials=len(infos),
+            considered=len(candidates),
             qualified=qualified,
-            taken=[one for one, _ in taken],
+            taken=[trial for trial, _ in taken],
             wanted=trials,
             tolerance=tolerance,
             condition=condition,
@@ -174,8 +128,8 @@ def choose_frames(
         inputs=tuple(networks),
         levels=tuple(float(level) for level in levels),
         scored_levels=tuple(float(level) for level in scored_levels),
-        trials=tuple(one for one, _ in taken),
-        frames=tuple(picks),
+        trials=tuple(trial for trial, _ in taken),
+        frames=frames,
     )
 
 
@@ -203,10 +157,10 @@ def _check(
         )
 
 
-def _tell(
+def _summarise(
     *,
-    infos: int,
-    found: int,
+    trials: int,
+    considered: int,
     qualified: int,
     taken: Sequence[ChosenTrial],
     wanted: int,
@@ -215,44 +169,17 @@ def _tell(
     networks: int,
 ) -> str:
     who = "the network reads" if networks == 1 else "both networks read" if networks == 2 else "all networks read"
-    told = f"Of {infos} {condition} trials {found} have a frame near every level, and in {qualified} of those {who} "
-    told += f"every such frame within {tolerance:.0%}."
-    others = [one for one in taken if not one.qualified]
+    summary = f"Of {trials} {condition} trials {considered} have a frame near every level, and in {qualified} of those "
+    summary += f"{who} every such frame within {tolerance:.0%}."
+    others = [trial for trial in taken if not trial.qualified]
     if others:
-        worst = max(max(one.worst_error.values()) for one in others)
-        told += (
+        worst = max(max(trial.worst_error.values()) for trial in others)
+        summary += (
             f" {wanted} were wanted, so the {len(others)} read best among the others were taken too; the worst of "
             f"their answers is off by {worst:.0%}."
         )
     elif qualified > wanted:
-        told += f" The first {wanted} were taken."
+        summary += f" The first {wanted} were taken."
     if len(taken) < wanted:
-        told += f" There were no more: {len(taken)} instead of {wanted}."
-    return told
-
-
-def save_choice(choice: Choice, folder: Path) -> None:
-    """Write a choice as the `result.json` of a folder."""
-    write_json(folder / RESULT_FILE, choice)
-
-
-def load_choice(folder: Path) -> Choice:
-    """Read what `save_choice` wrote.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or is no choice.
-    """
-    values: dict[str, Any] = read_json(folder / RESULT_FILE)
-    try:
-        return Choice(
-            **{
-                **values,
-                **{name: tuple(values[name]) for name in ("inputs", "levels", "scored_levels")},
-                "trials": tuple(ChosenTrial(**one) for one in values["trials"]),
-                "frames": tuple(Pick(**one) for one in values["frames"]),
-            }
-        )
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{folder / RESULT_FILE} holds no choice of frames ({error}); make the study again") from None
+        summary += f" There were no more: {len(taken)} instead of {wanted}."
+    return summary

@@ -1,137 +1,41 @@
-"""The sound curves of a study: every method and control, under several fills and units, with intervals and alarms."""
+"""Sound scores of a study: every method and control, under several fills and units, with intervals and alarms."""
 
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from scipy.stats import kendalltau
 
+from sliplens.codec import keep_part
 from sliplens.errors import InputError
 from sliplens.faithfulness import get_fill
 from sliplens.faithfulness.alarms import controls_win, fill_decides, flat_maps, rankings_disagree, saturated
 from sliplens.faithfulness.controls import CONTROLS
 from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness, Predict, answer_whole, faithfulness
-from sliplens.files import write_json
-from sliplens.intervals import Difference, paired_difference
-from sliplens.study.explaining import RESULT_FILE, Explained
+from sliplens.intervals import paired_difference
+from sliplens.progress import OnProgress, continued
+from sliplens.results.explanation import Explained
+from sliplens.results.faithfulness import Agreement, Comparison, RemovalScore, RemovalScores, RemovalTable
 from sliplens.study.material import Material
 
 RANDOMISED = "randomised"
 """The control that explains a network whose weights were drawn anew."""
 EQUAL_AREAS = (0.01, 0.02, 0.05, 0.1, 0.2)
+STUDY_AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
+"""Fewer than `removal.AREAS`, so that many settings can be scored: the equal areas, and enough for trapezoids."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """One way to remove parts: what is removed at once, and what takes its place."""
+    """Way to remove parts: what is removed at once, and what takes its place."""
 
     fill: str
     unit: str
-
-
-Found = Mapping[Setting, Mapping[str, Faithfulness]]
-"""Curves by setting and method, controls included."""
-
-
-def judge_curves(found: Found, *, trials: np.ndarray, seed: int) -> dict[str, Any]:
-    """Scores with intervals, comparisons, and how far the fills agree; whole trials are resampled.
-
-    Parameters
-    ----------
-    found
-        Curves by setting and method, controls included.
-    trials
-        Trial of each frame.
-    seed
-        Of the resampling.
-    """
-    rng = np.random.default_rng(seed)
-    scores, comparisons = [], []
-    for setting, curves in found.items():
-        where = {"fill": setting.fill, "unit": setting.unit}
-        for name, curve in curves.items():
-            none = np.zeros_like(curve.symmetric_gain)
-            scores.append(
-                {
-                    **where,
-                    "method": name,
-                    "control": is_control(name),
-                    "srg": _interval(paired_difference(curve.symmetric_gain, none, trials=trials, rng=rng)),
-                    "gain_over_random": _interval(
-                        paired_difference(curve.gain_over_random, none, trials=trials, rng=rng)
-                    ),
-                    "most_first": float(curve.most_first.mean()),
-                    "least_first": float(curve.least_first.mean()),
-                    "random": float(curve.random.mean()),
-                    "at": {str(area): float(curve.at(area)[0].mean()) for area in EQUAL_AREAS if area in curve.areas},
-                }
-            )
-        methods = [name for name in curves if not is_control(name)]
-        controls = [name for name in curves if is_control(name)]
-        best = max(controls, key=lambda name: float(curves[name].symmetric_gain.mean()), default=None)
-        pairs = [*combinations(methods, 2), *((name, best) for name in methods if best is not None)]
-        for first, second in pairs:
-            gains = (curves[first].symmetric_gain, curves[second].symmetric_gain)
-            gap = paired_difference(*gains, trials=trials, rng=rng)
-            comparisons.append({**where, "first": first, "second": second, "measure": "srg", **_interval(gap)})
-    return {"scores": scores, "comparisons": comparisons, "agreement": _agreement(found)}
-
-
-def is_control(name: str) -> bool:
-    """Whether a row stands for a map that knows nothing of what the network learned."""
-    return name in CONTROLS or name == RANDOMISED
-
-
-def _interval(gap: Difference) -> dict[str, Any]:
-    return {"estimate": gap.estimate, "low": gap.low, "high": gap.high, "units": gap.units, "sure": gap.sure}
-
-
-def _agreement(found: Found) -> list[dict[str, Any]]:
-    told = []
-    for first, second in combinations(found, 2):
-        if first.unit != second.unit:
-            continue
-        names = [name for name in found[first] if not is_control(name)]
-        ranks = [[float(found[one][name].symmetric_gain.mean()) for name in names] for one in (first, second)]
-        tau = float(np.asarray(kendalltau(*ranks))[0]) if len(names) > 1 else float("nan")
-        told.append(
-            {"unit": first.unit, "first": first.fill, "second": second.fill, "tau": tau if np.isfinite(tau) else None}
-        )
-    return told
-
-
-def ranking_alarms(found: Found) -> list[str]:
-    """Say where a control wins, and which fills rank the methods differently."""
-    by_fill: dict[str, dict[str, float]] = {}
-    told = []
-    for setting, curves in found.items():
-        methods = {name: curve for name, curve in curves.items() if not is_control(name)}
-        controls = {name: curve for name, curve in curves.items() if is_control(name)}
-        where = f"under {setting.fill}, {setting.unit} by {setting.unit}"
-        told += [f"{where}: {alarm}" for alarm in controls_win(methods, controls)]
-        if setting.unit == "pixel":
-            by_fill[setting.fill] = {name: float(curve.symmetric_gain.mean()) for name, curve in methods.items()}
-    return [*rankings_disagree(by_fill), *told]
-
-
-CURVES_FILE = "curves.parquet"
-STUDY_AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
-"""Fewer than `removal.AREAS`, so that many settings can be scored: the equal areas, and enough for trapezoids."""
-
-Influence = Mapping[str, Float[np.ndarray, "images height width"]]
-Report = Callable[[int, int], None]
-"""Takes the frames done, and their number."""
-Scoring = Callable[[Report], Mapping[str, Faithfulness]]
-"""Finds the curves of every map, and reports the frames done."""
 
 
 SETTINGS = (
@@ -142,6 +46,18 @@ SETTINGS = (
     Setting(fill="reference", unit="tile"),
     Setting(fill="reference", unit="marker"),
 )
+
+Curves = Mapping[Setting, Mapping[str, Faithfulness]]
+"""Curves by setting and method, controls included."""
+Influence = Mapping[str, Float[np.ndarray, "images height width"]]
+"""Maps to rank parts by, of each method and control."""
+Scoring = Callable[[OnProgress | None], Mapping[str, Faithfulness]]
+"""Finds the curves of every map; takes what is called with the frames done and their number."""
+
+
+def is_control(name: str) -> bool:
+    """Whether a row stands for a map that knows nothing of what the network learned."""
+    return name in CONTROLS or name == RANDOMISED
 
 
 def influences(material: Material) -> dict[str, Float[np.ndarray, "frames size size"]]:
@@ -156,28 +72,31 @@ def influences(material: Material) -> dict[str, Float[np.ndarray, "frames size s
     return maps | {name: control(material.inputs).double().cpu().numpy() for name, control in CONTROLS.items()}
 
 
-def score_curves(
+@dataclass(frozen=True, kw_only=True)
+class _SettingCurves:
+    """Curves of every map under one setting (`Faithfulness.curves`)."""
+
+    areas: Float64[np.ndarray, " areas"]
+    curves: dict[str, Float64[np.ndarray, "3 frames areas"]]
+
+
+def score_removal(
     material: Material,
-    folder: Path,
     *,
     maps: Influence,
     settings: Sequence[Setting] = SETTINGS,
     random_orders: int = RANDOM_ORDERS,
     further: Mapping[Setting, Scoring] | None = None,
     seed: int = 0,
-    on_frame: Callable[[int, int], None] | None = None,
-) -> None:
-    """Remove parts in the order of every map, under every setting, and write what it tells.
-
-    Each setting is written under `parts` as soon as it is done; a second call with the same folder goes on after the
-    last.
+    parts: Path | None = None,
+    on_progress: OnProgress | None = None,
+) -> RemovalScores:
+    """Remove parts in the order of every map, under every setting.
 
     Parameters
     ----------
     material
         The network, and the explanations of the frames that are scored.
-    folder
-        Gets `curves.parquet` and `result.json`; must exist.
     maps
         Influence by method, controls included (`influences`).
     settings
@@ -185,19 +104,20 @@ def score_curves(
     random_orders
         How many random orders.
     further
-        What finds curves in another way, such as by drawing the scene anew; they are written and judged with the
-        others.
+        What finds curves in another way, such as by drawing the scene anew; they are judged with the others.
     seed
-        Of the random orders and the noise.
-    on_frame
-        Called with the frames done, over all settings, and their number.
+        Of the random orders, the noise and the resampling.
+    parts
+        Folder that keeps the curves of each setting, so that an interrupted run goes on after the last.
+    on_progress
+        Takes the frames done, over all settings, and their number.
 
     Raises
     ------
     InputError
         If a fill is unknown.
     """
-    inputs, references, explained = material.inputs, material.references, material.explained
+    inputs, explained = material.inputs, material.explained
     for setting in settings:
         get_fill(setting.fill)
     units = material.units()
@@ -205,61 +125,60 @@ def score_curves(
     orders = 2 * len(maps) + random_orders
     predict = material.fast(len(known) * len(inputs) * orders * (len(STUDY_AREAS) - 2))
 
-    def remove(setting: Setting, report: Report) -> Mapping[str, Faithfulness]:
+    def remove(setting: Setting, on_frames: OnProgress | None) -> Mapping[str, Faithfulness]:
         return faithfulness(
             predict,
             inputs,
             dict(maps),
             units[setting.unit],
             fill=get_fill(setting.fill),
-            references=references,
-            towards=material.towards,
+            references=material.references,
+            towards=explained.towards,
             # the same random orders under every fill
             rng=np.random.default_rng(seed),
             random_orders=random_orders,
             areas=STUDY_AREAS,
             seed=seed,
-            on_progress=report,
+            on_progress=on_frames,
         )
 
     works: dict[Setting, Scoring] = {setting: partial(remove, setting) for setting in known} | dict(further or {})
-    parts = folder / "parts"
-    parts.mkdir(exist_ok=True)
-    found: dict[Setting, dict[str, Faithfulness]] = {}
+    curves: dict[Setting, dict[str, Faithfulness]] = {}
     for number, (setting, work) in enumerate(works.items()):
-        part = parts / f"{setting.fill}-{setting.unit}.npz"
-        if not part.is_file():
+        on_frames = continued(on_progress, before=number * len(inputs), total=len(works) * len(inputs))
 
-            def report(done: int, _: int, before: int = number * len(inputs)) -> None:
-                if on_frame is not None:
-                    on_frame(before + done, len(works) * len(inputs))
+        def find(work: Scoring = work, on_frames: OnProgress | None = on_frames) -> _SettingCurves:
+            found = work(on_frames)
+            return _SettingCurves(
+                areas=next(iter(found.values())).areas, curves={name: one.curves for name, one in found.items()}
+            )
 
-            _save(part, work(report))
-        found[setting] = _load(part)
-    pq.write_table(_table(found, explained), folder / CURVES_FILE)
+        part = None if parts is None else parts / f"{setting.fill}-{setting.unit}"
+        found = keep_part(part, _SettingCurves, find)
+        curves[setting] = {name: Faithfulness(areas=found.areas, curves=own) for name, own in found.curves.items()}
     whole = answer_whole(predict, inputs, batch_size=64)
     blank = {setting.fill: _answer_blank(predict, material, setting.fill, seed) for setting in known}
-    write_json(
-        folder / RESULT_FILE,
-        {
-            "input": explained.input,
-            "source": explained.source,
-            "frames": len(inputs),
-            "trials": len(set(material.trials.tolist())),
-            "random_orders": random_orders,
-            "fills": list(dict.fromkeys(setting.fill for setting in found)),
-            "units": list(dict.fromkeys(setting.unit for setting in found)),
-            "areas": list(STUDY_AREAS),
-            **judge_curves(found, trials=material.trials, seed=seed),
-            "alarms": [
-                *saturated(whole),
-                *flat_maps({name: maps[name] for name in explained.relevance}),
-                *(alarm for fill, answers in blank.items() for alarm in fill_decides(whole, answers, fill=fill)),
-                *ranking_alarms(found),
-            ],
-        },
+    scores, comparisons = judge_curves(curves, trials=material.trials, seed=seed)
+    return RemovalScores(
+        input=explained.input,
+        source=explained.source,
+        frames=len(inputs),
+        trials=len(set(material.trials.tolist())),
+        random_orders=random_orders,
+        fills=tuple(dict.fromkeys(setting.fill for setting in curves)),
+        units=tuple(dict.fromkeys(setting.unit for setting in curves)),
+        areas=STUDY_AREAS,
+        scores=scores,
+        comparisons=comparisons,
+        agreement=compare_fills(curves),
+        alarms=(
+            *saturated(whole),
+            *flat_maps({name: maps[name] for name in explained.relevance}),
+            *(alarm for fill, answers in blank.items() for alarm in fill_decides(whole, answers, fill=fill)),
+            *ranking_alarms(curves),
+        ),
+        table=_table(curves, explained),
     )
-    shutil.rmtree(parts)
 
 
 def _answer_blank(predict: Predict, material: Material, fill: str, seed: int) -> Float[np.ndarray, " frames"]:
@@ -267,55 +186,102 @@ def _answer_blank(predict: Predict, material: Material, fill: str, seed: int) ->
     inputs = material.inputs
     paint = get_fill(fill)(inputs, material.references, seed)
     gone = torch.ones((len(inputs), *inputs.shape[-2:]), dtype=torch.bool, device=inputs.device)
-    some = torch.arange(len(inputs), device=inputs.device).split(16)
-    return answer_whole(predict, torch.cat([paint(rows, gone[rows]) for rows in some]), batch_size=64)
+    batches = torch.arange(len(inputs), device=inputs.device).split(16)
+    return answer_whole(predict, torch.cat([paint(rows, gone[rows]) for rows in batches]), batch_size=64)
 
 
-def _save(path: Path, found: Mapping[str, Faithfulness]) -> None:
-    hidden = path.with_suffix(".part.npz")
-    np.savez(
-        hidden,
-        allow_pickle=False,
-        areas=next(iter(found.values())).areas,
-        **{name: one.curves for name, one in found.items()},
-    )
-    hidden.replace(path)
+def judge_curves(
+    curves: Curves, *, trials: np.ndarray, seed: int
+) -> tuple[tuple[RemovalScore, ...], tuple[Comparison, ...]]:
+    """Scores with intervals, and methods compared with each other and with the best control.
+
+    Parameters
+    ----------
+    curves
+        By setting and method, controls included.
+    trials
+        Trial of each frame; whole trials are resampled.
+    seed
+        Of the resampling.
+    """
+    rng = np.random.default_rng(seed)
+    scores, comparisons = [], []
+    for setting, own in curves.items():
+        for name, curve in own.items():
+            none = np.zeros_like(curve.symmetric_gain)
+            scores.append(
+                RemovalScore(
+                    fill=setting.fill,
+                    unit=setting.unit,
+                    method=name,
+                    control=is_control(name),
+                    srg=paired_difference(curve.symmetric_gain, none, trials=trials, rng=rng),
+                    gain_over_random=paired_difference(curve.gain_over_random, none, trials=trials, rng=rng),
+                    most_first=float(curve.most_first.mean()),
+                    least_first=float(curve.least_first.mean()),
+                    random=float(curve.random.mean()),
+                    at={area: float(curve.at(area)[0].mean()) for area in EQUAL_AREAS if area in curve.areas},
+                )
+            )
+        methods, controls = ([name for name in own if is_control(name) is wanted] for wanted in (False, True))
+        best = max(controls, key=lambda name: float(own[name].symmetric_gain.mean()), default=None)
+        pairs = [*combinations(methods, 2), *((name, best) for name in methods if best is not None)]
+        for first, second in pairs:
+            gap = paired_difference(own[first].symmetric_gain, own[second].symmetric_gain, trials=trials, rng=rng)
+            comparisons.append(Comparison(fill=setting.fill, unit=setting.unit, first=first, second=second, gap=gap))
+    return tuple(scores), tuple(comparisons)
 
 
-def _load(path: Path) -> dict[str, Faithfulness]:
-    with np.load(path, allow_pickle=False) as archive:
-        areas = archive["areas"]
-        return {name: Faithfulness(areas=areas, curves=archive[name]) for name in archive.files if name != "areas"}
+def compare_fills(curves: Curves) -> tuple[Agreement, ...]:
+    """How far the rankings of the methods agree between fills of the same unit."""
+    agreement = []
+    for first, second in combinations(curves, 2):
+        if first.unit != second.unit:
+            continue
+        names = [name for name in curves[first] if not is_control(name)]
+        ranks = [[float(curves[setting][name].symmetric_gain.mean()) for name in names] for setting in (first, second)]
+        tau = float(np.asarray(kendalltau(*ranks))[0]) if len(names) > 1 else float("nan")
+        agreement.append(
+            Agreement(unit=first.unit, first=first.fill, second=second.fill, tau=tau if np.isfinite(tau) else None)
+        )
+    return tuple(agreement)
 
 
-def _table(found: Mapping[Setting, Mapping[str, Faithfulness]], explained: Explained) -> pa.Table:
+def ranking_alarms(curves: Curves) -> list[str]:
+    """Say where a control wins, and which fills rank the methods differently."""
+    by_fill: dict[str, dict[str, float]] = {}
+    alarms = []
+    for setting, own in curves.items():
+        methods = {name: curve for name, curve in own.items() if not is_control(name)}
+        controls = {name: curve for name, curve in own.items() if is_control(name)}
+        where = f"under {setting.fill}, {setting.unit} by {setting.unit}"
+        alarms += [f"{where}: {alarm}" for alarm in controls_win(methods, controls)]
+        if setting.unit == "pixel":
+            by_fill[setting.fill] = {name: float(curve.symmetric_gain.mean()) for name, curve in methods.items()}
+    return [*rankings_disagree(by_fill), *alarms]
+
+
+def _table(curves: Curves, explained: Explained) -> RemovalTable:
+    margins = [np.nan if frame.safety_margin is None else frame.safety_margin for frame in explained.frames]
     tables = []
-    for setting, curves in found.items():
-        for name, curve in curves.items():
+    for setting, own in curves.items():
+        for name, curve in own.items():
             frames, steps = curve.curves.shape[1:]
             if frames != len(explained.frames):
                 raise InputError(f"{frames} curves of {name} for {len(explained.frames)} frames; make the study again")
+            rows = frames * steps
             tables.append(
-                pa.table(
-                    {
-                        **{
-                            column: [value] * (frames * steps)
-                            for column, value in (("fill", setting.fill), ("unit", setting.unit), ("method", name))
-                        },
-                        "frame_id": np.repeat([frame.id for frame in explained.frames], steps),
-                        "trial": np.repeat([frame.trial for frame in explained.frames], steps),
-                        "safety_margin": np.repeat(
-                            np.array(
-                                [np.nan if one.safety_margin is None else one.safety_margin for one in explained.frames]
-                            ),
-                            steps,
-                        ),
-                        "area": np.tile(curve.areas, frames),
-                        **{
-                            column: curve.curves[number].ravel()
-                            for number, column in enumerate(("most_first", "least_first", "random"))
-                        },
-                    }
+                RemovalTable(
+                    fill=np.repeat(setting.fill, rows),
+                    unit=np.repeat(setting.unit, rows),
+                    method=np.repeat(name, rows),
+                    frame_id=np.repeat([frame.id for frame in explained.frames], steps),
+                    trial=np.repeat([frame.trial for frame in explained.frames], steps),
+                    safety_margin=np.repeat(np.array(margins, dtype=np.float64), steps),
+                    area=np.tile(curve.areas, frames),
+                    most_first=curve.curves[0].ravel(),
+                    least_first=curve.curves[1].ravel(),
+                    random=curve.curves[2].ravel(),
                 )
             )
-    return pa.concat_tables(tables)
+    return RemovalTable.joined(tables)

@@ -1,26 +1,23 @@
-"""Explain frames, one piece at a time, so that an interrupted run loses at most one map."""
+"""Frames to explain, and their explanations, made one map at a time."""
 
 import re
-import shutil
-import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
-from sliplens.arrays import require_saliency
+from sliplens.codec import keep_part
 from sliplens.errors import InputError, RecordingError
-from sliplens.explainers import EXPLAINERS, Explainer, Explanation
-from sliplens.files import RUN_FILE, read_json, require_folder, write_json
-from sliplens.images.files import write_png
+from sliplens.explainers import EXPLAINERS, Explainer
 from sliplens.models import TrainedModel
+from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset
 from sliplens.recordings.source import open_source
+from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
 
 DEFAULT_LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 """Safety margins at which the thesis explains frames (section 4)."""
@@ -232,141 +229,6 @@ def _label(path: Path) -> float:
     return int(found.group(1)) / 100
 
 
-RESULT_FILE = "result.json"
-MAPS_FILE = "maps.npz"
-INPUTS_FILE = "inputs.npz"
-_SALIENCY = ".saliency"
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExplainedFrame:
-    """One explained frame, its numbers in margin units; `safety_margin` is None where there is no label."""
-
-    id: str
-    trial: str
-    condition: str
-    safety_margin: float | None
-    prediction: float
-    reference_prediction: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Explained:
-    """A folder of explanations, loaded.
-
-    Attributes
-    ----------
-    images
-        The network's inputs before normalisation, 8 bits.
-    relevance, saliency
-        By method: signed maps in margin units, and the same in [0, 1] for viewing and for ranking pixels.
-    weights_sha256
-        Hash of the network that was explained.
-    """
-
-    input: str
-    source: str
-    frames: tuple[ExplainedFrame, ...]
-    images: UInt8[Tensor, "frames 3 size size"]
-    relevance: Mapping[str, Float32[np.ndarray, "frames size size"]]
-    saliency: Mapping[str, Float32[np.ndarray, "frames size size"]]
-    weights_sha256: str
-
-
-def save_explained(
-    explained: Explained, folder: Path, *, pictures: UInt8[Tensor, "frames 3 size size"], methods: Mapping[str, Any]
-) -> None:
-    """Write maps, inputs, a picture of each input, and the table.
-
-    Parameters
-    ----------
-    explained
-        What was found.
-    folder
-        Must exist.
-    pictures
-        The normalised inputs, 8 bits, for people to look at.
-    methods
-        What the report says of each method: seconds a frame and warnings.
-    """
-    maps = dict(explained.relevance) | {name + _SALIENCY: value for name, value in explained.saliency.items()}
-    np.savez_compressed(folder / MAPS_FILE, allow_pickle=False, **maps)
-    np.savez_compressed(folder / INPUTS_FILE, allow_pickle=False, images=explained.images.numpy())
-    (folder / "frames").mkdir(exist_ok=True)
-    for frame, picture in zip(explained.frames, pictures, strict=True):
-        write_png(folder / "frames" / f"{frame.id}.png", picture.permute(1, 2, 0).contiguous().numpy())
-    write_json(
-        folder / RESULT_FILE,
-        {
-            "input": explained.input,
-            "source": explained.source,
-            "image_size": explained.images.shape[-1],
-            "frames": list(explained.frames),
-            "methods": methods,
-        },
-    )
-
-
-def load_explained(folder: Path) -> Explained:
-    """Read a folder that `sliplens explain` wrote.
-
-    Raises
-    ------
-    InputError
-        If the folder or one of its files is missing or damaged.
-    SaliencyError
-        If a map has another shape than its frame, or is not finite.
-    """
-    require_folder(folder, what="the explanations")
-    result = read_json(folder / RESULT_FILE)
-    run = read_json(folder / RUN_FILE)
-    if not isinstance(result, dict) or run.get("stage") != "explain":
-        raise InputError(f"{folder} holds no explanations; make them with sliplens explain")
-    images = read_arrays(folder / INPUTS_FILE)["images"]
-    maps = read_arrays(folder / MAPS_FILE)
-    names = [frame["id"] for frame in result["frames"]]
-    for method, stack in maps.items():
-        if len(stack) != len(names):
-            raise InputError(
-                f"{folder / MAPS_FILE} has {len(stack)} {method} maps for {len(names)} frames; explain again"
-            )
-        for name, one in zip(names, stack, strict=True):
-            require_saliency(one, images.shape[-2:], where=f"the {method} map of {name} in {folder / MAPS_FILE}")
-    return Explained(
-        input=result["input"],
-        source=result["source"],
-        frames=tuple(ExplainedFrame(**frame) for frame in result["frames"]),
-        images=torch.from_numpy(images),
-        relevance={name: value for name, value in maps.items() if not name.endswith(_SALIENCY)},
-        saliency={name.removesuffix(_SALIENCY): value for name, value in maps.items() if name.endswith(_SALIENCY)},
-        weights_sha256=run["config"]["weights_sha256"],
-    )
-
-
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read arrays of one file by name.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or damaged.
-    """
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except FileNotFoundError:
-        raise InputError(f"{path} is missing; explain the frames again") from None
-    except (zipfile.BadZipFile, OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path} is damaged ({error}); explain the frames again") from None
-
-
-def mean_of_known(values: Float[np.ndarray, " values"]) -> float | None:
-    """Mean of what is defined; None where nothing is, since JSON knows no NaN."""
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if len(known) else None
-
-
-Progress = Callable[[int, int], None]
 DEFAULT_METHODS = ("grad-cam", "integrated-gradients", "poly-cam")
 """The three methods the thesis compares."""
 
@@ -384,18 +246,26 @@ def require_methods(methods: Sequence[str], explainers: Mapping[str, object] = E
             raise InputError(f"there is no explainer named {name!r}; choose from {', '.join(explainers)}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Map:
+    """Explanation of one frame by one method."""
+
+    relevance: Float32[np.ndarray, "height width"]
+    saliency: Float32[np.ndarray, "height width"]
+    seconds: float
+    warnings: tuple[str, ...]
+
+
 def explain_frames(
     trained: TrainedModel,
     chosen: ChosenFrames,
-    folder: Path,
     *,
     methods: Sequence[str] = DEFAULT_METHODS,
     explainers: Mapping[str, Explainer | Sequence[Explainer]] = EXPLAINERS,
-    on_map: Progress | None = None,
+    parts: Path | None = None,
+    on_progress: OnProgress | None = None,
 ) -> Explained:
-    """Explain frames with several methods and write the result.
-
-    Each map is written under `parts` as soon as it is there; a second call with the same folder goes on after the last.
+    """Explain frames with several methods.
 
     Parameters
     ----------
@@ -403,15 +273,15 @@ def explain_frames(
         The network.
     chosen
         The frames.
-    folder
-        Where the result is written; must exist.
     methods
         Names in the table of explainers.
     explainers
         The table, where their options are not the default ones; a method whose options differ from frame to frame has
         one explainer for each.
-    on_map
-        Called with the number of maps done and the number of all.
+    parts
+        Folder that keeps each map as soon as it is there, so that an interrupted run loses at most one.
+    on_progress
+        Takes the number of maps done and the number of all.
 
     Raises
     ------
@@ -419,83 +289,71 @@ def explain_frames(
         If a method is unknown.
     """
     require_methods(methods, explainers)
-    parts = folder / "parts"
-    parts.mkdir(exist_ok=True)
     inputs = trained.encoding.normalise(chosen.images).to(trained.device)
-    untouched = chosen.references.to(trained.device)
-    relevance: dict[str, Any] = {}
-    saliency: dict[str, Any] = {}
-    notes: dict[str, Any] = {}
+    references = chosen.references.to(trained.device)
+
+    def explain(method: str, index: int) -> _Map:
+        own, frame = explainers[method], slice(index, index + 1)
+        explainer = own[index] if isinstance(own, Sequence) else own
+        explanation = explainer(trained.model, inputs[frame], reference=references[frame])
+        return _Map(
+            relevance=explanation.relevance[0].cpu().numpy(),
+            saliency=explanation.saliency[0].cpu().numpy(),
+            seconds=explanation.seconds,
+            warnings=explanation.warnings,
+        )
+
+    maps: dict[str, list[_Map]] = {method: [] for method in methods}
     total = len(methods) * len(inputs)
-    for number, method in enumerate(methods):
-        pieces = []
-        for index in range(len(inputs)):
-            part = parts / f"{method}-{index:05d}.npz"
-            if not part.is_file():
-                one = slice(index, index + 1)
-                explain = explainers[method]
-                if isinstance(explain, Sequence):
-                    explain = explain[index]
-                explanation = explain(trained.model, inputs[one], reference=untouched[one])
-                _save_part(part, explanation)
-            with np.load(part, allow_pickle=False) as archive:
-                pieces.append({name: archive[name] for name in archive.files})
-            if on_map is not None:
-                on_map(number * len(inputs) + index + 1, total)
-        relevance[method] = np.stack([piece["relevance"] for piece in pieces])
-        saliency[method] = np.stack([piece["saliency"] for piece in pieces])
-        notes[method] = _notes(pieces, chosen.ids)
+    for done in range(total):
+        method, index = methods[done // len(inputs)], done % len(inputs)
+        part = None if parts is None else parts / f"{method}-{index:05d}"
+        maps[method].append(keep_part(part, _Map, lambda method=method, index=index: explain(method, index)))
+        if on_progress is not None:
+            on_progress(done + 1, total)
     # the same answers for every method: asked once, on all frames
-    predictions = trained.predict(inputs)
-    references = trained.predict(chosen.references)
-    explained = Explained(
+    predictions, untouched = trained.predict(inputs).tolist(), trained.predict(chosen.references).tolist()
+    return Explained(
         input=trained.encoding.name,
         source=chosen.source,
+        weights_sha256=trained.manifest.weights_sha256,
         frames=tuple(
             ExplainedFrame(
                 id=chosen.ids[index],
                 trial=chosen.trial[index],
                 condition=chosen.condition[index],
-                safety_margin=_or_none(float(chosen.safety_margin[index])),
-                prediction=float(predictions[index]),
-                reference_prediction=float(references[index]),
+                safety_margin=float(margin) if np.isfinite(margin) else None,
+                prediction=predictions[index],
+                reference_prediction=untouched[index],
             )
-            for index in range(len(inputs))
+            for index, margin in enumerate(chosen.safety_margin)
         ),
-        images=chosen.images,
-        relevance=relevance,
-        saliency=saliency,
-        weights_sha256=trained.manifest.weights_sha256,
+        methods={method: _note(own, chosen.ids) for method, own in maps.items()},
+        images=chosen.images.numpy(),
+        pictures=(255 * inputs).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous().cpu().numpy(),
+        relevance={method: np.stack([one.relevance for one in own]) for method, own in maps.items()},
+        saliency={method: np.stack([one.saliency for one in own]) for method, own in maps.items()},
     )
-    save_explained(explained, folder, pictures=(255 * inputs).round().to(torch.uint8).cpu(), methods=notes)
-    shutil.rmtree(parts)
-    return explained
 
 
-def _save_part(path: Path, explanation: Explanation) -> None:
-    hidden = path.with_suffix(".part.npz")
-    np.savez(
-        hidden,
-        allow_pickle=False,
-        relevance=explanation.relevance[0].cpu().numpy(),
-        saliency=explanation.saliency[0].cpu().numpy(),
-        seconds=np.float64(explanation.seconds),
-        warnings=np.array(explanation.warnings, dtype=np.str_),
-    )
-    hidden.replace(path)
-
-
-def _notes(pieces: list[dict[str, np.ndarray]], ids: Sequence[str]) -> dict[str, Any]:
+def _note(maps: Sequence[_Map], ids: Sequence[str]) -> MethodNotes:
     warnings: dict[str, list[str]] = {}
-    for name, piece in zip(ids, pieces, strict=True):
-        for warning in piece["warnings"]:
+    for name, own in zip(ids, maps, strict=True):
+        for warning in own.warnings:
             # each frame was explained by itself: its place in that batch of one tells nothing
-            warnings.setdefault(str(warning).removeprefix("image 0: "), []).append(name)
-    return {
-        "seconds_per_frame": float(np.mean([piece["seconds"] for piece in pieces])),
-        "warnings": [f"{', '.join(names)}: {warning}" for warning, names in warnings.items()],
-    }
+            warnings.setdefault(warning.removeprefix("image 0: "), []).append(name)
+    return MethodNotes(
+        seconds_per_frame=float(np.mean([own.seconds for own in maps])),
+        warnings=tuple(f"{', '.join(names)}: {warning}" for warning, names in warnings.items()),
+    )
 
 
-def _or_none(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+def network_inputs(trained: TrainedModel, explained: Explained) -> Float[Tensor, "frames 3 size size"]:
+    """What the network got of explained frames, in [0, 1], on its device."""
+    return trained.encoding.normalise(torch.from_numpy(explained.images)).to(trained.device)
+
+
+def mean_of_known(values: Float[np.ndarray, " values"]) -> float | None:
+    """Mean of what is defined; None where nothing is, since JSON knows no NaN."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else None

@@ -1,9 +1,7 @@
 """What the eye judges of the maps of a study, as numbers."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Sequence
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,27 +10,21 @@ from torch import Tensor
 
 from sliplens.explainers import Explainer
 from sliplens.faithfulness.map_quality import gini, resolution, stability, total_variation
-from sliplens.files import write_json
 from sliplens.intervals import paired_difference
 from sliplens.models import TrainedModel
+from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset
-from sliplens.study.choice import Pick
-from sliplens.study.explaining import RESULT_FILE, mean_of_known
+from sliplens.results.study import ChosenFrame, MapMeasures, MapQuality, Roughness
+from sliplens.study.explaining import mean_of_known
 from sliplens.study.material import Material
 
 _NORMAL_QUARTILE = 0.6745
 """Median size of a standard normal number."""
 
 
-def check_looks(
-    material: Material,
-    data: Dataset,
-    folder: Path,
-    *,
-    repeated: int = 3,
-    seed: int = 0,
-    on_method: Callable[[int, int], None] | None = None,
-) -> None:
+def measure_maps(
+    material: Material, data: Dataset, *, repeated: int = 3, seed: int = 0, on_progress: OnProgress | None = None
+) -> MapQuality:
     """Measure resolution, smoothness, sparsity and stability of the maps.
 
     Stability is the correlation with the map of the same frame under other camera noise, as large as what differs
@@ -44,71 +36,69 @@ def check_looks(
         The network, its maps and methods.
     data
         Data set that the frames came from.
-    folder
-        Gets `result.json`; must exist.
     repeated
         How many frames, from the first on, are explained twice more.
     seed
         Of the noise.
-    on_method
-        Called with the methods done and their number.
+    on_progress
+        Takes the methods done and their number.
     """
     explained, rng = material.explained, np.random.default_rng(seed)
-    noisy, following, noise_sd = _once_more(material.trained, data, material.picks[:repeated], rng=rng)
+    noisy, following, noise_sd = _once_more(material.trained, data, material.chosen[:repeated], rng=rng)
     references = material.references[:repeated]
-    told, roughness = {}, {}
+    methods, roughness = {}, {}
     for number, (name, explainer) in enumerate(material.explainers.items(), start=1):
 
         def again(images: Tensor, explainer: Explainer = explainer) -> Float[np.ndarray, "repeated height width"]:
             return explainer(material.trained.model, images, reference=references).relevance.double().cpu().numpy()
 
-        saliency = explained.saliency[name].astype(np.float64)
+        maps = explained.saliency[name].astype(np.float64)
         before = explained.relevance[name][:repeated].astype(np.float64)
-        apart = [
-            resolution(one, material.places(frame.id)[0])
-            for one, frame in zip(saliency, explained.frames, strict=True)
+        resolutions = [
+            resolution(saliency, material.places(frame.id)[0])
+            for saliency, frame in zip(maps, explained.frames, strict=True)
             if frame.id in material.markers
         ]
-        roughness[name] = np.array([total_variation(one) for one in saliency])
-        told[name] = {
-            "resolution": mean_of_known(np.array(apart, dtype=np.float64)),
-            "total_variation": mean_of_known(roughness[name]),
-            "gini": mean_of_known(np.array([gini(one) for one in saliency])),
-            "noise_stability": mean_of_known(stability(before, again(noisy))),
-            "frame_stability": mean_of_known(stability(before, again(following))),
-        }
-        if on_method is not None:
-            on_method(number, len(material.explainers))
-    write_json(
-        folder / RESULT_FILE,
-        {
-            "input": explained.input,
-            "source": explained.source,
-            "frames": len(explained.frames),
-            "repeated_frames": len(references),
-            "noise_sd": noise_sd,
-            "methods": told,
-            # stability was tried on few frames: no interval would mean anything
-            "comparisons": [
-                {"measure": "total_variation", "first": first, "second": second, **asdict(gap), "sure": gap.sure}
-                for first, second in combinations(roughness, 2)
-                for gap in [paired_difference(roughness[first], roughness[second], trials=material.trials, rng=rng)]
-            ],
-        },
+        roughness[name] = np.array([total_variation(saliency) for saliency in maps])
+        methods[name] = MapMeasures(
+            resolution=mean_of_known(np.array(resolutions, dtype=np.float64)),
+            total_variation=mean_of_known(roughness[name]),
+            gini=mean_of_known(np.array([gini(saliency) for saliency in maps])),
+            noise_stability=mean_of_known(stability(before, again(noisy))),
+            frame_stability=mean_of_known(stability(before, again(following))),
+        )
+        if on_progress is not None:
+            on_progress(number, len(material.explainers))
+    return MapQuality(
+        input=explained.input,
+        source=explained.source,
+        frames=len(explained.frames),
+        repeated_frames=len(references),
+        noise_sd=noise_sd,
+        methods=methods,
+        # stability was tried on few frames: no interval would mean anything
+        comparisons=tuple(
+            Roughness(
+                first=first,
+                second=second,
+                gap=paired_difference(roughness[first], roughness[second], trials=material.trials, rng=rng),
+            )
+            for first, second in combinations(roughness, 2)
+        ),
     )
 
 
 def _once_more(
-    trained: TrainedModel, data: Dataset, picks: Sequence[Pick], *, rng: np.random.Generator
+    trained: TrainedModel, data: Dataset, chosen: Sequence[ChosenFrame], *, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor, float]:
     """The frames with more camera noise, and the frames that follow them, as the network gets them; grey levels."""
     infos = {info.trial: info for info in data.trials}
     noisy, following, levels = [], [], []
-    for pick in picks:
-        recording = data.load(infos[pick.trial], truth=False)
-        frame = recording.frames[pick.frame].astype(np.float64)
+    for own in chosen:
+        recording = data.load(infos[own.trial], truth=False)
+        frame = recording.frames[own.frame].astype(np.float64)
         # the last frame has none after it
-        other = recording.frames[pick.frame + 1 if pick.frame + 1 < len(recording) else pick.frame - 1]
+        other = recording.frames[own.frame + 1 if own.frame + 1 < len(recording) else own.frame - 1]
         # most pixels do not move from one frame to the next: what they differ by is noise, twice
         sd = float(np.median(np.abs(frame - other)) / _NORMAL_QUARTILE / np.sqrt(2))
         levels.append(sd)

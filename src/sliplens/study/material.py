@@ -5,7 +5,6 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -14,9 +13,10 @@ from sliplens.faithfulness.units import Units, marker_units, pixel_units, tile_u
 from sliplens.models import TrainedModel
 from sliplens.models.engines import Engine, prepare
 from sliplens.recordings import Dataset
-from sliplens.study.choice import Pick
-from sliplens.study.explaining import Explained, frames_at, require_methods
-from sliplens.study.states import MarkedFrame, network_places
+from sliplens.results.explanation import Explained
+from sliplens.results.study import ChosenFrame, MarkedFrame
+from sliplens.study.explaining import frames_at, network_inputs, require_methods
+from sliplens.study.states import network_places
 
 THESIS_POLY_CAM = "poly-cam-thesis"
 STUDY_METHODS = ("grad-cam", "integrated-gradients", THESIS_POLY_CAM, "poly-cam", "occlusion")
@@ -87,7 +87,7 @@ class Material:
     """What the network got, in [0, 1]."""
     references: Float[Tensor, "frames 3 size size"]
     """The untouched sensor for each frame."""
-    picks: tuple[Pick, ...]
+    chosen: tuple[ChosenFrame, ...]
     markers: Mapping[str, MarkedFrame]
     """By frame, in camera pixels; frames in which none could be followed are absent."""
     explainers: Mapping[str, Explainer]
@@ -98,14 +98,9 @@ class Material:
         """Trial of each frame."""
         return np.array([frame.trial for frame in self.explained.frames])
 
-    @property
-    def towards(self) -> Float[np.ndarray, " frames"]:
-        """Sign of each answer's change from that on the untouched sensor, which the maps explain."""
-        return np.array([np.sign(one.prediction - one.reference_prediction) for one in self.explained.frames])
-
     def towards_target(self, method: str) -> Float[np.ndarray, "frames size size"]:
         """The part of a method's relevance that works towards each frame's target."""
-        return self.explained.relevance[method] * self.towards[:, None, None]
+        return self.explained.relevance[method] * self.explained.towards[:, None, None]
 
     def fast(self, passes: int) -> Engine:
         """Make an engine ready for so many passes of the network."""
@@ -140,7 +135,7 @@ def gather(
     trained: TrainedModel,
     explained: Explained,
     data: Dataset,
-    picks: tuple[Pick, ...],
+    chosen: tuple[ChosenFrame, ...],
     *,
     markers: Mapping[str, MarkedFrame],
     explainers: Mapping[str, Explainer],
@@ -151,31 +146,24 @@ def gather(
     ----------
     trained, explained, data
         The network, its explanations, and the data set that the frames came from.
-    picks
+    chosen
         Frames that count, each of which is explained.
     markers, explainers
         See `Material`.
     """
     places = {frame.id: at for at, frame in enumerate(explained.frames)}
-    rows = [places[pick.id] for pick in picks]
-    some = replace(
-        explained,
-        frames=tuple(explained.frames[row] for row in rows),
-        images=explained.images[torch.tensor(rows)],
-        relevance={name: maps[rows] for name, maps in explained.relevance.items()},
-        saliency={name: maps[rows] for name, maps in explained.saliency.items()},
-    )
+    counted = explained.take([places[frame.id] for frame in chosen])
     by_trial: dict[str, list[int]] = {}
-    for pick in picks:
-        by_trial.setdefault(pick.trial, []).append(pick.frame)
-    chosen = frames_at(trained, data, by_trial)
-    at = {name: row for row, name in enumerate(chosen.ids)}
+    for frame in chosen:
+        by_trial.setdefault(frame.trial, []).append(frame.frame)
+    frames = frames_at(trained, data, by_trial)
+    rows = [frames.ids.index(frame.id) for frame in chosen]
     return Material(
         trained=trained,
-        explained=some,
-        inputs=trained.encoding.normalise(some.images).to(trained.device),
-        references=chosen.references[torch.tensor([at[pick.id] for pick in picks])].to(trained.device),
-        picks=picks,
+        explained=counted,
+        inputs=network_inputs(trained, counted),
+        references=frames.references[rows].to(trained.device),
+        chosen=chosen,
         markers=markers,
         explainers=explainers,
     )

@@ -13,10 +13,10 @@ from sliplens.faithfulness.units import Units
 from sliplens.models import TrainedModel
 from sliplens.recordings import Dataset
 from sliplens.recordings.trial import SLIPS
+from sliplens.results.explanation import Explained
 from sliplens.simulation import SimulationRecipe
 from sliplens.simulation.information import visible_markers
 from sliplens.simulation.intervention import FilmedTrial, draw_with_markers_back, marker_outlines, rebuild_trial
-from sliplens.study.explaining import Explained
 
 _RIM_PX = 1.5
 """How far a marker's edge reaches on either side of its outline, in pixels of the network's input."""
@@ -108,8 +108,8 @@ def stage_frames(
             name = explained.frames[row].id
             number = _number(name, trial, frames=len(recording.frames))
             compared = trained.encoding.compare(recording.frames[number : number + 1], recording.reference)
-            found = trained.encoding.resize(compared, image_size=trained.manifest.image_size)[0].short()
-            if (found - explained.images[row].short()).abs().max() > _ROUNDING:
+            image = trained.encoding.resize(compared, image_size=trained.manifest.image_size)[0].numpy()
+            if np.abs(image.astype(np.int16) - explained.images[row].astype(np.int16)).max() > _ROUNDING:
                 raise InputError(f"{name} is not the frame of {data.folder} that was explained; explain it again")
             truth = recording.truth
             assert truth is not None  # what was rebuilt has its truth

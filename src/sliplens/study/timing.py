@@ -1,22 +1,21 @@
-"""What a map costs: seconds a frame, with warm-up, the device waited for, with and without the forward pass."""
+"""Cost of a map: seconds a frame, with warm-up, the device waited for, with and without the forward pass."""
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sliplens.files import write_json
-from sliplens.study.explaining import RESULT_FILE
+from sliplens.progress import OnProgress
+from sliplens.results.study import MethodTime, Timing
 from sliplens.study.material import Material, as_the_thesis_ran
 
 _REPEATS, _SLOW_REPEATS, _SLOW_S = 5, 3, 3.0
 
 
-def time_explainers(material: Material, folder: Path, *, on_method: Callable[[int, int], None] | None = None) -> None:
-    """Time each method on one frame, and write the median and the extremes of a few runs.
+def time_explainers(material: Material, *, on_progress: OnProgress | None = None) -> Timing:
+    """Time each method on one frame: the median and the extremes of a few runs.
 
     The thesis's Poly-CAM is timed with all its channels, as it was run, even where a budget makes its maps.
 
@@ -24,50 +23,42 @@ def time_explainers(material: Material, folder: Path, *, on_method: Callable[[in
     ----------
     material
         The network, frames (the first is timed) and methods.
-    folder
-        Gets `result.json`; must exist.
-    on_method
-        Called with the methods done and their number.
+    on_progress
+        Takes the methods done and their number.
     """
     model, inputs, references = material.trained.model, material.inputs[:1], material.references[:1]
     forward = float(np.median(_seconds(lambda: material.trained.predict(inputs))))
-    told, counts = {}, []
+    methods, counts = {}, []
     for number, (name, explainer) in enumerate(as_the_thesis_ran(material.explainers).items(), start=1):
-        seconds = _seconds(lambda one=explainer: one(model, inputs, reference=references).relevance)
-        middle = float(np.median(seconds))
+        seconds = _seconds(lambda explainer=explainer: explainer(model, inputs, reference=references).relevance)
+        median = float(np.median(seconds))
         counts.append(len(seconds))
-        told[name] = {
-            "seconds": middle,
-            # what the thesis left out of Grad-CAM's time
-            "seconds_without_forward": max(0.0, middle - forward),
-            "low": min(seconds),
-            "high": max(seconds),
-        }
-        if on_method is not None:
-            on_method(number, len(material.explainers))
-    write_json(
-        folder / RESULT_FILE,
-        {
-            "input": material.explained.input,
-            "source": material.explained.source,
-            "device": inputs.device.type,
-            "threads": torch.get_num_threads(),
-            # of the method that takes longest; the others have more
-            "repeats": min(counts),
-            "forward_seconds": forward,
-            "methods": told,
-        },
+        # without the forward pass: the thesis left it out of Grad-CAM's time
+        methods[name] = MethodTime(
+            seconds=median, seconds_without_forward=max(0.0, median - forward), low=min(seconds), high=max(seconds)
+        )
+        if on_progress is not None:
+            on_progress(number, len(material.explainers))
+    return Timing(
+        input=material.explained.input,
+        source=material.explained.source,
+        device=inputs.device.type,
+        threads=torch.get_num_threads(),
+        # of the method that takes longest; the others have more
+        repeats=min(counts),
+        forward_seconds=forward,
+        methods=methods,
     )
 
 
 def _seconds(work: Callable[[], Tensor]) -> list[float]:
     """Seconds of each of a few runs, after one that does not count; fewer where one takes long."""
-    found: list[float] = []
+    seconds: list[float] = []
     work()
-    while len(found) < (_SLOW_REPEATS if found and found[0] > _SLOW_S else _REPEATS):
+    while len(seconds) < (_SLOW_REPEATS if seconds and seconds[0] > _SLOW_S else _REPEATS):
         started = time.perf_counter()
         result = work()
         if result.is_cuda:
             torch.cuda.synchronize(result.device)
-        found.append(time.perf_counter() - started)
-    return found
+        seconds.append(time.perf_counter() - started)
+    return seconds

@@ -1,18 +1,15 @@
 """Explanations held against the truth that only a simulator knows: what each marker does when it is put back."""
 
-import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from scipy.stats import spearmanr
 from torch import Tensor
 
+from sliplens.codec import keep_part
 from sliplens.faithfulness import get_fill
 from sliplens.faithfulness.localisation import relevance_mass, relevance_rank
 from sliplens.faithfulness.removal import (
@@ -25,26 +22,31 @@ from sliplens.faithfulness.removal import (
 )
 from sliplens.faithfulness.true_fill import SHARES, Redraw, influence_orders, marker_curves, marker_faithfulness
 from sliplens.faithfulness.units import unit_means, unit_order
-from sliplens.files import write_json
-from sliplens.intervals import paired_difference
+from sliplens.intervals import Difference, paired_difference
 from sliplens.models import TrainedModel
+from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset
+from sliplens.results.explanation import Explained
+from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTest, OracleTest, Truth
 from sliplens.simulation import SimulationRecipe
 from sliplens.simulation.intervention import marker_readings
-from sliplens.study.explaining import MAPS_FILE, RESULT_FILE, Explained, mean_of_known
+from sliplens.study.explaining import mean_of_known, network_inputs
 from sliplens.study.material import make_fast
 from sliplens.study.scenes import Places, StagedFrame, find_places, redrawing, stage_frames
 from sliplens.study.scoring import require_same_network
 
 TRUE_FILL = "true"
-EFFECTS_FILE = "effects.parquet"
-EFFECTS = ("network", "margin")
-"""What putting a marker back changes."""
 ORACLE, DEGRADED = "oracle", "degraded-oracle"
+RANDOM = "random"
+"""A map of even noise."""
+TRUTH_FILLS = ("reference", "grey", "background", "blur")
+"""Fills that the oracle is tried under; the true one always is. The noisy-linear one takes longer than all of them."""
+
+Maps = Float[np.ndarray, "frames size size"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class MarkerEffects:
+class FrameEffects:
     """What each marker of a frame does, in margin units: the value as it is less the value with the marker put back.
 
     Attributes
@@ -60,10 +62,10 @@ class MarkerEffects:
         changes by their size, as `Faithfulness` has them, and one for changes counted towards the target.
     """
 
-    network: Float[np.ndarray, " markers"]
-    margin: Float[np.ndarray, " markers"]
-    shuffled: Float[np.ndarray, " markers"]
-    gains: Mapping[str, Float[np.ndarray, "2 2"]]
+    network: Float64[np.ndarray, " markers"]
+    margin: Float64[np.ndarray, " markers"]
+    shuffled: Float64[np.ndarray, " markers"]
+    gains: dict[str, Float64[np.ndarray, "2 2"]]
 
 
 def network_effects(predict: Predict, redraw: Redraw, image: int, *, markers: int) -> Float[np.ndarray, " markers"]:
@@ -102,7 +104,7 @@ def find_effects(
     towards: float,
     fills: Sequence[str],
     rng: np.random.Generator,
-) -> MarkerEffects:
+) -> FrameEffects:
     """Put every marker of a frame back, and see which fills can tell a map that knows its effects from half of one.
 
     Parameters
@@ -142,11 +144,11 @@ def find_effects(
     curves[TRUE_FILL] = marker_curves(
         predict, lambda _, back: redraw(image, back), np.concatenate([influence_orders(one[None]) for one in known])
     )
-    return MarkerEffects(
+    return FrameEffects(
         network=network,
         margin=marker_readings(frame.scene, frame.number)[1],
         shuffled=shuffled,
-        gains={name: _gains(found, towards) for name, found in curves.items()},
+        gains={name: _gains(own, towards) for name, own in curves.items()},
     )
 
 
@@ -158,69 +160,6 @@ def _gains(curves: RemovalCurves, towards: float) -> Float[np.ndarray, "2 2"]:
     return means[:, ::2] - means[:, 1::2]
 
 
-def save_effects(path: Path, effects: MarkerEffects) -> None:
-    """Write the effects of a frame, beside the target first."""
-    hidden = path.with_suffix(".part.npz")
-    np.savez(
-        hidden,
-        allow_pickle=False,
-        network=effects.network,
-        margin=effects.margin,
-        shuffled=effects.shuffled,
-        fills=np.array(list(effects.gains), dtype=np.str_),
-        gains=np.stack(list(effects.gains.values())),
-    )
-    hidden.replace(path)
-
-
-def load_effects(path: Path) -> MarkerEffects:
-    """Read what `save_effects` wrote."""
-    with np.load(path, allow_pickle=False) as archive:
-        return MarkerEffects(
-            network=archive["network"],
-            margin=archive["margin"],
-            shuffled=archive["shuffled"],
-            gains=dict(zip(archive["fills"].tolist(), archive["gains"], strict=True)),
-        )
-
-
-def write_effects(
-    folder: Path, frames: Sequence[StagedFrame], places: Sequence[Places], effects: Sequence[MarkerEffects]
-) -> None:
-    """Write the effects of all frames as a table, and painted on the markers."""
-    tables = [
-        pa.table(
-            {
-                "frame_id": [frame.id] * len(frame.markers),
-                "trial": [frame.trial] * len(frame.markers),
-                "safety_margin": np.full(len(frame.markers), frame.safety_margin),
-                "marker": frame.markers.astype(np.int64),
-                "x_px": one.now_px[:, 0],
-                "y_px": one.now_px[:, 1],
-                "network_effect": found.network,
-                "margin_effect": found.margin,
-                "state": one.state,
-            }
-        )
-        for frame, one, found in zip(frames, places, effects, strict=True)
-    ]
-    pq.write_table(pa.concat_tables(tables), folder / EFFECTS_FILE)
-    maps = {
-        effect: np.stack([one.paint(getattr(found, effect)) for one, found in zip(places, effects, strict=True)])
-        for effect in EFFECTS
-    }
-    np.savez_compressed(
-        folder / MAPS_FILE, allow_pickle=False, **{name: values.astype(np.float32) for name, values in maps.items()}
-    )
-
-
-AREAS = ("markers", "slip_annulus", "edges")
-"""Where a map may lie."""
-_MEASURES: dict[str, Callable[..., float]] = {"mass": relevance_mass, "rank": relevance_rank}
-
-Maps = Float[np.ndarray, "frames size size"]
-
-
 def marker_means(maps: Maps, places: Sequence[Places]) -> list[Float[np.ndarray, " markers"]]:
     """Mean of each frame's map over each of its markers, where it is and where it was."""
     return [
@@ -230,44 +169,29 @@ def marker_means(maps: Maps, places: Sequence[Places]) -> list[Float[np.ndarray,
 
 
 def covered_shares(places: Sequence[Places]) -> dict[str, float | None]:
-    """Share of the image that each area covers, mean over the frames that have it: the mass of a map of chance."""
-    shares = {area: np.array([getattr(one, area).mean() for one in places]) for area in AREAS}
-    return {area: mean_of_known(values[values > 0]) for area, values in shares.items()}
+    """Share of the image that each region covers, mean over the frames that have it: the mass of a map of chance."""
+    shares = {region: np.array([getattr(own, region).mean() for own in places]) for region in REGIONS}
+    return {region: mean_of_known(values[values > 0]) for region, values in shares.items()}
 
 
-def localisation(maps: Maps, places: Sequence[Places]) -> dict[str, dict[str, float | None]]:
-    """Mass and rank of the positive part of maps in each area, mean over the frames that have the area."""
+def localise(maps: Maps, places: Sequence[Places], measure: Callable[..., float]) -> dict[str, float | None]:
+    """Mass or rank of the positive part of maps in each region, mean over the frames that have the region."""
     positive = np.clip(maps.astype(np.float64), 0, None)
-    found: dict[str, dict[str, float | None]] = {}
-    for name, measure in _MEASURES.items():
-        found[name] = {}
-        for area in AREAS:
-            truths = [getattr(one, area) for one in places]
-            # where nothing slips there is nothing to find
-            pairs = [(values, truth) for values, truth in zip(positive, truths, strict=True) if truth.any()]
-            found[name][area] = mean_of_known(np.array([measure(values, truth) for values, truth in pairs]))
-    return found
+    means = {}
+    for region in REGIONS:
+        truths = [getattr(own, region) for own in places]
+        # where nothing slips there is nothing to find
+        pairs = [(values, truth) for values, truth in zip(positive, truths, strict=True) if truth.any()]
+        means[region] = mean_of_known(np.array([measure(values, truth) for values, truth in pairs]))
+    return means
 
 
 def edges_over_chance(maps: Maps, places: Sequence[Places]) -> Float[np.ndarray, " frames"]:
     """Mass of the positive part of each map on the edges of markers, less the share of the image that they cover."""
     positive = np.clip(maps.astype(np.float64), 0, None)
     return np.array(
-        [relevance_mass(values, one.edges) - one.edges.mean() for values, one in zip(positive, places, strict=True)]
+        [relevance_mass(values, own.edges) - own.edges.mean() for values, own in zip(positive, places, strict=True)]
     )
-
-
-def agreements(
-    maps: Maps, places: Sequence[Places], effects: Sequence[MarkerEffects]
-) -> dict[str, Float[np.ndarray, " frames"]]:
-    """Rank correlation, by frame, between a map marker by marker and each of the effects."""
-    means = marker_means(maps, places)
-    return {
-        effect: np.array(
-            [rank_correlation(told, getattr(truth, effect)) for told, truth in zip(means, effects, strict=True)]
-        )
-        for effect in EFFECTS
-    }
 
 
 def rank_correlation(first: Float[np.ndarray, " markers"], second: Float[np.ndarray, " markers"]) -> float:
@@ -278,82 +202,70 @@ def rank_correlation(first: Float[np.ndarray, " markers"], second: Float[np.ndar
     return float(np.asarray(spearmanr(first, second))[0])
 
 
-def mean_interval(values: Float[np.ndarray, " frames"], trials: np.ndarray, *, seed: int) -> dict[str, Any] | None:
+def mean_interval(values: Float[np.ndarray, " frames"], trials: np.ndarray, *, seed: int) -> Difference | None:
     """Mean over the frames in which it is defined, with a 95 % interval over resampled trials; None if in none."""
     known = np.isfinite(values)
     if not known.any():
         return None
-    gap = paired_difference(
-        values[known], np.zeros(int(known.sum())), trials=trials[known], rng=np.random.default_rng(seed)
-    )
-    return {**asdict(gap), "sure": gap.sure}
+    none = np.zeros(int(known.sum()))
+    return paired_difference(values[known], none, trials=trials[known], rng=np.random.default_rng(seed))
 
 
-def meta_test(effects: Sequence[MarkerEffects], trials: np.ndarray, *, seed: int) -> list[dict[str, Any]]:
+def meta_test(effects: Sequence[FrameEffects], trials: np.ndarray, *, seed: int) -> tuple[MetaTest, ...]:
     """Whether each fill ranks the map that knows the effects above the one that knows half, and that above chance.
 
     A gain counts changes of the answer towards the target, as `faithfulness` does when it is told; `by_size` counts how
     large they are, where a marker that works against the answer moves it as far as one that works for it.
     """
-    told = []
+    tests = []
     for fill in effects[0].gains:
-        gains = np.stack([found.gains[fill] for found in effects])
-        by_size, signed = (_ranked(gains[:, row], trials, seed=seed) for row in (0, 1))
-        told.append({"fill": fill, **signed, "by_size": by_size})
-    return told
+        gains = np.stack([own.gains[fill] for own in effects])
+        signed, by_size = (_test_oracle(gains[:, row], trials, seed=seed) for row in (1, 0))
+        tests.append(MetaTest(fill=fill, by_size=by_size, **vars(signed)))
+    return tuple(tests)
 
 
-def _ranked(gains: Float[np.ndarray, "frames 2"], trials: np.ndarray, *, seed: int) -> dict[str, Any]:
+def _test_oracle(gains: Float[np.ndarray, "frames 2"], trials: np.ndarray, *, seed: int) -> OracleTest:
     oracle, degraded = gains.mean(axis=0).tolist()
-    return {
-        "holds": oracle > degraded > 0,
-        "oracle": oracle,
-        "degraded": degraded,
+    return OracleTest(
+        holds=oracle > degraded > 0,
+        oracle=oracle,
+        degraded=degraded,
         # a random order turned round is a random order: its symmetric gain is 0 on average
-        "random": 0.0,
-        "gap": mean_interval(gains[:, 0] - gains[:, 1], trials, seed=seed),
-    }
+        random=0.0,
+        gap=mean_interval(gains[:, 0] - gains[:, 1], trials, seed=seed),
+    )
 
 
-def tell(meta: Sequence[Mapping[str, Any]], own: Mapping[str, Any] | None) -> str:
+def _summarise(meta: Sequence[MetaTest], agreement: Difference | None) -> str:
     """Say which fills can tell, and whether the network looks where the best reader would."""
-    held = [str(row["fill"]) for row in meta if row["holds"]]
-    by_size = [str(row["fill"]) for row in meta if row["by_size"]["holds"]]
-    told = (
+    held, by_size = [test.fill for test in meta if test.holds], [test.fill for test in meta if test.by_size.holds]
+    summary = (
         "The map of the network's own marker effects ranks above one of which half is shuffled, and that above chance, "
         f"under {len(held)} of {len(meta)} fills ({', '.join(held) or 'none'}); counted by the size of the answer's "
         f"changes instead of along them, under {len(by_size)} ({', '.join(by_size) or 'none'})."
     )
-    if own is not None:
-        told += (
+    if agreement is not None:
+        summary += (
             f" Marker by marker the network's effects agree with those on the best reading of the margin by "
-            f"{own['estimate']:.2f} (Spearman, 95 % interval {own['low']:.2f} to {own['high']:.2f})."
+            f"{agreement.estimate:.2f} (Spearman, 95 % interval {agreement.low:.2f} to {agreement.high:.2f})."
         )
-    return told
-
-
-RANDOM = "random"
-"""A map of even noise."""
-TRUTH_FILLS = ("reference", "grey", "background", "blur")
-"""Fills that the oracle is tried under; the true one always is. The noisy-linear one takes longer than all of them."""
+    return summary
 
 
 def judge_by_truth(
     trained: TrainedModel,
     explained: Explained,
     data: Dataset,
-    folder: Path,
     *,
     maps: Mapping[str, Maps],
     fills: Sequence[str] = TRUTH_FILLS,
     recipe: SimulationRecipe | None = None,
     seed: int = 0,
-    on_frame: Callable[[int, int], None] | None = None,
-) -> None:
+    parts: Path | None = None,
+    on_progress: OnProgress | None = None,
+) -> Truth:
     """Put every marker of every frame back, and hold maps against what that does.
-
-    What is found of a frame is written under `parts` as soon as it is there; a second call with the same folder goes on
-    after the last.
 
     A map's mass and rank are those of its positive part, what works towards the answer: a share of a sum needs one
     sign. Marker by marker it is the size of a map's mean that is compared with the size of the effect: a marker that
@@ -365,8 +277,6 @@ def judge_by_truth(
         The network, and the explanations of the frames to judge.
     data
         The simulated data set that they are from.
-    folder
-        Gets `effects.parquet`, `maps.npz` and `result.json`; must exist.
     maps
         Influence by method, controls included: signed relevance times the sign of the answer's change from the
         untouched sensor.
@@ -376,8 +286,10 @@ def judge_by_truth(
         What simulated the data set; read from its folder if None.
     seed
         Of the random map, the shuffling and the resampling.
-    on_frame
-        Called with the number of frames done and the number of all.
+    parts
+        Folder that keeps what is found of each frame, so that an interrupted run goes on after the last.
+    on_progress
+        Takes the number of frames done and the number of all.
 
     Raises
     ------
@@ -392,47 +304,69 @@ def judge_by_truth(
     for fill in fills:
         get_fill(fill)
     frames, places = _stage(trained, explained, data, recipe=recipe)
-    effects = _all_effects(
-        trained, explained, frames, places, folder / "parts", fills=fills, seed=seed, on_frame=on_frame
+    effects = _find_all_effects(
+        trained, explained, frames, places, fills=fills, seed=seed, parts=parts, on_progress=on_progress
     )
-    towards, size = _towards(explained), trained.manifest.image_size
+    size, towards = trained.manifest.image_size, explained.towards
     judged = dict(maps) | {
         RANDOM: np.random.default_rng(seed).random((len(frames), size, size)),
-        ORACLE: _paint(places, [sign * found.network for sign, found in zip(towards, effects, strict=True)]),
-        DEGRADED: _paint(places, [sign * found.shuffled for sign, found in zip(towards, effects, strict=True)]),
+        ORACLE: _paint(places, [sign * own.network for sign, own in zip(towards, effects, strict=True)]),
+        DEGRADED: _paint(places, [sign * own.shuffled for sign, own in zip(towards, effects, strict=True)]),
     }
     trials = np.array([frame.trial for frame in frames])
-    agreement = {name: agreements(values, places, effects) for name, values in judged.items()}
-    own = np.array([rank_correlation(found.network, found.margin) for found in effects])
-    meta, interval = meta_test(effects, trials, seed=seed), mean_interval(own, trials, seed=seed)
-    write_effects(folder, frames, places, effects)
-    write_json(
-        folder / RESULT_FILE,
-        {
-            "input": explained.input,
-            "source": explained.source,
-            "frames": len(frames),
-            "areas": covered_shares(places),
-            "methods": {
-                name: {
-                    **localisation(values, places),
-                    **{f"spearman_{effect}": mean_of_known(agreement[name][effect]) for effect in EFFECTS},
-                }
-                for name, values in judged.items()
-            },
-            "intervals": {
-                name: {
-                    **{f"spearman_{effect}": mean_interval(found[effect], trials, seed=seed) for effect in EFFECTS},
-                    "edges_over_chance": mean_interval(edges_over_chance(judged[name], places), trials, seed=seed),
-                }
-                for name, found in agreement.items()
-            },
-            "network_against_margin": interval,
-            "meta": meta,
-            "told": tell(meta, interval),
-        },
+    own = np.array([rank_correlation(one.network, one.margin) for one in effects])
+    meta, agreement = meta_test(effects, trials, seed=seed), mean_interval(own, trials, seed=seed)
+    return Truth(
+        input=explained.input,
+        source=explained.source,
+        frames=len(frames),
+        areas=covered_shares(places),
+        methods={name: _judge(values, places, effects, trials, seed=seed) for name, values in judged.items()},
+        network_against_margin=agreement,
+        meta=meta,
+        summary=_summarise(meta, agreement),
+        effects=_table(frames, places, effects),
+        network_maps=_paint(places, [one.network for one in effects]).astype(np.float32),
+        margin_maps=_paint(places, [one.margin for one in effects]).astype(np.float32),
     )
-    shutil.rmtree(folder / "parts")
+
+
+def _judge(
+    maps: Maps, places: Sequence[Places], effects: Sequence[FrameEffects], trials: np.ndarray, *, seed: int
+) -> Localisation:
+    means = marker_means(maps, places)
+    network, margin = (
+        np.array([rank_correlation(values, truth) for values, truth in zip(means, truths, strict=True)])
+        for truths in ([own.network for own in effects], [own.margin for own in effects])
+    )
+    return Localisation(
+        mass=localise(maps, places, relevance_mass),
+        rank=localise(maps, places, relevance_rank),
+        spearman_network=mean_of_known(network),
+        spearman_margin=mean_of_known(margin),
+        network=mean_interval(network, trials, seed=seed),
+        margin=mean_interval(margin, trials, seed=seed),
+        edges=mean_interval(edges_over_chance(maps, places), trials, seed=seed),
+    )
+
+
+def _table(frames: Sequence[StagedFrame], places: Sequence[Places], effects: Sequence[FrameEffects]) -> MarkerEffects:
+    return MarkerEffects.joined(
+        [
+            MarkerEffects(
+                frame_id=np.repeat(frame.id, len(frame.markers)),
+                trial=np.repeat(frame.trial, len(frame.markers)),
+                safety_margin=np.full(len(frame.markers), frame.safety_margin),
+                marker=frame.markers.astype(np.int64),
+                x_px=place.now_px[:, 0],
+                y_px=place.now_px[:, 1],
+                network=own.network,
+                margin=own.margin,
+                state=place.state,
+            )
+            for frame, place, own in zip(frames, places, effects, strict=True)
+        ]
+    )
 
 
 def true_curves(
@@ -444,13 +378,13 @@ def true_curves(
     recipe: SimulationRecipe | None = None,
     random_orders: int = RANDOM_ORDERS,
     seed: int = 0,
-    on_frame: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> dict[str, Faithfulness]:
     """Removal curves under the true fill: markers put back, most or least influential first, or in random orders.
 
     Parameters
     ----------
-    trained, explained, data, maps, recipe, on_frame
+    trained, explained, data, maps, recipe, on_progress
         As `judge_by_truth` takes them.
     random_orders, seed
         How many random orders, and what they are drawn from.
@@ -461,16 +395,16 @@ def true_curves(
         As `judge_by_truth`.
     """
     frames, places = _stage(trained, explained, data, recipe=recipe)
-    inputs = trained.encoding.normalise(explained.images)
+    inputs = network_inputs(trained, explained)
     passes = len(frames) * (2 * len(maps) + random_orders) * (len(SHARES) - 2)
     return marker_faithfulness(
         make_fast(trained, inputs, passes=passes),
         redrawing(trained, frames),
         {name: np.stack(marker_means(values, places)) for name, values in maps.items()},
         rng=np.random.default_rng(seed),
-        towards=np.array(_towards(explained)),
+        towards=explained.towards,
         random_orders=random_orders,
-        on_progress=on_frame,
+        on_progress=on_progress,
     )
 
 
@@ -482,49 +416,47 @@ def _stage(
     return frames, [find_places(frame, image_size=trained.manifest.image_size) for frame in frames]
 
 
-def _towards(explained: Explained) -> list[float]:
-    return [float(np.sign(frame.prediction - frame.reference_prediction)) for frame in explained.frames]
-
-
 def _paint(places: Sequence[Places], values: Sequence[Float[np.ndarray, " markers"]]) -> Maps:
-    return np.stack([one.paint(some) for one, some in zip(places, values, strict=True)])
+    return np.stack([place.paint(own) for place, own in zip(places, values, strict=True)])
 
 
-def _all_effects(
+def _find_all_effects(
     trained: TrainedModel,
     explained: Explained,
     frames: Sequence[StagedFrame],
     places: Sequence[Places],
-    parts: Path,
     *,
     fills: Sequence[str],
     seed: int,
-    on_frame: Callable[[int, int], None] | None,
-) -> list[MarkerEffects]:
-    parts.mkdir(exist_ok=True)
-    inputs, towards = trained.encoding.normalise(explained.images).to(trained.device), _towards(explained)
-    files = [parts / f"{index:05d}.npz" for index in range(len(frames))]
+    parts: Path | None,
+    on_progress: OnProgress | None,
+) -> list[FrameEffects]:
+    inputs, towards = network_inputs(trained, explained), explained.towards
     # each marker alone, and under each fill two maps both ways
-    passes = sum(not file.is_file() for file in files) * (len(frames[0].markers) + 4 * len(SHARES) * (len(fills) + 1))
+    passes = len(frames) * (len(frames[0].markers) + 4 * len(SHARES) * (len(fills) + 1))
     predict = make_fast(trained, inputs, passes=passes)
     redraw = redrawing(trained, frames)
-    for index, (file, frame) in enumerate(zip(files, frames, strict=True)):
-        if not file.is_file():
-            empty = trained.encoding.empty(frame.reference, image_size=trained.manifest.image_size)
-            found = find_effects(
-                predict,
-                redraw,
-                index,
-                frame,
-                places[index],
-                inputs=inputs[index : index + 1],
-                references=empty[None].to(trained.device),
-                towards=towards[index],
-                fills=fills,
-                # a run that goes on draws the same
-                rng=np.random.default_rng((seed, index)),
-            )
-            save_effects(file, found)
-        if on_frame is not None:
-            on_frame(index + 1, len(frames))
-    return [load_effects(file) for file in files]
+
+    def find(index: int) -> FrameEffects:
+        empty = trained.encoding.empty(frames[index].reference, image_size=trained.manifest.image_size)
+        return find_effects(
+            predict,
+            redraw,
+            index,
+            frames[index],
+            places[index],
+            inputs=inputs[index : index + 1],
+            references=empty[None].to(trained.device),
+            towards=float(towards[index]),
+            fills=fills,
+            # a run that goes on draws the same
+            rng=np.random.default_rng((seed, index)),
+        )
+
+    effects = []
+    for index in range(len(frames)):
+        part = None if parts is None else parts / f"{index:05d}"
+        effects.append(keep_part(part, FrameEffects, lambda index=index: find(index)))
+        if on_progress is not None:
+            on_progress(index + 1, len(frames))
+    return effects
