@@ -12,10 +12,12 @@ from sliplens.progress import OnProgress, note, stage, wrote
 
 
 def write(folder: Path, name: str, on_progress: OnProgress) -> None:
-    """Write a file, and say so."""
+    """Write a file beside another one's, and say so."""
     with stage(on_progress, f"Writing {name}") as count:
         (folder / name).write_text(f"{os.getpid()} {torch.get_num_threads()}")
         count(1, 1)
+        while len(list(folder.iterdir())) < 2:
+            time.sleep(0.01)
     wrote(on_progress, folder / name, f"the file of {name}")
 
 

@@ -62,12 +62,14 @@ def run_together(
         for future in futures:
             future.add_done_callback(end_with)
         for _, theirs in pipes.values():
-            theirs.close()  # so that the end of the processes is the end of the pipes
-        pool.shutdown(wait=False)
+            theirs.close()  # so that the end of the last process is the end of the pipes
         _show({ours: ExitStack() for ours, _ in pipes.values()}, on_progress)
-    finally:
+    except BaseException:
         life.close()
+        raise
+    finally:
         pool.shutdown(cancel_futures=True)
+        life.close()
     errors = [error for future in futures if (error := future.exception()) is not None]
     for error in errors:
         if not isinstance(error, BrokenProcessPool):
@@ -91,9 +93,10 @@ def _show(pipes: dict[Connection, ExitStack], on_progress: OnProgress | None) ->
                 try:
                     kind, *values = pipe.recv()
                 except EOFError:
-                    pipes.pop(pipe).close()
-                    continue
+                    kind, values = "done", []
                 match kind:
+                    case "done":
+                        pipes.pop(pipe).close()
                     case "begin":
                         counts[pipe] = pipes[pipe].enter_context(stage(on_progress, *values))
                     case "count":
@@ -145,7 +148,10 @@ def _end_with(alive: Connection) -> None:
 
 
 def _work(work: Callable[[str, OnProgress], Any], name: str) -> None:
-    work(name, _Relay(_PIPES[name]))
+    try:
+        work(name, _Relay(_PIPES[name]))
+    finally:
+        _PIPES[name].send(("done",))
 
 
 __all__ = ["run_together"]
