@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from sliplens.recordings.splits import split_dataset
     from sliplens.report.page import write_report
     from sliplens.simulation.trials import simulate
+    from sliplens.study.run import run_study
     from sliplens.training.evaluation import evaluate
     from sliplens.training.fitting import train
 
@@ -39,6 +40,7 @@ _MODULES = {
     "load_dataset": "sliplens.recordings.dataset",
     "plot": "sliplens.plots.figure",
     "predict": "sliplens.models.predictions",
+    "run_study": "sliplens.study.run",
     "score": "sliplens.faithfulness.scoring",
     "simulate": "sliplens.simulation.trials",
     "split_dataset": "sliplens.recordings.splits",
@@ -62,6 +64,7 @@ __all__ = [
     "load_dataset",
     "plot",
     "predict",
+    "run_study",
     "score",
     "simulate",
     "split_dataset",

@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 import tyro
 
 from sliplens.cli.console import Terminal
-from sliplens.cli.evaluate import Evaluate
 from sliplens.cli.report import Report
 from sliplens.cli.simulate import Simulate
 from sliplens.errors import InputError
@@ -94,14 +93,6 @@ class Study:
             overwrite=self.overwrite,
             on_progress=Terminal(),
         )
-        for name, run in given.items():
-            Evaluate(
-                model=Path(run),
-                data=data,
-                output=self.output / f"evaluate-{name}",
-                device=self.device,
-                overwrite=self.overwrite,
-            ).run()
         Report(workspace=self.output).run()
 
     def _simulate(self) -> Path:

@@ -100,6 +100,7 @@ def _gather_study(workspace: Path, found: dict[tuple[str, str, str], Any]) -> St
     by_input = {
         field: {name: value for (own, name, _), value in found.items() if own == stage}
         for stage, field in (
+            ("evaluate", "evaluations"),
             ("explain", "explanations"),
             ("score", "deletion"),
             ("remedies", "remedies"),

@@ -216,7 +216,7 @@ def _truth(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
         yield plate_truth(results, name)
         yield table_localisation(found[name])
         yield table_meta(found[name])
-        yield _notes(f"How this was measured, {input_name(name).lower()}", [found[name].told])
+        yield _notes(f"How this was measured, {input_name(name).lower()}", [found[name].summary])
 
 
 def _recipe(results: Results, absent: dict[str, list[str]]) -> Section:
@@ -347,7 +347,7 @@ OUTLINES: tuple[Outline, ...] = (
         id="choice",
         title="Which trials were taken",
         short_title="Trials",
-        intro=lambda results: "" if results.study.choice is None else results.study.choice.told,
+        intro=lambda results: "" if results.study.choice is None else results.study.choice.summary,
         command="study",
         build=lambda results, _: () if results.study.choice is None else (table_trials(results.study.choice),),
     ),

@@ -339,7 +339,7 @@ def table_remedies(remedies: Remedies, scored: DeletionScores | None) -> Table:
         means = [scores[name].mean for name in methods if name in scores and name not in CONTROLS]
         best = (min if better == "lower" else max)(means, default=None)
         rows.append((title, better, *(_score_cell(scores.get(name), best) for name in methods)))
-    told = " ".join(f"{titles[name]}: {one.told.rstrip('.')}." for name, one in remedies.variants.items())
+    told = " ".join(f"{titles[name]}: {one.summary.rstrip('.')}." for name, one in remedies.variants.items())
     return make_table(
         f"{input_name(remedies.input)}: the score of the thesis with the remedies it proposes, and insertion; mean ± "
         f"standard deviation over frames, the best method of each row bold. {told}",
@@ -358,7 +358,7 @@ def table_looks(looks: Mapping[str, MapQuality]) -> Table:
         "frame under other sensor noise, and with that of the next frame.",
         ("Input", "Method", *(_LOOK_NAMES[measure] for measure in MAP_MEASURES)),
         [
-            (input_name(name), method_name(method), *(decimals(measures[one], 3) for one in MAP_MEASURES))
+            (input_name(name), method_name(method), *(decimals(getattr(measures, one), 3) for one in MAP_MEASURES))
             for name in inputs_in_order(looks)
             for method in methods_in_order(looks[name].methods)
             for measures in [looks[name].methods[method]]

@@ -11,7 +11,10 @@ from sliplens.results.evaluation import (
     RegressionScores,
     Reliability,
 )
+from sliplens.results.explanation import Explained, ExplainedFrame, load_explained
+from sliplens.results.faithfulness import DeletionCurve, DeletionScores, Remedies, RemovalCurve, RemovalScores
 from sliplens.results.simulation import Simulation, SplitCount, describe_simulation
+from sliplens.results.study import Choice, MapQuality, Randomisation, States, Study, Timing, Truth
 from sliplens.results.training import LearningCurve, Training
 
 __all__ = [
@@ -19,14 +22,29 @@ __all__ = [
     "BaselineScores",
     "Baselines",
     "BinScore",
+    "Choice",
+    "DeletionCurve",
+    "DeletionScores",
     "Evaluation",
+    "Explained",
+    "ExplainedFrame",
     "LeadTimes",
     "LearningCurve",
+    "MapQuality",
     "Predictions",
+    "Randomisation",
     "RegressionScores",
     "Reliability",
+    "Remedies",
+    "RemovalCurve",
+    "RemovalScores",
     "Simulation",
     "SplitCount",
+    "States",
+    "Study",
+    "Timing",
     "Training",
+    "Truth",
     "describe_simulation",
+    "load_explained",
 ]

@@ -112,6 +112,3 @@ def load_explained(folder: Path) -> Explained:
             for frame, values in zip(explained.frames, stack, strict=True):
                 require_saliency(values, values.shape, where=f"the {method} {kind} of {frame.id} in {folder}")
     return explained
-
-
-__all__ = ["Explained", "ExplainedFrame", "MethodNotes", "load_explained"]

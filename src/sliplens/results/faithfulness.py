@@ -146,7 +146,7 @@ class Comparison:
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """Kendall's tau of the methods' ranking between two fills; None where it is not defined."""
+    """Kendall's tau, a coefficient from -1 to 1, of the methods' ranking between two fills; None where undefined."""
 
     unit: str
     first: str
@@ -159,7 +159,7 @@ class RemovalCurve:
     """Changes of the answers of one method under one fill and unit, in margin units."""
 
     frame_ids: tuple[str, ...]
-    trials: np.ndarray
+    trials: Shaped[np.ndarray, " frames"]
     areas: Float64[np.ndarray, " areas"]
     most_first: Float64[np.ndarray, "frames areas"]
     least_first: Float64[np.ndarray, "frames areas"]
@@ -258,21 +258,3 @@ def _require_curves(names: Iterable[str | Key], curves: Mapping[Any, object]) ->
     for name in names:
         if name not in curves:
             raise ValueError(f"lacks the curves of {name if isinstance(name, str) else ' / '.join(name)}")
-
-
-__all__ = [
-    "Agreement",
-    "Comparison",
-    "DeletionCurve",
-    "DeletionScores",
-    "DeletionTable",
-    "Key",
-    "MethodScore",
-    "Remedies",
-    "RemovalCurve",
-    "RemovalScore",
-    "RemovalScores",
-    "RemovalTable",
-    "Variant",
-    "VariantTable",
-]

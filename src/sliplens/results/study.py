@@ -11,6 +11,7 @@ from jaxtyping import Float32, Float64, Int64, Shaped, UInt8
 
 from sliplens.codec import Columns
 from sliplens.intervals import Difference
+from sliplens.results.evaluation import Evaluation
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionScores, Remedies, RemovalScores
 
@@ -51,6 +52,7 @@ class Choice:
 
     trials_wanted: int
     tolerance: float
+    """Largest error of an answer in margin units, within which a trial qualifies."""
     considered: int
     """Trials that have a frame near every level."""
     qualified: int
@@ -392,6 +394,7 @@ class Study:
 
     folder: Path | None = None
     scratch: TemporaryDirectory[str] | None = field(default=None, repr=False, compare=False)
+    evaluations: dict[str, Evaluation] = field(default_factory=dict)
     choice: Choice | None = None
     states: States | None = None
     explanations: dict[str, Explained] = field(default_factory=dict)
@@ -423,31 +426,3 @@ class Study:
     @property
     def _tests(self) -> tuple[Mapping[str, _Test], ...]:
         return self.remedies, self.faithfulness, self.randomisation, self.map_quality, self.timing, self.truth
-
-
-__all__ = [
-    "MAP_MEASURES",
-    "REGIONS",
-    "Choice",
-    "ChosenFrame",
-    "ChosenTrial",
-    "Localisation",
-    "MapMeasures",
-    "MapQuality",
-    "MarkedFrame",
-    "MarkerEffects",
-    "MarkerTable",
-    "MetaTest",
-    "MethodTime",
-    "OracleTest",
-    "Randomisation",
-    "RandomisedMethod",
-    "Roughness",
-    "ShownFrame",
-    "StateFrame",
-    "States",
-    "Study",
-    "Timing",
-    "Truth",
-    "UntrainedMaps",
-]

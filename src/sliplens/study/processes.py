@@ -152,6 +152,3 @@ def _work(work: Callable[[str, OnProgress], Any], name: str) -> None:
         work(name, _Relay(_PIPES[name]))
     finally:
         _PIPES[name].send(("done",))
-
-
-__all__ = ["run_together"]

@@ -44,6 +44,7 @@ from sliplens.study.scoring import STEPS, score_explanations, score_remedies
 from sliplens.study.states import show_states
 from sliplens.study.timing import time_explainers
 from sliplens.study.truth import TRUE_FILL, judge_by_truth, true_curves
+from sliplens.training.evaluation import evaluate
 
 _COMMAND = "sliplens study"
 Network: TypeAlias = TrainedModel | Path | str
@@ -78,8 +79,9 @@ def run_study(
 ) -> Study:
     """Find out which explanation of a network can be believed: the experiment of the thesis, and controls it lacks.
 
-    Picks trials that the networks read well, explains frames from full stick to full slip, scores the explanations by
-    removal under several fills against controls, by randomisation and, where the data are simulated, by the truth.
+    Evaluates the networks on the test trials, picks trials that they read well, explains frames from full stick to full
+    slip, scores the explanations by removal under several fills against controls, by randomisation and, where the data
+    are simulated, by the truth.
     Every stage is a folder that is complete or absent: interrupted, the same call goes on where it stopped.
 
     Parameters
@@ -150,6 +152,12 @@ def run_study(
         overwrite=overwrite,
         on_progress=on_progress,
     )
+    evaluations = {
+        name: evaluate(
+            run, stages.data, stages.folder / f"evaluate-{name}", overwrite=overwrite, on_progress=on_progress
+        )
+        for name, run in networks.items()
+    }
     choice, states = stages.choose(split=split, condition=condition, trials=trials, tolerance=tolerance)
     cores = torch.get_num_threads()
     if min(jobs or (len(networks) if device == "cpu" else 1), len(networks), cores) > 1:
@@ -162,6 +170,7 @@ def run_study(
     return Study(
         folder=stages.folder,
         scratch=scratch,
+        evaluations=evaluations,
         choice=choice,
         states=states,
         explanations={name: own.explained for name, own in judged.items()},
