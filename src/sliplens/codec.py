@@ -396,6 +396,8 @@ def _decode(kind: Any, value: object) -> object:
         return value
     if kind is Path:
         return Path(str(value))
+    if kind is object:
+        return value
     raise NotImplementedError(f"{kind} has no form in JSON")
 
 
