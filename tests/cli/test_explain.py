@@ -49,7 +49,7 @@ def test_maps_overlays_and_a_panel(difference_run: Path, small_dataset: Dataset,
         assert panel.height > panel.width
     told = capsys.readouterr().out
     notes = [note for one in read_json(output / "result.json")["methods"].values() for note in one["warnings"]]
-    assert told.count("note, ") == len(notes)
+    assert told.count("note: ") == len(notes)
     run(difference_run, small_dataset.folder, "-o", output, *QUICK, "--levels", 1, 0)
     assert "kept" in capsys.readouterr().out
 
@@ -74,7 +74,7 @@ def test_a_budget_reaches_poly_cam(difference_run: Path, difference_folder: Path
         seen.append(explainers["poly-cam"].budget)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sliplens.study.explain_frames", explain)
+    monkeypatch.setattr("sliplens.study.workspace.explain_frames", explain)
     with pytest.raises(KeyboardInterrupt):
         run(difference_run, "--frames", difference_folder, "-o", tmp_path / "maps", "--budget", 0.25)
     assert seen == [0.25]
@@ -102,7 +102,7 @@ def test_markers_are_occluded_where_each_frame_has_them(
         asked.append(f"{recording.trial}-f{row:04d}")
         return MARKERS + len(asked)  # elsewhere in every frame
 
-    monkeypatch.setattr("sliplens.explainers.occlusion.markers_in_recording", places)
+    monkeypatch.setattr("sliplens.study.workspace.markers_in_recording", places)
     run(difference_run, small_dataset.folder, "-o", tmp_path / "maps", "--method", "occlusion-marker")
     explained = load_explained(tmp_path / "maps")
     assert asked == [frame.id for frame in explained.frames]
@@ -127,7 +127,7 @@ def test_markers_are_found_in_camera_frames_only(
         seen.append(frame)
         return MARKERS
 
-    monkeypatch.setattr("sliplens.explainers.occlusion.markers_in_frame", places)
+    monkeypatch.setattr("sliplens.study.workspace.markers_in_frame", places)
     paths = list_images(difference_folder)
     run(raw_run, "--frames", difference_folder, "--reference", paths[0], *words)
     assert all(np.array_equal(one, read_image(path)) for one, path in zip(seen, paths, strict=True))

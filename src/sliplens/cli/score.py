@@ -6,10 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from sliplens.cli.console import print_table, progress_bar, say, unchanged, wrote
-from sliplens.codec import ARRAYS_FILE, save_result
-from sliplens.extras import require_device
-from sliplens.files import hash_file, output_folder
+from sliplens.cli.console import Terminal, print_table, say
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,47 +36,26 @@ class Score:
 
     def run(self) -> None:
         """Score and write the curves."""
-        from sliplens.faithfulness import get_fill
-        from sliplens.models.checkpoint import load
-        from sliplens.study import load_explained, score_explanations
-        from sliplens.study.scoring import require_same_network
+        from sliplens.study.workspace import score_explained
 
-        get_fill(self.fill)
-        require_device(self.device)
-        trained = load(self.model, device=self.device)
-        explained = load_explained(self.explanations)
-        require_same_network(trained, explained)
-        recipe = {
-            "weights_sha256": trained.manifest.weights_sha256,
-            "maps_sha256": hash_file(self.explanations / ARRAYS_FILE),
-            "input": explained.input,
-            "source": explained.source,
-            "fill": self.fill,
-            "steps": self.steps,
-            "seed": self.seed,
-        }
-        with output_folder(self.output, stage="score", config=recipe, overwrite=self.overwrite) as out:
-            if out.complete:
-                unchanged(self.output)
-                return
-            with progress_bar(f"Deleting pixels ({explained.input}, {explained.source})") as bar:
-                result = score_explanations(
-                    trained,
-                    explained,
-                    fill=self.fill,
-                    steps=self.steps,
-                    seed=self.seed,
-                    on_progress=bar,
-                )
-            save_result(result, out.folder)
+        scores = score_explained(
+            self.model,
+            self.explanations,
+            fill=self.fill,
+            steps=self.steps,
+            seed=self.seed,
+            out=self.output,
+            device=self.device,
+            overwrite=self.overwrite,
+            on_progress=Terminal(),
+        )
         print_table(
-            f"deletion score, {explained.input} images ({explained.source}), fill {self.fill}: lower is more faithful",
+            f"deletion score, {scores.input} images ({scores.source}), fill {self.fill}: lower is more faithful",
             ("method", "D_AUC", "+-", "last step", "frames"),
             [
-                (name, f"{one.mean:.3f}", f"{one.sd:.3f}", f"{one.last_step_mean:.3f}", str(one.frames))
-                for name, one in result.methods.items()
+                (name, f"{method.mean:.3f}", f"{method.sd:.3f}", f"{method.last_step_mean:.3f}", str(method.frames))
+                for name, method in scores.methods.items()
             ],
         )
-        for alarm in result.alarms:
+        for alarm in scores.alarms:
             say(f"  alarm: {alarm}")
-        wrote(self.output, "curves and scores")

@@ -94,9 +94,9 @@ def explain(
     return explainer(trained.model, inputs, reference=empty.to(trained.device), on_progress=on_progress)
 
 
-def open_run(run: TrainedModel | Path | str) -> TrainedModel:
+def open_run(run: TrainedModel | Path | str, *, device: str = "cpu") -> TrainedModel:
     """Network that a caller named: itself, its folder, or the name of one that comes with sliplens."""
-    return run if isinstance(run, TrainedModel) else load(run)
+    return run if isinstance(run, TrainedModel) else load(run, device=device)
 
 
 def get_explainer(method: str, **options: Any) -> Explainer:

@@ -9,15 +9,18 @@ from sliplens.study.explaining import (
 )
 from sliplens.study.run import run_study
 from sliplens.study.scoring import score_explanations
+from sliplens.study.workspace import explain_source, score_explained
 
 __all__ = [
     "ChosenFrames",
     "Explained",
     "ExplainedFrame",
     "explain_frames",
+    "explain_source",
     "frames_from_dataset",
     "frames_from_folder",
     "load_explained",
     "run_study",
+    "score_explained",
     "score_explanations",
 ]

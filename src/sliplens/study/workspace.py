@@ -1,0 +1,286 @@
+"""Explanations of one network and their deletion scores, as records, and as folders of a workspace."""
+
+import hashlib
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from sliplens.codec import load_result, save_result
+from sliplens.errors import InputError
+from sliplens.explainers import EXPLAINERS, ExpectedGradients, Explainer, Occlusion, get_explainer
+from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
+from sliplens.explainers.table import open_run
+from sliplens.faithfulness import get_fill
+from sliplens.files import output_folder
+from sliplens.images import write_png
+from sliplens.models import TrainedModel
+from sliplens.plots.saliency import draw_panel, overlay_jet, overlay_saliency, stretch_saliency
+from sliplens.plots.style import drawing_style, method_name, percent
+from sliplens.progress import OnProgress, note, stage, wrote
+from sliplens.recordings import Dataset
+from sliplens.recordings.source import open_source
+from sliplens.results.explanation import Explained, load_explained
+from sliplens.results.faithfulness import DeletionScores
+from sliplens.study.explaining import (
+    DEFAULT_LEVELS,
+    DEFAULT_METHODS,
+    ChosenFrames,
+    explain_frames,
+    frames_from_dataset,
+    frames_from_folder,
+    require_methods,
+)
+from sliplens.study.scoring import require_same_network, score_explanations
+
+_BY_MARKER = "occlusion-marker"
+_FULL_STICK = 0.9
+"""Safety margin from which a labelled frame counts as one without slip."""
+
+
+def explain_source(
+    run: TrainedModel | Path | str,
+    source: Dataset | Path,
+    *,
+    reference: Path | None = None,
+    labels_in_names: bool = False,
+    methods: Sequence[str] = DEFAULT_METHODS,
+    budget: float = 1.0,
+    split: str = "test",
+    condition: str = "dry",
+    trials: int = 1,
+    levels: Sequence[float] = DEFAULT_LEVELS,
+    device: str = "cpu",
+    out: Path | None = None,
+    colours: Literal["inferno", "jet"] = "inferno",
+    overwrite: bool = False,
+    on_progress: OnProgress | None = None,
+) -> Explained:
+    """Explain frames of a data set along the safety margin, or all frames of a folder or recording.
+
+    Parameters
+    ----------
+    run
+        The network, its folder, or the name of one that comes with sliplens.
+    source
+        A data set; or a folder of images, or a recording: camera frames if a reference is given or the recording
+        brings one, else absolute difference images.
+    reference
+        Image of the untouched sensor, for camera frames that bring none.
+    labels_in_names
+        Read the safety margin in percent from names of images such as `image_433_20.png`.
+    methods
+        Rows of `EXPLAINERS`.
+    budget
+        Share of the channels that `poly-cam` measures at first.
+    split, condition, trials, levels
+        Which trials of a data set and how many, and the safety margins at which frames are taken.
+    device
+        Where a network that is loaded here runs: cpu, cuda or cuda:1.
+    out
+        Folder to write: maps, overlays of every map, all of them side by side; nowhere if None. A folder that was
+        interrupted goes on after its last map.
+    colours
+        Colours of the overlays: perceptually uniform, or as the thesis's figures have them.
+    overwrite
+        Replace a folder made otherwise.
+    on_progress
+        Called with the maps done and their number.
+
+    Raises
+    ------
+    InputError
+        If there is no such method, the source has no such frames, or the folder holds something else.
+    """
+    require_methods(methods)
+    if trials < 1:
+        raise InputError(f"--trials must be at least 1, got {trials}")
+    trained = open_run(run, device=device)
+    if isinstance(source, Dataset):
+        chosen = frames_from_dataset(
+            trained, source, split=split, condition=condition, trials=trials, levels=tuple(levels)
+        )
+    else:
+        chosen = frames_from_folder(trained, source, reference=reference, labels_in_names=labels_in_names)
+    explainers = _choose_explainers(trained, chosen, source, reference=reference, methods=methods, budget=budget)
+    title = f"Explaining {len(chosen.ids)} frames ({trained.manifest.input}, {chosen.source})"
+    if out is None:
+        with stage(on_progress, title) as count:
+            return explain_frames(trained, chosen, methods=methods, explainers=explainers, on_progress=count)
+    recipe = {
+        "weights_sha256": trained.manifest.weights_sha256,
+        "input": trained.manifest.input,
+        "source": chosen.source,
+        "ids": chosen.ids,
+        "images_sha256": _hash_images(chosen),
+        "method": tuple(methods),
+        "budget": budget,
+        "colours": colours,
+    }
+    what = f"{len(methods)} maps of each of {len(chosen.ids)} frames, panel.png"
+    with output_folder(out, stage="explain", config=recipe, overwrite=overwrite) as output:
+        if not output.complete:
+            with stage(on_progress, title) as count:
+                explained = explain_frames(
+                    trained,
+                    chosen,
+                    methods=methods,
+                    explainers=explainers,
+                    parts=output.folder / "parts",
+                    on_progress=count,
+                )
+            shutil.rmtree(output.folder / "parts")
+            draw_explained(explained, output.folder, colours=colours)
+            save_result(explained, output.folder)
+            for name, notes in explained.methods.items():
+                for warning in notes.warnings:
+                    note(on_progress, f"{name}: {warning}")
+    wrote(on_progress, out, what, kept=output.complete)
+    return load_explained(out)
+
+
+def score_explained(
+    run: TrainedModel | Path | str,
+    explanations: Explained | Path,
+    *,
+    fill: str = "grey",
+    steps: int | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    out: Path | None = None,
+    overwrite: bool = False,
+    on_progress: OnProgress | None = None,
+) -> DeletionScores:
+    """Score explanations by deletion, as the thesis does, beside a random order.
+
+    Parameters
+    ----------
+    run
+        The network that was explained, its folder, or the name of one that comes with sliplens.
+    explanations
+        What `explain_source` gave, or its folder.
+    fill
+        What removed pixels become, a row of `FILLS`.
+    steps
+        Steps until every pixel is gone; the image's height if None, as in the thesis.
+    seed
+        Seed of the random order.
+    device
+        Where a network that is loaded here runs.
+    out
+        Folder to write: curves and scores; nowhere if None.
+    overwrite
+        Replace a folder made otherwise.
+    on_progress
+        Called with the curves done and their number.
+
+    Raises
+    ------
+    InputError
+        If there is no such fill or folder, or the folder to write holds something else.
+    CheckpointError
+        If the explanations are of another network.
+    """
+    get_fill(fill)
+    trained = open_run(run, device=device)
+    explained = explanations if isinstance(explanations, Explained) else load_explained(explanations)
+    require_same_network(trained, explained)
+    title = f"Deleting pixels ({explained.input}, {explained.source})"
+    if out is None:
+        with stage(on_progress, title) as count:
+            return score_explanations(trained, explained, fill=fill, steps=steps, seed=seed, on_progress=count)
+    recipe = {
+        "weights_sha256": trained.manifest.weights_sha256,
+        "maps_sha256": _hash_maps(explained),
+        "input": explained.input,
+        "source": explained.source,
+        "fill": fill,
+        "steps": steps,
+        "seed": seed,
+    }
+    with output_folder(out, stage="score", config=recipe, overwrite=overwrite) as output:
+        if not output.complete:
+            with stage(on_progress, title) as count:
+                scores = score_explanations(trained, explained, fill=fill, steps=steps, seed=seed, on_progress=count)
+            save_result(scores, output.folder)
+    wrote(on_progress, out, "curves and scores", kept=output.complete)
+    return load_result(out, DeletionScores, command="sliplens score")
+
+
+def draw_explained(explained: Explained, folder: Path, *, colours: Literal["inferno", "jet"]) -> None:
+    """Write an overlay of every map (`overlays/METHOD/FRAME.png`), and all of them side by side (`panel.png`)."""
+    lay = (
+        overlay_jet
+        if colours == "jet"
+        else lambda picture, saliency: overlay_saliency(picture, stretch_saliency(saliency))
+    )
+    rows = {"Input": list(explained.pictures)}
+    for method, maps in explained.saliency.items():
+        (overlays := folder / "overlays" / method).mkdir(parents=True, exist_ok=True)
+        row = rows[method_name(method)] = []
+        for frame, picture, saliency in zip(explained.frames, explained.pictures, maps, strict=True):
+            # a map that holds NaN is named in the notes, and is not shown
+            row.append(lay(picture, saliency) if np.isfinite(saliency).all() else None)
+            if row[-1] is not None:
+                write_png(overlays / f"{frame.id}.png", row[-1])
+    titles = [
+        # of recorded images the margin need not be known
+        ("" if frame.safety_margin is None else f"true {percent(frame.safety_margin)}, ")
+        + f"read {percent(frame.prediction)}"
+        for frame in explained.frames
+    ]
+    with drawing_style():
+        draw_panel(rows, titles=titles).savefig(folder / "panel.png")
+
+
+def _choose_explainers(
+    trained: TrainedModel,
+    chosen: ChosenFrames,
+    source: Dataset | Path,
+    *,
+    reference: Path | None,
+    methods: Sequence[str],
+    budget: float,
+) -> Mapping[str, Explainer | Sequence[Explainer]]:
+    """The explainers with the options that these frames allow."""
+    free = [index for index, margin in enumerate(chosen.safety_margin) if margin >= _FULL_STICK]
+    background = trained.encoding.normalise(chosen.images[free]) if free else None
+    own: dict[str, Explainer | Sequence[Explainer]] = {
+        "poly-cam": get_explainer("poly-cam", budget=budget),
+        "expected-gradients": ExpectedGradients(background=background),
+    }
+    if _BY_MARKER in methods:
+        own[_BY_MARKER] = _occlude_markers(trained, chosen, source, reference=reference)
+    return {**EXPLAINERS, **own}
+
+
+def _occlude_markers(
+    trained: TrainedModel, chosen: ChosenFrames, source: Dataset | Path, *, reference: Path | None
+) -> list[Explainer]:
+    """Occlusion by marker, frame by frame: where the simulator put them, else where they are found."""
+    size = trained.manifest.image_size
+    if isinstance(source, Dataset):
+        opened = {info.trial: source.load(info) for info in source.trials if info.trial in chosen.trial}
+        places = [
+            markers_in_recording(opened[trial], int(name.removeprefix(f"{trial}-f")), image_size=size)
+            for name, trial in zip(chosen.ids, chosen.trial, strict=True)
+        ]
+    else:
+        opened_trials = open_source(source, reference=reference)
+        if any(trial.read_reference is None for trial in opened_trials):
+            raise InputError(
+                f"{_BY_MARKER} finds the markers in camera frames, which difference images are not; give camera frames "
+                "and --reference, or a data set"
+            )
+        places = [markers_in_frame(frame, image_size=size) for trial in opened_trials for frame in trial.read_frames()]
+    return [Occlusion(markers_px=centres) for centres in places]
+
+
+def _hash_images(chosen: ChosenFrames) -> str:
+    return hashlib.sha256(chosen.images.numpy().tobytes() + chosen.references.numpy().tobytes()).hexdigest()
+
+
+def _hash_maps(explained: Explained) -> str:
+    return hashlib.sha256(b"".join(maps.tobytes() for maps in explained.saliency.values())).hexdigest()
