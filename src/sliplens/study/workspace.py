@@ -134,9 +134,8 @@ def explain_source(
             shutil.rmtree(output.folder / "parts")
             draw_explained(explained, output.folder, colours=colours)
             save_result(explained, output.folder)
-            for name, notes in explained.methods.items():
-                for warning in notes.warnings:
-                    note(on_progress, f"{name}: {warning}")
+            for warning, names in _warned(explained).items():
+                note(on_progress, f"{', '.join(names)}: {warning}")
     wrote(on_progress, out, what, kept=output.complete)
     return load_explained(out)
 
@@ -233,6 +232,15 @@ def draw_explained(explained: Explained, folder: Path, *, colours: Literal["infe
     ]
     with drawing_style():
         draw_panel(rows, titles=titles).savefig(folder / "panel.png")
+
+
+def _warned(explained: Explained) -> dict[str, list[str]]:
+    """Methods by what they warned of."""
+    warned: dict[str, list[str]] = {}
+    for method, notes in explained.methods.items():
+        for warning in notes.warnings:
+            warned.setdefault(warning, []).append(method)
+    return warned
 
 
 def _choose_explainers(
