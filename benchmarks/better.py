@@ -29,7 +29,7 @@ from sliplens.explainers.frozen_model import frozen
 from sliplens.explainers.occlusion import marker_regions, markers_in_recording
 from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.localisation import relevance_mass, relevance_rank
-from sliplens.faithfulness.removal import faithfulness
+from sliplens.faithfulness.removal import score_maps
 from sliplens.faithfulness.units import Units, pixel_units, tile_units
 from sliplens.files import machine, versions
 from sliplens.intervals import paired_difference
@@ -136,7 +136,7 @@ def judge(trained: TrainedModel, case: Case, *, options: argparse.Namespace) -> 
         for fill in options.fills:
             for unit in options.units:
                 units: Units = UNITS[unit]((both.shape[-2], both.shape[-1]))
-                found = faithfulness(
+                found = score_maps(
                     ready,
                     both[:1],
                     {name: one[None] for name, one in maps.items()},

@@ -6,7 +6,7 @@ import torch
 
 from sliplens.errors import InputError
 from sliplens.faithfulness import get_fill
-from sliplens.faithfulness.removal import AREAS, faithfulness, removal_curves
+from sliplens.faithfulness.removal import AREAS, removal_curves, score_maps
 from sliplens.faithfulness.units import pixel_units, random_unit_order, tile_units, unit_order
 
 SIZE = 20
@@ -48,7 +48,7 @@ def test_what_contributes_is_the_best_map_there_is(images: torch.Tensor, weights
     values = contributions(images, weights)
     units = [pixel_units((SIZE, SIZE))] * IMAGES
     maps = {"truth": values, "noisy": values + rng.normal(0, values.std(), values.shape), "opposite": -values}
-    scores = faithfulness(linear(weights), images, maps, units, fill=get_fill("black"), rng=rng, areas=EVERY)
+    scores = score_maps(linear(weights), images, maps, units, fill=get_fill("black"), rng=rng, areas=EVERY)
     truth, noisy, opposite = (scores[name] for name in maps)
     assert np.all(truth.symmetric_gain > noisy.symmetric_gain)
     assert np.all(noisy.symmetric_gain > 0)
@@ -75,7 +75,7 @@ def test_along_the_target_a_signed_map_is_scored_as_what_it_is(images: torch.Ten
     shuffled[:, half] = shuffled[:, rng.permutation(half)]
     maps = {"truth": -values, "half": -shuffled.reshape(values.shape)}
     told = {"fill": get_fill("black"), "rng": rng, "areas": EVERY, "random_orders": 2}
-    scores = faithfulness(linear(mixed), images, maps, units, towards=towards, **told)
+    scores = score_maps(linear(mixed), images, maps, units, towards=towards, **told)
     falling = -np.sort((-values).reshape(IMAGES, -1), axis=1)[:, ::-1]
     lost = np.concatenate([np.zeros((IMAGES, 1)), np.cumsum(-falling, axis=1)], axis=1)
     np.testing.assert_allclose(scores["truth"].curves[0], lost, atol=1e-12)
@@ -89,7 +89,7 @@ def test_along_the_target_a_signed_map_is_scored_as_what_it_is(images: torch.Ten
 def test_at_equal_areas_the_curves_can_be_read(images: torch.Tensor, weights: torch.Tensor, rng):
     maps = {"truth": contributions(images, weights)}
     units = [tile_units((SIZE, SIZE), size=2)] * IMAGES
-    score = faithfulness(linear(weights), images, maps, units, fill=get_fill("black"), rng=rng)["truth"]
+    score = score_maps(linear(weights), images, maps, units, fill=get_fill("black"), rng=rng)["truth"]
     np.testing.assert_array_equal(score.areas, AREAS)
     most, least, random = score.at(0.05)
     assert np.all(most > random)

@@ -329,7 +329,7 @@ def _jobs(
         yield image, 0, last
 
 
-def faithfulness(
+def score_maps(
     predict: Predict,
     images: Float[Tensor, "images 3 height width"],
     influence: dict[str, Float[np.ndarray, "images height width"]],

@@ -23,7 +23,7 @@ from sliplens.faithfulness.deletion import (
     saliency_orders,
 )
 from sliplens.faithfulness.fills import get_fill
-from sliplens.faithfulness.removal import AREAS, RANDOM_ORDERS, Faithfulness, faithfulness
+from sliplens.faithfulness.removal import AREAS, RANDOM_ORDERS, Faithfulness, score_maps
 from sliplens.faithfulness.units import pixel_units, tile_units
 from sliplens.models import TrainedModel
 from sliplens.models.engines import Engine, prepare
@@ -93,7 +93,7 @@ def score(
     shape = (inputs.shape[-2], inputs.shape[-1])
     units = pixel_units(shape) if unit == "pixel" else tile_units(shape, size=max(1, shape[0] // _TILES_ACROSS))
     orders = 2 * len(influence) + random_orders
-    scores = faithfulness(
+    scores = score_maps(
         prepare_passes(trained, inputs, len(inputs) * orders * (len(AREAS) - 2)),
         inputs,
         influence,

@@ -68,7 +68,7 @@ def influence_orders(influence: Float[np.ndarray, "images markers"]) -> Int[np.n
     return np.stack([np.argsort(sign * influence, axis=-1, kind="stable") for sign in (-1, 1)])
 
 
-def marker_faithfulness(
+def score_maps_by_marker(
     predict: Predict,
     redraw: Redraw,
     influence: Mapping[str, Float[np.ndarray, "images markers"]],
@@ -89,7 +89,7 @@ def marker_faithfulness(
         How much each marker matters, by method (`unit_means`): larger goes first. Of signed relevance give the part
         that works towards the target, `relevance * sign(target)`.
     towards
-        As `faithfulness` takes it.
+        As `score_maps` takes it.
 
     Raises
     ------

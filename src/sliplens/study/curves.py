@@ -16,7 +16,7 @@ from sliplens.errors import InputError
 from sliplens.faithfulness import get_fill
 from sliplens.faithfulness.alarms import controls_win, fill_decides, flat_maps, rankings_disagree, saturated
 from sliplens.faithfulness.controls import CONTROLS
-from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness, Predict, answer_whole, faithfulness
+from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness, Predict, answer_whole, score_maps
 from sliplens.intervals import paired_difference
 from sliplens.progress import OnProgress, continued
 from sliplens.results.explanation import Explained
@@ -126,7 +126,7 @@ def score_removal(
     predict = material.fast(len(known) * len(inputs) * orders * (len(STUDY_AREAS) - 2))
 
     def remove(setting: Setting, on_frames: OnProgress | None) -> Mapping[str, Faithfulness]:
-        return faithfulness(
+        return score_maps(
             predict,
             inputs,
             dict(maps),

@@ -9,9 +9,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sliplens.explainers import EXPLAINERS, Explainer, Likeness, PolyCam
+from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.faithfulness.units import Units, marker_units, pixel_units, tile_units
 from sliplens.models import TrainedModel
-from sliplens.models.engines import Engine, prepare
+from sliplens.models.engines import Engine
 from sliplens.recordings import Dataset
 from sliplens.results.explanation import Explained
 from sliplens.results.study import ChosenFrame, MarkedFrame
@@ -74,7 +75,6 @@ def method_options(explainers: Mapping[str, Explainer]) -> dict[str, dict[str, A
 
 
 _TILE_PX = 16
-_PARITY_IMAGES = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +104,7 @@ class Material:
 
     def fast(self, passes: int) -> Engine:
         """Make an engine ready for so many passes of the network."""
-        return make_fast(self.trained, self.inputs, passes=passes)
+        return prepare_passes(self.trained, self.inputs, passes)
 
     def units(self) -> dict[str, list[Units]]:
         """What can be removed at once, for each frame: pixels, tiles, and markers where they are known in every one."""
@@ -123,12 +123,6 @@ class Material:
         """Where the network sees the markers of a frame, and how far each one reaches (`network_places`)."""
         size = self.trained.manifest.frame_size
         return network_places(self.markers[frame], frame_size=(size[0], size[1]), image_size=self.inputs.shape[-1])
-
-
-def make_fast(trained: TrainedModel, inputs: Float[Tensor, "frames 3 size size"], *, passes: int) -> Engine:
-    """Make an engine ready for so many passes of a network, checked on a few of its inputs, on the network's device."""
-    some = inputs[:_PARITY_IMAGES].to(trained.device)
-    return prepare(trained.model, some, trained.predict(some).to(trained.device), passes=passes)
 
 
 def gather(

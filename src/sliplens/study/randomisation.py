@@ -49,7 +49,7 @@ def randomise_weights(
         explainer = _shortened(whole)
 
         def explain(model: nn.Module, images: Tensor, explainer: Explainer = explainer) -> Maps:
-            return _towards_target(explainer(model, images, reference=references))
+            return _influence(explainer(model, images, reference=references))
 
         started = time.perf_counter()
         scores = randomisation_scores(
@@ -127,7 +127,7 @@ def explain_untrained(
     maps = []
     for index in range(len(material.inputs)):
         frame = slice(index, index + 1)
-        maps.append(_towards_target(explainer(model, material.inputs[frame], reference=material.references[frame]))[0])
+        maps.append(_influence(explainer(model, material.inputs[frame], reference=material.references[frame]))[0])
         if on_progress is not None:
             on_progress(index + 1, len(material.inputs))
     return UntrainedMaps(
@@ -135,9 +135,9 @@ def explain_untrained(
     )
 
 
-def _towards_target(explanation: Explanation) -> Maps:
+def _influence(explanation: Explanation) -> Maps:
     """The part of the relevance that works towards the network's own target: the sign of another's says nothing."""
-    return (explanation.relevance * explanation.change.sign()[:, None, None]).double().cpu().numpy()
+    return explanation.influence.double().cpu().numpy()
 
 
 def _untrained(model: nn.Module, images: Tensor, *, seed: int) -> nn.Module:

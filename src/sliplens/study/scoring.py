@@ -17,6 +17,7 @@ from sliplens.faithfulness import (
 )
 from sliplens.faithfulness.alarms import fill_decides, flat_maps, follows_last_step, saturated
 from sliplens.faithfulness.deletion import deletion_steps, saliency_orders
+from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.models import TrainedModel
 from sliplens.progress import OnProgress, continued
 from sliplens.results.explanation import Explained
@@ -29,7 +30,7 @@ from sliplens.results.faithfulness import (
     VariantTable,
 )
 from sliplens.study.explaining import network_inputs
-from sliplens.study.material import Material, make_fast
+from sliplens.study.material import Material
 
 CONTROL = "random"
 STEPS = 28
@@ -99,7 +100,7 @@ def score_explanations(
     inputs = network_inputs(trained, explained)
     orders, shape = _orders(explained, seed=seed), (inputs.shape[-2], inputs.shape[-1])
     total = len(orders) * len(inputs)
-    predict = make_fast(trained, inputs, passes=total * len(deletion_steps(shape, steps=steps)))
+    predict = prepare_passes(trained, inputs, total * len(deletion_steps(shape, steps=steps)))
     deleted = {
         name: deletion_curves(
             predict,

@@ -20,7 +20,8 @@ from sliplens.faithfulness.removal import (
     answer_whole,
     removal_curves,
 )
-from sliplens.faithfulness.true_fill import SHARES, Redraw, influence_orders, marker_curves, marker_faithfulness
+from sliplens.faithfulness.scoring import prepare_passes
+from sliplens.faithfulness.true_fill import SHARES, Redraw, influence_orders, marker_curves, score_maps_by_marker
 from sliplens.faithfulness.units import unit_means, unit_order
 from sliplens.intervals import Difference, paired_difference
 from sliplens.models import TrainedModel
@@ -31,7 +32,6 @@ from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTes
 from sliplens.simulation import SimulationRecipe
 from sliplens.simulation.intervention import marker_readings
 from sliplens.study.explaining import mean_of_known, network_inputs
-from sliplens.study.material import make_fast
 from sliplens.study.scenes import Places, StagedFrame, find_places, redrawing, stage_frames
 from sliplens.study.scoring import require_same_network
 
@@ -214,7 +214,7 @@ def mean_interval(values: Float[np.ndarray, " frames"], trials: np.ndarray, *, s
 def meta_test(effects: Sequence[FrameEffects], trials: np.ndarray, *, seed: int) -> tuple[MetaTest, ...]:
     """Whether each fill ranks the map that knows the effects above the one that knows half, and that above chance.
 
-    A gain counts changes of the answer towards the target, as `faithfulness` does when it is told; `by_size` counts how
+    A gain counts changes of the answer towards the target, as `score_maps` does when it is told; `by_size` counts how
     large they are, where a marker that works against the answer moves it as far as one that works for it.
     """
     tests = []
@@ -397,8 +397,8 @@ def true_curves(
     frames, places = _stage(trained, explained, data, recipe=recipe)
     inputs = network_inputs(trained, explained)
     passes = len(frames) * (2 * len(maps) + random_orders) * (len(SHARES) - 2)
-    return marker_faithfulness(
-        make_fast(trained, inputs, passes=passes),
+    return score_maps_by_marker(
+        prepare_passes(trained, inputs, passes),
         redrawing(trained, frames),
         {name: np.stack(marker_means(values, places)) for name, values in maps.items()},
         rng=np.random.default_rng(seed),
@@ -434,7 +434,7 @@ def _find_all_effects(
     inputs, towards = network_inputs(trained, explained), explained.towards
     # each marker alone, and under each fill two maps both ways
     passes = len(frames) * (len(frames[0].markers) + 4 * len(SHARES) * (len(fills) + 1))
-    predict = make_fast(trained, inputs, passes=passes)
+    predict = prepare_passes(trained, inputs, passes)
     redraw = redrawing(trained, frames)
 
     def find(index: int) -> FrameEffects:
