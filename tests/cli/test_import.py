@@ -1,6 +1,5 @@
 """`sliplens import`: from files of one's own to a data set that trains a network."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,9 @@ from command_line import refused, run
 from own_recording import TARE, write_forces, write_video
 
 from sliplens.images import write_png
-from sliplens.recordings import Dataset, ReadOptions, Recording
-from sliplens.recordings.store import read_header, write_trial
+from sliplens.recordings import Dataset, Recording
+from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.store import read_header, save_recording, write_trial
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 
@@ -139,15 +139,13 @@ def test_friction_by_hand_is_taken(tmp_path: Path, table: Path, video: Path):
 
 
 def test_an_interrupted_import_goes_on_where_it_stopped(
-    tmp_path: Path, recorded: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, trial: Recording, monkeypatch: pytest.MonkeyPatch
 ):
-    video, table = recorded
-    # two trials of one table cannot be told in one command, so the table is given as the default of the options
-    sources = [tmp_path / name for name in ("a.mkv", "b.mkv")]
-    for source in sources:
-        shutil.copy(video, source)
-    monkeypatch.setattr(ReadOptions, "given", lambda _: {"forces": table})
-    whole, broken = (("import", *sources, "-o", tmp_path / name, "--sensor", "mine", "--no-audit") for name in "wb")
+    source = tmp_path / "source"
+    for name in "ab":
+        save_recording(replace(trial, trial=name), trial_path(source, name))
+    write_dataset_table(source, [trial_info(trial_path(source, name), split="train") for name in "ab"])
+    whole, broken = (("import", source, "-o", tmp_path / name, "--no-audit") for name in "wb")
     assert run(*whole) == 0
     written = []
 

@@ -99,7 +99,9 @@ def import_recordings(
         "test_trials": test_trials,
         "sources": [_fingerprint(path) for path in paths],
         "reading": {
-            name: _fingerprint(value) if isinstance(value, Path) else value for name, value in reading.given().items()
+            name: _fingerprint(value) if isinstance(value, Path) else value
+            for name in reading.given()
+            for value in [getattr(reading, name)]
         },
         "labelling": labelling,
         "splits": None if plan is None else plan.rules,

@@ -53,13 +53,9 @@ class ReadOptions:
     margin_unit: Literal["fraction", "percent"] | None = None
     """Unit of a list's safety margins; told by their size if not given."""
 
-    def given(self) -> dict[str, object]:
-        """Options that were said, by name."""
-        return {
-            field.name: getattr(self, field.name)
-            for field in fields(self)
-            if getattr(self, field.name) not in (None, False)
-        }
+    def given(self) -> tuple[str, ...]:
+        """Names of the options that were said."""
+        return tuple(field.name for field in fields(self) if getattr(self, field.name) not in (None, False))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -125,7 +125,7 @@ def open_captures(path: Path, *, format: str | None = None, options: ReadOptions
         raise InputError(
             f"{path} is read as {name}, which does not take {spoken(strange)}; leave it out or name another format"
         )
-    captures = reader.read(path, **given)
+    captures = reader.read(path, **{option: getattr(options, option) for option in given})
     return (captures,) if isinstance(captures, Capture) else tuple(captures)
 
 

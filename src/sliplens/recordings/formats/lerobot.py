@@ -46,18 +46,29 @@ class Episode:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Feature:
+    """One of the features that `meta/info.json` lists; what it may tell besides is believed where it is used."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    names: object
+    info: object
+    video_info: object
+
+
+@dataclass(frozen=True, kw_only=True)
 class Layout:
     """What `meta/info.json` says."""
 
     folder: Path
     fps: float
-    features: dict[str, dict[str, Any]]
+    features: dict[str, Feature]
     data_path: str
     video_path: str | None
 
     def width(self, key: str) -> int:
         """Numbers that a feature has in each frame."""
-        return prod(self.features[key]["shape"])
+        return prod(self.features[key].shape)
 
 
 def read_layout(folder: Path) -> Layout:
@@ -80,12 +91,12 @@ def read_layout(folder: Path) -> Layout:
     features, fps = info.get("features"), info.get("fps")
     if not isinstance(fps, int | float) or not isfinite(fps) or fps <= 0:
         raise RecordingError(f"{path} has fps {fps}; write a positive number of frames a second there")
-    if not isinstance(features, dict) or not all(_is_feature(feature) for feature in features.values()):
+    if not isinstance(features, dict):
         raise RecordingError(f"{path} lacks features with dtype and shape; copy it again")
     return Layout(
         folder=folder,
         fps=float(fps),
-        features=features,
+        features={key: _feature(feature, path) for key, feature in features.items()},
         data_path=str(info.get("data_path")),
         video_path=None if info.get("video_path") is None else str(info["video_path"]),
     )
@@ -93,7 +104,7 @@ def read_layout(folder: Path) -> Layout:
 
 def read_episodes(layout: Layout, *, camera_key: str, only: int | None = None) -> list[Episode]:
     """Episodes of a data set and where their frames from a camera lie, in their order."""
-    in_video = layout.features[camera_key]["dtype"] == "video"
+    in_video = layout.features[camera_key].dtype == "video"
     columns = ["episode_index", "length", "data/chunk_index", "data/file_index"]
     video = [f"videos/{camera_key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
     folder = layout.folder / "meta" / "episodes"
@@ -151,11 +162,13 @@ def read_columns(path: Path, columns: list[str]) -> pa.Table:
     return table
 
 
-def _is_feature(feature: Any) -> bool:
-    if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str):
-        return False
-    shape = feature.get("shape")
-    return isinstance(shape, list) and all(isinstance(size, int) for size in shape)
+def _feature(feature: Any, path: Path) -> Feature:
+    table = feature if isinstance(feature, dict) else {}
+    dtype, shape = table.get("dtype"), table.get("shape")
+    if not isinstance(dtype, str) or not isinstance(shape, list) or not all(isinstance(size, int) for size in shape):
+        raise RecordingError(f"{path} lacks features with dtype and shape; copy it again")
+    more = {name: table.get(name) for name in ("names", "info", "video_info")}
+    return Feature(dtype=dtype, shape=tuple(shape), **more)
 
 
 def _expand(layout: Layout, template: str, values: dict[str, Any]) -> Path:
@@ -216,7 +229,7 @@ class EpisodeRows:
     def words(self, rows: pa.Table, key: str, episode: Episode) -> tuple[str, ...]:
         """A feature whose whole numbers count through words that `meta/info.json` lists."""
         codes: Int64[np.ndarray, " frames"] = self._one(rows, key, episode, pa.types.is_integer, "whole numbers")
-        info = self.layout.features[key].get("info")
+        info = self.layout.features[key].info
         words = info.get("values") if isinstance(info, dict) else None
         if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
             raise RecordingError(
@@ -588,7 +601,7 @@ def _choose_camera(layout: Layout, named: str | None) -> tuple[str, list[str]]:
     cameras = [
         key
         for key, feature in layout.features.items()
-        if feature["dtype"] in {"video", "image"} and not _is_depth(feature)
+        if feature.dtype in {"video", "image"} and not _is_depth(feature)
     ]
     if named is not None:
         if named not in cameras:
@@ -611,7 +624,7 @@ def _choose_force(layout: Layout, named: str | None) -> str | None:
     fitting = [
         key
         for key, feature in layout.features.items()
-        if feature["dtype"].startswith("float") and feature["shape"] in ([3], [6])
+        if feature.dtype.startswith("float") and feature.shape in ((3,), (6,))
     ]
     if named is not None:
         if named not in layout.features:
@@ -619,7 +632,7 @@ def _choose_force(layout: Layout, named: str | None) -> str | None:
         if named not in fitting:
             feature = layout.features[named]
             raise RecordingError(
-                f"{named} of {layout.folder} is {feature['dtype']} of shape {feature['shape']}; a force has 3 or 6 "
+                f"{named} of {layout.folder} is {feature.dtype} of shape {list(feature.shape)}; a force has 3 or 6 "
                 "floating-point numbers"
             )
         found = [named]
@@ -630,7 +643,7 @@ def _choose_force(layout: Layout, named: str | None) -> str | None:
             raise RecordingError(f"{layout.folder} has forces {_listed(found)}; name one with --force-key")
     if not found:
         return None
-    first = _names(layout.features[found[0]].get("names"))[:3]
+    first = _names(layout.features[found[0]].names)[:3]
     if any(_TORQUE.search(name) for name in first):
         raise RecordingError(f"{found[0]} of {layout.folder} begins with {', '.join(first)}; forces must come first")
     return found[0]
@@ -642,8 +655,8 @@ def _names(names: object) -> list[str]:
     return [str(name) for group in groups if isinstance(group, list) for name in group]
 
 
-def _is_depth(feature: dict) -> bool:
-    details = [feature.get(name) for name in ("info", "video_info")]
+def _is_depth(feature: Feature) -> bool:
+    details = (feature.info, feature.video_info)
     return any(
         found.get("is_depth_map") or found.get("video.is_depth_map") for found in details if isinstance(found, dict)
     )

@@ -153,7 +153,7 @@ class DataFiles:
             self.writer = pq.ParquetWriter(path, self.schema, compression="snappy", use_dictionary=False)
         return divmod(self.number, CHUNK_FILES)
 
-    def write(self, columns: Mapping[str, Any], *, images: str, pngs: Sequence[bytes], first: int) -> None:
+    def write(self, columns: Mapping[str, np.ndarray], *, images: str, pngs: Sequence[bytes], first: int) -> None:
         """Write frames of an episode as a row group."""
         assert self.writer is not None
         paths = [f"frame-{first + index:06d}.png" for index in range(len(pngs))]
