@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -30,15 +29,6 @@ class BaselinePlan:
     """Training trials of the data set."""
     markers: str
     """Row of `markers.KINDS`."""
-
-    @property
-    def recipe(self) -> dict[str, Any]:
-        """What shapes the result, as `run.json` keeps it."""
-        return {
-            "estimators": self.estimators,
-            "markers": self.markers,
-            "trials": [trial.trial for trial in self.training],
-        }
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -81,7 +81,8 @@ def evaluate(
         "split": split,
     }
     if plan is not None:
-        recipe["baselines"] = plan.recipe
+        trained_on = [trial.trial for trial in plan.training]
+        recipe["baselines"] = {"estimators": plan.estimators, "markers": plan.markers, "trials": trained_on}
     with output_folder(Path(out), stage="evaluate", config=recipe, overwrite=overwrite) as output:
         if output.complete:
             evaluation = load_result(output.folder, Evaluation, command="sliplens evaluate")
