@@ -5,7 +5,6 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 
@@ -52,7 +51,9 @@ LOGGERS: dict[str, tuple[tuple[str, ...], Callable[[Path, str], Logger]]] = {
 
 
 @contextmanager
-def open_logger(name: str, folder: Path, *, run_name: str, recipe: Mapping[str, Any]) -> Iterator[Logger | None]:
+def open_logger(
+    name: str, folder: Path, *, run_name: str, recipe: Mapping[str, str | float | None]
+) -> Iterator[Logger | None]:
     """Open a logger that keeps its files in the run's folder, and close it so that the folder can take its name.
 
     TensorBoard and MLflow write there, MLflow elsewhere if `MLFLOW_TRACKING_URI` says so. Weights & Biases too writes
