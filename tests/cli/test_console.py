@@ -91,3 +91,12 @@ def test_a_stage_that_fails_closes_its_bar(screen: Console) -> None:
 
 def test_equal_messages_are_counted_in_order() -> None:
     assert fold_equal(["b", "a", "b"]) == ["b (2 times)", "a"]
+
+
+def test_messages_that_differ_in_numbers_alone_are_one_line() -> None:
+    messages = ["grad-cam loses by 0.10", "poly-cam loses by 0.10", "grad-cam loses by -0.25", "grad-cam loses by 0.3"]
+
+    assert fold_equal(messages) == [
+        "grad-cam loses by 0.10 (and 2 more with other numbers)",
+        "poly-cam loses by 0.10",
+    ]

@@ -1,5 +1,6 @@
 """What the command line shows: progress bars, results, errors."""
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -134,9 +135,18 @@ class Terminal:
 
 
 def fold_equal(messages: Iterable[str]) -> list[str]:
-    """Keep each message once, in the order of the first, with how often it came where that is more than once."""
-    counts = Counter(messages)
-    return [message if count == 1 else f"{message} ({count} times)" for message, count in counts.items()]
+    """Keep each message once, in the order of the first; those that differ in numbers alone are counted with it."""
+    alike: dict[str, Counter[str]] = {}
+    for message in messages:
+        alike.setdefault(re.sub(r"[-\u2212]?\d+(?:[.,]\d+)?", "#", message), Counter())[message] += 1
+    folded = []
+    for counts in alike.values():
+        first, others = next(iter(counts)), len(counts) - 1
+        if others:
+            folded.append(f"{first} (and {others} more with other numbers)")
+        else:
+            folded.append(first if counts[first] == 1 else f"{first} ({counts[first]} times)")
+    return folded
 
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from sliplens.cli.console import progress_bar, say, wrote
+from sliplens.cli.console import Terminal, say, wrote
 from sliplens.errors import InputError
 
 
@@ -39,7 +39,7 @@ class View:
                 raise InputError(f"{self.output} exists; choose another file or pass --overwrite")
         data = Dataset.open(self.data)
         info = data.trials[0] if self.trial is None else data.find(self.trial)
-        with progress_bar(f"Reading {info.trial}") as bar:
+        with Terminal().stage(f"Reading {info.trial}") as bar:
             if self.output is None:
                 open_viewer(data, info, on_progress=bar)
             else:
