@@ -5,9 +5,9 @@ References
 Polak, *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning*, sections 5.2 to 5.4 and 6.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 
@@ -39,6 +39,8 @@ from sliplens.results.faithfulness import RemovalScores
 from sliplens.results.study import MapQuality, Truth
 
 Outcome = Literal["holds", "does not hold", "undecided"]
+Record = TypeVar("Record")
+_UNSCORED = "its explanations were not scored; `sliplens study` does that"
 OUTCOMES: tuple[Outcome, ...] = ("holds", "does not hold", "undecided")
 
 
@@ -127,7 +129,7 @@ def tell_first(findings: list[Finding]) -> str:
     return f"Under {findings[0].where}, {'; '.join(parts)}." if parts else ""
 
 
-def untested(name: str, why: str = "its explanations were not scored; `sliplens study` does that") -> Answer:
+def untested(name: str, why: str) -> Answer:
     """Answer that stays open, and why; the name is that of an input, or empty for both networks."""
     subject = input_name(name) if name else "Both networks"
     return Answer(subject=subject, outcome="undecided", text=f"Not tested: {why}.")
@@ -230,24 +232,13 @@ _TWO = 2
 
 def claim_noisy(results: Results) -> Claim:
     """Integrated Gradients is noisy: rougher than the other methods, and less stable under sensor noise."""
-    answers = []
-    for name in inputs_in_order(results.study.inputs)[::-1]:
-        looks = results.study.map_quality.get(name)
-        answers.append(
-            Answer(
-                subject=input_name(name),
-                outcome="undecided",
-                text="Not tested: the looks of the maps were not measured; `sliplens study` does that.",
-            )
-            if looks is None
-            else _noisiest(looks)
-        )
+    unmeasured = "the looks of the maps were not measured; `sliplens study` does that"
     return Claim(
         id="noisy",
         title="Integrated Gradients is noisy",
         test="Tested by numbers: holds where its maps have a larger total variation than those of every other method, "
         "beyond the 95 % interval, and are the least stable under sensor noise (means over few frames, no interval).",
-        answers=tuple(answers),
+        answers=_of_each(results, results.study.map_quality, lambda looks: [_noisiest(looks)], why=unmeasured),
     )
 
 
@@ -309,25 +300,14 @@ def _rougher(looks: MapQuality, others: Iterable[str]) -> dict[str, Difference]:
 
 def claim_edges(results: Results, *, rng: np.random.Generator) -> Claim:
     """The network looks at the edges of two markers: they hold most of its effects, and maps lie on edges."""
-    answers = []
-    for name in inputs_in_order(results.study.inputs)[::-1]:
-        truth = results.study.truth.get(name)
-        answers.append(
-            Answer(
-                subject=input_name(name),
-                outcome="undecided",
-                text="Not tested: only simulated touch tells what each marker does, and no such result is here.",
-            )
-            if truth is None
-            else _looks_at_two(truth, rng=rng)
-        )
+    unknown = "only simulated touch tells what each marker does, and no such result is here"
     return Claim(
         id="two-markers",
         title="The network looks at the edges of two markers",
         test="Tested on simulated touch in two parts, both needed: putting back a marker at a time, the strongest two "
         "hold more than half of all change of the answer; and Poly-CAM's relevance lies on marker edges more than "
         "their share of the image.",
-        answers=tuple(answers),
+        answers=_of_each(results, results.study.truth, lambda truth: [_looks_at_two(truth, rng=rng)], why=unknown),
     )
 
 
@@ -394,20 +374,16 @@ def judge_claims(results: Results, *, rng: np.random.Generator) -> tuple[Claim, 
 
 
 def _claim_poly_cam(results: Results, *, rng: np.random.Generator) -> Claim:
-    answers = []
-    for name in _inputs(results):
-        faithful = results.study.faithfulness.get(name)
-        if faithful is None:
-            answers.append(untested(name))
-            continue
+    def judge(faithful: RemovalScores) -> list[Answer]:
         claimants = poly_cams(faithful)
-        answers += [_best_of(faithful, one, claimants, results, rng=rng) for one in claimants]
+        return [_best_of(faithful, one, claimants, results, rng=rng) for one in claimants]
+
     return Claim(
         id="most-faithful",
         title="Poly-CAM is the most faithful of the three methods",
         test="Tested by the symmetric relevance gain (SRG): holds under a fill where Poly-CAM's is larger than both "
         "others' and the 95 % interval of each difference leaves zero out.",
-        answers=tuple(answers),
+        answers=_of_each(results, results.study.faithfulness, judge, why=_UNSCORED),
     )
 
 
@@ -464,16 +440,17 @@ def _thesis_score_findings(
 
 
 def _claim_grad_cam(results: Results, *, rng: np.random.Generator) -> Claim:
-    answers = []
-    for name in _inputs(results):
-        faithful = results.study.faithfulness.get(name)
-        answers.append(untested(name) if faithful is None else _no_better(faithful, GRAD_CAM, rng=rng))
     return Claim(
         id="grad-cam",
         title="Grad-CAM is not faithful",
         test="Tested against maps that know nothing of the network: holds under a fill where Grad-CAM's SRG lies below "
         "chance or below the best control for sure; does not hold where it lies above both for sure.",
-        answers=tuple(answers),
+        answers=_of_each(
+            results,
+            results.study.faithfulness,
+            lambda faithful: [_no_better(faithful, GRAD_CAM, rng=rng)],
+            why=_UNSCORED,
+        ),
     )
 
 
@@ -513,5 +490,11 @@ def _no_better(faithful: RemovalScores, method: str, *, rng: np.random.Generator
     )
 
 
-def _inputs(results: Results) -> list[str]:
-    return inputs_in_order(results.study.inputs)[::-1]
+def _of_each(
+    results: Results, found: Mapping[str, Record], judge: Callable[[Record], Sequence[Answer]], *, why: str
+) -> tuple[Answer, ...]:
+    """Answer for each network, difference before raw; one without a result stays open, and why."""
+    names = inputs_in_order(results.study.inputs)[::-1]
+    return tuple(
+        answer for name in names for answer in (judge(found[name]) if name in found else [untested(name, why)])
+    )
