@@ -146,6 +146,7 @@ def plate_poly_cam(results: Results) -> Plate | None:
 def _plate(explained: Explained, frames: list[ShownFrame], methods: list[str], *, name: str, what: str) -> Plate | None:
     if not frames:
         return None
+    trials = {explained.frames[one.index].trial for one in frames}
     numbers = _Saliencies()
     pictures, called = bright_pictures(explained, [one.index for one in frames])
     rows = [(called, [Cell(picture=pictures[one.index], words=_answer(explained, one.index)) for one in frames])]
@@ -163,7 +164,7 @@ def _plate(explained: Explained, frames: list[ShownFrame], methods: list[str], *
         figure=draw_grid(rows, heads=[f"Γ {percent(one.level)}" for one in frames], bar=True).figure,
         alt=f"{what}: {listed([method_name(one) for one in methods])} at Γ "
         f"{', '.join(percent(one.level) for one in frames)}",
-        caption=f"{what}: {'frames' if explained.source == 'real' else 'one trial'} from full stick to full slip.{off} "
+        caption=f"{what}: {'one trial' if len(trials) == 1 else 'frames'} from full stick to full slip.{off} "
         "Colours are relative to each map's own saliency, so brightness does not compare between maps. "
         f"{numbers.tell_travel(methods)}{_tell_blank(explained, frames, methods)}",
         numbers=numbers.columns(),
