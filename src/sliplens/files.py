@@ -139,6 +139,20 @@ def scratch_folder() -> Iterator[Path]:
         yield Path(folder)
 
 
+def require_new_file(path: Path, *, suffix: str | None = None, overwrite: bool = False) -> None:
+    """Check that a file can be written under its name.
+
+    Raises
+    ------
+    InputError
+        If it ends in something else than the suffix, or exists and is not to be overwritten.
+    """
+    if suffix is not None and path.suffix != suffix:
+        raise InputError(f"{path} does not end in {suffix}; name the file to write so")
+    if path.exists() and not overwrite:
+        raise InputError(f"{path} exists; choose another file or pass --overwrite")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Output:
     """A folder being written: `folder` lies beside the target until everything is in it."""

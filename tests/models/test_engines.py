@@ -182,6 +182,11 @@ def test_the_fastest_engine_is_that_which_pays(monkeypatch: pytest.MonkeyPatch):
     assert chosen(100_000) == "folded"
 
 
+def test_a_file_that_was_made_before_pays_at_once(networks: dict[str, TrainedModel], onnx_files: dict[str, Path]):
+    skip_without("openvino")
+    assert make_engine("auto", networks["point"], frames=1, onnx_file=onnx_files["point"]).name == "openvino"
+
+
 def test_nothing_is_reported_to_anybody(tmp_path: Path):
     """Both libraries keep an identifier below the home folder when they report."""
     skip_without("openvino")

@@ -9,6 +9,7 @@ import tyro
 
 from sliplens.cli.console import Terminal, say, wrote
 from sliplens.errors import InputError
+from sliplens.files import require_new_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,8 +68,7 @@ class Track:
             if len(trials) != 1:
                 raise InputError(f"a clip shows one trial and {self.source} has {len(trials)}; name one with --trial")
             (trial,) = trials
-            if self.video.exists() and not self.overwrite:
-                raise InputError(f"{self.video} exists; choose another file or pass --overwrite")
+            require_new_file(self.video, overwrite=self.overwrite)
             clip = clip_writer(self.video, size=trial.frame_size, frames_per_s=trial.frame_rate_hz)
         with clip as draw:
             tracking = track(

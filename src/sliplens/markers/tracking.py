@@ -14,6 +14,7 @@ from sliplens._version import __version__
 from sliplens.codec import write_tables
 from sliplens.errors import InputError
 from sliplens.extras import import_cv2
+from sliplens.files import require_new_file
 from sliplens.markers.detect import get_kind
 from sliplens.markers.tracker import Tracker
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame
@@ -123,10 +124,8 @@ def track(
         If the source cannot be read.
     """
     path = None if out is None else Path(out)
-    if path is not None and path.suffix != ".parquet":
-        raise InputError(f"{path} does not end in .parquet; name the file to write so")
-    if path is not None and path.exists() and not overwrite:
-        raise InputError(f"{path} exists; choose another file or pass --overwrite")
+    if path is not None:
+        require_new_file(path, suffix=".parquet", overwrite=overwrite)
     get_kind(markers)
     import_cv2()
     if isinstance(source, Path | str | np.ndarray | Dataset):

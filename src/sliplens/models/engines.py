@@ -128,7 +128,11 @@ def prepare(
         If an engine that is asked for by name cannot run the network, or answers otherwise.
     """
     _PASSES[model] = known = _PASSES.get(model, 0) + passes
-    pay = [name for name, row in ENGINES.items() if row.pays_after is not None and known >= row.pays_after]
+    pay = [
+        name
+        for name, row in ENGINES.items()
+        if (row.pays_after is not None and known >= row.pays_after) or (onnx_file is not None and name in _CONVERTED)
+    ]
     names = [engine] if engine != "auto" else [*reversed(pay)]
     for name in names:
         kind = ENGINES.pick(name)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from sliplens._version import __version__
 from sliplens.errors import InputError, ModelError
 from sliplens.extras import ONNX_PACKAGES, import_onnxruntime, require_packages
-from sliplens.files import to_builtins
+from sliplens.files import require_new_file, to_builtins
 from sliplens.models.backbones import Answers, answer_names, bin_edges
 from sliplens.models.checkpoint import TrainedModel, load
 
@@ -65,10 +65,7 @@ def export_onnx(run: TrainedModel | Path | str, out: Path | str, *, overwrite: b
         If torch cannot export the network, or an answer differs by more than `TOLERANCE`.
     """
     path = Path(out)
-    if path.suffix != ".onnx":
-        raise InputError(f"{path} does not end in .onnx; name the file to write so")
-    if path.exists() and not overwrite:
-        raise InputError(f"{path} exists; choose another file or pass --overwrite")
+    require_new_file(path, suffix=".onnx", overwrite=overwrite)
     require_packages(*ONNX_PACKAGES, extra="onnx", purpose="an ONNX file")
     trained = run if isinstance(run, TrainedModel) else load(run)
     size = trained.manifest.image_size

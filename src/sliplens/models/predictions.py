@@ -14,7 +14,7 @@ from torch import Tensor
 from sliplens._version import __version__
 from sliplens.codec import write_tables
 from sliplens.errors import InputError
-from sliplens.files import hash_json
+from sliplens.files import hash_json, require_new_file
 from sliplens.models.checkpoint import Estimate, TrainedModel, load
 from sliplens.models.engines import Engine, make_engine
 from sliplens.progress import OnProgress, note, stage
@@ -123,7 +123,12 @@ def predict(
     ['trial', 'frame', 'time_s', 'prediction', 'sigma', 'low_90', 'high_90']
     """
     path = None if out is None else Path(out)
-    _check_arguments(path, overwrite=overwrite, batch_size=batch_size, engine=engine, onnx_file=onnx_file)
+    if path is not None:
+        require_new_file(path, suffix=".parquet", overwrite=overwrite)
+    if batch_size < 1:
+        raise InputError(f"--batch-size must be at least 1, got {batch_size}")
+    if onnx_file is not None and engine not in {"auto", "onnxruntime", "openvino"}:
+        raise InputError(f"--onnx is for onnxruntime and openvino, not for {engine}; leave it out")
     trained = run if isinstance(run, TrainedModel) else load(run, device=device)
     if isinstance(source, Path | str | np.ndarray | Dataset):
         with stage(on_progress, "Opening the source"):
@@ -151,19 +156,6 @@ def predict(
     with stage(on_progress, f"Predicting frames ({trained.manifest.input}, {ready.name})") as count:
         rows = write_tables(_tables(ready, trained, source, schema, count), path, schema)
     return Predictions(frames=total, engine=ready.name, path=path, rows=rows, notes=notes)
-
-
-def _check_arguments(
-    path: Path | None, *, overwrite: bool, batch_size: int, engine: str, onnx_file: Path | None
-) -> None:
-    if path is not None and path.suffix != ".parquet":
-        raise InputError(f"{path} does not end in .parquet; name the file to write so")
-    if path is not None and path.exists() and not overwrite:
-        raise InputError(f"{path} exists; choose another file or pass --overwrite")
-    if batch_size < 1:
-        raise InputError(f"--batch-size must be at least 1, got {batch_size}")
-    if onnx_file is not None and engine not in {"auto", "onnxruntime", "openvino"}:
-        raise InputError(f"--onnx is for onnxruntime and openvino, not for {engine}; leave it out")
 
 
 def _require_comparable(trained: TrainedModel, trial: TrialFrames) -> Iterator[str]:
