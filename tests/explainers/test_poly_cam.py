@@ -140,6 +140,12 @@ def test_nothing_is_relevant_where_the_image_is_the_reference(network, images, r
     assert not relevance[22:38, 32:48].any()
 
 
+def test_a_frame_that_moves_no_channel_has_an_empty_map():
+    # without biases every activation of a black image is 0
+    layers = nn.Conv2d(3, 4, 3, bias=False), nn.ReLU(), nn.Flatten(), nn.Linear(3600, 1)
+    assert not PolyCam()(nn.Sequential(*layers).eval(), torch.zeros(1, 3, 32, 32)).relevance.any()
+
+
 def test_full_mask_has_the_whole_effect():
     class Flat(nn.Module):
         """One channel, nearly constant but for a dark corner: its mask is nearly full."""

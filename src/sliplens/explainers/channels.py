@@ -211,7 +211,8 @@ def measure(
 
     One row for what is kept and one for what is removed, as far as the variant has them.
     """
-    parts = channels.split(max(1, engine.batch_size // variant.passes))
+    # of no channels at all, as where nothing differs from the reference, there is still one empty part
+    parts = channels.split(max(1, engine.batch_size // variant.passes)) if len(channels) else ()
 
     def batches() -> Iterator[Tensor]:
         for part in parts:
