@@ -84,8 +84,6 @@ def load_record(path: Path, kind: type[Record], *, command: str) -> Record:
 
     Parameters
     ----------
-    path
-        JSON file.
     kind
         Dataclass that it holds.
     command
@@ -173,8 +171,6 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
 
     Parameters
     ----------
-    folder
-        Folder of the result.
     kind
         Dataclass that it holds.
     command
@@ -299,8 +295,6 @@ def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schem
         Rows, in their order.
     path
         File to write, one that is there is replaced; None to join the tables in memory.
-    schema
-        Columns and metadata.
 
     Returns
     -------

@@ -140,13 +140,7 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def require_new_file(path: Path, *, suffix: str | None = None, overwrite: bool = False) -> None:
-    """Check that a file can be written under its name.
-
-    Raises
-    ------
-    InputError
-        If it ends in something else than the suffix, or exists and is not to be overwritten.
-    """
+    """Check that a file can be written under its name."""
     if suffix is not None and path.suffix != suffix:
         raise InputError(f"{path} does not end in {suffix}; name the file to write so")
     if path.exists() and not overwrite:

@@ -133,20 +133,7 @@ def network_images(
     frames: UInt8[np.ndarray, "batch height width 3"],
     reference: UInt8[np.ndarray, "height width 3"] | None,
 ) -> tuple[UInt8[Tensor, "batch 3 size size"], Float[Tensor, "3 size size"]]:
-    """Images of a network before they are normalised, 8 bits, and the input of the untouched sensor, in [0, 1].
-
-    Parameters
-    ----------
-    frames, reference
-        As `explain` takes them.
-
-    Raises
-    ------
-    InputError
-        If the network needs a reference.
-    ImageError
-        If there is no frame, or the frames are not of the size the network's sensor has.
-    """
+    """Images of a network before they are normalised, 8 bits, and the input of the untouched sensor, in [0, 1]."""
     if not len(frames):
         raise ImageError("there is no frame to explain; give one at least")
     trained.require_frame_size(frames.shape[1:3])

@@ -353,8 +353,6 @@ def score_maps(
 
     Parameters
     ----------
-    predict, images, references, fill, areas, seed, batch_size, on_progress
-        As `removal_curves` takes them.
     influence
         Maps by method, larger where a method says that a part matters more. Of signed relevance give the part that
         works towards the target, `relevance * sign(target)`, and `towards`.

@@ -36,8 +36,6 @@ def marker_curves(
 
     Parameters
     ----------
-    predict
-        As `removal_curves` takes it.
     orders
         Places among an image's markers, first to be put back first.
     batch_size
@@ -83,18 +81,11 @@ def score_maps_by_marker(
 
     Parameters
     ----------
-    predict, redraw, batch_size, on_progress
-        As `marker_curves` takes them.
     influence
         How much each marker matters, by method (`unit_means`): larger goes first. Of signed relevance give the part
         that works towards the target, `relevance * sign(target)`.
     towards
         As `score_maps` takes it.
-
-    Raises
-    ------
-    InputError
-        If an influence is not finite.
     """
     for name, values in influence.items():
         if not np.isfinite(values).all():

@@ -37,12 +37,6 @@ def choose_frames(
 
     Parameters
     ----------
-    networks
-        By input.
-    data, split, condition
-        Trials to choose from.
-    trials
-        How many are wanted.
     tolerance
         Largest error of an answer, in margin units.
     levels
@@ -51,15 +45,6 @@ def choose_frames(
         Those of them that count in the scores.
     shown_trials
         How many trials the panels show, the best read first.
-    on_progress
-        Takes the trials looked at and the number of all.
-
-    Raises
-    ------
-    InputError
-        If a number is out of range, or a scored level is not among the levels.
-    RecordingError
-        If no trial has a frame near every level.
 
     References
     ----------

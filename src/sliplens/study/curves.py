@@ -61,13 +61,7 @@ def is_control(name: str) -> bool:
 
 
 def influences(material: Material) -> dict[str, Float[np.ndarray, "frames size size"]]:
-    """Maps to rank parts by: of each method the part of its relevance that works towards the target, and the controls.
-
-    Parameters
-    ----------
-    material
-        The explanations and what was explained.
-    """
+    """Maps to rank parts by: the part of each method's relevance that works towards the target, and the controls."""
     maps = {name: material.towards_target(name) for name in material.explained.relevance}
     return maps | {name: control(material.inputs).double().cpu().numpy() for name, control in CONTROLS.items()}
 
@@ -95,27 +89,14 @@ def score_removal(
 
     Parameters
     ----------
-    material
-        The network, and the explanations of the frames that are scored.
     maps
         Influence by method, controls included (`influences`).
     settings
         What to remove, and what to put there; those whose unit is not known of every frame are left out.
-    random_orders
-        How many random orders.
     further
         What finds curves in another way, such as by drawing the scene anew; they are judged with the others.
-    seed
-        Of the random orders, the noise and the resampling.
     parts
         Folder that keeps the curves of each setting, so that an interrupted run goes on after the last.
-    on_progress
-        Takes the frames done, over all settings, and their number.
-
-    Raises
-    ------
-    InputError
-        If a fill is unknown.
     """
     inputs, explained = material.inputs, material.explained
     for setting in settings:
@@ -201,8 +182,6 @@ def judge_curves(
         By setting and method, controls included.
     trials
         Trial of each frame; whole trials are resampled.
-    seed
-        Of the resampling.
     """
     rng = np.random.default_rng(seed)
     scores, comparisons = [], []

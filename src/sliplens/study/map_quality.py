@@ -32,16 +32,8 @@ def measure_maps(
 
     Parameters
     ----------
-    material
-        The network, its maps and methods.
-    data
-        Data set that the frames came from.
     repeated
         How many frames, from the first on, are explained twice more.
-    seed
-        Of the noise.
-    on_progress
-        Takes the methods done and their number.
     """
     explained, rng = material.explained, np.random.default_rng(seed)
     noisy, following, noise_sd = _once_more(material.trained, data, material.chosen[:repeated], rng=rng)

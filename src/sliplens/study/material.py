@@ -37,11 +37,6 @@ def study_explainers(methods: Sequence[str] = STUDY_METHODS, *, budget: float = 
         Rows of `EXPLAINERS`, or `poly-cam-thesis`: the public code's score, layers, and the map that the thesis scored.
     budget
         Of Poly-CAM, with either score; see `PolyCam`.
-
-    Raises
-    ------
-    InputError
-        If a method is unknown; the message lists those there are.
     """
     table = {
         **EXPLAINERS,
@@ -138,12 +133,8 @@ def gather(
 
     Parameters
     ----------
-    trained, explained, data
-        The network, its explanations, and the data set that the frames came from.
     chosen
         Frames that count, each of which is explained.
-    markers, explainers
-        See `Material`.
     """
     places = {frame.id: at for at, frame in enumerate(explained.frames)}
     counted = explained.take([places[frame.id] for frame in chosen])

@@ -31,17 +31,8 @@ def run_together(
     ----------
     work
         Takes a name, and what shows its stages and progress; must be picklable.
-    names
-        What there is to do.
     threads
         Of torch, in each process.
-    on_progress
-        Shows the stages of all.
-
-    Raises
-    ------
-    SliplensError
-        That of the process that failed first, or one that says that it died.
     """
     context = multiprocessing.get_context("spawn")  # a fork would inherit locks of torch's threads
     pipes = {name: context.Pipe(duplex=False) for name in names}

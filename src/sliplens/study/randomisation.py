@@ -30,14 +30,8 @@ def randomise_weights(
 
     Parameters
     ----------
-    material
-        The network, frames and methods.
     frames
         How many of the frames, from the first on.
-    seed
-        Of the new weights.
-    on_progress
-        Takes the methods done and their number.
 
     References
     ----------
@@ -110,19 +104,7 @@ def _smooth_rise(
 def explain_untrained(
     material: Material, explainer: Explainer, *, seed: int = 0, on_progress: OnProgress | None = None
 ) -> UntrainedMaps:
-    """Explain the network with all weights drawn anew: a control that every map has to beat.
-
-    Parameters
-    ----------
-    material
-        The network and the frames.
-    explainer
-        What explains.
-    seed
-        Of the new weights.
-    on_progress
-        Takes the frames done and their number.
-    """
+    """Explain the network with all weights drawn anew: a control that every map has to beat."""
     model = _untrained(material.trained.model, material.inputs, seed=seed)
     maps = []
     for index in range(len(material.inputs)):

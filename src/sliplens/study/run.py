@@ -86,8 +86,6 @@ def run_study(
 
     Parameters
     ----------
-    data
-        Data set with labels, or its folder.
     difference, raw
         Networks on difference and on raw images, each as it was loaded, as its folder, or as the name of one that comes
         with sliplens; None to leave it out.
@@ -95,8 +93,6 @@ def run_study(
         Folder of the study, a subfolder a stage; a temporary one that lives as long as the result if None.
     methods
         Explainers to compare (`study_explainers`).
-    split, condition
-        Trials to choose from.
     trials
         How many trials to look at.
     tolerance
@@ -110,12 +106,6 @@ def run_study(
     jobs
         Networks to judge at the same time, each by a process with its share of the cores; both where they run on a
         processor if None.
-    seed
-        Of the random orders, of new weights and of noise.
-    overwrite
-        Make every stage again.
-    on_progress
-        Takes the steps done and their number, stage by stage.
 
     Raises
     ------
@@ -186,13 +176,7 @@ def run_study(
 
 
 def load_network(network: Network, name: str, *, device: str = "cpu") -> TrainedModel:
-    """Network of a study by what it reads.
-
-    Raises
-    ------
-    InputError
-        If it was trained on other images than `name` says.
-    """
+    """Network of a study by what it reads."""
     run = network if isinstance(network, TrainedModel) else load(str(network), device=device)
     if run.manifest.input != name:
         raise InputError(

@@ -78,19 +78,8 @@ def stage_frames(
 
     Parameters
     ----------
-    trained
-        The network that was explained.
-    explained
-        Explanations of frames of a simulated data set.
-    data
-        That data set.
     recipe
         What simulated it; read from its folder if None.
-
-    Raises
-    ------
-    InputError
-        If the frames are not simulated or of another data set, or cannot be drawn as they are stored.
     """
     if not data.simulated or explained.source != "simulated":
         raise InputError(f"{data.folder} was recorded: what each marker does is known of simulated frames alone")
@@ -148,15 +137,7 @@ def redrawing(trained: TrainedModel, frames: Sequence[StagedFrame]) -> Redraw:
 
 
 def find_places(frame: StagedFrame, *, image_size: int) -> Places:
-    """Where the markers, their rims and the slipping skin are in a network's input.
-
-    Parameters
-    ----------
-    frame
-        The frame.
-    image_size
-        Side of the network's input.
-    """
+    """Where the markers, their rims and the slipping skin are in a network's input."""
     height, width = frame.contact_map.shape
     scale = image_size / width
     steps = np.arange(image_size)

@@ -54,13 +54,7 @@ _Curves = Mapping[str, Sequence[_Curve]]
 
 
 def require_same_network(trained: TrainedModel, explained: Explained) -> None:
-    """Refuse explanations of another network.
-
-    Raises
-    ------
-    CheckpointError
-        If the weights' hashes differ.
-    """
+    """Refuse explanations of another network."""
     if explained.weights_sha256 != trained.manifest.weights_sha256:
         raise CheckpointError(
             "these explanations were made with another network; explain the frames again with this run"
@@ -80,16 +74,10 @@ def score_explanations(
 
     Parameters
     ----------
-    trained
-        The network that was explained.
     explained
         Explanations of it.
     fill, steps
         What removed pixels become, and in how many steps (the image's height if None).
-    seed
-        Of the random control.
-    on_progress
-        Takes the number of curves done and the number of all.
 
     Raises
     ------
@@ -143,16 +131,10 @@ def score_remedies(
 
     Parameters
     ----------
-    material
-        The network, and the explanations of the frames that are scored.
     grey
         The same frames scored as the thesis does, by deletion to grey: stopping early needs no pass of its own.
     steps
         Steps of the others until every pixel is gone.
-    seed
-        Of the random control.
-    on_progress
-        Takes the number of curves done and the number of all.
 
     References
     ----------

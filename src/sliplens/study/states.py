@@ -22,12 +22,8 @@ def show_states(choice: Choice, data: Dataset, *, on_progress: OnProgress | None
 
     Parameters
     ----------
-    choice
-        What the study looks at.
     data
         Data set that it was chosen from.
-    on_progress
-        Takes the number of frames done and the number of all.
     """
     infos = {info.trial: info for info in data.trials}
     tables: list[MarkerTable] = [_NO_MARKERS]
@@ -110,10 +106,6 @@ def network_places(
     ----------
     marked
         Markers in camera pixels; those not followed are left out.
-    frame_size
-        Height and width of the camera's frames.
-    image_size
-        Side of the network's input.
 
     Returns
     -------

@@ -23,8 +23,6 @@ def time_explainers(material: Material, *, on_progress: OnProgress | None = None
     ----------
     material
         The network, frames (the first is timed) and methods.
-    on_progress
-        Takes the methods done and their number.
     """
     model, inputs, references = material.trained.model, material.inputs[:1], material.references[:1]
     forward = float(np.median(_seconds(lambda: material.trained.predict(inputs))))

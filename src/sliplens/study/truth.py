@@ -69,15 +69,7 @@ class FrameEffects:
 
 
 def network_effects(predict: Predict, redraw: Redraw, image: int, *, markers: int) -> Float[np.ndarray, " markers"]:
-    """What the network's answer loses when each marker alone is put back, in margin units.
-
-    Parameters
-    ----------
-    predict, redraw
-        The network, and what draws the image.
-    image, markers
-        Number of the image, and of the markers in it.
-    """
+    """What the network's answer loses when each marker alone is put back, in margin units."""
     # the whole image first
     back = np.eye(markers + 1, markers, k=-1, dtype=bool)
     answers = answer_whole(predict, redraw(image, back), batch_size=64)
@@ -109,20 +101,12 @@ def find_effects(
 
     Parameters
     ----------
-    predict, redraw
-        The network, and what draws the image.
-    image
-        Number of the frame, as `redraw` takes it.
-    frame, places
-        The frame, and where its markers are.
     inputs, references
         The frame as the network gets it, and the untouched sensor.
     towards
         Sign of the answer's change from the untouched sensor: what works towards it goes first.
     fills
         Names of fills; the true one is always there.
-    rng
-        Source of the shuffling.
     """
     network = network_effects(predict, redraw, image, markers=len(frame.markers))
     shuffled = shuffle_half(network, rng=rng)
@@ -273,8 +257,6 @@ def judge_by_truth(
 
     Parameters
     ----------
-    trained, explained
-        The network, and the explanations of the frames to judge.
     data
         The simulated data set that they are from.
     maps
@@ -284,22 +266,8 @@ def judge_by_truth(
         Names of the fills under which a map that knows the effects is held against one that knows half of them.
     recipe
         What simulated the data set; read from its folder if None.
-    seed
-        Of the random map, the shuffling and the resampling.
     parts
         Folder that keeps what is found of each frame, so that an interrupted run goes on after the last.
-    on_progress
-        Takes the number of frames done and the number of all.
-
-    Raises
-    ------
-    CheckpointError
-        If the explanations are of another network.
-    InputError
-        If the data are not simulated or not those that were explained, cannot be drawn as they are stored, or a fill is
-        unknown.
-    ContactError
-        If a frame has no contact.
     """
     for fill in fills:
         get_fill(fill)
@@ -384,15 +352,8 @@ def true_curves(
 
     Parameters
     ----------
-    trained, explained, data, maps, recipe, on_progress
-        As `judge_by_truth` takes them.
     random_orders, seed
         How many random orders, and what they are drawn from.
-
-    Raises
-    ------
-    CheckpointError, InputError
-        As `judge_by_truth`.
     """
     frames, places = _stage(trained, explained, data, recipe=recipe)
     inputs = network_inputs(trained, explained)

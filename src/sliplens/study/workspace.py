@@ -84,10 +84,6 @@ def explain_source(
         interrupted goes on after its last map.
     colours
         Colours of the overlays: perceptually uniform, or as the thesis's figures have them.
-    overwrite
-        Replace a folder made otherwise.
-    on_progress
-        Called with the maps done and their number.
 
     Raises
     ------
@@ -164,16 +160,10 @@ def score_explained(
         What removed pixels become, a row of `FILLS`.
     steps
         Steps until every pixel is gone; the image's height if None, as in the thesis.
-    seed
-        Seed of the random order.
     device
         Where a network that is loaded here runs.
     out
         Folder to write: curves and scores; nowhere if None.
-    overwrite
-        Replace a folder made otherwise.
-    on_progress
-        Called with the curves done and their number.
 
     Raises
     ------
