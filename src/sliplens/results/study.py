@@ -392,7 +392,7 @@ class Study:
         Keeps a temporary workspace as long as the study lives.
     """
 
-    folder: Path | None = None
+    folder: Path = Path()
     scratch: TemporaryDirectory[str] | None = field(default=None, repr=False, compare=False)
     evaluations: dict[str, Evaluation] = field(default_factory=dict)
     choice: Choice | None = None

@@ -1,7 +1,7 @@
 """Frames to explain, and their explanations, made one map at a time."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -233,7 +233,7 @@ DEFAULT_METHODS = ("grad-cam", "integrated-gradients", "poly-cam")
 """The three methods the thesis compares."""
 
 
-def require_methods(methods: Sequence[str], explainers: Mapping[str, object] = EXPLAINERS) -> None:
+def require_methods(methods: Sequence[str], explainers: Collection[str] = EXPLAINERS) -> None:
     """Refuse a method that is not in the table.
 
     Raises
