@@ -1,5 +1,6 @@
 """What the README shows in Python runs as it stands, on small networks and data."""
 
+import inspect
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from own_recording import write_forces, write_video
 from sliplens.models import Manifest, build_model, save_checkpoint
 from sliplens.recordings import Dataset, Recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
+from sliplens.study.run import run_study
 from sliplens.training import RECIPES
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
@@ -28,9 +30,12 @@ def grip() -> Recording:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_dataset: Dataset, grip: Recording) -> Path:
+def folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_dataset: Dataset, fine_dataset: Dataset, grip: Recording
+) -> Path:
     """Folder in which the names of the README stand for small things: networks, a data set, a recording."""
     (tmp_path / "data").symlink_to(small_dataset.folder)
+    (tmp_path / "grips").symlink_to(fine_dataset.folder)
     write_forces(grip, tmp_path / "cup.csv")
     write_video(grip, tmp_path / "cup.mp4")  # Matroska, whatever its name: FFmpeg looks inside
     for kind in ("difference", "raw"):
@@ -49,6 +54,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_dataset: Datas
             torch.manual_seed(0)
             save_checkpoint(run, build_model(head="histogram").eval(), manifest)
     monkeypatch.setitem(RECIPES, "default", replace(RECIPES["default"], image_size=IMAGE_SIZE, batch_size=16))
+    for option in ("random_orders", "trials"):
+        monkeypatch.setitem(inspect.unwrap(run_study).__kwdefaults__, option, 1)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
