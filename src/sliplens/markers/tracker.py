@@ -272,10 +272,7 @@ def _changed(rest: Markers, found: Markers, spot: Int[np.ndarray, " markers"]) -
     low, high = _RADIUS_CHANGE
     radius, contrast = (
         ratio / np.nanmedian(ratio) if np.isfinite(ratio).any() else ratio
-        for ratio in (
-            _taken(found.radius_px, spot) / rest.radius_px,
-            _taken(found.contrast, spot) / rest.contrast,
-        )
+        for ratio in (_taken(found.radius_px, spot) / rest.radius_px, _taken(found.contrast, spot) / rest.contrast)
     )
     roundness = _taken(found.roundness, spot)
     flat = (roundness < _ROUNDNESS_LEFT * rest.roundness) & (roundness < _ROUND)

@@ -24,12 +24,7 @@ _FAR = 50.0
 
 
 def hertz_displacement(
-    distance_m: Numbers,
-    depth_m: Numbers,
-    *,
-    contact_radius_m: Numbers,
-    sphere_radius_m: float,
-    poisson_ratio: float,
+    distance_m: Numbers, depth_m: Numbers, *, contact_radius_m: Numbers, sphere_radius_m: float, poisson_ratio: float
 ) -> Field:
     """Displacements (u_r, u_z) inside the gel under Hertz's pressure, in metres.
 
@@ -163,12 +158,7 @@ def partial_slip_displacement(
     strain_per_metre = 4 * friction / (np.pi * (1 - nu) * sphere_radius_m)
     whole, stuck = (
         shear_displacement(
-            x_m,
-            y_m,
-            depth_m,
-            contact_radius_m=radius,
-            peak_strain=strain_per_metre * radius,
-            poisson_ratio=nu,
+            x_m, y_m, depth_m, contact_radius_m=radius, peak_strain=strain_per_metre * radius, poisson_ratio=nu
         )
         for radius in (contact_radius_m, stick_m)
     )

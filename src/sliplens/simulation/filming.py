@@ -93,9 +93,7 @@ class Film:
 
     def _face_distance_squared(self, frames: slice) -> Float32[np.ndarray, "frames height width"]:
         return self.sensor.geometry.face_distance_squared(
-            self.rays,
-            contact_centre_m=self.motion.contact_centre_m,
-            indentation_m=self.motion.indentation_m[frames],
+            self.rays, contact_centre_m=self.motion.contact_centre_m, indentation_m=self.motion.indentation_m[frames]
         )
 
     def _draw(

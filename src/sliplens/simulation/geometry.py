@@ -15,10 +15,7 @@ from sliplens.errors import ContactError
 
 
 def _squared_distance(
-    rays: Float[np.ndarray, "height width 2"],
-    *,
-    height: Float[np.ndarray, " frames"],
-    centre: Float[np.ndarray, "2"],
+    rays: Float[np.ndarray, "height width 2"], *, height: Float[np.ndarray, " frames"], centre: Float[np.ndarray, "2"]
 ) -> Float32[np.ndarray, "frames height width"]:
     """Squared distance |h u - c|^2 between a point c and where rays of slope u are at heights h."""
     slope, along = (rays**2).sum(axis=-1).astype(np.float32), (rays @ (2 * centre)).astype(np.float32)
@@ -65,11 +62,7 @@ class Dome:
 
     def __post_init__(self) -> None:
         require_positive(
-            {
-                "dome radius": self.radius_m,
-                "focal length": self.focal_px_per_rad,
-                "ring spacing": self.ring_spacing_deg,
-            }
+            {"dome radius": self.radius_m, "focal length": self.focal_px_per_rad, "ring spacing": self.ring_spacing_deg}
         )
         if not -1 < self.camera_offset < 1:
             raise ContactError(

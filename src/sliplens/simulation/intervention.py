@@ -14,13 +14,7 @@ from sliplens.errors import ContactError, InputError
 from sliplens.files import RUN_FILE, read_json
 from sliplens.recordings import Recording
 from sliplens.simulation.filming import Film, batches
-from sliplens.simulation.information import (
-    Touch,
-    marker_sensitivity,
-    prior_sigma,
-    reading_gain,
-    visible_markers,
-)
+from sliplens.simulation.information import Touch, marker_sensitivity, prior_sigma, reading_gain, visible_markers
 from sliplens.simulation.loading import Loading
 from sliplens.simulation.nuisances import Nuisances
 from sliplens.simulation.plan import FrameTotals, SimulationRecipe, TrialPlan, plan_trials

@@ -68,12 +68,7 @@ def relief(sensor: Sensor, *, contact_px: Float[np.ndarray, "2"]) -> Float32[np.
 
 
 def haze(
-    sensor: Sensor,
-    *,
-    grasp: Grasp,
-    contact_px: Float[np.ndarray, "2"],
-    radius_px: float,
-    rng: np.random.Generator,
+    sensor: Sensor, *, grasp: Grasp, contact_px: Float[np.ndarray, "2"], radius_px: float, rng: np.random.Generator
 ) -> Float32[np.ndarray, "3 height width"]:
     """Grey levels that full contact adds: a veil, a glow where the object reflects the light, the grain of the skin.
 

@@ -44,10 +44,7 @@ def prepare_trial(plan: TrialPlan) -> tuple[Loading, Film]:
 
 
 def simulate_trial(
-    plan: TrialPlan,
-    *,
-    device: str | torch.device = "cpu",
-    on_progress: OnProgress | None = None,
+    plan: TrialPlan, *, device: str | torch.device = "cpu", on_progress: OnProgress | None = None
 ) -> Recording:
     """Simulate one trial."""
     loading, film = prepare_trial(plan)
@@ -166,11 +163,7 @@ def simulate(
 
 
 def simulate_dataset(
-    folder: Path,
-    recipe: SimulationRecipe,
-    *,
-    device: str | torch.device = "cpu",
-    on_progress: OnProgress | None = None,
+    folder: Path, recipe: SimulationRecipe, *, device: str | torch.device = "cpu", on_progress: OnProgress | None = None
 ) -> Dataset:
     """Simulate a data set into a folder; trials that are already there are kept.
 
