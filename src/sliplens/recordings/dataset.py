@@ -171,10 +171,7 @@ def trial_info(path: Path, *, split: str) -> TrialInfo:
     samples = forces_path(path.parent.parent, path.stem)
     shared = {one.name: getattr(header, one.name) for one in fields(TrialInfo) if hasattr(header, one.name)}
     return TrialInfo(
-        **shared,
-        split=split,
-        sha256=hash_file(path),
-        forces_sha256=hash_file(samples) if samples.is_file() else "",
+        **shared, split=split, sha256=hash_file(path), forces_sha256=hash_file(samples) if samples.is_file() else ""
     )
 
 

@@ -20,15 +20,7 @@ from sliplens.errors import RecordingError
 from sliplens.images.files import decode_png, encode_png
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import Labelling
-from sliplens.recordings.trial import (
-    OPTIONAL_LABELS,
-    SIGNALS,
-    ContactState,
-    GroundTruth,
-    Labels,
-    Recording,
-    TrialFacts,
-)
+from sliplens.recordings.trial import OPTIONAL_LABELS, SIGNALS, ContactState, GroundTruth, Labels, Recording, TrialFacts
 
 SCHEMA_VERSION = 2
 CODEC = "rows+zstd"
@@ -213,12 +205,7 @@ def write_trial(
         columns["contact_map"] = pa.array(maps, type=pa.binary())
     height, width, _ = reference.shape
     header = TrialHeader(
-        **_facts(facts),
-        frames=len(time_s),
-        height=height,
-        width=width,
-        labelling=labels.labelling,
-        truth=kept,
+        **_facts(facts), frames=len(time_s), height=height, width=width, labelling=labels.labelling, truth=kept
     )
     metadata = {
         _HEADER: msgspec.json.encode(to_builtins(header)),

@@ -41,13 +41,7 @@ class ContactState(StrEnum):
     UNKNOWN = "unknown"
 
 
-LABEL_SIGNALS = (
-    "normal_force_n",
-    "tangential_force_n",
-    "friction_coefficient",
-    "safety_margin",
-    "stick_ratio",
-)
+LABEL_SIGNALS = ("normal_force_n", "tangential_force_n", "friction_coefficient", "safety_margin", "stick_ratio")
 """The numbers of `Labels`, in the order they are stored."""
 SIGNALS = ("time_s", *LABEL_SIGNALS)
 """The per-frame numbers of a `Recording`, in the order they are stored."""

@@ -292,11 +292,7 @@ _RATE_WHERE_NONE = 30
 
 
 def write_lerobot(
-    data: Dataset,
-    folder: Path,
-    *,
-    trials: Sequence[TrialInfo] | None = None,
-    on_progress: OnProgress | None = None,
+    data: Dataset, folder: Path, *, trials: Sequence[TrialInfo] | None = None, on_progress: OnProgress | None = None
 ) -> None:
     """Write trials as a LeRobot v3.0 data set, one episode a trial, without loss: `read_lerobot` gives them back.
 

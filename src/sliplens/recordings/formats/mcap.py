@@ -83,11 +83,7 @@ _BLOCK = 1000
 
 
 def write_mcap(
-    data: Dataset,
-    folder: Path,
-    *,
-    trials: Sequence[TrialInfo] | None = None,
-    on_progress: OnProgress | None = None,
+    data: Dataset, folder: Path, *, trials: Sequence[TrialInfo] | None = None, on_progress: OnProgress | None = None
 ) -> None:
     """Write trials as `TRIAL.mcap`, without loss: `read_rosbag` gives each back as it is in the data set.
 

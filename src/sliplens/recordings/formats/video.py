@@ -140,13 +140,7 @@ def inspect_video(path: Path) -> VideoFile:
             )
         notes = _notes(container, video, path)
     return VideoFile(
-        path=path,
-        frames=len(found),
-        stamps=stamps,
-        time_s=time,
-        counted=counted,
-        frame_size=size,
-        notes=notes,
+        path=path, frames=len(found), stamps=stamps, time_s=time, counted=counted, frame_size=size, notes=notes
     )
 
 

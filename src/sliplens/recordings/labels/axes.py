@@ -37,11 +37,7 @@ _DOUBTFUL = 0.6
 
 
 def infer_axes(
-    forces: Forces,
-    *,
-    normal: str | None = None,
-    sign: int | None = None,
-    tare_n: Vector | None = None,
+    forces: Forces, *, normal: str | None = None, sign: int | None = None, tare_n: Vector | None = None
 ) -> ForceAxes:
     """Infer what is not declared of how to read a force sensor.
 

@@ -92,13 +92,7 @@ class _Design:
         """Level at the break, slope and bend before it, depth of the fall, slope after it."""
         since = time_s - moment_s
         before, after = np.minimum(since, 0), np.maximum(since, 0)
-        columns = (
-            np.ones_like(since),
-            before,
-            before**2,
-            np.minimum(after / fall_s, 1),
-            np.maximum(after - fall_s, 0),
-        )
+        columns = (np.ones_like(since), before, before**2, np.minimum(after / fall_s, 1), np.maximum(after - fall_s, 0))
         basis, triangle = np.linalg.qr(np.stack(columns, axis=1))
         return cls(moment_s=float(moment_s), basis=basis, triangle=triangle)
 
