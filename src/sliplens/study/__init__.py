@@ -9,6 +9,7 @@ from sliplens.study.explaining import (
 )
 from sliplens.study.run import run_study
 from sliplens.study.scoring import score_explanations
+from sliplens.study.strip import explain_trial
 from sliplens.study.workspace import explain_source, score_explained
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "ExplainedFrame",
     "explain_frames",
     "explain_source",
+    "explain_trial",
     "frames_from_dataset",
     "frames_from_folder",
     "load_explained",

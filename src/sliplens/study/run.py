@@ -3,7 +3,7 @@
 import pickle
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -58,6 +58,10 @@ _NEW_WEIGHTS = {"control": to_builtins(_CONTROL), "statistics": "images"}
 """What the control depends on, and with it all that it is compared with."""
 
 
+TESTS = ("score", "remedies", "faithfulness", "randomisation", "map-quality", "truth", "timing")
+"""Stages that a study may leave out: the thesis's score and its remedies, removal curves, weights drawn anew, ..."""
+
+
 def run_study(
     data: Dataset | Path | str,
     *,
@@ -70,6 +74,8 @@ def run_study(
     trials: int = 14,
     tolerance: float = 0.03,
     budget: float = STUDY_BUDGET,
+    tests: Collection[str] = TESTS,
+    settings: Sequence[Setting] = SETTINGS,
     random_orders: int = RANDOM_ORDERS,
     device: str = "cpu",
     jobs: int | None = None,
@@ -97,6 +103,8 @@ def run_study(
         How many trials to look at.
     tolerance
         Largest error of an answer in them, in margin units; where too few qualify, the next best are taken.
+    tests, settings
+        What to judge explanations by, some of `TESTS`, and what is removed and put there by the removal curves.
     budget
         Share of the channels that Poly-CAM measures at first, 1 for all.
     random_orders
@@ -124,6 +132,8 @@ def run_study(
     """
     if random_orders < 1:
         raise InputError(f"{random_orders} random orders are too few; --random-orders must be at least 1")
+    if unknown := sorted(set(tests) - set(TESTS)):
+        raise InputError(f"a study has no test named {unknown[0]!r}; choose from {', '.join(TESTS)}")
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {jobs}")
     explainers = study_explainers(methods, budget=budget)
@@ -137,6 +147,8 @@ def run_study(
         data=data if isinstance(data, Dataset) else Dataset.open(Path(data)),
         networks=networks,
         explainers=explainers,
+        tests=frozenset(tests),
+        settings=tuple(settings),
         random_orders=random_orders,
         seed=seed,
         overwrite=overwrite,
@@ -164,14 +176,14 @@ def run_study(
         choice=choice,
         states=states,
         explanations={name: own.explained for name, own in judged.items()},
-        deletion={name: own.deletion for name, own in judged.items()},
-        remedies={name: own.remedies for name, own in judged.items()},
-        faithfulness={name: own.faithfulness for name, own in judged.items()},
-        randomisation={name: own.randomisation for name, own in judged.items()},
-        map_quality={name: own.map_quality for name, own in judged.items()},
+        deletion={name: own.deletion for name, own in judged.items() if own.deletion is not None},
+        remedies={name: own.remedies for name, own in judged.items() if own.remedies is not None},
+        faithfulness={name: own.faithfulness for name, own in judged.items() if own.faithfulness is not None},
+        randomisation={name: own.randomisation for name, own in judged.items() if own.randomisation is not None},
+        map_quality={name: own.map_quality for name, own in judged.items() if own.map_quality is not None},
         truth={name: own.truth for name, own in judged.items() if own.truth is not None},
         # while nothing else runs
-        timing={name: stages.time(name, own.explained) for name, own in judged.items()},
+        timing={name: stages.time(name, own.explained) for name, own in judged.items() if "timing" in tests},
     )
 
 
@@ -190,12 +202,21 @@ class _Judged:
     """What is known of the explanations of one network."""
 
     explained: Explained
-    deletion: DeletionScores
-    remedies: Remedies
-    faithfulness: RemovalScores
-    randomisation: Randomisation
-    map_quality: MapQuality
+    deletion: DeletionScores | None
+    remedies: Remedies | None
+    faithfulness: RemovalScores | None
+    randomisation: Randomisation | None
+    map_quality: MapQuality | None
     truth: Truth | None
+
+
+_NEEDED_BY = {"score": {"score", "remedies"}, "control": {"faithfulness", "truth"}}
+"""Tests that need a stage, where it is not that test alone."""
+
+
+def _required(result: _Result | None) -> _Result:
+    assert result is not None  # whatever needs it has it run (`_NEEDED_BY`)
+    return result
 
 
 def _judge(stages: bytes, name: str, on_progress: OnProgress) -> None:
@@ -210,6 +231,8 @@ class _Stages:
     data: Dataset
     networks: Mapping[str, TrainedModel]
     explainers: Mapping[str, Explainer]
+    tests: frozenset[str]
+    settings: tuple[Setting, ...]
     random_orders: int
     seed: int
     overwrite: bool
@@ -266,7 +289,9 @@ class _Stages:
 
         def test(
             stage: str, kind: type[_Result], depends: Mapping[str, Any], title: str, work: _Work[_Result]
-        ) -> _Result:
+        ) -> _Result | None:
+            if _NEEDED_BY.get(stage, {stage}).isdisjoint(self.tests):
+                return None
             return self._run(f"{stage}-{name}", kind, {**about, **depends}, f"{title} ({name})", work)
 
         deletion = test(
@@ -282,7 +307,7 @@ class _Stages:
             Remedies,
             {"steps": STEPS},
             "Trying the thesis's remedies",
-            lambda _, count: score_remedies(material(), grey=deletion, seed=self.seed, on_progress=count),
+            lambda _, count: score_remedies(material(), grey=_required(deletion), seed=self.seed, on_progress=count),
         )
         control = test(
             "control",
@@ -291,11 +316,11 @@ class _Stages:
             "Explaining the network with new weights",
             lambda _, count: explain_untrained(material(), _CONTROL, seed=self.seed, on_progress=count),
         )
-        influence = cache(lambda: {**influences(material()), RANDOMISED: control.maps})
+        influence = cache(lambda: {**influences(material()), RANDOMISED: _required(control).maps})
         faithfulness = test(
             "faithfulness",
             RemovalScores,
-            {"random_orders": self.random_orders, "areas": STUDY_AREAS, "settings": SETTINGS, **_NEW_WEIGHTS},
+            {"random_orders": self.random_orders, "areas": STUDY_AREAS, "settings": self.settings, **_NEW_WEIGHTS},
             "Removing parts under every fill",
             lambda parts, count: self._score_removal(material(), influence(), parts, count),
         )
@@ -314,7 +339,7 @@ class _Stages:
             lambda _, count: measure_maps(material(), self.data, seed=self.seed, on_progress=count),
         )
         truth = None
-        if self._redrawn:
+        if "truth" in self.tests and self._redrawn:
             truth = test(
                 "truth",
                 Truth,
@@ -386,11 +411,15 @@ class _Stages:
                 on_progress=on_frames,
             )
 
+        put_back_too = "truth" in self.tests and self._redrawn
         return score_removal(
             material,
             maps=maps,
+            settings=self.settings,
             random_orders=self.random_orders,
-            further={Setting(fill=TRUE_FILL, unit="marker"): put_back} if self._redrawn else None,
+            further={Setting(fill=TRUE_FILL, unit="marker"): put_back}
+            if "truth" in self.tests and self._redrawn
+            else None,
             seed=self.seed,
             parts=parts,
             on_progress=count,

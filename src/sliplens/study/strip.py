@@ -6,12 +6,12 @@ import numpy as np
 import torch
 
 from sliplens.errors import RecordingError
-from sliplens.explainers import EXPLAINERS
 from sliplens.models import TrainedModel
 from sliplens.progress import OnProgress
 from sliplens.recordings import Recording
 from sliplens.results.strip import Strip, StripReadings
 from sliplens.study.explaining import nearest_frame
+from sliplens.study.material import study_explainers
 
 _LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 _CONFIDENCE = 0.9
@@ -22,7 +22,8 @@ def explain_trial(
     recording: Recording,
     *,
     source: str,
-    method: str = "occlusion",
+    method: str = "poly-cam",
+    budget: float = 1.0,
     levels: Sequence[float] = _LEVELS,
     on_progress: OnProgress | None = None,
 ) -> Strip:
@@ -33,7 +34,9 @@ def explain_trial(
     source
         `simulated` or `real`.
     method
-        Key of `EXPLAINERS`.
+        Explainer of the maps (`study_explainers`).
+    budget
+        Share of the channels that `poly-cam` measures at first.
     levels
         Safety margins whose frames are explained, in [0, 1]; a frame that is nearest to two is shown once.
     """
@@ -46,7 +49,8 @@ def explain_trial(
     unknown = np.full(len(margin), np.nan)
     low, high = estimate.interval(_CONFIDENCE) or (unknown, unknown)
     reference = run.encoding.empty(recording.reference, image_size=run.manifest.image_size)
-    explanation = EXPLAINERS[method](
+    explainer = study_explainers([method], budget=budget)[method]
+    explanation = explainer(
         run.model, inputs[list(shown)], reference=reference.expand(len(shown), -1, -1, -1), on_progress=on_progress
     )
     return Strip(

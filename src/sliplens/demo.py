@@ -1,0 +1,172 @@
+"""A first look: simulated grips, read, explained and judged, on one page that grows while the rest is still made."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from sliplens.codec import load_result, save_result
+from sliplens.errors import InputError
+from sliplens.files import output_folder, require_folder
+from sliplens.models.checkpoint import load
+from sliplens.progress import OnProgress, stage, wrote
+from sliplens.recordings import Dataset
+from sliplens.report import write_report
+from sliplens.results.strip import Strip
+from sliplens.simulation.trials import simulate
+from sliplens.study import explain_source, explain_trial, run_study, score_explained
+from sliplens.study.curves import Setting
+from sliplens.training import evaluate, train
+
+INPUTS = ("difference", "raw")
+METHODS = ("grad-cam", "integrated-gradients", "poly-cam-thesis", "poly-cam")
+"""The three methods of the thesis as it ran them, and Poly-CAM for a regressor."""
+_SETTINGS = (Setting(fill="reference", unit="pixel"), Setting(fill="noisy-linear", unit="pixel"))
+_TESTS = ("score", "faithfulness")
+_BUDGET = 0.15
+"""Share of the channels that Poly-CAM measures at first."""
+_RANDOM_ORDERS = 10
+_TRIALS = 3
+"""Trials that are explained: intervals come from trials."""
+_SEED = 20261122
+"""No seed of the data that the networks of the package were trained on."""
+_FIRST_LOOK = {"dry_trials": 8, "wet_trials": 4, "frames_per_trial": 40, "days": 4, "test_days": 3}
+_TO_TRAIN = {"dry_trials": 96, "wet_trials": 8, "frames_per_trial": 48, "days": 12}
+_OTHER_MINUTES = 3.5
+"""What the path takes beside the training, on two cores."""
+_SHORTEST_TRAINING = 1.4
+"""Minutes below which a network has not learned enough to be worth explaining."""
+
+
+def run_demo(
+    out: Path | str,
+    *,
+    train_minutes: float | None = None,
+    image_size: int = 96,
+    real_frames: Path | str | None = None,
+    seed: int = _SEED,
+    on_page: Callable[[Path], None] | None = None,
+    on_progress: OnProgress | None = None,
+) -> Path:
+    """Simulate a few grips, read, explain and judge them, and write a page of it all.
+
+    The page is written as soon as the first grip is explained, and again whenever more is known; it opens with that
+    grip, from stick to slip. Interrupted, the same call goes on where it stopped.
+
+    Parameters
+    ----------
+    out
+        Folder of the demo, a subfolder a stage; the page is `report.html` in it.
+    train_minutes
+        Train two networks of one's own for so many minutes in all, everything included, instead of those that come
+        with the package.
+    image_size
+        Height and width of the input of networks that are trained here, in pixels.
+    real_frames
+        Folder of real difference images named ..._GG.png with the safety margin in percent. The public ChromaTouch
+        images where `SLIPLENS_REFERENCE` (or ../shared/reference) holds them, if None.
+    seed
+        Of the simulation and of the random orders.
+    on_page
+        Called with the page each time it was written.
+    on_progress
+        Takes the steps done and their number, stage by stage.
+
+    Returns
+    -------
+    Path
+        The page.
+
+    Raises
+    ------
+    InputError
+        If the folder holds something else, or there are no real frames where they are named.
+    """
+    folder = Path(out)
+    real = find_real_frames(real_frames)
+    _require_demo_folder(folder)
+
+    def show(*waiting: str) -> Path:
+        with stage(on_progress, "Writing the page"):
+            page = write_report(folder, waiting_for=waiting).page
+        if on_page is not None:
+            on_page(page)
+        return page
+
+    later = ("how well both networks read", "which explanation can be believed") + (
+        ("what the network reads from real frames",) if real is not None else ()
+    )
+    sizes = _FIRST_LOOK if train_minutes is None else _TO_TRAIN
+    data = simulate(folder / "data", seed=seed, on_progress=on_progress, **sizes)
+    networks = {name: f"chromatouch-{name}" for name in INPUTS}
+    if train_minutes is not None:
+        minutes = max(_SHORTEST_TRAINING, (train_minutes - _OTHER_MINUTES) / len(INPUTS))
+        for name in INPUTS:
+            networks[name] = str(folder / f"train-{name}")
+            train(
+                data, networks[name], input=name, image_size=image_size, epochs=60, max_minutes=minutes, seed=seed,
+                on_progress=on_progress,
+            )  # fmt: skip
+    _make_strip(folder / "strip", data, networks["difference"], on_progress=on_progress)
+    show(*later)
+    for name in INPUTS:
+        evaluate(networks[name], data, folder / f"evaluate-{name}", on_progress=on_progress)
+    show(*later[1:])
+    run_study(
+        data,
+        out=folder,
+        difference=networks["difference"],
+        raw=networks["raw"],
+        methods=METHODS,
+        trials=_TRIALS,
+        budget=_BUDGET,
+        tests=_TESTS,
+        settings=_SETTINGS,
+        random_orders=_RANDOM_ORDERS,
+        seed=seed,
+        on_progress=on_progress,
+    )
+    if real is not None:
+        show(*later[2:])
+        explanations = folder / "explain-real"
+        explain_source(
+            networks["difference"], real, labels_in_names=True, budget=_BUDGET, out=explanations,
+            on_progress=on_progress,
+        )  # fmt: skip
+        score_explained(
+            networks["difference"], explanations, out=folder / "score-real", seed=seed, on_progress=on_progress
+        )
+    return show()
+
+
+def find_real_frames(folder: Path | str | None = None) -> Path | None:
+    """Folder of real difference images: the one that is named, else the public ChromaTouch images where they are."""
+    if folder is not None:
+        return require_folder(Path(folder), what="the folder of real frames")
+    reference = Path(os.environ.get("SLIPLENS_REFERENCE", "../shared/reference"))
+    images = reference / "chromatouch" / "difference"
+    return images if images.is_dir() else None
+
+
+def _require_demo_folder(folder: Path) -> None:
+    made = [path for path in folder.iterdir() if not path.name.startswith(".")] if folder.is_dir() else []
+    if (folder.exists() and not folder.is_dir()) or (made and not (folder / "data" / "run.json").is_file()):
+        raise InputError(f"{folder} exists and is no demo; choose another folder")
+
+
+def _make_strip(out: Path, data: Dataset, network: str, *, on_progress: OnProgress | None) -> Strip:
+    """Strip of the first dry trial that tests: chosen by its place, so that no answer plays a part."""
+    run = load(network)
+    info = data.select(split="test", condition="dry")[0]
+    config = {"data_hash": data.hash, "trial": info.trial, "weights_sha256": run.manifest.weights_sha256}
+    with output_folder(out, stage="strip", config=config) as output:
+        if not output.complete:
+            with stage(on_progress, "Explaining a grip from stick to slip") as count:
+                strip = explain_trial(
+                    run, data.load(info), source=data.source, method="poly-cam", budget=_BUDGET, on_progress=count
+                )
+            save_result(strip, output.folder)
+    wrote(on_progress, out, "a grip from stick to slip", kept=output.complete)
+    return load_result(out, Strip, command="sliplens demo")
+
+
+__all__ = ["find_real_frames", "run_demo"]
