@@ -47,15 +47,29 @@ class Demo:
                 say(f"open {page.resolve()} now: it grows while the rest is made")
             pages.append(page)
 
+        terminal = _WithoutNotes()
         seed = {} if self.seed is None else {"seed": self.seed}
         page = run_demo(
             self.output,
             train_minutes=self.max_minutes if self.train else None,
             image_size=self.image_size,
             real_frames=self.real_frames,
+            jobs=2,
             on_page=on_page,
-            on_progress=Terminal(),
+            on_progress=terminal,
             **seed,
         )
+        if terminal.notes:
+            say(f"{terminal.notes} notes on what to be careful with stand on the page")
         say(f"the demo took {(time.perf_counter() - started) / 60:.1f} minutes")
         say(f"open {page.resolve()}")
+
+
+class _WithoutNotes(Terminal):
+    """Terminal that counts notes: a first look has the page to tell them."""
+
+    notes = 0
+
+    def note(self, message: str, /) -> None:
+        """Count a note."""
+        self.notes += 1

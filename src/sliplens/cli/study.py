@@ -88,7 +88,7 @@ class Study:
             budget=self.budget,
             random_orders=self.random_orders,
             device=self.device,
-            jobs=self.jobs,
+            jobs=self.jobs if self.jobs is not None else 1 if self.device != "cpu" else 2,
             seed=self.seed,
             overwrite=self.overwrite,
             on_progress=Terminal(),

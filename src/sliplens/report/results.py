@@ -12,6 +12,7 @@ from sliplens.results.evaluation import Evaluation
 from sliplens.results.explanation import Explained, load_explained
 from sliplens.results.faithfulness import DeletionScores, Remedies, RemovalScores
 from sliplens.results.simulation import Simulation, describe_simulation
+from sliplens.results.strip import Strip
 from sliplens.results.study import Choice, MapQuality, Randomisation, States, Study, Timing, Truth
 from sliplens.results.training import Training
 
@@ -31,6 +32,7 @@ RECORDS: dict[str, type] = {
     "evaluate": Evaluation,
     "explain": Explained,
     "score": DeletionScores,
+    "strip": Strip,
     **_OF_A_STUDY,
 }
 """Record of each stage."""
@@ -91,6 +93,7 @@ def load_results(workspace: Path) -> Results:
         evaluations={key[1]: value for key, value in found.items() if key[0] == "evaluate"},
         explanations={key[1:]: value for key, value in found.items() if key[0] == "explain"},
         scores={key[1:]: value for key, value in found.items() if key[0] == "score"},
+        strip=next((value for key, value in found.items() if key[0] == "strip"), None),
         study=_gather_study(workspace, found),
         notes=tuple(notes),
     )

@@ -78,7 +78,7 @@ def run_study(
     settings: Sequence[Setting] = SETTINGS,
     random_orders: int = RANDOM_ORDERS,
     device: str = "cpu",
-    jobs: int | None = None,
+    jobs: int = 1,
     seed: int = 0,
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
@@ -112,8 +112,8 @@ def run_study(
     device
         Where networks that are loaded here run: cpu, cuda or cuda:1.
     jobs
-        Networks to judge at the same time, each by a process with its share of the cores; both where they run on a
-        processor if None.
+        Networks to judge at the same time, each by a process with its share of the cores. More than one needs a script
+        that starts its work under `if __name__ == "__main__":`, as all that starts processes does.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def run_study(
         raise InputError(f"{random_orders} random orders are too few; --random-orders must be at least 1")
     if unknown := sorted(set(tests) - set(TESTS)):
         raise InputError(f"a study has no test named {unknown[0]!r}; choose from {', '.join(TESTS)}")
-    if jobs is not None and jobs < 1:
+    if jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {jobs}")
     explainers = study_explainers(methods, budget=budget)
     given = {name: network for name, network in (("difference", difference), ("raw", raw)) if network is not None}
@@ -162,7 +162,7 @@ def run_study(
     }
     choice, states = stages.choose(split=split, condition=condition, trials=trials, tolerance=tolerance)
     cores = torch.get_num_threads()
-    if min(jobs or (len(networks) if device == "cpu" else 1), len(networks), cores) > 1:
+    if min(jobs, len(networks), cores) > 1:
         # they leave their stages in folders, and what is here reads them
         work = pickle.dumps(replace(stages, on_progress=None))
         run_together(partial(_judge, work), list(networks), threads=cores // len(networks), on_progress=on_progress)
@@ -411,15 +411,13 @@ class _Stages:
                 on_progress=on_frames,
             )
 
-        put_back_too = "truth" in self.tests and self._redrawn
+        redrawn = "truth" in self.tests and self._redrawn
         return score_removal(
             material,
             maps=maps,
             settings=self.settings,
             random_orders=self.random_orders,
-            further={Setting(fill=TRUE_FILL, unit="marker"): put_back}
-            if "truth" in self.tests and self._redrawn
-            else None,
+            further={Setting(fill=TRUE_FILL, unit="marker"): put_back} if redrawn else None,
             seed=self.seed,
             parts=parts,
             on_progress=count,
