@@ -20,6 +20,8 @@ from sliplens.training import evaluate, train
 INPUTS = ("difference", "raw")
 METHODS = ("grad-cam", "integrated-gradients", "poly-cam-thesis", "poly-cam")
 """The three methods of the thesis as it ran them, and Poly-CAM for a regressor."""
+STRIP_METHOD = "poly-cam"
+"""Method of the first picture: the one whose maps are quickest to read."""
 _SETTINGS = (Setting(fill="reference", unit="pixel"), Setting(fill="noisy-linear", unit="pixel"))
 _TESTS = ("score", "faithfulness")
 _BUDGET = 0.15
@@ -165,7 +167,7 @@ def _make_strip(out: Path, data: Dataset, network: str, *, on_progress: OnProgre
         if not output.complete:
             with stage(on_progress, "Explaining a grip from stick to slip") as count:
                 strip = explain_trial(
-                    run, data.load(info), source=data.source, method="poly-cam", budget=_BUDGET, on_progress=count
+                    run, data.load(info), source=data.source, method=STRIP_METHOD, budget=_BUDGET, on_progress=count
                 )
             save_result(strip, output.folder)
     wrote(on_progress, out, "a grip from stick to slip", kept=output.complete)

@@ -1,75 +1,106 @@
-"""The demo, small: every stage, the page, and a second run that has nothing to do."""
+"""The demo, small: every stage, the page that grows, and a second run that has nothing to do."""
 
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from command_line import refused, run
 
-from sliplens.cli import demo, main
+import sliplens.demo
+from sliplens.demo import find_real_frames, run_demo
 from sliplens.files import read_json
 
-SMALL = ("--dry-trials", "8", "--wet-trials", "1", "--frames-per-trial", "24", "--days", "2", "--image-size", "32")
+SMALL = {"dry_trials": 3, "wet_trials": 1, "frames_per_trial": 24, "days": 2, "test_days": 1}
 
 
-class Links(HTMLParser):
-    def __init__(self) -> None:
-        super().__init__()
-        self.links: list[str] = []
-        self.images = 0
+@pytest.fixture(autouse=True)
+def _small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SLIPLENS_REFERENCE", str(tmp_path / "nothing"))
+    monkeypatch.setattr(sliplens.demo, "_FIRST_LOOK", SMALL)
+    monkeypatch.setattr(sliplens.demo, "_TO_TRAIN", {**SMALL, "dry_trials": 8})
+    monkeypatch.setattr(sliplens.demo, "METHODS", ("grad-cam", "integrated-gradients"))
+    monkeypatch.setattr(sliplens.demo, "STRIP_METHOD", "grad-cam")
+    monkeypatch.setattr(sliplens.demo, "_TRIALS", 1)
+    monkeypatch.setattr(sliplens.demo, "_RANDOM_ORDERS", 2)
+    monkeypatch.setattr(sliplens.demo, "_SHORTEST_TRAINING", 0.01)
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.images += tag == "img"
-        self.links += [value or "" for name, value in attrs if name in {"src", "href", "srcset", "data"}]
+
+def train_two(out: Path, *, on_page=None) -> Path:
+    """Networks of 32 px, so that explaining them takes seconds."""
+    return run_demo(out, train_minutes=0.02, image_size=32, on_page=on_page)
 
 
 @pytest.fixture
-def no_real_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SLIPLENS_REFERENCE", str(tmp_path / "nothing"))
+def pages() -> list[str]:
+    return []
 
 
-def test_the_demo_runs_every_stage_and_ends_in_a_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], no_real_frames: None
-):
-    monkeypatch.setattr(demo, "_SHORTEST_TRAINING", 0.02)
+def test_the_demo_runs_every_stage_and_its_page_grows(tmp_path: Path, pages: list[str]):
     out = tmp_path / "demo"
-    words = ("demo", str(out), *SMALL, "--max-minutes", "0.1")
-    assert main(words) == 0
-    printed = capsys.readouterr().out.replace("\n", "")
-    assert "no real frames found" in printed
-    assert str(out / "report.html") in printed
+    page = train_two(out, on_page=lambda page: pages.append(page.read_text(encoding="utf-8")))
     stages = {read_json(path)["stage"] for path in out.glob("*/run.json")}
-    assert stages == {"simulate", "train", "evaluate", "explain", "score"}
-    assert set(read_json(out / "explain-raw" / "result.json")["methods"]) == {
-        "grad-cam",
-        "integrated-gradients",
-        "poly-cam",
-    }
-    page = Links()
-    page.feed((out / "report.html").read_text(encoding="utf-8"))
-    assert page.images > 12
-    assert all(link.startswith(("data:", "#")) for link in page.links)  # opens from disk, without a network
+    assert stages >= {"simulate", "train", "strip", "evaluate", "choice", "explain", "score", "faithfulness"}
+    assert page == out / "report.html"
+    assert pages[-1] == page.read_text(encoding="utf-8")
+    # while something is missing the page says so and loads itself anew, and ends complete
+    assert ['http-equiv="refresh"' in text for text in pages] == [True] * (len(pages) - 1) + [False]
+    assert len(pages) == 3
+    assert "which explanation can be believed" in pages[0]
+    # each opens with the grip, above the verdict
+    assert all(0 < text.index('id="opening"') < text.index('id="verdict"') for text in pages)
 
-    weights = (out / "train-raw" / "model.safetensors").stat().st_mtime_ns
-    assert main(words) == 0
-    assert capsys.readouterr().out.count("kept") == 9  # data, and two of train, evaluate, explain and score
-    assert (out / "train-raw" / "model.safetensors").stat().st_mtime_ns == weights
-    assert main((*words, "--seed", "1")) == 2
-    assert "holds a demo of other settings" in capsys.readouterr().err
+    written = {path: path.stat().st_mtime_ns for path in out.glob("*/run.json")}
+    assert train_two(out) == page
+    assert {path: path.stat().st_mtime_ns for path in out.glob("*/run.json")} == written
 
 
-@pytest.mark.parametrize(
-    ("rate", "size", "shortest"),
-    [(1000.0, 112, False), (150.0, 96, False), (0.5, 64, True)],
-)
-def test_a_slow_machine_gets_smaller_images_and_never_a_starved_training(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_real_frames: None, *, rate: float, size: int, shortest: bool
+def test_the_demo_is_there_for_the_networks_of_the_package_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    named = []
+
+    def stop(run: object, *arguments: object, **options: object) -> None:
+        named.append(run)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sliplens.demo, "evaluate", stop)
+    with pytest.raises(KeyboardInterrupt):
+        run_demo(tmp_path / "demo")
+    assert named == ["chromatouch-difference"]
+    # interrupted after the first page: it is there
+    assert (tmp_path / "demo" / "report.html").is_file()
+
+
+def test_a_folder_that_is_no_demo_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("precious")
+    assert "is no demo; choose another folder" in refused(capsys, "demo", tmp_path / "mine")
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
+
+
+def test_wrong_options_are_refused_before_anything_is_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert "--max-minutes must be above 0" in refused(capsys, "demo", tmp_path / "a", "--train", "--max-minutes", "0")
+    assert "folder of real frames" in refused(capsys, "demo", tmp_path / "a", "--real-frames", tmp_path / "none")
+    assert not (tmp_path / "a").exists()
+
+
+def test_real_frames_are_found_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    assert find_real_frames() is None
+    (tmp_path / "chromatouch" / "difference").mkdir(parents=True)
+    monkeypatch.setenv("SLIPLENS_REFERENCE", str(tmp_path))
+    assert find_real_frames() == tmp_path / "chromatouch" / "difference"
+    assert find_real_frames(tmp_path) == tmp_path
+
+
+def test_the_command_says_where_the_page_is_as_soon_as_it_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    # twelve frames of 4464 + 4 x 112 passes by an engine twice as fast, and of 400 without: 68.5 thousand of 2 x rate,
-    # for which 420 - 60 - 2 x 84 = 192 s are left: 178 images a second for 112 px, 130 for 96 px
-    monkeypatch.setattr(demo, "_measure_rates", lambda _: demo._Rates(plain=rate, engine=2 * rate))
-    run = demo.Demo(output=tmp_path / "demo", max_minutes=7.0)
-    run._open_workspace(None)
-    chosen, minutes = run._plan_training(demo.time.perf_counter(), None)
-    assert chosen == size
-    assert (minutes == demo._SHORTEST_TRAINING) == shortest
-    assert run._plan_training(0.0, None) == (chosen, minutes)  # decided once
+    def made(out: Path, *, on_page, on_progress, **options: object) -> Path:
+        page = out / "report.html"
+        on_page(page)
+        on_progress.note("a method does not beat a random order")
+        return page
+
+    monkeypatch.setattr(sliplens.demo, "run_demo", made)
+    assert run("demo", tmp_path / "demo") == 0
+    printed = capsys.readouterr().out.replace("\n", "")
+    assert printed.index(f"open {tmp_path / 'demo' / 'report.html'} now") < printed.index("the demo took")
+    assert "1 note" in printed
+    assert "random order" not in printed  # the page tells them

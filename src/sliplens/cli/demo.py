@@ -60,16 +60,18 @@ class Demo:
             **seed,
         )
         if terminal.notes:
-            say(f"{terminal.notes} notes on what to be careful with stand on the page")
+            say(f"{len(terminal.notes)} note{'s' * (len(terminal.notes) > 1)} on what to be careful with: see the page")
         say(f"the demo took {(time.perf_counter() - started) / 60:.1f} minutes")
         say(f"open {page.resolve()}")
 
 
 class _WithoutNotes(Terminal):
-    """Terminal that counts notes: a first look has the page to tell them."""
+    """Terminal that keeps notes to itself: a first look has the page to tell them."""
 
-    notes = 0
+    def __init__(self) -> None:
+        super().__init__()
+        self.notes: list[str] = []
 
     def note(self, message: str, /) -> None:
-        """Count a note."""
-        self.notes += 1
+        """Keep a sentence."""
+        self.notes.append(message)
