@@ -66,12 +66,8 @@ def frames_from_dataset(
 
     Parameters
     ----------
-    trained
-        The network: decides encoding and size.
     split, condition, trials
         Which trials, and how many of them, in the order of the data set's table.
-    levels
-        Safety margins in [0, 1].
 
     Raises
     ------
@@ -93,24 +89,7 @@ def frames_from_dataset(
 
 
 def frames_at(trained: TrainedModel, data: Dataset, rows: Mapping[str, Sequence[int]]) -> ChosenFrames:
-    """Frames of a data set by trial and number.
-
-    Parameters
-    ----------
-    trained
-        The network: decides encoding and size.
-    data
-        The data set.
-    rows
-        Numbers of frames, by trial.
-
-    Raises
-    ------
-    RecordingError
-        If the data set has no such trial.
-    ImageError
-        If the frames are of another sensor.
-    """
+    """Frames of a data set by trial and number."""
     infos = {info.trial: info for info in data.trials}
     images, references, labels, names = [], [], [], []
     for trial, frames in rows.items():
@@ -144,8 +123,6 @@ def nearest_frame(margin: Float[np.ndarray, " frames"], level: float) -> int:
     ----------
     margin
         Label of each frame, NaN where there is none; one at least has one.
-    level
-        Safety margin asked for.
     """
     distance = np.abs(margin - level)
     nearest = np.flatnonzero(distance == np.nanmin(distance))
@@ -159,13 +136,9 @@ def frames_from_folder(
 
     Parameters
     ----------
-    trained
-        The network.
     folder
         Frames of the size the network's sensor has: camera frames if `reference` is given or the source brings one,
         otherwise absolute difference images |T_n - T_0|.
-    reference
-        Image of the untouched sensor.
     labels_in_names
         Read the safety margin in percent from names that end in `_GG`, as in `image_433_20.png`.
 
@@ -234,13 +207,7 @@ DEFAULT_METHODS = ("grad-cam", "integrated-gradients", "poly-cam")
 
 
 def require_methods(methods: Sequence[str], explainers: Collection[str] = EXPLAINERS) -> None:
-    """Refuse a method that is not in the table.
-
-    Raises
-    ------
-    InputError
-        Listing those there are.
-    """
+    """Refuse a method that is not in the table."""
     for name in methods:
         if name not in explainers:
             raise InputError(f"there is no explainer named {name!r}; choose from {', '.join(explainers)}")
@@ -269,10 +236,6 @@ def explain_frames(
 
     Parameters
     ----------
-    trained
-        The network.
-    chosen
-        The frames.
     methods
         Names in the table of explainers.
     explainers
@@ -280,8 +243,6 @@ def explain_frames(
         one explainer for each.
     parts
         Folder that keeps each map as soon as it is there, so that an interrupted run loses at most one.
-    on_progress
-        Takes the number of maps done and the number of all.
 
     Raises
     ------
