@@ -266,10 +266,6 @@ def import_trial(
 
     Parameters
     ----------
-    capture
-        Recording, which must have labels or forces.
-    settings
-        What is known of axes, friction and lag, where labels are to be found.
     forces_file
         Where to keep the samples of the force sensor, from which labels can be made anew; not kept if None.
     """

@@ -121,11 +121,6 @@ class SplitPlan:
 def read_splits(path: Path) -> SplitPlan:
     """Read the rules of a TOML file, as described in `docs/splits.md`.
 
-    Parameters
-    ----------
-    path
-        File with one table `[[split]]` for each rule.
-
     Raises
     ------
     InputError

@@ -186,8 +186,6 @@ def write_trial(
     ----------
     images
         Encoded frames in chunks, a row group each; see `encode_frames`.
-    facts
-        Name of the trial, its sensor, day, condition and object.
     """
     columns: dict[str, Any] = {"time_s": time_s, "contact_state": [str(state) for state in labels.contact_state]}
     columns |= {name: getattr(labels, name) for name in SIGNALS[1:]}
@@ -243,8 +241,6 @@ def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Re
 
     Parameters
     ----------
-    truth
-        Read a simulated trial's ground truth too; training does without it.
     pixels
         Read the images too. Without them, and the truth, a trial of any length takes little memory: the reference
         stands for every frame, and `read_frames` reads those that are needed.

@@ -27,10 +27,6 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
     ----------
     path
         `slip/GRASP/camera_N.avi` or `noslip/GRASP/camera_N.avi`.
-    labels
-        Table of the data set; `labels.csv` two folders above the clip's own if None.
-    frame_rate
-        Frames per second that the times assume.
     """
     table = path.absolute().parent.parent.parent / LABELS_FILE if labels is None else labels
     rows = _read_labels(table)
@@ -75,8 +71,6 @@ def read_gelsight(path: Path, *, frame_rate: float | None = None) -> list[Captur
     ----------
     path
         The data set's folder, for all clips that are there; the folder of a grasp; or a clip.
-    frame_rate
-        Frames per second that the times assume; roughly known if None.
     """
     if path.is_file():
         clips = [path]

@@ -158,19 +158,7 @@ def read_image_folder(
 
     Images are TIFF, PNG, JPEG or BMP, 8-bit RGB or grey, in natural order (2 before 10). Where they were taken in time
     must be said in one of three ways: by `times`, `frame_rate` or `name_unit`.
-
-    Parameters
-    ----------
-    forces
-        Table of forces; `read_force_table` tells of it and of `columns`.
-    times
-        Table with the name and the time of every image; frames are then ordered by time.
-    name_unit
-        Unit (s, ms, us, ns) of the last number in every file's name, which is then its time.
-    start_s
-        When the first frame was taken, on the clock of the forces; None where both count from the same zero.
-    name
-        Of the trial; that of the folder if None.
+    Options are those of `ReadOptions`.
     """
     given = [option for option in (times, frame_rate, name_unit) if option is not None]
     if len(given) != 1:

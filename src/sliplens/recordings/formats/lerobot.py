@@ -524,19 +524,10 @@ def read_lerobot(
 
     Parameters
     ----------
-    folder
-        Folder with `meta/info.json` of version 3.
     camera_key
         Feature with the images; by default the only camera, or the only one named like a tactile sensor.
     force_key
         Feature of 3 or 6 numbers, the first three the force (x, y, z); by default the only one named like a force.
-    episode
-        Index of an episode; all by default.
-
-    Returns
-    -------
-    list of Capture
-        In the order of the episodes.
     """
     layout = read_layout(folder)
     if camera_key is None and force_key is None and (kept := read_kept(layout)) is not None:

@@ -310,8 +310,6 @@ def write_lerobot(
     ----------
     folder
         Folder to write to; `data` and `meta` of an earlier attempt that came to no end are replaced.
-    trials
-        Rows of its table; all by default.
 
     References
     ----------

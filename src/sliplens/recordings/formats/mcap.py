@@ -96,13 +96,6 @@ def write_mcap(
     Stamps are the times of the trial to the nanosecond. ROS takes a stamp of 0 for none and cannot write one before:
     where a trial begins before 1 s, stamps are later by the whole seconds that let it begin within [1 s, 2 s), which
     `stamp_offset_s` of `/tactile/trial` tells. Exact times stand in `/tactile/labels` and `/tactile/wrench_times`.
-
-    Parameters
-    ----------
-    folder
-        An empty folder.
-    trials
-        Rows of its table; all by default.
     """
     require_folder(folder, what="the folder to write to")
     if any(folder.iterdir()):

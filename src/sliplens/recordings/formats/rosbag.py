@@ -4,10 +4,10 @@ import io
 import os
 import sys
 from array import array
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from importlib.util import find_spec, module_from_spec
 from pathlib import Path
@@ -74,7 +74,12 @@ def image_size(message: Any, *, where: str) -> tuple[int, int]:
 def image_pixels(message: Any, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
     """Pixels of an image as RGB; grey is repeated in all three channels."""
     if message.__msgtype__ == COMPRESSED:
-        return _decompress(message, where=where)
+        with _open_compressed(message, where=where) as image:
+            try:
+                pixels = np.array(image)
+            except _DAMAGED as error:
+                raise RecordingError(f"{where} is damaged ({error}); cut the bag before it") from None
+        return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
     height, width = image_size(message, where=where)
     channels = _CHANNELS[message.encoding]
     # rows may be padded: step counts the padding too
@@ -98,15 +103,6 @@ def _open_compressed(message: Any, *, where: str) -> Image.Image:
     if image.mode not in {"RGB", "L"}:
         raise RecordingError(f"{where} has pixels of mode {image.mode}; record it as 8-bit RGB or grey")
     return image
-
-
-def _decompress(message: Any, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    with _open_compressed(message, where=where) as image:
-        try:
-            pixels = np.array(image)
-        except _DAMAGED as error:
-            raise RecordingError(f"{where} is damaged ({error}); cut the bag before it") from None
-    return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
 
 
 MOST_BYTES = 256 * 2**20
@@ -237,18 +233,21 @@ def bag_topics(path: Path) -> dict[str, str]:
         return {connection.topic: connection.msgtype for connection in bag.connections}
 
 
-def bag_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+def bag_messages(
+    path: Path, topics: Collection[str], *, kinds: Mapping[str, str] | None = None
+) -> Iterator[tuple[str, int, Any]]:
     """Topic, time of arrival in nanoseconds and content of each message, in the order of recording.
 
     Definitions that the bag brings along are not used, for `rosbags` turns them into code; those of the messages read
     here are the same in all of ROS 2. Message data are views of the bytes read: a large header claims nothing. What is
-    compressed is expanded a chunk, message or file at a time, within the limits of `ros_expansion`.
+    compressed is expanded a chunk, message or file at a time, within the limits above. Where `kinds` tells the type of
+    a topic, messages of another are passed over: a second channel of the same topic could hold anything.
     """
     with open_bag(path) as bag:
-        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 (an extra)
-
-        types = get_typestore(Stores.LATEST)
-        wanted = [connection for connection in bag.connections if connection.topic in topics]
+        types, kinds = trial_types(), kinds or {}
+        wanted = [
+            one for one in bag.connections if one.topic in topics and kinds.get(one.topic, one.msgtype) == one.msgtype
+        ]
         if not wanted:  # to rosbags none means all
             return
         for connection, time_ns, data in bag.messages(wanted):
@@ -311,7 +310,7 @@ def read_trial_bag(path: Path, topics: dict[str, str]) -> Capture | None:
     """
     if topics.get(TRIAL) != TOPICS[TRIAL]:
         return None
-    text = next((message.data for _, message in _messages(path, {TRIAL})), "")
+    text = next((message.data for _, _, message in bag_messages(path, {TRIAL}, kinds=TOPICS)), "")
     # either is enough: the other may be what is damaged
     if FORMAT not in text and topics.get(LABELS) != TOPICS[LABELS]:
         return None
@@ -322,7 +321,7 @@ def read_trial_bag(path: Path, topics: dict[str, str]) -> Capture | None:
         raise RecordingError(
             f"{path} lacks {', '.join(f'{topic} ({TOPICS[topic]})' for topic in missing)}; export the trial again"
         )
-    found = _scan_labels(path, needed)
+    found = _scan(path, needed, images=IMAGE, wrenches=WRENCH, kinds=TOPICS)
     _require_whole(found, about, path)
     assert found.size is not None
     source = f"{about.trial} of {path}"
@@ -331,14 +330,8 @@ def read_trial_bag(path: Path, topics: dict[str, str]) -> Capture | None:
         source=source,
         frame_time_s=found.column("time_s"),
         frame_size=found.size,
-        read_frames=lambda: _read_labelled_frames(path),
-        forces=None
-        if not about.force_samples
-        else Forces(
-            time_s=np.array(found.force_time_s, dtype=np.float64),
-            force_n=np.array(found.force_n, dtype=np.float64).reshape(-1, 3),
-            source=about.force_source,
-        ),
+        read_frames=partial(_read_frames, path, IMAGE, kinds=TOPICS),
+        forces=found.forces(np.array(found.force_time_s), source=about.force_source) if about.force_samples else None,
         labels=about.labels(
             {name: found.column(name) for name in (*LABEL_SIGNALS, "safety_margin_sigma")},
             states=tuple(found.states),
@@ -349,168 +342,6 @@ def read_trial_bag(path: Path, topics: dict[str, str]) -> Capture | None:
         reference=found.reference,
         split=about.split,
         simulated=about.simulated,
-    )
-
-
-@dataclass(kw_only=True)
-class _LabelScan:
-    """What a bag holds besides pixels."""
-
-    size: tuple[int, int] | None = None
-    reference: UInt8[np.ndarray, "height width 3"] | None = None
-    references: int = 0
-    image_ns: array = field(default_factory=lambda: array("q"))
-    label_ns: array = field(default_factory=lambda: array("q"))
-    numbers: array = field(default_factory=lambda: array("d"))
-    valid: list[bool] = field(default_factory=list)
-    states: list[str] = field(default_factory=list)
-    reasons: list[str] = field(default_factory=list)
-    force_n: array = field(default_factory=lambda: array("d"))
-    force_time_s: array = field(default_factory=lambda: array("d"))
-
-    def column(self, name: str) -> Float[np.ndarray, " frames"]:
-        """One of `NUMBERS`."""
-        return np.array(self.numbers, dtype=np.float64).reshape(-1, len(NUMBERS))[:, NUMBERS.index(name)].copy()
-
-
-def _scan_labels(path: Path, topics: Collection[str]) -> _LabelScan:
-    found = _LabelScan()
-    for topic, message in _messages(path, topics):
-        if topic == IMAGE:
-            where = _where_label(len(found.image_ns), path)
-            found.image_ns.append(_stamp_ns(message))
-            size = image_size(message, where=where)
-            if found.size not in {None, size}:
-                raise RecordingError(f"{where} has another size than those before it; export the trial again")
-            found.size = size
-        elif topic == LABELS:
-            _add_label(found, message)
-        elif topic == WRENCH:
-            force = message.wrench.force
-            found.force_n.extend((force.x, force.y, force.z))
-        elif topic == WRENCH_TIMES:
-            found.force_time_s.extend(message.time_s.tolist())
-        else:
-            found.references += 1
-            found.reference = image_pixels(message, where=f"{REFERENCE} of {path}")
-    return found
-
-
-def _add_label(found: _LabelScan, message: Any) -> None:
-    found.label_ns.append(_stamp_ns(message))
-    found.numbers.extend(getattr(message, name) for name in NUMBERS)
-    found.valid.append(bool(message.valid))
-    # few words, and often
-    found.states.append(sys.intern(message.contact_state))
-    found.reasons.append(sys.intern(message.invalid_reason))
-
-
-def _require_whole(found: _LabelScan, about: ExportedTrial, path: Path) -> None:
-    """Check that all that was promised is there, and that labels belong to their frames."""
-    counts = {
-        "reference frames": (found.references, 1),
-        "frames": (len(found.image_ns), about.frames),
-        "labels": (len(found.label_ns), about.frames),
-        "wrenches": (len(found.force_n) // 3, about.force_samples),
-        "times of wrenches": (len(found.force_time_s), about.force_samples),
-    }
-    for name, (count, promised) in counts.items():
-        if count != promised:
-            raise RecordingError(f"{path} has {count} {name}, {TRIAL} promises {promised}; export the trial again")
-    if found.image_ns != found.label_ns:
-        at = next(i for i, (one, other) in enumerate(zip(found.image_ns, found.label_ns, strict=True)) if one != other)
-        raise RecordingError(f"label {at} of {path} has another stamp than its frame; export the trial again")
-    if not np.isfinite(found.column("time_s")).all():
-        raise RecordingError(f"{LABELS} of {path} has a time that is not a number; export the trial again")
-
-
-def _read_labelled_frames(path: Path) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    for index, (_, message) in enumerate(_messages(path, {IMAGE})):
-        yield image_pixels(message, where=_where_label(index, path))
-
-
-def _messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, Any]]:
-    """Topic and content of each message of some of our topics, in the order of recording."""
-    with open_bag(path) as bag:
-        types = trial_types()
-        # a second channel of the same topic could hold anything
-        wanted = [one for one in bag.connections if one.topic in topics and one.msgtype == TOPICS[one.topic]]
-        if not wanted:  # to rosbags none means all
-            return
-        for connection, _, data in bag.messages(wanted):
-            yield connection.topic, types.deserialize_cdr(memoryview(data), connection.msgtype)
-
-
-def _stamp_ns(message: Any) -> int:
-    stamp = message.header.stamp
-    return stamp.sec * 1_000_000_000 + stamp.nanosec
-
-
-def _where_label(index: int, path: Path) -> str:
-    return f"frame {index} of {IMAGE} in {path}"
-
-
-_IMAGES = (RAW, COMPRESSED)
-_WRENCHES = ("geometry_msgs/msg/WrenchStamped",)
-
-
-def read_rosbag(path: Path, *, image_topic: str | None = None, wrench_topic: str | None = None) -> Capture:
-    """Read a bag as one trial.
-
-    Images are `sensor_msgs/Image` (rgb8, bgr8, mono8) or `CompressedImage` (JPEG, PNG), forces the x, y, z of
-    `geometry_msgs/WrenchStamped`; torques are left out. A first pass reads stamps and sizes; pixels are decoded when
-    frames are read. Frames and forces share one clock, that of the message headers; where a header has no stamp, or
-    the two topics have clocks that never meet, both take the times at which the bag received them, and `notes` say so.
-    Times are seconds since the first frame or force: since the epoch, double precision would round them to 0.2 us.
-
-    A trial that `write_mcap` exported comes back as it was, with its labels; where a topic is named, like any bag.
-
-    Parameters
-    ----------
-    path
-        Folder with `metadata.yaml`, or an .mcap or .db3 file.
-    image_topic
-        By default the only topic that holds images.
-    wrench_topic
-        By default the only topic that holds wrenches; there are no forces where there is none.
-    """
-    topics = bag_topics(path)
-    if image_topic is None and wrench_topic is None and (trial := read_trial_bag(path, topics)) is not None:
-        return trial
-    images = _choose(topics, image_topic, types=_IMAGES, what="images", path=path)
-    wrenches = _choose(topics, wrench_topic, types=_WRENCHES, what="wrenches", path=path)
-    if images is None:
-        raise RecordingError(
-            f"{path} has no topic with images ({' or '.join(_IMAGES)}); record the camera too "
-            f"(it has {_listed(topics)})"
-        )
-    found = _scan(path, images=images, wrenches=wrenches)
-    notes = []
-    if wrenches is None:
-        notes.append(f"There are no forces: the bag has no topic of {_WRENCHES[0]}.")
-    elif wrench_topic is None and not found.wrenches.bag_ns:
-        notes.append(f"There are no forces: {wrenches} has no message.")
-        wrenches = None
-    if found.size is None:
-        raise RecordingError(f"{images} of {path} has no frame; leave it out or record it again")
-    clock, why = _choose_clock(found)
-    notes += why
-    frame_ns, wrench_ns = found.frames.times(clock), found.wrenches.times(clock)
-    zero = min(series[0] for series in (frame_ns, wrench_ns) if len(series))
-    return Capture(
-        trial=trial_name(path.stem if path.is_file() else path.resolve().name),
-        source=f"{images} of {path}",
-        frame_time_s=_seconds(frame_ns - zero),
-        frame_size=found.size,
-        read_frames=lambda: _read_frames(path, images),
-        forces=None
-        if wrenches is None
-        else Forces(
-            time_s=_seconds(wrench_ns - zero),
-            force_n=np.array(found.force_n, dtype=np.float64).reshape(-1, 3),
-            source=f"{wrenches} of {path}",
-        ),
-        notes=tuple(notes),
     )
 
 
@@ -533,38 +364,145 @@ class _Stamps:
 
 @dataclass(kw_only=True)
 class _Scan:
-    """What the first pass found."""
+    """What a bag holds besides pixels; labels, reference and exact times only where `write_mcap` wrote it."""
 
     frames: _Stamps
     wrenches: _Stamps
-    force_n: array = field(default_factory=lambda: array("d"))
+    labels: _Stamps = field(default_factory=lambda: _Stamps(topic=LABELS))
     size: tuple[int, int] | None = None
+    force_n: array = field(default_factory=lambda: array("d"))
+    force_time_s: array = field(default_factory=lambda: array("d"))
+    reference: UInt8[np.ndarray, "height width 3"] | None = None
+    references: int = 0
+    numbers: array = field(default_factory=lambda: array("d"))
+    valid: list[bool] = field(default_factory=list)
+    states: list[str] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
+
+    def add_label(self, message: Any) -> None:
+        self.numbers.extend(getattr(message, name) for name in NUMBERS)
+        self.valid.append(bool(message.valid))
+        # few words, and often
+        self.states.append(sys.intern(message.contact_state))
+        self.reasons.append(sys.intern(message.invalid_reason))
+
+    def column(self, name: str) -> Float[np.ndarray, " frames"]:
+        """One of `NUMBERS`."""
+        return np.array(self.numbers, dtype=np.float64).reshape(-1, len(NUMBERS))[:, NUMBERS.index(name)].copy()
+
+    def forces(self, time_s: Float[np.ndarray, " samples"], *, source: str) -> Forces:
+        return Forces(time_s=time_s, force_n=np.array(self.force_n).reshape(-1, 3), source=source)
 
 
-def _scan(path: Path, *, images: str, wrenches: str | None) -> _Scan:
-    """Read stamps, sizes and forces, but no pixel."""
+def _scan(
+    path: Path,
+    topics: Collection[str],
+    *,
+    images: str,
+    wrenches: str | None,
+    kinds: Mapping[str, str] | None = None,
+) -> _Scan:
+    """Read stamps, sizes and forces, but no pixel of a frame."""
     found = _Scan(frames=_Stamps(topic=images), wrenches=_Stamps(topic=wrenches or "no topic"))
-    for topic, bag_ns, message in bag_messages(path, {images, wrenches} - {None}):
-        if topic == wrenches:
+    for topic, bag_ns, message in bag_messages(path, topics, kinds=kinds):
+        if topic == images:
+            where = _where(len(found.frames.bag_ns), images, path)
+            size = image_size(message, where=where)
+            if found.size is not None and size != found.size:
+                before = f"{found.size[0]} x {found.size[1]}"
+                cure = "cut the bag there" if kinds is None else "export the trial again"
+                raise RecordingError(f"{where} is {size[0]} x {size[1]} pixels, those before it are {before}; {cure}")
+            found.size = size
+            found.frames.append(message, bag_ns)
+        elif topic == wrenches:
             found.wrenches.append(message, bag_ns)
             force = message.wrench.force
             found.force_n.extend((force.x, force.y, force.z))
-            continue
-        index = len(found.frames.bag_ns)
-        size = image_size(message, where=_where(index, images, path))
-        if found.size is not None and size != found.size:
-            raise RecordingError(
-                f"{_where(index, images, path)} is {size[0]} x {size[1]} pixels, those before it are "
-                f"{found.size[0]} x {found.size[1]}; cut the bag there"
-            )
-        found.size = size
-        found.frames.append(message, bag_ns)
+        elif topic == LABELS:
+            found.labels.append(message, bag_ns)
+            found.add_label(message)
+        elif topic == WRENCH_TIMES:
+            found.force_time_s.extend(message.time_s.tolist())
+        else:
+            found.references += 1
+            found.reference = image_pixels(message, where=f"{REFERENCE} of {path}")
     return found
 
 
-def _read_frames(path: Path, images: str) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    for index, (_, _, message) in enumerate(bag_messages(path, {images})):
+def _read_frames(
+    path: Path, images: str, *, kinds: Mapping[str, str] | None = None
+) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    for index, (_, _, message) in enumerate(bag_messages(path, {images}, kinds=kinds)):
         yield image_pixels(message, where=_where(index, images, path))
+
+
+def _require_whole(found: _Scan, about: ExportedTrial, path: Path) -> None:
+    """Check that all that was promised is there, and that labels belong to their frames."""
+    counts = {
+        "reference frames": (found.references, 1),
+        "frames": (len(found.frames.bag_ns), about.frames),
+        "labels": (len(found.labels.bag_ns), about.frames),
+        "wrenches": (len(found.wrenches.bag_ns), about.force_samples),
+        "times of wrenches": (len(found.force_time_s), about.force_samples),
+    }
+    for name, (count, promised) in counts.items():
+        if count != promised:
+            raise RecordingError(f"{path} has {count} {name}, {TRIAL} promises {promised}; export the trial again")
+    apart = found.frames.times("header") != found.labels.times("header")
+    if apart.any():
+        at = int(np.argmax(apart))
+        raise RecordingError(f"label {at} of {path} has another stamp than its frame; export the trial again")
+    if not np.isfinite(found.column("time_s")).all():
+        raise RecordingError(f"{LABELS} of {path} has a time that is not a number; export the trial again")
+
+
+_IMAGES = (RAW, COMPRESSED)
+_WRENCHES = ("geometry_msgs/msg/WrenchStamped",)
+
+
+def read_rosbag(path: Path, *, image_topic: str | None = None, wrench_topic: str | None = None) -> Capture:
+    """Read a bag as one trial.
+
+    Images are `sensor_msgs/Image` (rgb8, bgr8, mono8) or `CompressedImage` (JPEG, PNG), forces the x, y, z of
+    `geometry_msgs/WrenchStamped`; torques are left out. A first pass reads stamps and sizes; pixels are decoded when
+    frames are read. Frames and forces share one clock, that of the message headers; where a header has no stamp, or
+    the two topics have clocks that never meet, both take the times at which the bag received them, and `notes` say so.
+    Times are seconds since the first frame or force: since the epoch, double precision would round them to 0.2 us.
+
+    A trial that `write_mcap` exported comes back as it was, with its labels; where a topic is named, like any bag.
+    """
+    topics = bag_topics(path)
+    if image_topic is None and wrench_topic is None and (trial := read_trial_bag(path, topics)) is not None:
+        return trial
+    images = _choose(topics, image_topic, types=_IMAGES, what="images", path=path)
+    wrenches = _choose(topics, wrench_topic, types=_WRENCHES, what="wrenches", path=path)
+    if images is None:
+        raise RecordingError(
+            f"{path} has no topic with images ({' or '.join(_IMAGES)}); record the camera too "
+            f"(it has {_listed(topics)})"
+        )
+    found = _scan(path, {images, wrenches} - {None}, images=images, wrenches=wrenches)
+    notes = []
+    if wrenches is None:
+        notes.append(f"There are no forces: the bag has no topic of {_WRENCHES[0]}.")
+    elif wrench_topic is None and not found.wrenches.bag_ns:
+        notes.append(f"There are no forces: {wrenches} has no message.")
+        wrenches = None
+    if found.size is None:
+        raise RecordingError(f"{images} of {path} has no frame; leave it out or record it again")
+    clock, why = _choose_clock(found)
+    notes += why
+    frame_ns, wrench_ns = found.frames.times(clock), found.wrenches.times(clock)
+    zero = min(series[0] for series in (frame_ns, wrench_ns) if len(series))
+    return Capture(
+        trial=trial_name(path.stem if path.is_file() else path.resolve().name),
+        source=f"{images} of {path}",
+        frame_time_s=(frame_ns - zero) / 1e9,
+        frame_size=found.size,
+        read_frames=partial(_read_frames, path, images),
+        forces=found.forces((wrench_ns - zero) / 1e9, source=f"{wrenches} of {path}") if wrenches else None,
+        notes=tuple(notes),
+    )
 
 
 def _choose(topics: dict[str, str], named: str | None, *, types: tuple[str, ...], what: str, path: Path) -> str | None:
@@ -603,10 +541,6 @@ def _choose_clock(found: _Scan) -> tuple[str, list[str]]:
 def _meet(clock: str, found: _Scan) -> bool:
     frames, wrenches = found.frames.times(clock), found.wrenches.times(clock)
     return bool(frames[0] <= wrenches[-1] and wrenches[0] <= frames[-1])
-
-
-def _seconds(time_ns: Int64[np.ndarray, " messages"]) -> Float[np.ndarray, " messages"]:
-    return time_ns / 1e9
 
 
 def _listed(topics: dict[str, str]) -> str:

@@ -26,11 +26,6 @@ def read_stored(folder: Path) -> list[Capture]:
 
     Forces are the samples that were kept on import, else, as for a simulated trial, those of the frames: the pull along
     x, pressing along z.
-
-    Parameters
-    ----------
-    folder
-        Folder with `dataset.json`.
     """
     data = load_dataset(folder)
     return [read_stored_trial(data, info) for info in data.trials]

@@ -403,10 +403,6 @@ def read_force_table(
     force_columns
         Names of three columns, forces along x, y and z; or of two, the normal and the tangential force, which become
         z and x.
-    time_unit
-        s, ms, us or ns.
-    force_unit
-        N, mN, kN, gf, kgf or lbf.
     """
     table = open_table(path)
     time_name = guess_time_column(table) if time_column is None else table.require(time_column, option="--time-column")

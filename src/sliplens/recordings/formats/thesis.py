@@ -120,18 +120,6 @@ def read_thesis(
     ----------
     path
         The list of frames, or the folder that holds just one.
-    image_root
-        Folder under which the images lie now; that of the list if None. Relative paths start at the list and may not
-        lead out of it.
-    margin_unit
-        "fraction" or "percent"; from the largest margin if None.
-    frame_rate
-        Frames per second, which the lists do not give; those of a usual camera if None.
-
-    Returns
-    -------
-    list of Capture
-        A trial for each reference frame, in the order of the list, with the margins of the list as its labels.
     """
     rate = _FRAME_RATE_HZ if frame_rate is None else frame_rate
     how = "assumed" if frame_rate is None else "declared"

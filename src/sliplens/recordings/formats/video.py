@@ -268,23 +268,7 @@ def read_video(
     """Open a video, and a table of forces recorded beside it.
 
     Times are the presentation stamps of the container, so that a variable frame rate is kept.
-
-    Parameters
-    ----------
-    path
-        Whatever FFmpeg reads: MP4, AVI, Matroska, ...
-    forces
-        Table of forces; `read_force_table` tells of it and of `columns`.
-    frame_rate
-        True frames per second, where the stamps are missing or wrong; takes their place.
-    start_s
-        When the first frame of the file was taken, on the clock of the forces; None where both count from one zero.
-    skip_frames
-        Leave out so many frames at the start.
-    skip_stale
-        Leave out what `stale_frames` finds at the start; reads the beginning of the video.
-    name
-        Of the trial; that of the file if None.
+    Options are those of `ReadOptions`.
     """
     file = inspect_video(path)
     notes = list(file.notes)

@@ -201,8 +201,6 @@ def estimate_friction(
     ----------
     contact_threshold_n
         Normal force below which the ratio means nothing.
-    image
-        How the image moves, to support the onset.
 
     Raises
     ------

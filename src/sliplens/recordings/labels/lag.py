@@ -36,13 +36,7 @@ def image_motion(previous: UInt8[np.ndarray, "height width 3"], frame: UInt8[np.
 
 
 def measure_motion(frames: Iterable[UInt8[np.ndarray, "height width 3"]]) -> Float[np.ndarray, " frames"]:
-    """How much each frame differs from the one before it (`image_motion`); 0 for the first.
-
-    Parameters
-    ----------
-    frames
-        One image for each time; they are taken one at a time.
-    """
+    """How much each frame differs from the one before it (`image_motion`); 0 for the first."""
     motion: list[float] = []
     previous = None
     for frame in frames:
@@ -100,8 +94,6 @@ def estimate_lag(
 
     Parameters
     ----------
-    frame_time_s
-        Times on the camera's clock.
     image_motion
         How much each frame differs from the one before it; see `measure_motion`. The first is not used.
     longest_s

@@ -158,19 +158,11 @@ def label_frames(
 
     Parameters
     ----------
-    frame_time_s
-        Times on the camera's clock.
     friction
         Static friction, estimated or given. Where it tells no onset, gross slip begins with the first frame whose
         forces clearly lie outside the friction cone.
-    lag
-        The camera's lag, as far as it is known.
-    apply_lag
-        Take the forces of a frame at its time less the lag.
     contact_threshold_n
         Least normal force of a contact; chosen by `contact_threshold` if None.
-    force_range_n
-        What each axis of the force sensor can measure, either way; None if it is not known.
     window_s
         Time over which forces are averaged, the time of a frame if None; 0 interpolates between two samples.
     gap_s
@@ -302,10 +294,6 @@ def label_trial(
 
     Parameters
     ----------
-    frame_time_s
-        Times on the camera's clock.
-    image_motion
-        See `measure_motion`.
     lag
         Lag that was measured otherwise, with its uncertainty; that of the settings, or estimated, if None.
 

@@ -39,14 +39,10 @@ def choose_reference(
 
     Parameters
     ----------
-    read_frames
-        Begins anew at every call, as that of a `Capture`.
     untouched
         Which frames have no contact, as the forces say.
     index
         The reference by hand; it may touch.
-    method
-        `least contact energy` or `first still`.
 
     Raises
     ------
