@@ -13,7 +13,7 @@ pull takes about as long as any other.
 
 import argparse
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import cast
@@ -23,14 +23,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import nn
 
+from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, PRESETS, TrialPlan, plan_trials
 from sliplens.simulation.geometry import Dome
 from sliplens.simulation.information import (
+    MARGIN,
+    Sensitivity,
     Touch,
-    margin_bound,
     marker_sensitivity,
+    observations,
     prior_sigma,
-    sequence_bound,
     visible_markers,
 )
 from sliplens.simulation.loading import TRIAL_S, load_at_margins, load_grasp
@@ -339,6 +341,62 @@ def _marginal(
         "shear_exponent": np.mean(ranges.shear_exponent) - grasp.shear_exponent,
     }
     return spread @ np.array([centre.get(name, 0.0) / value for name, value in sigma.items()]), spread
+
+
+def margin_bound(
+    sensitivity: Sensitivity, *, noise_px: float, prior: Mapping[str, float]
+) -> Float[np.ndarray, " frames"]:
+    """Bound on the standard deviation of the safety margin that is read from one frame, for each frame.
+
+    The square root of the margin's entry in (J^T J / sigma^2 + diag(1 / prior^2))^-1: without priors the bound of
+    Cramer and Rao, with priors on the nuisances the hybrid one, with one on the margin too that of Van Trees here.
+
+    `noise_px`: standard deviation of each coordinate, in pixels; `prior`: standard deviation of each unknown before the
+    frame is seen; infinite where nothing is known. A nuisance that is left out is known; a margin that is left out is
+    not.
+
+    Kay, *Fundamentals of Statistical Signal Processing* I (1993), section 3.7; Van Trees, *Detection, Estimation, and
+    Modulation Theory* I (1968), section 2.4; Gill and Levit, *Bernoulli* 1 (1995) 59.
+    """
+    return np.array([_bound(jacobian, sensitivity.unknowns, noise_px, prior) for jacobian in sensitivity.jacobian])
+
+
+def sequence_bound(
+    sensitivity: Sensitivity, *, noise_px: float, prior: Mapping[str, float], pull_known: bool = False
+) -> float:
+    """Bound on the standard deviation of the last frame's margin, read from all frames together.
+
+    They are of one trial, and share every nuisance.
+
+    `sensitivity`: from `marker_sensitivity`; the last frame is the one asked for; `pull_known`: whether it is known by
+    how much the margin fell between the frames, from a clock and a steady pull; else every frame's margin is an unknown
+    of its own.
+    """
+    (frames, coordinates, unknowns), names = sensitivity.jacobian.shape, sensitivity.unknowns
+    if pull_known:
+        return _bound(sensitivity.jacobian.reshape(-1, unknowns), names, noise_px, prior)
+    own = np.zeros((frames, coordinates, frames))
+    own[np.arange(frames), :, np.arange(frames)] = sensitivity.jacobian[..., 0]
+    # the last frame's margin first
+    stacked = np.concatenate([own[..., ::-1], sensitivity.jacobian[..., 1:]], axis=-1)
+    earlier = tuple(f"earlier {index}" for index in range(1, frames))
+    unbounded = {**prior, **dict.fromkeys(earlier, np.inf)}
+    return _bound(stacked.reshape(frames * coordinates, -1), (MARGIN, *earlier, *names[1:]), noise_px, unbounded)
+
+
+def _bound(
+    jacobian: Float[np.ndarray, "coordinates unknowns"],
+    unknowns: tuple[str, ...],
+    noise_px: float,
+    prior: Mapping[str, float],
+) -> float:
+    if wrong := set(prior) - set(unknowns):
+        raise ContactError(f"there is no unknown {sorted(wrong)[0]!r}; choose from {', '.join(unknowns)}")
+    rows, scale = observations(jacobian, unknowns, noise_px, prior)
+    # what of the margin's column no nuisance can imitate is what tells it
+    margin, nuisances = rows[:, 0], (rows / scale)[:, 1:]
+    evidence = np.linalg.norm(margin - nuisances @ np.linalg.lstsq(nuisances, margin, rcond=None)[0])
+    return float(1 / evidence) if evidence > 0 else float("inf")
 
 
 def bound_tables(touches: int, *, seed: int) -> list[dict[str, object]]:

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from limit import margin_bound
 from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, Nuisances, SimulationRecipe, plan_trials
 from sliplens.simulation.information import (
     MARGIN,
     Sensitivity,
     Touch,
-    margin_bound,
     marker_sensitivity,
     prior_sigma,
     reading_gain,

@@ -6,6 +6,7 @@ from typing import cast
 import numpy as np
 import pytest
 
+from limit import margin_bound, sequence_bound
 from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, Nuisances
 from sliplens.simulation.geometry import FlatPad
@@ -14,10 +15,8 @@ from sliplens.simulation.information import (
     NUISANCES,
     Sensitivity,
     Touch,
-    margin_bound,
     marker_sensitivity,
     prior_sigma,
-    sequence_bound,
     visible_markers,
 )
 from sliplens.simulation.motion import DISPLACEMENTS, Displacement

@@ -113,12 +113,5 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def natural_key(text: str) -> list[tuple[int, int | str]]:
-    """Sort key that reads runs of digits as numbers.
-
-    Examples
-    --------
-    >>> from sliplens.images.files import natural_key
-    >>> sorted(["frame10.png", "frame2.png"], key=natural_key)
-    ['frame2.png', 'frame10.png']
-    """
+    """Sort key that reads runs of digits as numbers."""
     return [(0, int(part)) if part.isdecimal() else (1, part.lower()) for part in re.split(r"(\d+)", text)]

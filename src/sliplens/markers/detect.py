@@ -277,12 +277,7 @@ def measure_spots(
     to three quarters (wholly) of the contrast: so speckle inside a marker does not move its centre, while its edge
     still does by fractions of a pixel.
 
-    Parameters
-    ----------
-    signal
-        High on markers.
-    near_px
-        x, y of each spot, to about a third of a radius.
+    `signal`: high on markers; `near_px`: x, y of each spot, to about a third of a radius.
     """
     window = _window(round(max(radius_px, 1.5), 1))
     height, width = signal.shape

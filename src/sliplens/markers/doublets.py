@@ -19,12 +19,7 @@ def resolve_signs(
     Signs spread from the longest displacement to its neighbours, strongest agreement first, and are then flipped one by
     one while that brings them closer to what the neighbours say.
 
-    Parameters
-    ----------
-    way_px
-        Displacement of each, up to its sign.
-    pressed
-        Choose the sign of all so that the displacements point away from their middle; left as it falls if False.
+    `pressed`: choose the sign of all so that the displacements point away from their middle; left as it falls if False.
     """
     distance = np.linalg.norm(place_px[:, None] - place_px[None], axis=-1)
     np.fill_diagonal(distance, np.inf)

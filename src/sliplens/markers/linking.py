@@ -37,13 +37,10 @@ def predict_from_neighbours(
 ) -> Float[np.ndarray, "markers 2"]:
     """Displacement of each marker as its neighbours alone tell it, in pixels.
 
-    A plane through the known neighbours' displacements, the near ones weighing most, its slopes held down a little;
-    NaN where fewer than three neighbours are known.
+    A plane through the known neighbours' displacements, the near ones weighing most, its slopes held down a little; NaN
+    where fewer than three neighbours are known.
 
-    Parameters
-    ----------
-    displacement_px
-        x, y of each marker; what is not known may be NaN.
+    `displacement_px`: x, y of each marker; what is not known may be NaN.
     """
     usable = known[neighbours.index]
     values = np.where(usable[..., None], displacement_px[neighbours.index], 0.0)
@@ -99,12 +96,8 @@ def pair(
     0.45 of the pitch away. Backward: the spot, moved back by the step that the marker's neighbours made, must lie less
     than 0.45 of the pitch from this marker's own place.
 
-    Parameters
-    ----------
-    predicted_px
-        Where each marker is expected; NaN if nowhere.
-    from_px
-        Where each marker was before; NaN where it was not seen.
+    `predicted_px`: where each marker is expected; NaN if nowhere; `from_px`: where each marker was before; NaN where it
+    was not seen.
     """
     spot = _mutual(predicted_px, found_px, reach_px=GATE * neighbours.pitch_px)
     step = np.full(predicted_px.shape, np.nan)
@@ -225,12 +218,8 @@ def link(
     of the print, so that neighbours move alike. A step of less than a quarter pitch is believed unless another does
     clearly better; of larger ones, and after a jump, the best is believed only where no other does nearly as well.
 
-    Parameters
-    ----------
-    origins
-        Places from which the markers may have come, the likeliest first; no NaN.
-    lost
-        Whether nothing was said of the frame before: then no step counts as small.
+    `origins`: places from which the markers may have come, the likeliest first; no NaN; `lost`: whether nothing was
+    said of the frame before: then no step counts as small.
     """
     step = _pair(origins[0], np.zeros(2), found_px, neighbours=neighbours, frame_size=frame_size)
     if not lost and _is_calm(step, neighbours, usual):
@@ -320,10 +309,7 @@ def drop_strays(
 ) -> tuple[Bool[np.ndarray, " markers"], Float[np.ndarray, "markers 2"]]:
     """Drop markers that stray from their neighbours, worst first: one stray makes all round it look astray.
 
-    Returns
-    -------
-    tuple
-        Which may still be believed, and what the neighbours that remain say of each displacement.
+    Gives which may still be believed, and what the neighbours that remain say of each displacement.
     """
     sound = sound.copy()
     told = predict_from_neighbours(neighbours, shift_px, sound)
@@ -389,17 +375,10 @@ def match_left_over(
     Where the skin moves more than half a pitch in one step, the nearest spot is the next marker's. Neighbours still
     move alike: from those that are sound each marker's place is told, and once it is found it tells of the next.
 
-    Parameters
-    ----------
-    spot
-        Which spot each marker has; -1 for none.
-    told_px
-        Displacement of each as its sound neighbours tell it; NaN where they do not.
+    `spot`: which spot each marker has; -1 for none; `told_px`: displacement of each as its sound neighbours tell it;
+    NaN where they do not.
 
-    Returns
-    -------
-    Int[np.ndarray, " markers"]
-        Spots, those of the sound markers as they were.
+    Gives spots, those of the sound markers as they were.
     """
     believed, spot = sound.copy(), np.where(sound, spot, -1)
     shift = (

@@ -49,12 +49,8 @@ class Newcomers:
     def update(self, spare: Markers, expected_px: Float[np.ndarray, "markers 2"]) -> NewPlaces:
         """Follow the new markers and admit more.
 
-        Parameters
-        ----------
-        spare
-            Spots of the frame that no marker of the reference took.
-        expected_px
-            Where the markers of the reference are, or should be: a spot near one may be its remains.
+        `spare`: spots of the frame that no marker of the reference took; `expected_px`: where the markers of the
+        reference are, or should be: a spot near one may be its remains.
         """
         place, radius = np.full(self._known.shape, np.nan), np.full(len(self._known), np.nan)
         free = np.ones(len(spare), dtype=bool)

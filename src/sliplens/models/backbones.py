@@ -23,15 +23,9 @@ _WIDTH_RATIO = 0.75
 class HistogramRegressor(nn.Module):
     """A network whose answer is a histogram over the safety margin; it returns the mean (HL-Gauss).
 
-    Parameters
-    ----------
-    backbone
-        Takes (batch, 3, height, width) and returns (batch, `bins`) logits.
-    bins, lowest, highest
-        Bins of one width, and the margins between which they lie.
+    `backbone`: takes (batch, 3, height, width) and returns (batch, `bins`) logits; `bins`, `lowest`, `highest`: bins of
+    one width, and the margins between which they lie.
 
-    References
-    ----------
     Imani & White, *Improving Regression Performance with Distributional Losses* (2018); Farebrother et al., *Stop
     Regressing* (2024), whose width of a label is taken.
     """
@@ -70,13 +64,7 @@ class HistogramRegressor(nn.Module):
 
 
 class Answers(nn.Module):
-    """A network that returns all it answers: margins, and the probabilities behind them where it has a histogram.
-
-    Parameters
-    ----------
-    model
-        Takes (batch, 3, height, width) and returns one number an image.
-    """
+    """A network that returns all it answers: margins, and the probabilities behind them where it has a histogram."""
 
     def __init__(self, model: nn.Module) -> None:
         super().__init__()
@@ -103,20 +91,7 @@ def bin_edges(model: nn.Module) -> Float[np.ndarray, " edges"] | None:
 
 
 def histogram_targets(margins: Float[Tensor, " batch"], edges: Float[Tensor, " edges"]) -> Float[Tensor, "batch bins"]:
-    """Share of a Gaussian round each label that falls into each bin; each row sums to 1.
-
-    Parameters
-    ----------
-    edges
-        Of bins of one width, rising.
-
-    Examples
-    --------
-    >>> import torch
-    >>> from sliplens.models.backbones import histogram_targets
-    >>> histogram_targets(torch.tensor([0.5]), torch.linspace(0, 1, 4)).round(decimals=2)
-    tensor([[0.2400, 0.5200, 0.2400]])
-    """
+    """Share of a Gaussian round each label that falls into each bin; each row sums to 1."""
     sigma = _WIDTH_RATIO * (edges[1] - edges[0])
     below = 0.5 * (1 + torch.erf((edges - margins[:, None]) / (math.sqrt(2) * sigma)))
     return (below[:, 1:] - below[:, :-1]) / (below[:, -1:] - below[:, :1])

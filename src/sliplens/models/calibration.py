@@ -22,8 +22,6 @@ class Calibration:
     regression); of one number, it is that number plus and minus the offset (split conformal). Both hold for the level's
     share of frames like those of the validation, and promise nothing for others.
 
-    References
-    ----------
     Vovk et al., *Algorithmic Learning in a Random World* (2005); Romano et al., *Conformalized Quantile Regression*
     (2019); Guo et al., *On Calibration of Modern Neural Networks* (2017), for the temperature.
     """
@@ -49,13 +47,7 @@ class Calibration:
 
 
 def fit_temperature(logits: Float[Tensor, "frames bins"], targets: Float[Tensor, "frames bins"]) -> float:
-    """Temperature with the least cross-entropy, by golden-section search on its logarithm (the loss is convex in 1/T).
-
-    Parameters
-    ----------
-    targets
-        Their labels as `histogram_targets` gives them.
-    """
+    """Temperature of least cross-entropy, by golden-section search on its logarithm; the loss is convex in 1/T."""
 
     def loss(log_temperature: float) -> float:
         return float(torch.nn.functional.cross_entropy(logits / float(np.exp(log_temperature)), targets))
@@ -72,19 +64,7 @@ def quantiles(
 ) -> Float[np.ndarray, " frames"]:
     """Margin below which a share of each distribution lies; within a bin the distribution is even.
 
-    Parameters
-    ----------
-    probabilities
-        Each row sums to 1.
-    share
-        Between 0 and 1.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from sliplens.models.calibration import quantiles
-    >>> quantiles(np.array([[0.5, 0.5]]), np.array([0.0, 0.5, 1.0]), 0.25)
-    array([0.25])
+    `probabilities`: each row sums to 1; `share`: between 0 and 1.
     """
     below = np.concatenate([np.zeros((len(probabilities), 1)), np.cumsum(probabilities, axis=1)], axis=1)
     below /= below[:, -1:]
@@ -104,25 +84,9 @@ def conformal_offset(
 ) -> float:
     """By how much intervals must widen to hold for a share of the frames, a frame more counted as missed.
 
-    Parameters
-    ----------
-    low, high
-        Intervals of validation frames; equal for one number.
+    `low`, `high`: intervals of validation frames; equal for one number.
 
-    References
-    ----------
     Romano et al. (2019), eq. 6 and 7.
-
-    Examples
-    --------
-    Of nine answers, each off by as many hundredths as its number, eight must lie within the offset:
-
-    >>> import numpy as np
-    >>> from sliplens.models.calibration import conformal_offset
-    >>> margins = np.linspace(0.1, 0.9, 9)
-    >>> answers = margins + np.arange(1, 10) / 100
-    >>> round(conformal_offset(answers, answers, margins, level=0.8), 6)
-    0.08
     """
     missed = np.sort(np.maximum(low - margins, margins - high))
     rank = int(np.ceil(level * (len(missed) + 1)))

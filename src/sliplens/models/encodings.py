@@ -50,8 +50,6 @@ class Encoding:
     def normalise(self, images: UInt8[Tensor, "batch 3 size size"]) -> Float[Tensor, "batch 3 size size"]:
         """Scale to [0, 1]: by each image's own maximum, as the thesis does, or by 255; an all-black image stays black.
 
-        References
-        ----------
         Polak, section 4 ("max normalization").
         """
         if not self.own_maximum:
@@ -60,13 +58,7 @@ class Encoding:
         return images.float() / largest
 
     def encode(self, frames: Frames, reference: Reference, *, image_size: int) -> Float[Tensor, "batch 3 size size"]:
-        """Encode frames against their reference frame.
-
-        Parameters
-        ----------
-        image_size
-            Height and width of the network's input, in pixels.
-        """
+        """Encode frames against their reference frame."""
         return self.normalise(self.resize(self.compare(frames, reference), image_size=image_size))
 
     def empty(self, reference: Reference, *, image_size: int) -> Float[Tensor, "3 size size"]:
@@ -93,17 +85,5 @@ ENCODINGS = Table("input", "sliplens.encodings", _ROWS)
 
 
 def get_encoding(name: str) -> Encoding:
-    """Look up an encoding by name.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from sliplens.models.encodings import get_encoding
-    >>> untouched = np.zeros((8, 8, 3), dtype=np.uint8)
-    >>> frame = untouched + np.uint8(40)
-    >>> get_encoding("difference").encode(frame[None], untouched, image_size=4).amax()  # by its own maximum
-    tensor(1.)
-    >>> get_encoding("amplitude").encode(frame[None], untouched, image_size=4).amax()  # 40 / 255
-    tensor(0.1569)
-    """
+    """Look up an encoding by name."""
     return ENCODINGS.pick(name)

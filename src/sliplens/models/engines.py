@@ -229,15 +229,8 @@ def fold_batch_norm(model: nn.Module) -> nn.Module:
     With its statistics fixed, batch normalisation is an affine map of each channel, and so is what scales and shifts
     the kernels of the convolution before it. A network whose graph torch cannot trace comes back as a plain copy.
 
-    Parameters
-    ----------
-    model
-        In evaluation mode.
-
-    References
-    ----------
-    Jacob et al., *Quantization and Training of Neural Networks for Efficient Integer-Arithmetic-Only Inference*
-    (2018), eq. 14.
+    Jacob et al., *Quantization and Training of Neural Networks for Efficient Integer-Arithmetic-Only Inference* (2018),
+    eq. 14.
     """
     copied = deepcopy(model)
     if isinstance(copied, HistogramRegressor):

@@ -85,10 +85,7 @@ def export_onnx(run: TrainedModel | Path | str, out: Path | str, *, overwrite: b
 def convert_network(model: nn.Module, images: Float[Tensor, "batch 3 height width"]) -> "ModelProto":
     """A network as ONNX holds it: input `image`, outputs named by `answer_names`, a batch of any size.
 
-    Parameters
-    ----------
-    model
-        In evaluation mode, one number an image; it stays as it is.
+    `model`: in evaluation mode, one number an image; it stays as it is.
     """
     copied = deepcopy(model).to("cpu", memory_format=torch.contiguous_format)  # pyright: ignore[reportCallIssue]
     # two images: torch takes a batch of one for a constant
@@ -182,13 +179,7 @@ def difference(found: np.ndarray, expected: np.ndarray) -> float:
 
 
 def trial_inputs(size: int) -> Iterator[Float[Tensor, "batch 3 size size"]]:
-    """Inputs that a network and its copies are compared on: black, white and noise, alone and in a batch.
-
-    Parameters
-    ----------
-    size
-        Height and width, in pixels.
-    """
+    """Inputs that a network and its copies are compared on: black, white and noise, alone and in a batch."""
     generator = torch.Generator().manual_seed(0)
     for batch in (1, 7):
         shape = batch, 3, size, size

@@ -170,10 +170,7 @@ def prepare_film(
 ) -> Film:
     """Move the markers, set the light and draw all that is random: what is left is drawing.
 
-    Parameters
-    ----------
-    noise
-        The camera's noise; None films without it.
+    `noise`: the camera's noise; None films without it.
     """
     motion = move_markers(
         sensor,

@@ -119,18 +119,7 @@ class Dome:
         return np.clip(points[..., 2] / np.linalg.norm(points, axis=-1), 0, 1)
 
     def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-        """Pixel coordinates (x, y) of points.
-
-        Examples
-        --------
-        The tip of the dome is seen in the middle of the image:
-
-        >>> import numpy as np
-        >>> from sliplens.simulation import CHROMATOUCH
-        >>> dome = CHROMATOUCH.geometry
-        >>> dome.project(np.array([0.0, 0.0, dome.sphere_radius_m]))
-        array([115.8, 111.3])
-        """
+        """Pixel coordinates (x, y) of points."""
         sideways = np.hypot(points[..., 0], points[..., 1])
         ahead = points[..., 2] + self.camera_offset * self.radius_m
         on_axis = sideways < 1e-9 * self.radius_m

@@ -1,4 +1,4 @@
-"""What the markers of a frame can tell of the safety margin at best: the Cramer-Rao bound, with priors or without.
+"""What the markers of a frame tell of the safety margin: their motion with it, and the best linear reading of it.
 
 Seen are the displacements of the markers inside the image, each coordinate with Gaussian noise. The camera's seat and
 the print's jitter move a marker and its place at rest alike: the reference frame shows them, and they are no unknowns.
@@ -84,10 +84,7 @@ def marker_sensitivity(
 ) -> Sensitivity:
     """Shift of the visible markers with the safety margin and with every nuisance, by central differences.
 
-    Parameters
-    ----------
-    margins
-        Safety margins to look at, inside (0, 1).
+    `margins`: safety margins to look at, inside (0, 1).
     """
     if not np.all((margins > 0) & (margins < 1)):
         raise ContactError("safety margins must lie inside (0, 1), where the derivative exists; leave out the ends")
@@ -142,82 +139,6 @@ def prior_sigma(nuisances: Nuisances, *, wet: bool) -> dict[str, float]:
     }
 
 
-def margin_bound(
-    sensitivity: Sensitivity, *, noise_px: float, prior: Mapping[str, float]
-) -> Float[np.ndarray, " frames"]:
-    """Bound on the standard deviation of the safety margin that is read from one frame, for each frame.
-
-    The square root of the margin's entry in (J^T J / sigma^2 + diag(1 / prior^2))^-1: without priors the bound of
-    Cramer and Rao, with priors on the nuisances the hybrid one, with one on the margin too that of Van Trees here.
-
-    Parameters
-    ----------
-    noise_px
-        Standard deviation of each coordinate, in pixels.
-    prior
-        Standard deviation of each unknown before the frame is seen; infinite where nothing is known. A nuisance that is
-        left out is known; a margin that is left out is not.
-
-    References
-    ----------
-    Kay, *Fundamentals of Statistical Signal Processing* I (1993), section 3.7; Van Trees, *Detection, Estimation, and
-    Modulation Theory* I (1968), section 2.4; Gill and Levit, *Bernoulli* 1 (1995) 59.
-
-    Examples
-    --------
-    One coordinate that moves 2 px from full slip to full stick, known to 0.1 px, tells the margin to 0.05:
-
-    >>> import numpy as np
-    >>> from sliplens.simulation.information import Sensitivity, margin_bound
-    >>> seen = Sensitivity(unknowns=("margin",), jacobian=np.array([[[2.0]]]))
-    >>> margin_bound(seen, noise_px=0.1, prior={})
-    array([0.05])
-    """
-    return np.array([_bound(jacobian, sensitivity.unknowns, noise_px, prior) for jacobian in sensitivity.jacobian])
-
-
-def sequence_bound(
-    sensitivity: Sensitivity, *, noise_px: float, prior: Mapping[str, float], pull_known: bool = False
-) -> float:
-    """Bound on the standard deviation of the last frame's margin, read from all frames together.
-
-    They are of one trial, and share every nuisance.
-
-    Parameters
-    ----------
-    sensitivity
-        From `marker_sensitivity`; the last frame is the one asked for.
-    pull_known
-        Whether it is known by how much the margin fell between the frames, from a clock and a steady pull; else every
-        frame's margin is an unknown of its own.
-    """
-    (frames, coordinates, unknowns), names = sensitivity.jacobian.shape, sensitivity.unknowns
-    if pull_known:
-        return _bound(sensitivity.jacobian.reshape(-1, unknowns), names, noise_px, prior)
-    own = np.zeros((frames, coordinates, frames))
-    own[np.arange(frames), :, np.arange(frames)] = sensitivity.jacobian[..., 0]
-    # the last frame's margin first
-    stacked = np.concatenate([own[..., ::-1], sensitivity.jacobian[..., 1:]], axis=-1)
-    earlier = tuple(f"earlier {index}" for index in range(1, frames))
-    unbounded = {**prior, **dict.fromkeys(earlier, np.inf)}
-    return _bound(stacked.reshape(frames * coordinates, -1), (MARGIN, *earlier, *names[1:]), noise_px, unbounded)
-
-
-def _bound(
-    jacobian: Float[np.ndarray, "coordinates unknowns"],
-    unknowns: tuple[str, ...],
-    noise_px: float,
-    prior: Mapping[str, float],
-) -> float:
-    if wrong := set(prior) - set(unknowns):
-        raise ContactError(f"there is no unknown {sorted(wrong)[0]!r}; choose from {', '.join(unknowns)}")
-    rows, scale = _observations(jacobian, unknowns, noise_px, prior)
-    # what of the margin's column no nuisance can imitate is what tells it
-    margin, nuisances = rows[:, 0], (rows / scale)[:, 1:]
-    evidence = np.linalg.norm(margin - nuisances @ np.linalg.lstsq(nuisances, margin, rcond=None)[0])
-    return float(1 / evidence) if evidence > 0 else float("inf")
-
-
 def reading_gain(
     jacobian: Float[np.ndarray, "coordinates unknowns"],
     unknowns: tuple[str, ...],
@@ -230,16 +151,13 @@ def reading_gain(
     The margin's row of (J^T J / sigma^2 + diag(1 / prior^2))^-1 J^T / sigma^2: with infinite priors the best linear
     unbiased estimator, else the posterior mean.
 
-    Parameters
-    ----------
-    jacobian, unknowns
-        Derivatives of the coordinates, as in `Sensitivity`; the margin first.
+    `jacobian`, `unknowns`: derivatives of the coordinates, as in `Sensitivity`; the margin first.
     """
-    rows, scale = _observations(jacobian, unknowns, noise_px, prior)
+    rows, scale = observations(jacobian, unknowns, noise_px, prior)
     return np.linalg.pinv(rows / scale)[0, : len(jacobian)] / (scale[0] * noise_px)
 
 
-def _observations(
+def observations(
     jacobian: Float[np.ndarray, "coordinates unknowns"],
     unknowns: tuple[str, ...],
     noise_px: float,

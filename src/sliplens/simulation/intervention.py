@@ -88,10 +88,7 @@ def _tuples(values: dict[str, Any]) -> dict[str, Any]:
 def rebuild_trial(folder: Path, recording: Recording, *, recipe: SimulationRecipe | None = None) -> FilmedTrial:
     """Make a stored simulated trial ready to be drawn anew, the same bytes as before.
 
-    Parameters
-    ----------
-    recipe
-        What simulated it; read from the folder if None.
+    `recipe`: what simulated it; read from the folder if None.
     """
     name, truth = recording.trial, recording.truth
     if truth is None:
@@ -195,10 +192,7 @@ def marker_readings(
 ) -> tuple[Int[np.ndarray, " markers"], Float[np.ndarray, " markers"]]:
     """Part of each marker that lies wholly in the image in the best reading of a frame's margin.
 
-    Returns
-    -------
-    markers, effects
-        Numbers of the markers, and the reading as it is less the reading with that marker put back, in margin units.
+    Gives numbers of the markers, and the reading as it is less the reading with that marker put back, in margin units.
     """
     margin = float(trial.loading.safety_margin[frame])
     if np.isnan(margin):

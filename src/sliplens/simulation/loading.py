@@ -42,15 +42,9 @@ def slide(
     short time (a share of static less kinetic: friction ages), then the contact slips back. With a share of 0 it slides
     on evenly.
 
-    Parameters
-    ----------
-    since_slip_s
-        Time since the first full slip, in seconds.
-    stuck_until
-        Frames after the first slip from which on the contact slips for good, at the level it then has: it is let go.
+    `since_slip_s`: time since the first full slip, in seconds; `stuck_until`: frames after the first slip from which on
+    the contact slips for good, at the level it then has: it is let go.
 
-    References
-    ----------
     Persson, *Sliding Friction* (2000), chapter 3 (spring-slider, stick-slip).
     """
     time_s = np.maximum(since_slip_s, 0)
@@ -121,11 +115,8 @@ def load_grasp(grasp: Grasp, *, frames: int, rng: np.random.Generator, release: 
 
     Sliding begins with a fall from static to kinetic friction; a spring-slider makes it stick and slip (`slide`).
 
-    Parameters
-    ----------
-    release
-        Let go at the end: the normal force falls to nothing while the object slides, and the last frames have no
-        contact.
+    `release`: let go at the end: the normal force falls to nothing while the object slides, and the last frames have no
+    contact.
     """
     if frames < MINIMUM_FRAMES:
         raise ContactError(f"a trial of {frames} frames cannot hold all phases; ask for {MINIMUM_FRAMES} or more")
@@ -164,10 +155,7 @@ def load_grasp(grasp: Grasp, *, frames: int, rng: np.random.Generator, release: 
 def load_at_margins(margins: Float[np.ndarray, " frames"], *, grasp: Grasp) -> Loading:
     """Load a grasp so that its frames have given margins, at its full normal force; NaN is no contact.
 
-    Parameters
-    ----------
-    grasp
-        Force and friction; drift, creep and the kinetic ratio are left out.
+    `grasp`: force and friction; drift, creep and the kinetic ratio are left out.
     """
     if np.any((margins < 0) | (margins > 1)):
         raise ContactError("safety margins must lie in [0, 1]; give them as fractions, not in percent")

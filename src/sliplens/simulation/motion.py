@@ -80,17 +80,10 @@ def move_markers(
 ) -> Motion:
     """Displace a sensor's markers by a loading.
 
-    Parameters
-    ----------
-    grasp
-        Contact offset, tilt, direction and exponent of the shear, creep.
-    displacement
-        `calibrated` gives the motion of the real ChromaTouch, whose stick zone is nominal; `half-space` gives exact
-        contact mechanics. The sensor's default if None.
-    modulus_factor
-        Stiffness of the gel over the sensor's nominal one.
-    marker_depth
-        Depth of the markers under the skin, in radii of the contact's sphere.
+    `grasp`: contact offset, tilt, direction and exponent of the shear, creep; `displacement`: `calibrated` gives the
+    motion of the real ChromaTouch, whose stick zone is nominal; `half-space` gives exact contact mechanics. The
+    sensor's default if None; `modulus_factor`: stiffness of the gel over the sensor's nominal one; `marker_depth`:
+    depth of the markers under the skin, in radii of the contact's sphere.
     """
     name = sensor.displacements[0] if displacement is None else displacement
     if name not in sensor.displacements:

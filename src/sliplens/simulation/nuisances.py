@@ -164,10 +164,7 @@ def nominal_unit(markers: int) -> Unit:
 def draw_day(nuisances: Nuisances, *, quantile: float, rng: np.random.Generator) -> Day:
     """Draw a day.
 
-    Parameters
-    ----------
-    quantile
-        Where in its range the day's dry friction lies, 0 to 1; the caller spreads the days.
+    `quantile`: where in its range the day's dry friction lies, 0 to 1; the caller spreads the days.
     """
     low, high = nuisances.dry_friction
     return Day(

@@ -72,10 +72,7 @@ def haze(
 ) -> Float32[np.ndarray, "3 height width"]:
     """Grey levels that full contact adds: a veil, a glow where the object reflects the light, the grain of the skin.
 
-    Parameters
-    ----------
-    contact_px, radius_px
-        Where the camera sees the contact's centre, and how large its radius in a nominal grasp.
+    `contact_px`, `radius_px`: where the camera sees the contact's centre, and how large its radius in a nominal grasp.
     """
     if not sensor.sees_contact:
         return np.zeros((3, sensor.image_size_px, sensor.image_size_px), dtype=np.float32)

@@ -148,16 +148,9 @@ def draw_look(
     the gel into the focus that the untouched one is out of, most in red and to one side of the image. Markers seen
     aslant are paler, too.
 
-    Parameters
-    ----------
-    scale
-        Size of each marker over its size at rest.
-    pressure
-        Pressure over the peak of the nominal grasp's.
-    touch
-        Indentation over that of the nominal grasp; 0 without contact.
-    blur_px
-        Standard deviation of the blur that the trial adds.
+    `scale`: size of each marker over its size at rest; `pressure`: pressure over the peak of the nominal grasp's;
+    `touch`: indentation over that of the nominal grasp; 0 without contact; `blur_px`: standard deviation of the blur
+    that the trial adds.
     """
     rest = geometry.marker_positions()
     aslant = 1 - geometry.slope_cosine(rest)[:, None] ** 2
