@@ -35,29 +35,21 @@ class MethodNotes:
 
 @dataclass(frozen=True, kw_only=True)
 class Explained:
-    """Explanations of some frames by several methods.
-
-    Attributes
-    ----------
-    weights_sha256
-        Hash of the network that was explained.
-    images
-        Inputs of the network before normalisation, 8 bits.
-    pictures
-        The normalised inputs, 8 bits, for people to look at.
-    relevance, saliency
-        By method: signed maps in margin units, and the same in [0, 1] for viewing and for ranking pixels.
-    """
+    """Explanations of some frames by several methods."""
 
     input: str
     source: str
     weights_sha256: str
+    """Hash of the network that was explained."""
     frames: tuple[ExplainedFrame, ...]
     methods: dict[str, MethodNotes]
     images: UInt8[np.ndarray, "frames 3 size size"]
+    """Inputs of the network before normalisation, 8 bits."""
     pictures: UInt8[np.ndarray, "frames size size 3"]
+    """The normalised inputs, 8 bits, for people to look at."""
     relevance: dict[str, Float32[np.ndarray, "frames size size"]]
     saliency: dict[str, Float32[np.ndarray, "frames size size"]]
+    """By method: signed maps in margin units, and the same in [0, 1] for viewing and for ranking pixels."""
 
     def __post_init__(self) -> None:
         """Hold the arrays against the frames that they are of."""

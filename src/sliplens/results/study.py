@@ -107,27 +107,19 @@ class StateFrame(ShownFrame, MarkedFrame):
 
 @dataclass(frozen=True, kw_only=True)
 class States:
-    """Trial from full stick to full slip as the camera saw it, and the markers of all chosen frames.
-
-    Attributes
-    ----------
-    markers_from
-        "simulation", or "tracking".
-    untracked
-        Trials in which the markers could not be followed, and why.
-    raw, difference
-        Pictures of `shown`, and their absolute differences from the untouched sensor.
-    table
-        Markers of every chosen frame in which they are known.
-    """
+    """Trial from full stick to full slip as the camera saw it, and the markers of all chosen frames."""
 
     trial: str
     markers_from: str
+    """Either "simulation" or "tracking"."""
     shown: tuple[ShownFrame, ...]
     untracked: tuple[str, ...]
+    """Trials in which the markers could not be followed, and why."""
     raw: UInt8[np.ndarray, "frames height width 3"]
     difference: UInt8[np.ndarray, "frames height width 3"]
+    """Pictures of `shown`, and their absolute differences from the untouched sensor."""
     table: MarkerTable
+    """Markers of every chosen frame in which they are known."""
 
     def __post_init__(self) -> None:
         """Hold the pictures against the frames."""
@@ -160,17 +152,12 @@ class States:
 
 @dataclass(frozen=True, kw_only=True)
 class UntrainedMaps:
-    """Maps of a network whose weights were drawn anew: a control that every map has to beat.
-
-    Attributes
-    ----------
-    maps
-        Part of the relevance that works towards that network's own target, in margin units.
-    """
+    """Maps of a network whose weights were drawn anew: a control that every map has to beat."""
 
     input: str
     source: str
     maps: Float64[np.ndarray, "frames size size"]
+    """Part of the relevance that works towards that network's own target, in margin units."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,21 +208,15 @@ class Roughness:
 
 @dataclass(frozen=True, kw_only=True)
 class MapQuality:
-    """What the eye judges of maps, by method.
-
-    Attributes
-    ----------
-    repeated_frames
-        Frames that were explained again for the stability.
-    noise_sd
-        Camera noise that was added for it, in grey levels.
-    """
+    """What the eye judges of maps, by method."""
 
     input: str
     source: str
     frames: int
     repeated_frames: int
+    """Frames that were explained again for the stability."""
     noise_sd: float
+    """Camera noise that was added for it, in grey levels."""
     methods: dict[str, MapMeasures]
     comparisons: tuple[Roughness, ...]
 
@@ -270,27 +251,19 @@ class Timing:
 
 @dataclass(frozen=True, kw_only=True)
 class Localisation:
-    """Where a method's relevance lies, and how well it ranks the markers as the network and the true margin do.
-
-    Attributes
-    ----------
-    mass, rank
-        Share of the relevance, and of its strongest pixels, by `REGIONS`.
-    spearman_network, spearman_margin
-        Mean rank correlation, marker by marker, with the effects on the answer and on the true margin.
-    network, margin
-        The two with their intervals.
-    edges
-        Mass on the edges of markers less the share of the image that they cover.
-    """
+    """Where a method's relevance lies, and how well it ranks the markers as the network and the true margin do."""
 
     mass: dict[str, float | None]
     rank: dict[str, float | None]
+    """Share of the relevance, and of its strongest pixels, by `REGIONS`."""
     spearman_network: float | None
     spearman_margin: float | None
+    """Mean rank correlation, marker by marker, with the effects on the answer and on the true margin."""
     network: Difference | None
     margin: Difference | None
+    """The two with their intervals."""
     edges: Difference | None
+    """Mass on the edges of markers less the share of the image that they cover."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -315,17 +288,7 @@ class MetaTest(OracleTest):
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerEffects(Columns):
-    """What putting one marker back does to the network's answer and to the true margin, a row a marker and frame.
-
-    Attributes
-    ----------
-    x_px, y_px
-        Place in pixels of the network's input.
-    network, margin
-        Answer and best reading as they are less those with the marker put back, in margin units.
-    state
-        Slips (1), sticks (2), or lies outside of the contact (0).
-    """
+    """What putting one marker back does to the network's answer and to the true margin, a row a marker and frame."""
 
     frame_id: Shaped[np.ndarray, " rows"]
     trial: Shaped[np.ndarray, " rows"]
@@ -333,36 +296,32 @@ class MarkerEffects(Columns):
     marker: Int64[np.ndarray, " rows"]
     x_px: Float64[np.ndarray, " rows"]
     y_px: Float64[np.ndarray, " rows"]
+    """Place in pixels of the network's input."""
     network: Float64[np.ndarray, " rows"]
     margin: Float64[np.ndarray, " rows"]
+    """Answer and best reading as they are less those with the marker put back, in margin units."""
     state: Int64[np.ndarray, " rows"]
+    """Slips (1), sticks (2), or lies outside of the contact (0)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Truth:
-    """What a network should have looked at, which only a simulation tells.
-
-    Attributes
-    ----------
-    areas
-        Share of the image that each of `REGIONS` covers, None where no frame has it.
-    network_against_margin
-        Rank correlation of the effects on the answer with those on the best reading of the margin.
-    network_maps, margin_maps
-        `effects` painted on the markers, a map a frame.
-    """
+    """What a network should have looked at, which only a simulation tells."""
 
     input: str
     source: str
     frames: int
     areas: dict[str, float | None]
+    """Share of the image that each of `REGIONS` covers, None where no frame has it."""
     methods: dict[str, Localisation]
     network_against_margin: Difference | None
+    """Rank correlation of the effects on the answer with those on the best reading of the margin."""
     meta: tuple[MetaTest, ...]
     summary: str
     effects: MarkerEffects
     network_maps: Float32[np.ndarray, "frames size size"]
     margin_maps: Float32[np.ndarray, "frames size size"]
+    """`effects` painted on the markers, a map a frame."""
 
     def __post_init__(self) -> None:
         """Hold the maps against the frames."""
@@ -382,18 +341,12 @@ _Test = Remedies | RemovalScores | Randomisation | MapQuality | Timing | Truth
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """A study, stage by stage; tables are by input, and empty where a stage was not run.
-
-    Attributes
-    ----------
-    folder
-        Workspace that holds the stages.
-    scratch
-        Keeps a temporary workspace as long as the study lives.
-    """
+    """A study, stage by stage; tables are by input, and empty where a stage was not run."""
 
     folder: Path = Path()
+    """Workspace that holds the stages."""
     scratch: TemporaryDirectory[str] | None = field(default=None, repr=False, compare=False)
+    """Keeps a temporary workspace as long as the study lives."""
     evaluations: dict[str, Evaluation] = field(default_factory=dict)
     choice: Choice | None = None
     states: States | None = None

@@ -27,27 +27,19 @@ _LABEL = re.compile(r"_(0|[1-9]\d?|100)$")
 
 @dataclass(frozen=True, kw_only=True)
 class ChosenFrames:
-    """Frames to explain, compared and resized but still in 8 bits, so that they can be stored exactly.
-
-    Attributes
-    ----------
-    images
-        Resized network inputs before normalisation.
-    references
-        What each explanation is measured against: the untouched sensor, in [0, 1].
-    safety_margin
-        Labels; NaN where a frame has none.
-    source
-        "simulated", or "real": a recorded data set or a folder of images.
-    """
+    """Frames to explain, compared and resized but still in 8 bits, so that they can be stored exactly."""
 
     ids: tuple[str, ...]
     trial: tuple[str, ...]
     condition: tuple[str, ...]
     safety_margin: Float32[np.ndarray, " frames"]
+    """Labels; NaN where a frame has none."""
     images: UInt8[Tensor, "frames 3 size size"]
+    """Resized network inputs before normalisation."""
     references: Float32[Tensor, "frames 3 size size"]
+    """What each explanation is measured against: the untouched sensor, in [0, 1]."""
     source: str
+    """Either "simulated" or "real": a recorded data set or a folder of images."""
 
 
 def frames_from_dataset(

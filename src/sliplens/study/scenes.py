@@ -42,29 +42,20 @@ class StagedFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class Places:
-    """Where the network sees what moves, in pixels of its input.
-
-    Attributes
-    ----------
-    units
-        For each pixel which of the frame's `markers` covers it, where it is or where it was, its rim included: its
-        place among them, or their number where there is none.
-    markers, edges
-        All markers in the image, those at its border too: their areas, and their rims alone.
-    slip_annulus
-        Where the skin slips over the object.
-    now_px
-        Where the frame's `markers` are, as x, y.
-    state
-        Whether each of them slips (1), sticks (2), or lies outside of the contact (0).
-    """
+    """Where the network sees what moves, in pixels of its input."""
 
     units: Units
+    """For each pixel which of the frame's `markers` covers it, where it is or where it was, its rim included: its place
+    among them, or their number where there is none."""
     markers: Bool[np.ndarray, "size size"]
     edges: Bool[np.ndarray, "size size"]
+    """All markers in the image, those at its border too: their areas, and their rims alone."""
     slip_annulus: Bool[np.ndarray, "size size"]
+    """Where the skin slips over the object."""
     now_px: Float[np.ndarray, "markers 2"]
+    """Where the frame's `markers` are, as x, y."""
     state: Int[np.ndarray, " markers"]
+    """Whether each of them slips (1), sticks (2), or lies outside of the contact (0)."""
 
     def paint(self, values: Float[np.ndarray, " markers"]) -> Float[np.ndarray, "size size"]:
         """Map with one value on each marker, 0 elsewhere."""

@@ -47,25 +47,17 @@ Maps = Float[np.ndarray, "frames size size"]
 
 @dataclass(frozen=True, kw_only=True)
 class FrameEffects:
-    """What each marker of a frame does, in margin units: the value as it is less the value with the marker put back.
-
-    Attributes
-    ----------
-    network
-        Of the network's answer.
-    margin
-        Of the margin as the best reader of markers reads it (`simulation.best_reading`).
-    shuffled
-        The network's, those of half of the markers shuffled: an oracle that is half wrong.
-    gains
-        Symmetric gain, under each fill, of the map that has `network` and of the one that has `shuffled`: a row for
-        changes by their size, as `Faithfulness` has them, and one for changes counted towards the target.
-    """
+    """What each marker of a frame does, in margin units: the value as it is less the value with the marker put back."""
 
     network: Float64[np.ndarray, " markers"]
+    """Of the network's answer."""
     margin: Float64[np.ndarray, " markers"]
+    """Of the margin as the best reader of markers reads it (`simulation.best_reading`)."""
     shuffled: Float64[np.ndarray, " markers"]
+    """The network's, those of half of the markers shuffled: an oracle that is half wrong."""
     gains: dict[str, Float64[np.ndarray, "2 2"]]
+    """Symmetric gain, under each fill, of the map that has `network` and of the one that has `shuffled`: a row for
+    changes by their size, as `Faithfulness` has them, and one for changes counted towards the target."""
 
 
 def network_effects(predict: Predict, redraw: Redraw, image: int, *, markers: int) -> Float[np.ndarray, " markers"]:

@@ -29,34 +29,25 @@ from sliplens.recordings.dataset import count_labelled, trial_path
 class Augmentation:
     """Slight rotations and shifts, colour, Gaussian noise and Gaussian blur, drawn for each image.
 
-    Parameters
-    ----------
-    rotation_deg
-        Rotations are uniform within plus and minus this: the pull is never exactly along gravity.
-    shift
-        Shifts along x and y are uniform within plus and minus this share of the image: a camera never sits twice alike,
-        and a network must not know a day by its place.
-    colour
-        Each channel is scaled by 1 plus or minus up to this: white balance.
-    noise_sd
-        Standard deviation of the noise is uniform in [0, noise_sd], in units of the image's maximum.
-    neutral
-        What stands for no change in the input; `colour` scales about it.
-    blur_probability, blur_sd_px
-        Share of batches that are blurred, and the largest standard deviation of the blur in pixels.
-
     References
     ----------
     Polak, section 4 ("random image augmentations": rotation, noise and blur; shift and colour are ours).
     """
 
     rotation_deg: float = 5.0
+    """Rotations are uniform within plus and minus this: the pull is never exactly along gravity."""
     shift: float = 0.015
+    """Shifts along x and y are uniform within plus and minus this share of the image: a camera never sits twice alike,
+    and a network must not know a day by its place."""
     colour: float = 0.05
+    """Each channel is scaled by 1 plus or minus up to this: white balance."""
     noise_sd: float = 0.03
+    """Standard deviation of the noise is uniform in [0, noise_sd], in units of the image's maximum."""
     blur_probability: float = 0.25
     blur_sd_px: float = 0.8
+    """Share of batches that are blurred, and the largest standard deviation of the blur in pixels."""
     neutral: float = 0.0
+    """What stands for no change in the input; `colour` scales about it."""
 
     def __call__(
         self, images: Float[Tensor, "batch 3 size size"], *, generator: torch.Generator
@@ -108,26 +99,19 @@ UNTOUCHED = -1
 
 @dataclass(frozen=True, kw_only=True)
 class FrameSet(TorchDataset):
-    """Resized 8-bit inputs with their labels; a batch is indexed at once, not frame by frame.
-
-    Attributes
-    ----------
-    images
-        Compared and resized frames, uint8, as `Encoding.resize` returns them.
-    safety_margin
-        Labels in [0, 1].
-    trial, frame, condition, day, time_s
-        Where each row comes from, for tables by trial, condition and day.
-    """
+    """Resized 8-bit inputs with their labels; a batch is indexed at once, not frame by frame."""
 
     encoding: Encoding
     images: UInt8[Tensor, "frames 3 size size"]
+    """Compared and resized frames, uint8, as `Encoding.resize` returns them."""
     safety_margin: Float32[Tensor, " frames"]
+    """Labels in [0, 1]."""
     trial: tuple[str, ...]
     frame: tuple[int, ...]
     condition: tuple[str, ...]
     day: tuple[int, ...]
     time_s: Float[np.ndarray, " frames"]
+    """Where each row comes from, for tables by trial, condition and day."""
 
     def __len__(self) -> int:
         """Count the frames."""
