@@ -106,7 +106,11 @@ def test_frames_and_data_at_once(
 @pytest.mark.parametrize(
     ("name", "pixels", "message"),
     [
-        ("a_20.png", np.zeros((50, 48, 3), np.uint8), "are 50 x 48 pixels but the network was trained on 48 x 48"),
+        (
+            "a_20.png",
+            np.zeros((50, 48, 3), np.uint8),
+            "frames such as a_20.png are 50 x 48 pixels but the network was",
+        ),
         ("a_20.png", np.zeros((48, 48, 4), np.uint8), "a_20.png has 4 channels (alpha)"),
         ("a_20.tiff", np.zeros((48, 48), np.uint16), "a_20.tiff has 16 bits a pixel"),
     ],

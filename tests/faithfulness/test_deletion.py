@@ -11,7 +11,6 @@ from sliplens.faithfulness import (
     deletion_score,
     get_fill,
     random_order,
-    summarise_deletion,
 )
 from sliplens.faithfulness.deletion import deletion_steps, saliency_orders
 
@@ -79,14 +78,6 @@ def test_the_chunk_size_does_not_change_the_curve(rng: np.random.Generator):
         deletion_curves(mean_of_pixels, images, orders, fill=get_fill("grey"), batch_size=size) for size in (3, 128)
     )
     np.testing.assert_allclose(small.predictions, large.predictions, atol=1e-6)
-
-
-def test_the_summary_uses_the_population_standard_deviation():
-    summary = summarise_deletion(np.array([0.1, 0.3]))
-    assert summary.mean == pytest.approx(0.2)
-    assert summary.sd == pytest.approx(0.1)
-    with pytest.raises(InputError, match="no deletion curve to summarise"):
-        summarise_deletion(np.array([]))
 
 
 def test_a_map_of_another_shape_is_refused():

@@ -70,7 +70,8 @@ def test_camera_frames_with_a_reference_give_the_same(difference: TrainedModel, 
 
 def test_a_raw_network_needs_the_untouched_sensor(raw: TrainedModel, difference_folder: Path):
     with pytest.raises(
-        InputError, match="a network on raw images needs the untouched sensor; give it with --reference"
+        InputError,
+        match="a network on raw images needs the untouched sensor; give it as reference, on the command line",
     ):
         frames_from_folder(raw, difference_folder)
 
@@ -86,7 +87,7 @@ def test_a_name_without_a_label_is_refused_when_labels_are_asked_for(
 
 def test_images_of_another_size_are_refused(difference: TrainedModel, tmp_path: Path):
     write_png(tmp_path / "a.png", np.zeros((50, 48, 3), np.uint8))
-    with pytest.raises(ImageError, match="frames are 50 x 48 pixels"):
+    with pytest.raises(ImageError, match=r"frames such as \S+\.png are 50 x 48 pixels"):
         frames_from_folder(difference, tmp_path)
 
 

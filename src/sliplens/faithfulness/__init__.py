@@ -2,12 +2,10 @@
 
 from sliplens.faithfulness.deletion import (
     DeletionCurves,
-    DeletionSummary,
     deletion_curves,
     deletion_order,
     deletion_score,
     random_order,
-    summarise_deletion,
 )
 from sliplens.faithfulness.fills import FILLS, get_fill
 from sliplens.faithfulness.removal import Faithfulness, RemovalCurves, removal_curves
@@ -16,7 +14,6 @@ from sliplens.faithfulness.scoring import score, score_by_deletion
 __all__ = [
     "FILLS",
     "DeletionCurves",
-    "DeletionSummary",
     "Faithfulness",
     "RemovalCurves",
     "deletion_curves",
@@ -27,5 +24,4 @@ __all__ = [
     "removal_curves",
     "score",
     "score_by_deletion",
-    "summarise_deletion",
 ]

@@ -10,7 +10,7 @@ from torch import Tensor
 from sliplens.arrays import require_saliency
 from sliplens.errors import InputError
 from sliplens.faithfulness.fills import Fill
-from sliplens.faithfulness.removal import Predict, Removal, answer_removals, answer_whole
+from sliplens.faithfulness.removal import Predict, removal_curves
 from sliplens.progress import OnProgress
 
 
@@ -56,15 +56,6 @@ class DeletionCurves:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class DeletionSummary:
-    """Mean and population standard deviation of D_AUC over images, as in Table 2 of the thesis."""
-
-    mean: float
-    sd: float
-    images: int
-
-
 def deletion_score(
     base: Float[np.ndarray, "*shape"], masked: Float[np.ndarray, "*shape2"]
 ) -> Float[np.ndarray, "*shape3"]:
@@ -82,26 +73,6 @@ def deletion_score(
     array([1.  , 0.25])
     """
     return (1 - np.abs(base - masked)) ** 2
-
-
-def summarise_deletion(auc: Float[np.ndarray, " images"]) -> DeletionSummary:
-    """Mean and population standard deviation of D_AUC over images.
-
-    Raises
-    ------
-    InputError
-        If there is no image.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from sliplens.faithfulness import summarise_deletion
-    >>> summarise_deletion(np.array([0.25, 0.75]))
-    DeletionSummary(mean=0.5, sd=0.25, images=2)
-    """
-    if len(auc) == 0:
-        raise InputError("there is no deletion curve to summarise; explain and score some frames first")
-    return DeletionSummary(mean=float(np.mean(auc)), sd=float(np.std(auc)), images=len(auc))
 
 
 def deletion_order(saliency: Float[np.ndarray, "height width"]) -> Int[np.ndarray, " pixels"]:
@@ -184,34 +155,23 @@ def deletion_curves(
     >>> curves.predictions
     array([[0.25, 0.  , 0.  , 0.  ]])
     """
-    shape = (images.shape[-2], images.shape[-1])
-    removed = deletion_steps(shape, steps=steps)
-    steps = len(removed)
-    answers = answer_removals(
+    removed = deletion_steps((images.shape[-2], images.shape[-1]), steps=steps)
+    curves = removal_curves(
         predict,
-        fill(images, references, seed),
-        [
-            Removal(image=index, order=order, pixels=int(count))
-            for index, order in enumerate(orders)
-            for count in removed
-        ],
-        shape=shape,
-        device=images.device,
+        images,
+        orders[None],
+        fill=fill,
+        references=references,
+        areas=[0.0, *removed / removed[-1]],
+        seed=seed,
         batch_size=batch_size,
         on_progress=on_progress,
     )
-    return DeletionCurves(
-        pixels_removed=removed,
-        base=answer_whole(predict, images, batch_size=batch_size),
-        predictions=answers.reshape(len(images), steps),
-    )
+    answers = curves.answers[0]
+    return DeletionCurves(pixels_removed=removed, base=answers[:, 0], predictions=answers[:, 1:])
 
 
 def saliency_orders(saliency: Float[np.ndarray, "images height width"], shape: tuple[int, int]) -> np.ndarray:
     """Deletion orders of several maps."""
-    return np.stack(
-        [
-            deletion_order(require_saliency(each, shape, where=f"saliency map {index}"))
-            for index, each in enumerate(saliency)
-        ]
-    )
+    maps = [require_saliency(each, shape, where=f"saliency map {index}") for index, each in enumerate(saliency)]
+    return np.stack([deletion_order(each) for each in maps])

@@ -90,7 +90,7 @@ class TrainedModel:
             return self.encoding.normalise(self.encoding.resize(frames, image_size=size))
         return self.encoding.encode(frames, reference, image_size=size)
 
-    def require_frame_size(self, size: tuple[int, ...]) -> None:
+    def require_frame_size(self, size: tuple[int, ...], *, what: str = "frames") -> None:
         """Refuse frames of another sensor.
 
         Raises
@@ -100,7 +100,7 @@ class TrainedModel:
         """
         if tuple(size) != tuple(self.manifest.frame_size):
             raise ImageError(
-                f"frames are {size[0]} x {size[1]} pixels but the network was trained on "
+                f"{what} are {size[0]} x {size[1]} pixels but the network was trained on "
                 f"{self.manifest.frame_size[0]} x {self.manifest.frame_size[1]}; use frames of the same sensor"
             )
 

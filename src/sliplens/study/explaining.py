@@ -13,6 +13,7 @@ from torch import Tensor
 from sliplens.codec import keep_part
 from sliplens.errors import InputError, RecordingError
 from sliplens.explainers import EXPLAINERS, Explainer
+from sliplens.explainers.table import network_images
 from sliplens.models import TrainedModel
 from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset
@@ -88,11 +89,9 @@ def frames_at(trained: TrainedModel, data: Dataset, rows: Mapping[str, Sequence[
         if trial not in infos:
             raise RecordingError(f"{data.folder} has no trial {trial}; use the data set that the frames came from")
         recording = data.load(infos[trial], truth=False)
-        trained.require_frame_size(recording.reference.shape[:2])
         chosen = list(frames)
-        compared = trained.encoding.compare(recording.frames[chosen], recording.reference)
-        images.append(trained.encoding.resize(compared, image_size=trained.manifest.image_size))
-        empty = trained.encoding.empty(recording.reference, image_size=trained.manifest.image_size)
+        inputs, empty = network_images(trained, recording.frames[chosen], recording.reference)
+        images.append(inputs)
         references.append(empty.expand(len(chosen), -1, -1, -1))
         labels.append(np.where(recording.labelled, recording.safety_margin, np.nan)[chosen])
         names += [(f"{trial}-f{row:04d}", trial, recording.condition) for row in chosen]
@@ -142,22 +141,12 @@ def frames_from_folder(
     ImageError
         If an image cannot be read, or has another size or kind of pixels.
     """
-    image_size, parts = trained.manifest.image_size, []
+    parts = []
     for trial in open_source(folder, reference=reference):
-        trained.require_frame_size(trial.frame_size)
-        frames = np.stack(list(trial.read_frames()))
-        if trial.read_reference is not None:
-            untouched = trial.read_reference()
-            frames = trained.encoding.compare(frames, untouched)
-            empty = trained.encoding.empty(untouched, image_size=image_size)
-        elif trained.encoding.empty_is_black:
-            empty = torch.zeros(3, image_size, image_size)
-        else:
-            raise InputError(
-                f"a network on {trained.encoding.name} images needs the untouched sensor; give it with "
-                "--reference IMAGE"
-            )
         names = trial.files or [f"{trial.name}-f{number:04d}" for number in range(trial.frames)]
+        trained.require_frame_size(trial.frame_size, what=f"frames such as {names[0]}")
+        untouched = None if trial.read_reference is None else trial.read_reference()
+        images, empty = network_images(trained, np.stack(list(trial.read_frames())), untouched)
         labels = np.full(trial.frames, np.nan) if trial.safety_margin is None else trial.safety_margin
         if labels_in_names:
             labels = np.array([_label(folder / name) for name in names])
@@ -167,7 +156,7 @@ def frames_from_folder(
                 trial=(folder.name if trial.files else trial.name,) * trial.frames,
                 condition=("unknown",) * trial.frames,
                 safety_margin=labels.astype(np.float32),
-                images=trained.encoding.resize(frames, image_size=image_size),
+                images=images,
                 references=empty.expand(trial.frames, -1, -1, -1).clone(),
                 source="real",
             )

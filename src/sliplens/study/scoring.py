@@ -13,7 +13,6 @@ from sliplens.faithfulness import (
     deletion_score,
     get_fill,
     random_order,
-    summarise_deletion,
 )
 from sliplens.faithfulness.alarms import fill_decides, flat_maps, follows_last_step, saturated
 from sliplens.faithfulness.deletion import deletion_steps, saliency_orders
@@ -221,9 +220,10 @@ def _split(curves: DeletionCurves) -> list[_Curve]:
 
 
 def _score(curves: Sequence[_Curve]) -> MethodScore:
-    summary = summarise_deletion(np.array([curve.scores.mean() for curve in curves]))
-    last = float(np.mean([curve.scores[-1] for curve in curves]))
-    return MethodScore(mean=summary.mean, sd=summary.sd, last_step_mean=last, frames=summary.images)
+    auc, last = np.array([(curve.scores.mean(), curve.scores[-1]) for curve in curves]).T
+    return MethodScore(
+        mean=float(auc.mean()), sd=float(auc.std()), last_step_mean=float(last.mean()), frames=len(curves)
+    )
 
 
 def _stopped(grey: DeletionScores, explained: Explained) -> _Curves:
