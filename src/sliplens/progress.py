@@ -4,13 +4,14 @@ Whatever takes long takes `on_progress`, called with how many are done and how m
 also names them where the callback can show that (`Stages`), as the command line's can.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Protocol, TypeAlias, runtime_checkable
+from typing import Protocol, TypeAlias, TypeVar, runtime_checkable
 
 OnProgress: TypeAlias = Callable[[int, int], None]
 """Takes how many are done, and how many there are."""
+Item = TypeVar("Item")
 
 
 @runtime_checkable
@@ -71,8 +72,16 @@ def continued(on_progress: OnProgress | None, *, before: int, total: int) -> OnP
     return None if on_progress is None else lambda done, _: on_progress(before + done, total)
 
 
+def counted(items: Collection[Item], on_progress: OnProgress | None) -> Iterator[Item]:
+    """Give items one by one; each counts as done when the next is asked for."""
+    for done, item in enumerate(items, start=1):
+        yield item
+        if on_progress is not None:
+            on_progress(done, len(items))
+
+
 def _ignore(done: int, total: int) -> None:
     """Show nothing."""
 
 
-__all__ = ["OnProgress", "Stages", "continued", "note", "stage", "wrote"]
+__all__ = ["OnProgress", "Stages", "continued", "counted", "note", "stage", "wrote"]

@@ -6,7 +6,7 @@ import numpy as np
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.models import TrainedModel
-from sliplens.progress import OnProgress
+from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
 from sliplens.results.study import Choice, ChosenFrame, ChosenTrial
 from sliplens.study.explaining import DEFAULT_LEVELS, nearest_frame
@@ -53,7 +53,7 @@ def choose_frames(
     _check(networks, trials=trials, tolerance=tolerance, levels=levels, scored_levels=scored_levels)
     infos = data.select(split=split, condition=condition)
     candidates: list[tuple[ChosenTrial, list[tuple[int, float]]]] = []
-    for number, info in enumerate(infos, start=1):
+    for info in counted(infos, on_progress):
         recording = data.load(info, truth=False)
         margin = np.where(recording.labelled, recording.safety_margin, np.nan)
         rows = [nearest_frame(margin, level) for level in levels] if np.isfinite(margin).any() else []
@@ -65,8 +65,6 @@ def choose_frames(
                 worst[name] = float(np.abs(answers - margin[rows]).max())
             trial = ChosenTrial(trial=info.trial, qualified=max(worst.values()) <= tolerance, worst_error=worst)
             candidates.append((trial, [(row, float(margin[row])) for row in rows]))
-        if on_progress is not None:
-            on_progress(number, len(infos))
     if not candidates:
         raise RecordingError(
             f"none of the {len(infos)} {condition} trials of split {split!r} has a labelled frame within {_REACH:.0%} "

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from sliplens.errors import InputError, RecordingError
 from sliplens.explainers import EXPLAINERS, Explainer
 from sliplens.explainers.table import network_images
 from sliplens.models import TrainedModel
-from sliplens.progress import OnProgress
+from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
 from sliplens.recordings.source import open_source
 from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
@@ -246,13 +247,9 @@ def explain_frames(
         )
 
     maps: dict[str, list[_Map]] = {method: [] for method in methods}
-    total = len(methods) * len(inputs)
-    for done in range(total):
-        method, index = methods[done // len(inputs)], done % len(inputs)
+    for method, index in counted(list(product(methods, range(len(inputs)))), on_progress):
         part = None if parts is None else parts / f"{method}-{index:05d}"
         maps[method].append(keep_part(part, _Map, lambda method=method, index=index: explain(method, index)))
-        if on_progress is not None:
-            on_progress(done + 1, total)
     # the same answers for every method: asked once, on all frames
     predictions, untouched = trained.predict(inputs).tolist(), trained.predict(chosen.references).tolist()
     return Explained(

@@ -12,7 +12,7 @@ from sliplens.explainers import Explainer
 from sliplens.faithfulness.map_quality import gini, resolution, stability, total_variation
 from sliplens.intervals import paired_difference
 from sliplens.models import TrainedModel
-from sliplens.progress import OnProgress
+from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
 from sliplens.results.study import ChosenFrame, MapMeasures, MapQuality, Roughness
 from sliplens.study.explaining import mean_of_known
@@ -39,7 +39,7 @@ def measure_maps(
     noisy, following, noise_sd = _once_more(material.trained, data, material.chosen[:repeated], rng=rng)
     references = material.references[:repeated]
     methods, roughness = {}, {}
-    for number, (name, explainer) in enumerate(material.explainers.items(), start=1):
+    for name, explainer in counted(material.explainers.items(), on_progress):
 
         def again(images: Tensor, explainer: Explainer = explainer) -> Float[np.ndarray, "repeated height width"]:
             return explainer(material.trained.model, images, reference=references).relevance.double().cpu().numpy()
@@ -59,8 +59,6 @@ def measure_maps(
             noise_stability=mean_of_known(stability(before, again(noisy))),
             frame_stability=mean_of_known(stability(before, again(following))),
         )
-        if on_progress is not None:
-            on_progress(number, len(material.explainers))
     return MapQuality(
         input=explained.input,
         source=explained.source,

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from sliplens.explainers import Explainer, Explanation, IntegratedGradients, PolyCam
 from sliplens.faithfulness.randomisation import cascade, histogram_entropy, randomisation_scores, smooth_maps
-from sliplens.progress import OnProgress
+from sliplens.progress import OnProgress, counted
 from sliplens.results.study import Randomisation, RandomisedMethod, UntrainedMaps
 from sliplens.study.explaining import mean_of_known
 from sliplens.study.material import Material
@@ -39,7 +39,7 @@ def randomise_weights(
     """
     inputs, references = material.inputs[:frames], material.references[:frames]
     methods, alarms = {}, []
-    for number, (name, whole) in enumerate(material.explainers.items(), start=1):
+    for name, whole in counted(material.explainers.items(), on_progress):
         explainer = _shortened(whole)
 
         def explain(model: nn.Module, images: Tensor, explainer: Explainer = explainer) -> Maps:
@@ -69,8 +69,6 @@ def randomise_weights(
                 f"{name} still correlates by {similarity[-1]:.2f} with its maps when all weights are new: it shows the "
                 "image rather than what the network learned"
             )
-        if on_progress is not None:
-            on_progress(number, len(material.explainers))
     return Randomisation(
         input=material.explained.input,
         source=material.explained.source,
@@ -107,11 +105,9 @@ def explain_untrained(
     """Explain the network with all weights drawn anew: a control that every map has to beat."""
     model = _untrained(material.trained.model, material.inputs, seed=seed)
     maps = []
-    for index in range(len(material.inputs)):
+    for index in counted(range(len(material.inputs)), on_progress):
         frame = slice(index, index + 1)
         maps.append(_influence(explainer(model, material.inputs[frame], reference=material.references[frame]))[0])
-        if on_progress is not None:
-            on_progress(index + 1, len(material.inputs))
     return UntrainedMaps(
         input=material.explained.input, source=material.explained.source, maps=np.stack(maps).astype(np.float64)
     )

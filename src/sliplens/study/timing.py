@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sliplens.progress import OnProgress
+from sliplens.progress import OnProgress, counted
 from sliplens.results.study import MethodTime, Timing
 from sliplens.study.material import Material, as_the_thesis_ran
 
@@ -15,19 +15,14 @@ _REPEATS, _SLOW_REPEATS, _SLOW_S = 5, 3, 3.0
 
 
 def time_explainers(material: Material, *, on_progress: OnProgress | None = None) -> Timing:
-    """Time each method on one frame: the median and the extremes of a few runs.
+    """Time each method on the first frame: the median and the extremes of a few runs.
 
     The thesis's Poly-CAM is timed with all its channels, as it was run, even where a budget makes its maps.
-
-    Parameters
-    ----------
-    material
-        The network, frames (the first is timed) and methods.
     """
     model, inputs, references = material.trained.model, material.inputs[:1], material.references[:1]
     forward = float(np.median(_seconds(lambda: material.trained.predict(inputs))))
     methods, counts = {}, []
-    for number, (name, explainer) in enumerate(as_the_thesis_ran(material.explainers).items(), start=1):
+    for name, explainer in counted(as_the_thesis_ran(material.explainers).items(), on_progress):
         seconds = _seconds(lambda explainer=explainer: explainer(model, inputs, reference=references).relevance)
         median = float(np.median(seconds))
         counts.append(len(seconds))
@@ -35,8 +30,6 @@ def time_explainers(material: Material, *, on_progress: OnProgress | None = None
         methods[name] = MethodTime(
             seconds=median, seconds_without_forward=max(0.0, median - forward), low=min(seconds), high=max(seconds)
         )
-        if on_progress is not None:
-            on_progress(number, len(material.explainers))
     return Timing(
         input=material.explained.input,
         source=material.explained.source,

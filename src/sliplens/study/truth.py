@@ -2,12 +2,12 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float64
 from scipy.stats import spearmanr
-from torch import Tensor
 
 from sliplens.codec import keep_part
 from sliplens.faithfulness import get_fill
@@ -15,17 +15,16 @@ from sliplens.faithfulness.localisation import relevance_mass, relevance_rank
 from sliplens.faithfulness.removal import (
     RANDOM_ORDERS,
     Faithfulness,
-    Predict,
     RemovalCurves,
     answer_whole,
     removal_curves,
 )
 from sliplens.faithfulness.scoring import prepare_passes
-from sliplens.faithfulness.true_fill import SHARES, Redraw, influence_orders, marker_curves, score_maps_by_marker
+from sliplens.faithfulness.true_fill import SHARES, influence_orders, marker_curves, score_maps_by_marker
 from sliplens.faithfulness.units import unit_means, unit_order
 from sliplens.intervals import Difference, paired_difference
 from sliplens.models import TrainedModel
-from sliplens.progress import OnProgress
+from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
 from sliplens.results.explanation import Explained
 from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTest, OracleTest, Truth
@@ -60,72 +59,12 @@ class FrameEffects:
     changes by their size, as `Faithfulness` has them, and one for changes counted towards the target."""
 
 
-def network_effects(predict: Predict, redraw: Redraw, image: int, *, markers: int) -> Float[np.ndarray, " markers"]:
-    """What the network's answer loses when each marker alone is put back, in margin units."""
-    # the whole image first
-    back = np.eye(markers + 1, markers, k=-1, dtype=bool)
-    answers = answer_whole(predict, redraw(image, back), batch_size=64)
-    return answers[0] - answers[1:]
-
-
 def shuffle_half(values: Float[np.ndarray, " markers"], *, rng: np.random.Generator) -> Float[np.ndarray, " markers"]:
     """Shuffle the values of half of the markers among themselves."""
     chosen = rng.permutation(len(values))[: len(values) // 2]
     shuffled = values.copy()
     shuffled[chosen] = values[rng.permutation(chosen)]
     return shuffled
-
-
-def find_effects(
-    predict: Predict,
-    redraw: Redraw,
-    image: int,
-    frame: StagedFrame,
-    places: Places,
-    *,
-    inputs: Float[Tensor, "1 3 size size"],
-    references: Float[Tensor, "1 3 size size"],
-    towards: float,
-    fills: Sequence[str],
-    rng: np.random.Generator,
-) -> FrameEffects:
-    """Put every marker of a frame back, and see which fills can tell a map that knows its effects from half of one.
-
-    Parameters
-    ----------
-    inputs, references
-        The frame as the network gets it, and the untouched sensor.
-    towards
-        Sign of the answer's change from the untouched sensor: what works towards it goes first.
-    fills
-        Names of fills; the true one is always there.
-    """
-    network = network_effects(predict, redraw, image, markers=len(frame.markers))
-    shuffled = shuffle_half(network, rng=rng)
-    known = [towards * network, towards * shuffled]
-    orders = [
-        unit_order(places.paint(one), places.units, least_first=least) for one in known for least in (False, True)
-    ]
-    curves = {
-        name: removal_curves(
-            predict,
-            inputs,
-            np.stack(orders)[:, None],
-            fill=get_fill(name),
-            references=references,
-            areas=SHARES,
-        )
-        for name in fills
-    }
-    curves[TRUE_FILL] = marker_curves(
-        predict, lambda _, back: redraw(image, back), np.concatenate([influence_orders(one[None]) for one in known])
-    )
-    return FrameEffects(
-        network=network,
-        margin=marker_readings(frame.scene, frame.number)[1],
-        shuffled=shuffled,
-        gains={name: _gains(own, towards) for name, own in curves.items()},
-    )
 
 
 def _gains(curves: RemovalCurves, towards: float) -> Float[np.ndarray, "2 2"]:
@@ -144,30 +83,14 @@ def marker_means(maps: Maps, places: Sequence[Places]) -> list[Float[np.ndarray,
     ]
 
 
-def covered_shares(places: Sequence[Places]) -> dict[str, float | None]:
-    """Share of the image that each region covers, mean over the frames that have it: the mass of a map of chance."""
-    shares = {region: np.array([getattr(own, region).mean() for own in places]) for region in REGIONS}
-    return {region: mean_of_known(values[values > 0]) for region, values in shares.items()}
-
-
-def localise(maps: Maps, places: Sequence[Places], measure: Callable[..., float]) -> dict[str, float | None]:
-    """Mass or rank of the positive part of maps in each region, mean over the frames that have the region."""
-    positive = np.clip(maps.astype(np.float64), 0, None)
-    means = {}
-    for region in REGIONS:
-        truths = [getattr(own, region) for own in places]
-        # where nothing slips there is nothing to find
-        pairs = [(values, truth) for values, truth in zip(positive, truths, strict=True) if truth.any()]
-        means[region] = mean_of_known(np.array([measure(values, truth) for values, truth in pairs]))
-    return means
-
-
-def edges_over_chance(maps: Maps, places: Sequence[Places]) -> Float[np.ndarray, " frames"]:
-    """Mass of the positive part of each map on the edges of markers, less the share of the image that they cover."""
-    positive = np.clip(maps.astype(np.float64), 0, None)
-    return np.array(
-        [relevance_mass(values, own.edges) - own.edges.mean() for values, own in zip(positive, places, strict=True)]
-    )
+def _by_region(places: Sequence[Places], measure: Callable[[int, np.ndarray], float]) -> dict[str, float | None]:
+    """Means over the frames that have the region: where nothing slips there is nothing to find."""
+    return {
+        region: mean_of_known(
+            np.array([measure(at, own) for at, own in enumerate(getattr(one, region) for one in places) if own.any()])
+        )
+        for region in REGIONS
+    }
 
 
 def rank_correlation(first: Float[np.ndarray, " markers"], second: Float[np.ndarray, " markers"]) -> float:
@@ -264,7 +187,7 @@ def judge_by_truth(
     for fill in fills:
         get_fill(fill)
     frames, places = _stage(trained, explained, data, recipe=recipe)
-    effects = _find_all_effects(
+    effects = _find_effects(
         trained, explained, frames, places, fills=fills, seed=seed, parts=parts, on_progress=on_progress
     )
     size, towards = trained.manifest.image_size, explained.towards
@@ -280,7 +203,8 @@ def judge_by_truth(
         input=explained.input,
         source=explained.source,
         frames=len(frames),
-        areas=covered_shares(places),
+        # the mass of a map of chance
+        areas=_by_region(places, lambda _, region: float(region.mean())),
         methods={name: _judge(values, places, effects, trials, seed=seed) for name, values in judged.items()},
         network_against_margin=agreement,
         meta=meta,
@@ -294,19 +218,20 @@ def judge_by_truth(
 def _judge(
     maps: Maps, places: Sequence[Places], effects: Sequence[FrameEffects], trials: np.ndarray, *, seed: int
 ) -> Localisation:
-    means = marker_means(maps, places)
+    means, positive = marker_means(maps, places), np.clip(maps.astype(np.float64), 0, None)
+    edges = [relevance_mass(own, place.edges) - place.edges.mean() for own, place in zip(positive, places, strict=True)]
     network, margin = (
         np.array([rank_correlation(values, truth) for values, truth in zip(means, truths, strict=True)])
         for truths in ([own.network for own in effects], [own.margin for own in effects])
     )
     return Localisation(
-        mass=localise(maps, places, relevance_mass),
-        rank=localise(maps, places, relevance_rank),
+        mass=_by_region(places, lambda frame, region: relevance_mass(positive[frame], region)),
+        rank=_by_region(places, lambda frame, region: relevance_rank(positive[frame], region)),
         spearman_network=mean_of_known(network),
         spearman_margin=mean_of_known(margin),
         network=mean_interval(network, trials, seed=seed),
         margin=mean_interval(margin, trials, seed=seed),
-        edges=mean_interval(edges_over_chance(maps, places), trials, seed=seed),
+        edges=mean_interval(np.array(edges), trials, seed=seed),
     )
 
 
@@ -373,7 +298,7 @@ def _paint(places: Sequence[Places], values: Sequence[Float[np.ndarray, " marker
     return np.stack([place.paint(own) for place, own in zip(places, values, strict=True)])
 
 
-def _find_all_effects(
+def _find_effects(
     trained: TrainedModel,
     explained: Explained,
     frames: Sequence[StagedFrame],
@@ -384,32 +309,49 @@ def _find_all_effects(
     parts: Path | None,
     on_progress: OnProgress | None,
 ) -> list[FrameEffects]:
-    inputs, towards = network_inputs(trained, explained), explained.towards
+    """Put every marker back, and see which fills can tell a map that knows its effects from half of one."""
+    inputs, redraw = network_inputs(trained, explained), redrawing(trained, frames)
     # each marker alone, and under each fill two maps both ways
     passes = len(frames) * (len(frames[0].markers) + 4 * len(SHARES) * (len(fills) + 1))
     predict = prepare_passes(trained, inputs, passes)
-    redraw = redrawing(trained, frames)
 
     def find(index: int) -> FrameEffects:
-        empty = trained.encoding.empty(frames[index].reference, image_size=trained.manifest.image_size)
-        return find_effects(
-            predict,
-            redraw,
-            index,
-            frames[index],
-            places[index],
-            inputs=inputs[index : index + 1],
-            references=empty[None].to(trained.device),
-            towards=float(towards[index]),
-            fills=fills,
-            # a run that goes on draws the same
-            rng=np.random.default_rng((seed, index)),
+        frame, place, towards = frames[index], places[index], float(explained.towards[index])
+        # the whole image first
+        back = np.eye(len(frame.markers) + 1, len(frame.markers), k=-1, dtype=bool)
+        answers = answer_whole(predict, redraw(index, back), batch_size=64)
+        network = answers[0] - answers[1:]
+        # a run that goes on draws the same
+        shuffled = shuffle_half(network, rng=np.random.default_rng((seed, index)))
+        known = [towards * network, towards * shuffled]
+        orders = [
+            unit_order(place.paint(one), place.units, least_first=least) for one in known for least in (False, True)
+        ]
+        empty = trained.encoding.empty(frame.reference, image_size=trained.manifest.image_size)
+        curves = {
+            name: removal_curves(
+                predict,
+                inputs[index : index + 1],
+                np.stack(orders)[:, None],
+                fill=get_fill(name),
+                references=empty[None].to(trained.device),
+                areas=SHARES,
+            )
+            for name in fills
+        }
+        curves[TRUE_FILL] = marker_curves(
+            predict, lambda _, back: redraw(index, back), np.concatenate([influence_orders(one[None]) for one in known])
+        )
+        return FrameEffects(
+            network=network,
+            margin=marker_readings(frame.scene, frame.number)[1],
+            shuffled=shuffled,
+            gains={name: _gains(own, towards) for name, own in curves.items()},
         )
 
-    effects = []
-    for index in range(len(frames)):
-        part = None if parts is None else parts / f"{index:05d}"
-        effects.append(keep_part(part, FrameEffects, lambda index=index: find(index)))
-        if on_progress is not None:
-            on_progress(index + 1, len(frames))
-    return effects
+    def part(index: int) -> Path | None:
+        return None if parts is None else parts / f"{index:05d}"
+
+    return [
+        keep_part(part(index), FrameEffects, partial(find, index)) for index in counted(range(len(frames)), on_progress)
+    ]

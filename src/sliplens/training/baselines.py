@@ -10,7 +10,7 @@ from jaxtyping import Float
 from sliplens.errors import InputError, RecordingError
 from sliplens.markers import KINDS, MarkerStatus, track_markers
 from sliplens.markers.estimators import FieldTrial, field_trial, get_estimator
-from sliplens.progress import OnProgress
+from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import trial_path
 from sliplens.recordings.store import load_recording, stream_frames
@@ -77,15 +77,13 @@ def evaluate_baselines(
     trials = {info.trial: info for info in (*plan.training, *(info for info in data.trials if info.trial in tested))}
     fields: dict[str, _Followed] = {}
     failed: dict[str, str] = {}
-    for done, info in enumerate(trials.values(), start=1):
+    for info in counted(trials.values(), on_progress):
         try:
             fields[info.trial] = _follow(data, info, plan.markers, folder)
         except RecordingError:
             raise
         except InputError as error:
             failed[info.trial] = str(error)
-        if on_progress is not None:
-            on_progress(done, len(trials))
     fitted = [info for info in plan.training if info.trial in fields]
     for what, usable in (("training", fitted), ("tested", tested - set(failed))):
         if not usable:
