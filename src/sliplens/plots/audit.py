@@ -26,7 +26,7 @@ from sliplens.plots.contact_sheet import (
     choose_margins,
     plot_margin,
 )
-from sliplens.plots.layout import place_axes, place_text, require_picture_path, save_page
+from sliplens.plots.layout import place_axes, place_text, require_picture_path, save_page, write_over
 from sliplens.plots.style import BLACK, BLUE, GREEN, GREY, PURPLE, SKY, VERMILLION, decimals, drawing_style, signed
 from sliplens.progress import OnProgress, stage
 from sliplens.recordings import ContactState, Dataset, Recording
@@ -236,13 +236,13 @@ def plot_labels(recording: Recording, *, ax: Axes) -> None:
     ax.plot(time_s, np.where(valid, np.nan, -9), color=GREY, linewidth=4, solid_capstyle="butt", label="no valid label")
     ax.set(xlabel="", ylim=(-14, 107))
     if not np.isfinite(margin).any():
-        ax.text(0.5, 0.5, "no frame has a label", transform=ax.transAxes, ha="center", va="center", color=GREY)
+        write_over(ax, "no frame has a label")
 
 
 def _say(ax: Axes, words: str) -> None:
     """Say over an empty chart why it is empty."""
     ax.set(yticks=[])
-    ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=GREY, parse_math=False)
+    write_over(ax, words, parse_math=False)
 
 
 def _width(recording: Recording) -> float:

@@ -15,7 +15,7 @@ from matplotlib.patheffects import Normal, Stroke
 
 from sliplens.errors import InputError
 from sliplens.images import absolute_difference
-from sliplens.plots.layout import place_axes, place_text, require_picture_path, save_page
+from sliplens.plots.layout import place_axes, place_text, require_picture_path, save_page, write_over
 from sliplens.plots.saliency import NOMINAL_MARGINS
 from sliplens.plots.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILLION, decimals, drawing_style, percent
 from sliplens.recordings import ContactState, Recording
@@ -167,8 +167,7 @@ def _draw_pictures(
             ax.spines[:].set_visible(False)
         if index is None and column:
             camera.spines[:].set(visible=True, color="#E5E7EB")
-            gap = f"no frame\nnear {percent(NOMINAL_MARGINS[column - 1])}"
-            camera.text(0.5, 0.5, gap, transform=camera.transAxes, ha="center", va="center", color=GREY)
+            write_over(camera, f"no frame\nnear {percent(NOMINAL_MARGINS[column - 1])}")
             continue
         frame = recording.reference if index is None else recording.frames[index]
         camera.imshow(frame)

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from sliplens.plots.layout import place_axes, place_text, require_picture_path, save_page
+from sliplens.plots.layout import place_axes, place_text, require_picture_path, save_page, write_over
 from sliplens.plots.style import (
     BLACK,
     BLUE,
@@ -268,7 +268,7 @@ def _plot_coverage(reliability: Mapping[str, Reliability], conditions: list[str]
     ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="as promised")
     ax.set(xlabel="Promised (% of the frames)", ylabel="Held (%)", xlim=(40, 100), ylim=(0, 102), title="Intervals")
     if not known:
-        _say(ax, "this network was never calibrated")
+        write_over(ax, "this network was never calibrated")
     ax.legend(fontsize=8, loc="upper left")
 
 
@@ -276,7 +276,7 @@ def _plot_uncertainty(predictions: Predictions, conditions: list[str], auroc: fl
     title = "Uncertainty" if auroc is None else f"Wet told from dry: AUROC {auroc:.2f}"
     ax.set(xlabel="Standard deviation of the answer (points of Γ)", ylabel="Share of the frames (%)", title=title)
     if not np.isfinite(predictions.sigma).any():
-        _say(ax, "one number, and no distribution")
+        write_over(ax, "one number, and no distribution")
         return
     sigma = 100 * predictions.sigma
     edges = np.linspace(0, max(1.0, float(np.quantile(sigma, 0.995))), 30).tolist()
@@ -343,10 +343,6 @@ def _summary(evaluation: Evaluation, conditions: list[str]) -> str:
             words += f", warns {lead.median_ms:.0f} ms before the slip (the true Γ: {lead.ideal_ms:.0f} ms)"
         parts.append(f"{words}, {lead.false_per_minute:.1f} false alarms a minute")
     return "\n".join(parts)
-
-
-def _say(ax: Axes, words: str) -> None:
-    ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=GREY)
 
 
 _FEW = 40

@@ -25,12 +25,9 @@ from sliplens.plots.style import (
     methods_in_order,
     percent,
 )
-from sliplens.results.evaluation import Evaluation
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionScores, RemovalScores
-from sliplens.results.strip import Strip
 from sliplens.results.study import Study
-from sliplens.results.training import Training
 
 __all__ = ["plot"]
 
@@ -81,14 +78,6 @@ def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
         assert figure is not None
         drawer(result, figure.subplots() if ax is None else ax, index)
     return figure
-
-
-def _evaluation(evaluation: Evaluation, ax: Axes, _: int) -> None:
-    plot_answers(evaluation.predictions, sorted(evaluation.conditions), ax=ax)
-
-
-def _training(training: Training, ax: Axes, _: int) -> None:
-    plot_learning_curves({training.input: training}, ax=ax)
 
 
 def _explanation(explanation: Any, ax: Axes, index: int) -> None:
@@ -193,10 +182,6 @@ def _tracking(tracking: Any, ax: Axes, index: int) -> None:
     ax.legend()
 
 
-def _strip(strip: Strip, ax: Axes, _: int) -> None:
-    plot_readings(strip, ax=ax)
-
-
 def _array(values: Any) -> np.ndarray:
     # a tensor answers NumPy's protocol once it is on the CPU and carries no gradient
     detached = values.detach().cpu() if hasattr(values, "detach") else values
@@ -209,9 +194,9 @@ def _of(count: int, index: int) -> int:
     return index
 
 
-DRAWERS: dict[str, Callable[[Any, Axes, int], None]] = {
-    "Evaluation": _evaluation,
-    "Training": _training,
+DRAWERS: dict[str, Callable[[Any, Axes, int], object]] = {
+    "Evaluation": lambda result, ax, _: plot_answers(result.predictions, sorted(result.conditions), ax=ax),
+    "Training": lambda result, ax, _: plot_learning_curves({result.input: result}, ax=ax),
     "Explanation": _explanation,
     "Explained": _explained,
     "Faithfulness": _faithfulness,
@@ -220,6 +205,6 @@ DRAWERS: dict[str, Callable[[Any, Axes, int], None]] = {
     "Study": _study,
     "Predictions": _predictions,
     "Tracking": _tracking,
-    "Strip": _strip,
+    "Strip": lambda result, ax, _: plot_readings(result, ax=ax),
 }
 """What draws a record, by the name of its class."""

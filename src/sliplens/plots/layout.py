@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from sliplens.errors import InputError
-from sliplens.plots.style import drawing_style
+from sliplens.plots.style import GREY, drawing_style
 
 # no dates: the same trials, the same file
 _METADATA: dict[str, dict[str, Any]] = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
@@ -58,6 +58,11 @@ def place_text(figure: Figure, left: float, top: float, text: str, **settings: A
     """Write words there, their upper edge on that line unless told otherwise."""
     across, down = figure.get_size_inches()
     figure.text(left / across, 1 - top / down, text, **{"va": "top", **settings})
+
+
+def write_over(ax: Axes, words: str, **settings: Any) -> None:
+    """Write in the middle of axes, grey, why there is nothing in them."""
+    ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=GREY, **settings)
 
 
 _CSS_PIXELS_PER_INCH = 96

@@ -1,5 +1,6 @@
 """Plates made of pictures: maps beside each other, and what deletion removes."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -215,12 +216,8 @@ class _Saliencies:
             rows = [row for row in self._rows if row[1] == method and np.isfinite(row[8])]
             if len(rows) > 1:
                 parts.append(f"{method_name(method)} {signed(rows[-1][8] - rows[0][8], 0)}")
-        told = ", ".join(parts)
-        return (
-            f"From the first to the last frame the centre of the saliency moves down by, in pixels: {told}."
-            if told
-            else ""
-        )
+        head = "From the first to the last frame the centre of the saliency moves down by, in pixels:"
+        return f"{head} {', '.join(parts)}." if parts else ""
 
 
 def _answer(explained: Explained, index: int) -> str:
@@ -236,11 +233,7 @@ def shown_methods(results: Results) -> list[str]:
 
 def plate_deletion(results: Results) -> Plate | None:
     """Illustrate deletion on one frame, with the score below (thesis, Fig. 5); None without a scored map."""
-    for name in inputs_in_order(results.inputs)[::-1]:
-        found = _material(results, name)
-        if found is None:
-            continue
-        explained, scored, index = found
+    for explained, scored, index in _materials(results):
         methods = [one for one in methods_in_order(scored.curves) if one in explained.saliency]
         if methods:
             method = _TOLD_METHOD if _TOLD_METHOD in methods else methods[-1]
@@ -251,15 +244,13 @@ def plate_deletion(results: Results) -> Plate | None:
 def plate_removal(results: Results, method: str) -> Plate | None:
     """Draw what one method has removed, with y and D at each step, a row an input (thesis, Figs. 19 to 21)."""
     rows, numbers, told = [], [], []
-    for name in inputs_in_order(results.inputs)[::-1]:
-        found = _material(results, name)
-        if found is None or method not in found[0].saliency or method not in found[1].curves:
+    for explained, scored, index in _materials(results):
+        if method not in explained.saliency or method not in scored.curves:
             continue
-        explained, scored, index = found
         steps = _steps(scored.curves[method], explained, index)
-        rows.append((short_input_name(name), _removed(explained, method, index, steps, fill=scored.fill)))
+        rows.append((short_input_name(explained.input), _removed(explained, method, index, steps, fill=scored.fill)))
         numbers += _steps_told(explained, method, index, steps)
-        told.append(f"{input_name(name)}: {_tell_fall(explained, index, steps)}")
+        told.append(f"{input_name(explained.input)}: {_tell_fall(explained, index, steps)}")
     if not rows:
         return None
     fill = " or ".join(sorted({one.fill for one in results.scores.values()}))
@@ -278,14 +269,12 @@ def plate_removal(results: Results, method: str) -> Plate | None:
 def plate_highlighted(results: Results) -> Plate | None:
     """Draw the frame without all that has a saliency above 0.5, a row an input (thesis, Fig. 10)."""
     rows, numbers, told, methods = [], [], [], shown_methods(results)
-    for name in inputs_in_order(results.inputs)[::-1]:
-        found, remedies = _material(results, name), results.study.remedies.get(name)
+    for explained, _, index in _materials(results):
+        name, own, picture = explained.input, explained.frames[index], explained.pictures[index]
+        remedies = results.study.remedies.get(name)
         variant = None if remedies is None else remedies.variants.get(_HALF)
-        if found is None or remedies is None or variant is None:
+        if remedies is None or variant is None:
             continue
-        explained, _, index = found
-        own = explained.frames[index]
-        picture = explained.pictures[index]
         cells, own_told = [Cell(picture=picture, words=f"y {percent(own.prediction)}")], []
         for method in methods:
             curve = remedies.curves.get((_HALF, method), {}).get(own.id)
@@ -355,45 +344,39 @@ def _illustrate(explained: Explained, scored: DeletionScores, method: str, index
     )
 
 
-def _material(results: Results, name: str) -> tuple[Explained, DeletionScores, int] | None:
-    explained = explained_of(results, name)
-    scored = results.scores.get((name, results.study.source))
-    if explained is None or scored is None:
-        return None
-    index = told_frame(explained, {method: one for method, one in scored.curves.items() if method not in CONTROLS})
-    return None if index is None else (explained, scored, index)
+def _materials(results: Results) -> Iterator[tuple[Explained, DeletionScores, int]]:
+    """Maps, scores and the frame to show of each input that has all three, difference before raw."""
+    for name in inputs_in_order(results.inputs)[::-1]:
+        explained, scored = explained_of(results, name), results.scores.get((name, results.study.source))
+        if explained is None or scored is None:
+            continue
+        index = told_frame(explained, {method: one for method, one in scored.curves.items() if method not in CONTROLS})
+        if index is not None:
+            yield explained, scored, index
 
 
 def _steps(curve: DeletionCurve, explained: Explained, index: int) -> list[tuple[int, float, float]]:
     """Pixels gone, answer and score at the steps nearest to `SHARES`."""
     row = curve.frame_ids.index(explained.frames[index].id)
     share = curve.pixels_removed / explained.image_size**2
-    places = [int(np.abs(share - one).argmin()) for one in SHARES]
     return [
         (int(curve.pixels_removed[at]), float(curve.predictions[row, at]), float(curve.scores[row, at]))
-        for at in places
+        for at in (np.abs(share - one).argmin() for one in SHARES)
     ]
 
 
 def _removed(
     explained: Explained, method: str, index: int, steps: list[tuple[int, float, float]], *, fill: str
 ) -> list[Cell]:
-    saliency = explained.saliency[method][index]
+    saliency, own = explained.saliency[method][index], explained.frames[index]
     # as the network saw it: made brighter, a difference would no longer compare with the fill
-    picture, own = explained.pictures[index], explained.frames[index]
-    first = Cell(
-        picture=show_map(bright_pictures(explained, [index])[0][index], saliency),
-        words=f"y {percent(own.prediction)}, D 1.00",
-    )
+    picture = explained.pictures[index]
+    shown = [show_map(bright_pictures(explained, [index])[0][index], saliency)]
+    shown += [_without(picture, gone(saliency, pixels), fill) for pixels, _, _ in steps]
+    answers = [(own.prediction, 1.0), *((answer, score) for _, answer, score in steps)]
     return [
-        first,
-        *(
-            Cell(
-                picture=_without(picture, gone(saliency, pixels), fill),
-                words=f"y {percent(answer)}, D {score:.2f}",
-            )
-            for pixels, answer, score in steps
-        ),
+        Cell(picture=one, words=f"y {percent(answer)}, D {score:.2f}")
+        for one, (answer, score) in zip(shown, answers, strict=True)
     ]
 
 

@@ -14,9 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sliplens.plots.contact_sheet import TIMES, brighten, brightening
-from sliplens.plots.layout import Picture, figure_picture, place_axes, place_text, save_page, written_whole
+from sliplens.plots.layout import Picture, figure_picture, place_axes, place_text, save_page, write_over, written_whole
 from sliplens.plots.saliency import choose_frames, overlay_saliency, plot_colour_bar, stretch_saliency
-from sliplens.plots.style import GREY, drawing_style
+from sliplens.plots.style import drawing_style
 from sliplens.report.workspace import Results
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionCurve
@@ -103,7 +103,7 @@ def _show(picture: UInt8[np.ndarray, "height width 3"] | None, *, ax: Axes) -> N
     ax.grid(visible=False)
     ax.spines[:].set_visible(False)
     if picture is None:
-        ax.text(0.5, 0.5, "no frame", transform=ax.transAxes, ha="center", va="center", fontsize=8, color=GREY)
+        write_over(ax, "no frame", fontsize=8)
     else:
         ax.imshow(picture, interpolation="none")
 

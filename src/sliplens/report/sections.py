@@ -7,46 +7,9 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sliplens.plots.style import input_name, inputs_in_order
-from sliplens.report.charts import (
-    plate_bins,
-    plate_each_frame,
-    plate_faithfulness,
-    plate_learning,
-    plate_over_time,
-    plate_predictions,
-    plate_randomisation,
-    plate_removal_curves,
-)
+from sliplens.report import charts, pictures, state_figures, tables
 from sliplens.report.claims import Claim, judge_claims
-from sliplens.report.pictures import (
-    plate_deletion,
-    plate_highlighted,
-    plate_methods,
-    plate_poly_cam,
-    plate_removal,
-    plate_states,
-    shown_methods,
-)
 from sliplens.report.plates import Plate, explained_of
-from sliplens.report.state_figures import plate_contact_states, plate_fields_beside_saliency, plate_truth
-from sliplens.report.tables import (
-    Table,
-    table_accuracy,
-    table_agreement,
-    table_deletion,
-    table_equal_areas,
-    table_localisation,
-    table_looks,
-    table_meta,
-    table_randomisation,
-    table_real,
-    table_remedies,
-    table_scores,
-    table_seconds,
-    table_times,
-    table_training,
-    table_trials,
-)
 from sliplens.report.verdict import AlarmGroup, alarms_of, group_alarms
 from sliplens.report.workspace import Results
 
@@ -62,7 +25,7 @@ class Notes:
     tone: Literal["plain", "caution"] = "plain"
 
 
-Block = Table | Plate | Claim | Notes
+Block = tables.Table | Plate | Claim | Notes
 """Laid out by the template's macro of the name `layout`."""
 
 
@@ -130,20 +93,20 @@ def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Secti
 
 def _accuracy(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
     if results.evaluations:
-        yield table_accuracy(results)
-        yield plate_bins(results)
-        yield plate_predictions(results)
-        yield plate_over_time(results)
+        yield tables.table_accuracy(results)
+        yield charts.plate_bins(results)
+        yield charts.plate_predictions(results)
+        yield charts.plate_over_time(results)
 
 
 def _faithfulness(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
     found = results.study.faithfulness
     for name in _names(found):
-        yield table_scores(found[name], results.scores.get((name, results.study.source)))
+        yield tables.table_scores(found[name], results.scores.get((name, results.study.source)))
         yield _alarms(results, name, "faithfulness")
-        yield table_equal_areas(found[name])
-        yield table_agreement(found[name])
-        yield plate_removal_curves(found[name])
+        yield tables.table_equal_areas(found[name])
+        yield tables.table_agreement(found[name])
+        yield charts.plate_removal_curves(found[name])
 
 
 def _deletion(results: Results, rng: np.random.Generator) -> Iterable[Block | None]:
@@ -153,69 +116,71 @@ def _deletion(results: Results, rng: np.random.Generator) -> Iterable[Block | No
         if results.scored_inputs(source)
     }
     # beside the sound scores stands D already
-    yield from (table_deletion(scores, rng=rng) for scores in by_source.values() if not results.study.faithfulness)
-    yield plate_deletion(results)
-    yield from (plate_faithfulness(scores) for scores in by_source.values())
+    yield from (
+        tables.table_deletion(scores, rng=rng) for scores in by_source.values() if not results.study.faithfulness
+    )
+    yield pictures.plate_deletion(results)
+    yield from (charts.plate_faithfulness(scores) for scores in by_source.values())
     remedies, own = results.study.remedies, by_source.get(results.study.source, {})
     for name in _names({*own, *remedies}):
         yield _alarms(results, name, "score")
         if name in remedies:
-            yield table_remedies(remedies[name], own.get(name))
+            yield tables.table_remedies(remedies[name], own.get(name))
             yield _alarms(results, name, "remedies")
-    yield plate_highlighted(results)
+    yield pictures.plate_highlighted(results)
     if own:
-        yield from (plate_removal(results, method) for method in shown_methods(results))
+        yield from (pictures.plate_removal(results, method) for method in pictures.shown_methods(results))
     if results.study:
-        yield from (plate_each_frame(scored) for scored in own.values())
+        yield from (charts.plate_each_frame(scored) for scored in own.values())
 
 
 def _randomisation(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
     found = results.study.randomisation
     if found:
-        yield plate_randomisation(results)
-        yield table_randomisation(found)
+        yield charts.plate_randomisation(results)
+        yield tables.table_randomisation(found)
         yield from (_alarms(results, name, "randomisation") for name in _names(found))
 
 
 def _maps(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
     study = results.study
     if study.states is not None:
-        yield plate_contact_states(study.states)
+        yield state_figures.plate_contact_states(study.states)
         yield _notes("Markers that could not be followed", study.states.untracked, tone="caution")
-    yield plate_methods(results)
+    yield pictures.plate_methods(results)
     for name in _names(results.inputs):
         explained = explained_of(results, name)
         if explained is not None:
-            yield plate_states(results, explained)
+            yield pictures.plate_states(results, explained)
             yield _alarms(results, name, "explain")
-    yield plate_poly_cam(results) if study else None
-    yield plate_fields_beside_saliency(results)
-    yield table_looks(study.map_quality) if study.map_quality else None
+    yield pictures.plate_poly_cam(results) if study else None
+    yield state_figures.plate_fields_beside_saliency(results)
+    yield tables.table_looks(study.map_quality) if study.map_quality else None
 
 
 def _real(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
     shown = {name: one for (name, source), one in results.explanations.items() if source == "real"}
     if shown:
-        yield table_real(results)
+        yield tables.table_real(results)
         if results.study.source != "real":
             for name in _names(shown):
-                yield plate_states(results, shown[name])
+                yield pictures.plate_states(results, shown[name])
                 yield _alarms(results, name, "explain") if explained_of(results, name) is None else None
 
 
 def _cost(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
     if results.study.timing:
-        yield table_times(results.study.timing)
+        yield tables.table_times(results.study.timing)
     elif results.explanations:
-        yield table_seconds(results)
+        yield tables.table_seconds(results)
 
 
 def _truth(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
     found = results.study.truth
     for name in _names(found):
-        yield plate_truth(results, name)
-        yield table_localisation(found[name])
-        yield table_meta(found[name])
+        yield state_figures.plate_truth(results, name)
+        yield tables.table_localisation(found[name])
+        yield tables.table_meta(found[name])
         yield _notes(f"How this was measured, {input_name(name).lower()}", [found[name].summary])
 
 
@@ -239,7 +204,7 @@ def _recipe(results: Results, absent: dict[str, list[str]]) -> Section:
         short_title="Recipe",
         intro=intro,
         missing=tuple(f"{', '.join(titles)}: not run yet; `{command}` makes it." for command, titles in absent.items()),
-        blocks=(table_training(results), plate_learning(results)) if results.trainings else (),
+        blocks=(tables.table_training(results), charts.plate_learning(results)) if results.trainings else (),
     )
 
 
@@ -349,7 +314,7 @@ OUTLINES: tuple[Outline, ...] = (
         short_title="Trials",
         intro=lambda results: "" if results.study.choice is None else results.study.choice.summary,
         command="study",
-        build=lambda results, _: () if results.study.choice is None else (table_trials(results.study.choice),),
+        build=lambda results, _: () if results.study.choice is None else (tables.table_trials(results.study.choice),),
     ),
     Outline(
         id="truth",
