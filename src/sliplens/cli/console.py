@@ -4,22 +4,14 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
 from threading import RLock
+from typing import NamedTuple
 
+from rich import progress as rich_progress
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 
 from sliplens.progress import OnProgress
@@ -27,7 +19,7 @@ from sliplens.progress import OnProgress
 OUT = Console()
 ERR = Console(stderr=True)
 
-_NAME_COLUMNS = 26
+_NAME_COLUMNS = 26  # names are as wide as they are, up to a third of 80 columns
 
 
 def fail(message: str) -> None:
@@ -40,29 +32,11 @@ def say(message: str) -> None:
     OUT.print(escape(message), soft_wrap=True, highlight=False)
 
 
-def wrote(path: Path, what: str) -> None:
-    """Say what was written where."""
-    OUT.print(f"[green]wrote[/] {escape(str(path))}  [dim]{escape(what)}[/]", soft_wrap=True, highlight=False)
-
-
-def unchanged(path: Path) -> None:
-    """Say that a result is there already."""
-    OUT.print(
-        f"[green]kept[/] {escape(str(path))}  [dim]made before with the same settings; --overwrite makes it again[/]",
-        soft_wrap=True,
-        highlight=False,
-    )
-
-
-def _progress() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=30),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=OUT,
-    )
+def wrote(path: Path, what: str, *, kept: bool = False) -> None:
+    """Say what was written where, or that it was there already."""
+    what = "made before with the same settings; --overwrite makes it again" if kept else what
+    verb = "kept" if kept else "wrote"
+    OUT.print(f"[green]{verb}[/] {escape(str(path))}  [dim]{escape(what)}[/]", soft_wrap=True, highlight=False)
 
 
 class Terminal:
@@ -73,8 +47,15 @@ class Terminal:
     """
 
     def __init__(self) -> None:
-        self._bars = _progress()
-        self._open: list[TaskID] = []
+        self._bars = rich_progress.Progress(
+            rich_progress.TextColumn("{task.description}"),
+            rich_progress.BarColumn(bar_width=30),
+            rich_progress.MofNCompleteColumn(),
+            rich_progress.TimeElapsedColumn(),
+            rich_progress.TimeRemainingColumn(),
+            console=OUT,
+        )
+        self._open: list[rich_progress.TaskID] = []
         self._notes: Counter[str] = Counter()
         self._lock = RLock()
 
@@ -106,12 +87,7 @@ class Terminal:
                         self._bars.remove_task(left)
                     self._tell_notes()
 
-    def wrote(self, path: Path, what: str, /, *, kept: bool = False) -> None:
-        """Say what was written where, or that it was there already."""
-        if kept:
-            unchanged(path)
-        else:
-            wrote(path, what)
+    wrote = staticmethod(wrote)
 
     def note(self, message: str, /) -> None:
         """Say a sentence; one that is told again and again is shown once, with a count."""
@@ -133,17 +109,15 @@ def fold_equal(messages: Iterable[str]) -> list[str]:
         alike.setdefault(re.sub(r"[-\u2212]?\d+(?:[.,]\d+)?", "#", message), Counter())[message] += 1
     folded = []
     for counts in alike.values():
-        first, others = next(iter(counts)), len(counts) - 1
-        if others:
-            folded.append(f"{first} (and {others} more with other numbers)")
-        else:
-            folded.append(first if counts[first] == 1 else f"{first} ({counts[first]} times)")
+        first, times = next(iter(counts.items()))
+        others = f"and {len(counts) - 1} more with other numbers" if len(counts) > 1 else f"{times} times"
+        folded.append(first if counts.total() == 1 else f"{first} ({others})")
     return folded
 
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print a table, numbers to the right; columns that do not fit beside each other are printed below, names again."""
-    columns = [_Column.of(name, [row[place] for row in rows], names=place == 0) for place, name in enumerate(header)]
+    columns = [_column(name, [row[place] for row in rows], names=place == 0) for place, name in enumerate(header)]
     for number, shown in enumerate(_fitting(columns, OUT.width)):
         table = Table(title=title if number == 0 else f"{title}, continued", title_justify="left")
         for column in shown:
@@ -153,28 +127,22 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
         OUT.print(table)
 
 
-@dataclass(frozen=True)
-class _Column:
+class _Column(NamedTuple):
     """Column of a table, its head broken at spaces so that it is hardly wider than what stands below it."""
 
     head: str
-    cells: tuple[str, ...]
+    cells: list[str]
     width: int
 
-    @classmethod
-    def of(cls, name: str, cells: Sequence[str], *, names: bool) -> "_Column":
-        """Fit a column to its cells; a column of names may be broken at spaces, numbers may not."""
-        longest = max((len(word) for word in name.split()), default=0)
-        # names are as wide as they are up to a third of 80 columns
-        widest = max(map(len, cells), default=0)
-        width = max(longest, min(widest, _NAME_COLUMNS) if names else widest)
-        broken = tuple("\n".join(wrap(cell, width, break_long_words=False)) for cell in cells)
-        lines = [line for cell in broken for line in cell.split("\n")]
-        return cls(
-            head=escape("\n".join(wrap(name, width, break_long_words=False))),
-            cells=broken,
-            width=max([longest, *map(len, lines)]),
-        )
+
+def _column(name: str, cells: Sequence[str], *, names: bool) -> _Column:
+    """Fit a column to its cells; a column of names may be broken at spaces, numbers may not."""
+    longest = max(map(len, name.split()), default=0)
+    widest = max(map(len, cells), default=0)
+    width = max(longest, min(widest, _NAME_COLUMNS) if names else widest)
+    head, *broken = ("\n".join(wrap(text, width, break_long_words=False)) for text in (name, *cells))
+    lines = [len(line) for cell in broken for line in cell.split("\n")]
+    return _Column(escape(head), broken, max([longest, *lines]))
 
 
 def _fitting(columns: Sequence[_Column], width: int) -> Iterator[list[_Column]]:

@@ -29,13 +29,14 @@ from sliplens.report.comparisons import (
     compare_thesis_score,
     gain_over_chance,
     mean_at,
+    reversed_gap,
     settings,
     share_of_strongest,
     tell_interval,
 )
 from sliplens.report.thesis import THESIS_POLY_CAM
 from sliplens.report.workspace import Results
-from sliplens.results.faithfulness import RemovalScores
+from sliplens.results.faithfulness import DeletionCurve, RemovalScores
 from sliplens.results.study import MapQuality, Truth
 
 Outcome = Literal["holds", "does not hold", "undecided"]
@@ -46,23 +47,16 @@ OUTCOMES: tuple[Outcome, ...] = ("holds", "does not hold", "undecided")
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One comparison: where, of what, its number with an interval if there is one, and what it says of the claim.
-
-    Attributes
-    ----------
-    where
-        Fill and unit, or the score.
-    value
-        Number where no interval is kept.
-    outcome
-        None where the comparison is told but does not decide.
-    """
+    """One comparison: where, of what, its number with an interval if there is one, and what it says of the claim."""
 
     where: str
+    """Fill and unit, or the score."""
     compared: str
     gap: Difference | None = None
     value: str = ""
+    """Number where no interval is kept."""
     outcome: Outcome | None = None
+    """None where the comparison is told but does not decide."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,13 +107,8 @@ def most_of(outcomes: Sequence[Outcome]) -> Outcome:
 
 def tell_settings(by_setting: dict[str, Outcome]) -> str:
     """Say under which settings a claim holds, does not, or stays open."""
-    parts = []
-    for outcome in OUTCOMES:
-        names = [name for name, found in by_setting.items() if found == outcome]
-        if names:
-            parts.append(f"{outcome} under {listed(names)}")
-    text = "; ".join(parts)
-    return f"{text[:1].upper()}{text[1:]}."
+    names = {found: [name for name, own in by_setting.items() if own == found] for found in OUTCOMES}
+    return _sentence("; ".join(f"{outcome} under {listed(where)}" for outcome, where in names.items() if where))
 
 
 def tell_first(findings: list[Finding]) -> str:
@@ -127,6 +116,17 @@ def tell_first(findings: list[Finding]) -> str:
     told = [one for one in findings if one.gap is not None and one.where == findings[0].where]
     parts = [f"{one.compared}: {tell_interval(one.gap)}" for one in told if one.gap is not None]
     return f"Under {findings[0].where}, {'; '.join(parts)}." if parts else ""
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def _over_settings(subject: str, by_setting: dict[str, Outcome], findings: list[Finding]) -> Answer:
+    """Answer by what holds under most settings."""
+    text = f"{tell_settings(by_setting)} {tell_first(findings)}"
+    outcome = most_of(list(by_setting.values()))
+    return Answer(subject=subject, outcome=outcome, text=text, findings=tuple(findings))
 
 
 def untested(name: str, why: str) -> Answer:
@@ -143,15 +143,15 @@ def claim_difference(results: Results, *, rng: np.random.Generator) -> Claim:
     """Test it on the same frames, evidence lost in margin units."""
     found = results.study.faithfulness
     if not {"difference", "raw"} <= set(found):
-        answers = [untested("", "the explanations of both networks are needed, and those of one are there")]
+        answer = untested("", "the explanations of both networks are needed, and those of one are there")
     else:
-        answers = [_compare_inputs(found["difference"], found["raw"], results, rng=rng)]
+        answer = _compare_inputs(found["difference"], found["raw"], results, rng=rng)
     return Claim(
         id="difference",
         title="Difference images give more faithful explanations than raw images",
         test="Tested on the same frames, evidence lost in margin units: holds under a fill where the SRG averaged over "
         "the methods is larger for difference images, beyond the 95 % interval.",
-        answers=tuple(answers),
+        answers=(answer,),
     )
 
 
@@ -169,38 +169,38 @@ def _compare_inputs(
         by_setting[where] = judge_gap(gap)
         compared = f"SRG, mean of {len(pairs)} methods, difference less raw"
         findings.append(Finding(where=where, compared=compared, gap=gap, outcome=by_setting[where]))
-        findings += [
-            Finding(
-                where=where,
-                compared=f"SRG of {method_name(one)}, difference less raw",
-                gap=compare_gain(*pair, rng=rng),
-            )
-            for one, pair in pairs.items()
-        ]
+        for one, pair in pairs.items():
+            compared = f"SRG of {method_name(one)}, difference less raw"
+            findings.append(Finding(where=where, compared=compared, gap=compare_gain(*pair, rng=rng)))
     if not by_setting:
         return untested("", "no method was scored on both inputs under one fill")
     findings += _thesis_score_of_inputs(results, rng=rng)
-    return Answer(
-        subject="Both networks",
-        outcome=most_of(list(by_setting.values())),
-        text=f"{tell_settings(by_setting)} {tell_first(findings)}",
-        findings=tuple(findings),
-    )
+    return _over_settings("Both networks", by_setting, findings)
 
 
 def _thesis_score_of_inputs(results: Results, *, rng: np.random.Generator) -> list[Finding]:
     scored = {name: one for (name, source), one in results.scores.items() if source == results.study.source}
     if not {"difference", "raw"} <= set(scored):
         return []
-    trials, first, second = scored_trials(results, "difference"), scored["difference"].curves, scored["raw"].curves
+    first, second = scored["difference"].curves, scored["raw"].curves
+    pairs = {
+        f"D of {method_name(one)}, difference less raw": (first[one], second[one])
+        for one in (*RIVALS, THESIS_POLY_CAM, POLY_CAM)
+        if one in first and one in second
+    }
+    return _by_thesis_score(pairs, scored_trials(results, "difference"), rng=rng)
+
+
+def _by_thesis_score(
+    pairs: dict[str, tuple[DeletionCurve, DeletionCurve]], trials: dict[str, str], *, rng: np.random.Generator
+) -> list[Finding]:
     return [
         Finding(
             where="score of the thesis",
-            compared=f"D of {method_name(one)}, difference less raw (below zero = more faithful)",
-            gap=compare_thesis_score(first[one], second[one], trials, rng=rng),
+            compared=f"{compared} (below zero = more faithful)",
+            gap=compare_thesis_score(*pair, trials, rng=rng),
         )
-        for one in (*RIVALS, THESIS_POLY_CAM, POLY_CAM)
-        if one in first and one in second
+        for compared, pair in pairs.items()
     ]
 
 
@@ -260,15 +260,8 @@ def _noisiest(looks: MapQuality) -> Answer:
         gaps = _rougher(looks, values) if measure == "total_variation" else {}
         if gaps:
             outcome = all_of(judge_gap(gap) for gap in gaps.values())
-            findings += [
-                Finding(
-                    where=_MEASURE_NAMES[measure],
-                    compared=f"{method_name(_NOISY)} less {method_name(name)}",
-                    gap=gap,
-                    outcome=judge_gap(gap),
-                )
-                for name, gap in gaps.items()
-            ]
+            named = {f"{method_name(_NOISY)} less {method_name(name)}": gap for name, gap in gaps.items()}
+            findings += _judged(_MEASURE_NAMES[measure], named)
         outcomes.append(outcome)
         others = listed([f"{method_name(name)} {decimals(value, 3)}" for name, value in values.items()])
         parts.append(f"{_MEASURE_NAMES[measure]} {decimals(own, 3)} ({others})")
@@ -280,10 +273,8 @@ def _noisiest(looks: MapQuality) -> Answer:
                 outcome=outcome,
             )
         )
-    text = listed(parts)
-    return Answer(
-        subject=subject, outcome=all_of(outcomes), text=f"{text[:1].upper()}{text[1:]}.", findings=tuple(findings)
-    )
+    text = _sentence(listed(parts))
+    return Answer(subject=subject, outcome=all_of(outcomes), text=text, findings=tuple(findings))
 
 
 def _rougher(looks: MapQuality, others: Iterable[str]) -> dict[str, Difference]:
@@ -293,8 +284,7 @@ def _rougher(looks: MapQuality, others: Iterable[str]) -> dict[str, Difference]:
         if (_NOISY, name) in looks.rougher:
             gaps[name] = looks.rougher[_NOISY, name]
         elif (name, _NOISY) in looks.rougher:
-            gap = looks.rougher[name, _NOISY]
-            gaps[name] = Difference(estimate=-gap.estimate, low=-gap.high, high=-gap.low, units=gap.units)
+            gaps[name] = reversed_gap(looks.rougher[name, _NOISY])
     return gaps
 
 
@@ -342,10 +332,7 @@ def _looks_at_two(truth: Truth, *, rng: np.random.Generator) -> Answer:
         text=f"The two strongest of up to {markers} markers hold {told}. {on_edges_told}",
         findings=(
             Finding(
-                where="each marker put back",
-                compared="share of the two strongest markers",
-                gap=share,
-                outcome=two,
+                where="each marker put back", compared="share of the two strongest markers", gap=share, outcome=two
             ),
             Finding(
                 where="relevance mass",
@@ -358,7 +345,6 @@ def _looks_at_two(truth: Truth, *, rng: np.random.Generator) -> Answer:
     )
 
 
-GRAD_CAM = "grad-cam"
 _SMALL_AREA = 0.05
 
 
@@ -390,53 +376,31 @@ def _claim_poly_cam(results: Results, *, rng: np.random.Generator) -> Claim:
 def _best_of(
     faithful: RemovalScores, method: str, claimants: list[str], results: Results, *, rng: np.random.Generator
 ) -> Answer:
-    rivals = list(RIVALS)
     findings, by_setting = [], {}
     for fill, unit in settings(faithful):
         own = faithful.curves.get((fill, unit, method))
-        others = [one for one in rivals if (fill, unit, one) in faithful.curves]
+        others = [one for one in RIVALS if (fill, unit, one) in faithful.curves]
         if own is None or not others:
             continue
         gaps = {one: compare_gain(own, faithful.curves[fill, unit, one], rng=rng) for one in others}
         where = fill_name(fill, unit)
         by_setting[where] = all_of(judge_gap(gap) for gap in gaps.values())
-        findings += [
-            Finding(
-                where=where,
-                compared=f"SRG, {method_name(method)} less {method_name(one)}",
-                gap=gap,
-                outcome=judge_gap(gap),
-            )
-            for one, gap in gaps.items()
-        ]
+        findings += _judged(where, {f"SRG, {method_name(method)} less {method_name(one)}": gaps[one] for one in gaps})
     if not by_setting:
         return untested(faithful.input, f"{method_name(method)} and another method were not scored together")
-    findings += _thesis_score_findings(results, faithful.input, method, rivals, rng=rng)
+    findings += _thesis_score_of_rivals(results, faithful.input, method, rng=rng)
     named = f", {method_name(method)}" if len(claimants) > 1 else ""
-    return Answer(
-        subject=f"{input_name(faithful.input)}{named}",
-        outcome=most_of(list(by_setting.values())),
-        text=f"{tell_settings(by_setting)} {tell_first(findings)}",
-        findings=tuple(findings),
-    )
+    return _over_settings(f"{input_name(faithful.input)}{named}", by_setting, findings)
 
 
-def _thesis_score_findings(
-    results: Results, name: str, method: str, rivals: list[str], *, rng: np.random.Generator
-) -> list[Finding]:
+def _thesis_score_of_rivals(results: Results, name: str, method: str, *, rng: np.random.Generator) -> list[Finding]:
     scored = next((one for (own, _), one in results.scores.items() if own == name), None)
     if scored is None or method not in scored.curves:
         return []
-    trials = scored_trials(results, name)
-    return [
-        Finding(
-            where="score of the thesis",
-            compared=f"D, {method_name(method)} less {method_name(one)} (below zero = more faithful)",
-            gap=compare_thesis_score(scored.curves[method], scored.curves[one], trials, rng=rng),
-        )
-        for one in rivals
-        if one in scored.curves
-    ]
+    curves = scored.curves
+    named = {f"D, {method_name(method)} less {method_name(one)}": one for one in RIVALS if one in curves}
+    pairs = {compared: (curves[method], curves[one]) for compared, one in named.items()}
+    return _by_thesis_score(pairs, scored_trials(results, name), rng=rng)
 
 
 def _claim_grad_cam(results: Results, *, rng: np.random.Generator) -> Claim:
@@ -446,16 +410,13 @@ def _claim_grad_cam(results: Results, *, rng: np.random.Generator) -> Claim:
         test="Tested against maps that know nothing of the network: holds under a fill where Grad-CAM's SRG lies below "
         "chance or below the best control for sure; does not hold where it lies above both for sure.",
         answers=_of_each(
-            results,
-            results.study.faithfulness,
-            lambda faithful: [_no_better(faithful, GRAD_CAM, rng=rng)],
-            why=_UNSCORED,
+            results, results.study.faithfulness, lambda faithful: [_no_better(faithful, rng=rng)], why=_UNSCORED
         ),
     )
 
 
-def _no_better(faithful: RemovalScores, method: str, *, rng: np.random.Generator) -> Answer:
-    findings, by_setting = [], {}
+def _no_better(faithful: RemovalScores, *, rng: np.random.Generator) -> Answer:
+    findings, by_setting, method = [], {}, "grad-cam"
     for fill, unit in settings(faithful):
         own = faithful.curves.get((fill, unit, method))
         if own is None:
@@ -482,12 +443,11 @@ def _no_better(faithful: RemovalScores, method: str, *, rng: np.random.Generator
         )
     if not by_setting:
         return untested(faithful.input, f"{method_name(method)} was not scored")
-    return Answer(
-        subject=input_name(faithful.input),
-        outcome=most_of(list(by_setting.values())),
-        text=f"{tell_settings(by_setting)} {tell_first(findings)}",
-        findings=tuple(findings),
-    )
+    return _over_settings(input_name(faithful.input), by_setting, findings)
+
+
+def _judged(where: str, gaps: Mapping[str, Difference | None]) -> list[Finding]:
+    return [Finding(where=where, compared=name, gap=gap, outcome=judge_gap(gap)) for name, gap in gaps.items()]
 
 
 def _of_each(

@@ -24,11 +24,9 @@ def compare_errors(first: Predictions, second: Predictions, *, rng: np.random.Ge
     if not same:
         return None
     trials, trial_at = np.unique(first.trial[order_a], return_inverse=True)
-    sums = np.zeros((3, len(trials)))
-    np.add.at(sums[0], trial_at, _squared_error(first)[order_a])
-    np.add.at(sums[1], trial_at, _squared_error(second)[order_b])
-    np.add.at(sums[2], trial_at, 1.0)
-    return bootstrap_difference(sums[0], sums[1], sums[2], rng=rng)
+    errors = (_squared_error(first)[order_a], _squared_error(second)[order_b], np.ones(len(trial_at)))
+    sums = (np.bincount(trial_at, weights=one, minlength=len(trials)) for one in errors)
+    return bootstrap_difference(*sums, rng=rng)
 
 
 def compare_deletion(first: DeletionCurve, second: DeletionCurve, *, rng: np.random.Generator) -> Difference | None:
@@ -89,13 +87,7 @@ def compare_gain(first: RemovalCurve, second: RemovalCurve, *, rng: np.random.Ge
 def compare_mean_gain(
     firsts: Sequence[RemovalCurve], seconds: Sequence[RemovalCurve], *, rng: np.random.Generator
 ) -> Difference | None:
-    """Compare as `compare_gain` does, the gain of each frame averaged over several methods first.
-
-    Parameters
-    ----------
-    firsts, seconds
-        Curves of the same methods in the same order, of one network and of another.
-    """
+    """Compare as `compare_gain` does, the gain of each frame averaged over several methods first, in the same order."""
     shared = sorted(set.intersection(*(set(curve.frame_ids) for curve in (*firsts, *seconds))))
     if not shared:
         return None
@@ -107,6 +99,11 @@ def compare_mean_gain(
     return paired_difference(means[0], means[1], trials=trials, rng=rng)
 
 
+def reversed_gap(gap: Difference) -> Difference:
+    """Difference of the second less the first."""
+    return Difference(estimate=-gap.estimate, low=-gap.high, high=-gap.low, units=gap.units)
+
+
 def gain_over_chance(curve: RemovalCurve, *, rng: np.random.Generator) -> Difference:
     """Symmetric relevance gain with its interval: a map that tells nothing has 0."""
     return paired_difference(curve.srg, np.zeros(len(curve.frame_ids)), trials=curve.trials, rng=rng)
@@ -115,13 +112,7 @@ def gain_over_chance(curve: RemovalCurve, *, rng: np.random.Generator) -> Differ
 def compare_thesis_score(
     first: DeletionCurve, second: DeletionCurve, trials: dict[str, str], *, rng: np.random.Generator
 ) -> Difference | None:
-    """Deletion score of the first less that of the second, over the frames whose trial is known; None without any.
-
-    Parameters
-    ----------
-    first, second
-        Of two methods, or of two inputs.
-    """
+    """Deletion score of the first less that of the second, over the frames whose trial is known; None without any."""
     ids, here, there = np.intersect1d(first.frame_ids, second.frame_ids, return_indices=True)
     known = np.array([name in trials for name in ids], dtype=bool)
     if not known.any():
@@ -135,11 +126,6 @@ def share_of_strongest(effects: MarkerEffects, *, count: int, rng: np.random.Gen
     """Share of a network's effects, in size, that its strongest markers hold; trials are resampled.
 
     None where no marker has any effect.
-
-    Parameters
-    ----------
-    effects
-        Of every marker, in margin units.
     """
     ids, first, member = np.unique(effects.frame_id, return_index=True, return_inverse=True)
     shares, kept = [], []
@@ -168,12 +154,8 @@ def controls(faithful: RemovalScores) -> set[str]:
 
 def best_control(faithful: RemovalScores, fill: str, unit: str) -> str | None:
     """Name the control with the highest gain under a fill and unit."""
-    gains = {
-        name: faithful.curves[key]
-        for name in sorted(controls(faithful))
-        if (key := (fill, unit, name)) in faithful.curves
-    }
-    return max(gains, key=lambda name: float(gains[name].srg.mean()), default=None)
+    known = [name for name in sorted(controls(faithful)) if (fill, unit, name) in faithful.curves]
+    return max(known, key=lambda name: float(faithful.curves[fill, unit, name].srg.mean()), default=None)
 
 
 def mean_at(curve: RemovalCurve, area: float) -> tuple[float, float]:

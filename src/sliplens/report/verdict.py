@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -25,7 +25,15 @@ from sliplens.plots.style import (
     signed,
     source_name,
 )
-from sliplens.report.comparisons import against_control, agreement, compare_errors, controls, settings, tell_interval
+from sliplens.report.comparisons import (
+    against_control,
+    agreement,
+    compare_errors,
+    controls,
+    reversed_gap,
+    settings,
+    tell_interval,
+)
 from sliplens.report.thesis import NETWORK_PIXELS
 from sliplens.report.workspace import Results
 from sliplens.results.explanation import Explained
@@ -55,10 +63,9 @@ def judge(results: Results, *, rng: np.random.Generator) -> tuple[Statement, ...
         if name in study.faithfulness:
             statements.append(_believe(study.faithfulness[name], results))
         elif study:
+            topic = f"Which to believe, {input_name(name).lower()}"
             text = "Not known: the explanations were not scored; `sliplens study` does that."
-            statements.append(
-                Statement(topic=f"Which to believe, {input_name(name).lower()}", text=text, tone="caution")
-            )
+            statements.append(Statement(topic=topic, text=text, tone="caution"))
     statements += _winners(results, rng=rng)
     # a study's sound scores say more than deletion does
     if not study:
@@ -123,14 +130,11 @@ def _winners(results: Results, *, rng: np.random.Generator) -> list[Statement]:
             text += f" That holds when the {gap.units} test trials are resampled."
         else:
             text += f" Resampling the {gap.units} test trials does not rule out chance."
-        statements.append(
-            Statement(topic=f"Raw or difference, {condition}", text=text, tone="good" if sure else "caution")
-        )
+        tone: Tone = "good" if sure else "caution"
+        statements.append(Statement(topic=f"Raw or difference, {condition}", text=text, tone=tone))
     if statements:
         seeds = "Each input stands for one trained network: another seed may change the order."
-        statements[-1] = Statement(
-            topic=statements[-1].topic, text=f"{statements[-1].text} {seeds}", tone=statements[-1].tone
-        )
+        statements[-1] = replace(statements[-1], text=f"{statements[-1].text} {seeds}")
     return statements
 
 
@@ -189,9 +193,7 @@ def _last_step(scored: DeletionScores) -> float | None:
 
 def _real_touch(explained: Explained) -> Statement:
     topic = f"Real touch, {input_name(explained.input).lower()}"
-    labelled = [
-        (frame.safety_margin, frame.prediction) for frame in explained.frames if frame.safety_margin is not None
-    ]
+    labelled = [(one.safety_margin, one.prediction) for one in explained.frames if one.safety_margin is not None]
     if not labelled:
         text = f"The {len(explained.frames)} real frames have no label, so nothing can be said of the answers on them."
         return Statement(topic=topic, text=text, tone="caution")
@@ -235,22 +237,15 @@ def _tell_scale(results: Results) -> list[Statement]:
 
 @dataclass(frozen=True, kw_only=True)
 class Standing:
-    """How a method stands: settings (fill, unit) in which it gains for sure, against chance and the best control.
-
-    Attributes
-    ----------
-    beaten
-        Settings in which it does.
-    tested
-        Settings in which it was compared with a control.
-    mean_gain
-        Symmetric relevance gain, mean over those settings, in margin units.
-    """
+    """How a method stands: settings (fill, unit) in which it gains for sure, against chance and the best control."""
 
     method: str
     beaten: tuple[tuple[str, str], ...]
+    """Settings in which it does."""
     tested: tuple[tuple[str, str], ...]
+    """Settings in which it was compared with a control."""
     mean_gain: float
+    """Symmetric relevance gain, mean over those settings, in margin units."""
 
     @property
     def qualifies(self) -> bool:
@@ -261,10 +256,7 @@ class Standing:
 def rank_methods(faithful: RemovalScores, truth: Truth | None = None) -> list[Standing]:
     """Rank the methods: those that beat the best control in most settings first, by their gain.
 
-    Parameters
-    ----------
-    truth
-        What the simulation tells: fills under which even a map made from the truth does not win are left out.
+    Fills under which even a map made from the truth does not win are left out.
     """
     unfit = _unfit_fills(truth)
     known = controls(faithful)
@@ -277,14 +269,8 @@ def rank_methods(faithful: RemovalScores, truth: Truth | None = None) -> list[St
         tested = [one for one in _votes(faithful, method) if (*one, method) in gaps and one[0] not in unfit]
         beaten = [one for one in tested if _gains(gaps[*one, method]) and _gains(scores[*one, method].srg)]
         gains = [scores[*one, method].srg.estimate for one in tested]
-        standings.append(
-            Standing(
-                method=method,
-                beaten=tuple(beaten),
-                tested=tuple(tested),
-                mean_gain=float(np.mean(gains)) if gains else float("-inf"),
-            )
-        )
+        mean = float(np.mean(gains)) if gains else float("-inf")
+        standings.append(Standing(method=method, beaten=tuple(beaten), tested=tuple(tested), mean_gain=mean))
     return sorted(standings, key=lambda one: (not one.qualifies, -one.mean_gain))
 
 
@@ -354,8 +340,7 @@ def _against(faithful: RemovalScores, method: str, rival: str) -> dict[tuple[str
         if (one.first, one.second) == (method, rival):
             gaps[one.fill, one.unit] = one.gap
         elif (one.first, one.second) == (rival, method):
-            gap = one.gap
-            gaps[one.fill, one.unit] = Difference(estimate=-gap.estimate, low=-gap.high, high=-gap.low, units=gap.units)
+            gaps[one.fill, one.unit] = reversed_gap(one.gap)
     return gaps
 
 
