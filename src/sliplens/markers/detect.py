@@ -117,13 +117,6 @@ def find_appearance(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind
     return Appearance(weights=weights, radius_px=spots.radius_px, contrast=max(level, 1.0))
 
 
-def refine_appearance(
-    appearance: Appearance, *, radius_px: Float[np.ndarray, " markers"], contrast: Float[np.ndarray, " markers"]
-) -> Appearance:
-    """Correct a first impression by what was measured on the markers themselves."""
-    return replace(appearance, radius_px=float(np.median(radius_px)), contrast=float(np.median(contrast)))
-
-
 def _require_exposed(frame: UInt8[np.ndarray, "height width 3"]) -> None:
     for what, share in (
         ("saturated", np.mean(frame.min(axis=-1) >= _BRIGHT)),
@@ -155,16 +148,15 @@ def _find_spots(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind, co
         return None
     scaled = np.minimum(over * (255 / top), 255).astype(np.uint8)
     _, mask = cv2.threshold(scaled, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
-    if count <= FEWEST:
-        return None
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
     round_ones = _round(stats, kind, (height, width))
     if round_ones.sum() < FEWEST:
         return None
     area = stats[:, cv2.CC_STAT_AREA].astype(float)
-    # weighed by area: specks are many, and small
-    alike = round_ones & (np.abs(np.log(area / _weighted_median(area[round_ones]))) < np.log(2.5))
-    chosen = np.flatnonzero(alike)
+    # the median is weighed by area: specks are many, and small
+    order = np.sort(area[round_ones])
+    typical = order[np.searchsorted(np.cumsum(order), order.sum() / 2)]
+    chosen = np.flatnonzero(round_ones & (np.abs(np.log(area / typical)) < np.log(2.5)))
     if len(chosen) < FEWEST:
         return None
     spread = float(np.std(np.log(area[chosen])))
@@ -186,11 +178,6 @@ def _round(stats: np.ndarray, kind: MarkerKind, size: tuple[int, int]) -> Bool[n
     fill = area / (width * height)
     shape = (np.maximum(width, height) < 1.7 * np.minimum(width, height)) & (fill > 0.55) & (fill < 0.95)
     return inside & shape & (radius >= low) & (radius <= min(high, min(size) / 8)) & (np.arange(len(stats)) > 0)
-
-
-def _weighted_median(area: Float[np.ndarray, " spots"]) -> float:
-    order = np.sort(area)
-    return float(order[np.searchsorted(np.cumsum(order), order.sum() / 2)])
 
 
 def _weights(
@@ -386,7 +373,8 @@ def detect_markers(
                 f"only {int(sound.sum())} markers were found whole, at least {FEWEST} are needed; name another kind, "
                 "or use a frame in which the markers are seen"
             )
-        first = refine_appearance(first, radius_px=found.radius_px[sound], contrast=found.contrast[sound])
+        radius, contrast = (float(np.median(values[sound])) for values in (found.radius_px, found.contrast))
+        first = replace(first, radius_px=radius, contrast=contrast)
     return _detect(frame, first)
 
 

@@ -98,7 +98,8 @@ def interpolate_field(
         raise InputError(f"the grid's step and reach must be positive, got {step_px} and {reach_px} px")
     place, value = rest_px[known], displacement_px[known]
     if reach_px is None:
-        reach_px = _typical_reach(place)
+        near = np.sort(np.linalg.norm(place[:, None] - place[None], axis=-1), axis=1)[:, 1 : _FEWEST + 1]
+        reach_px = 0.75 * float(np.median(near[:, -1]))
     x = np.arange(step_px / 2, size[1], step_px) - 0.5
     y = np.arange(step_px / 2, size[0], step_px) - 0.5
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
@@ -136,9 +137,3 @@ def compute_field(tracks: Tracks, frame: int, *, size: tuple[int, int], step_px:
     if not 0 <= frame < len(tracks):
         raise InputError(f"there is no frame {frame}; name one from 0 to {len(tracks) - 1}")
     return interpolate_field(tracks.rest_px, tracks.displacement_px[frame], size=size, step_px=step_px)
-
-
-def _typical_reach(place_px: Float[np.ndarray, "markers 2"]) -> float:
-    distance = np.linalg.norm(place_px[:, None] - place_px[None], axis=-1)
-    near = np.sort(distance, axis=1)[:, 1 : _FEWEST + 1]
-    return 0.75 * float(np.median(near[:, -1]))

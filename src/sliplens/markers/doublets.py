@@ -45,9 +45,7 @@ def resolve_signs(
         # one at a time: two neighbours that flip together stay apart
         signs[np.argmin(signs * field)] *= -1
     outward = (place_px - place_px.mean(axis=0)) * way_px
-    if pressed and (outward.sum(axis=1) * signs).sum() < 0:
-        signs = -signs
-    return signs
+    return -signs if pressed and (outward.sum(axis=1) * signs).sum() < 0 else signs
 
 
 _LENGTHS = (0.8, 1.6, 2.5, 3.5, 4.5, 6.0, 7.5, 9.0, 10.5, 12.0, 14.0)  # pixels, for markers of 6.5 px
@@ -226,7 +224,7 @@ def _polish(
 ) -> tuple[Float[np.ndarray, "spots 4"], Float[np.ndarray, " spots"], Float[np.ndarray, " spots"]]:
     """Least squares over place, displacement, amplitude and background; gives their correlation too."""
 
-    def fit(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def fit(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         model = _doublet(at, half, radius_px, edge_px)
         total = weight.sum(axis=1)
         mean_model, mean_patch = (weight * model).sum(axis=1) / total, (weight * patches).sum(axis=1) / total
@@ -234,15 +232,13 @@ def _polish(
         rest = (patches - mean_patch[:, None]) * weight
         power = (free**2).sum(axis=1) + 1e-12
         amplitude = (free * rest).sum(axis=1) / power
-        residual = rest - amplitude[:, None] * free
         correlation = amplitude * np.sqrt(power / ((rest**2).sum(axis=1) + 1e-12))
-        return residual, free, amplitude, correlation
+        return rest - amplitude[:, None] * free, amplitude, correlation
 
-    residual, _, amplitude, correlation = fit(found)
+    residual, amplitude, correlation = fit(found)
     damping = np.full(len(found), 1e-2)
     for _ in range(_ROUNDS):
-        step = 0.05
-        columns = []
+        step, columns = 0.05, []
         for axis in range(4):
             moved = found.copy()
             moved[:, axis] += step
@@ -253,13 +249,11 @@ def _polish(
         damped = normal + (damping[:, None] * diagonal + 1e-9)[:, :, None] * np.eye(4)
         move = -np.linalg.solve(damped, np.einsum("npk,np->nk", jacobian, residual)[..., None])[..., 0]
         tried = found + np.clip(move, -1.5, 1.5)
-        new_residual, _, new_amplitude, new_correlation = fit(tried)
+        new_residual, new_amplitude, new_correlation = fit(tried)
         better = (new_residual**2).sum(axis=1) < (residual**2).sum(axis=1)
         found = np.where(better[:, None], tried, found)
         residual = np.where(better[:, None], new_residual, residual)
-        amplitude, correlation = (
-            np.where(better, new_amplitude, amplitude),
-            np.where(better, new_correlation, correlation),
-        )
+        amplitude = np.where(better, new_amplitude, amplitude)
+        correlation = np.where(better, new_correlation, correlation)
         damping = np.where(better, damping / 5, damping * 5)
     return found, correlation, amplitude

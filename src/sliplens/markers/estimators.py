@@ -63,15 +63,12 @@ class FieldTrial:
     @property
     def inner(self) -> Bool[np.ndarray, " markers"]:
         """The third of the markers nearest to where pressing moved nothing: what touches for sure."""
-        return self._by_distance(0.0, _INNER_SHARE)
+        return _ring(self.rest_px, self.displacement_px[self.hold], 0.0, _INNER_SHARE)
 
     @property
     def outer(self) -> Bool[np.ndarray, " markers"]:
         """The next third: the edge of the contact."""
-        return self._by_distance(_INNER_SHARE, 2 * _INNER_SHARE)
-
-    def _by_distance(self, low: float, high: float) -> Bool[np.ndarray, " markers"]:
-        return _ring(self.rest_px, self.displacement_px[self.hold], low, high)
+        return _ring(self.rest_px, self.displacement_px[self.hold], _INNER_SHARE, 2 * _INNER_SHARE)
 
 
 def _ring(

@@ -101,8 +101,7 @@ def pair(
     """
     spot = _mutual(predicted_px, found_px, reach_px=GATE * neighbours.pitch_px)
     step = np.full(predicted_px.shape, np.nan)
-    if len(found_px):
-        step = np.where(spot[:, None] >= 0, found_px[spot] - from_px, np.nan)
+    step[spot >= 0] = found_px[spot[spot >= 0]] - from_px[spot >= 0]
     known = np.all(np.isfinite(step), axis=1)
     told = predict_from_neighbours(neighbours, step, known)
     error = np.linalg.norm(step - told, axis=1)
@@ -140,8 +139,7 @@ def _mutual(
     distance = np.where(np.isfinite(distance), distance, np.inf)
     nearest = distance.argmin(axis=1)
     back = distance.argmin(axis=0)
-    markers = np.arange(len(predicted_px))
-    good = (back[nearest] == markers) & (distance[markers, nearest] < reach_px)
+    good = (back[nearest] == np.arange(len(predicted_px))) & (distance.min(axis=1) < reach_px)
     return np.where(good, nearest, -1)
 
 
@@ -161,12 +159,11 @@ def likely_shifts(
     keys = np.round(ways / cell).astype(np.int64)
     cells, inverse, votes = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
     # a peak may lie on the border of cells: neighbours lend their votes
-    near = (
-        np.abs(cells[:, None] - cells[None]).max(axis=-1) <= 1 if len(cells) < 4000 else np.eye(len(cells), dtype=bool)
-    )
-    total = near @ votes
+    near = np.eye(len(cells), dtype=bool)
+    if len(cells) < 4000:
+        near = np.abs(cells[:, None] - cells[None]).max(axis=-1) <= 1
     shifts: list[np.ndarray] = []
-    for at in np.argsort(-total, kind="stable"):
+    for at in np.argsort(-(near @ votes), kind="stable"):
         if len(shifts) == _VOTES:
             break
         chosen = near[at][inverse.ravel()]
@@ -352,13 +349,12 @@ def drop_contradicting(
         if np.array_equal(lowest, label):
             break
         label = lowest
-    largest = np.bincount(label[sound]).argmax()
-    main = label == largest
+    main = label == np.bincount(label[sound]).argmax()
     rows, columns = np.nonzero(against)
     others = neighbours.index[rows, columns]
-    wrong = {int(label[one]) for one, other in zip(rows, others, strict=True) if main[one] != main[other]}
-    wrong |= {int(label[other]) for one, other in zip(rows, others, strict=True) if main[one] != main[other]}
-    return sound & (main | ~np.isin(label, list(wrong)))
+    apart_from_main = main[rows] != main[others]
+    wrong = label[np.concatenate([rows[apart_from_main], others[apart_from_main]])]
+    return sound & (main | ~np.isin(label, wrong))
 
 
 def match_left_over(
@@ -375,25 +371,19 @@ def match_left_over(
     Where the skin moves more than half a pitch in one step, the nearest spot is the next marker's. Neighbours still
     move alike: from those that are sound each marker's place is told, and once it is found it tells of the next.
 
-    `spot`: which spot each marker has; -1 for none; `told_px`: displacement of each as its sound neighbours tell it;
-    NaN where they do not.
-
-    Gives spots, those of the sound markers as they were.
+    `spot`: which spot each marker has; -1 for none; `told_px`: displacement of each as its sound neighbours tell it.
     """
     believed, spot = sound.copy(), np.where(sound, spot, -1)
-    shift = (
-        np.where(sound[:, None], found_px[spot] - rest_px, np.nan) if len(found_px) else np.full_like(rest_px, np.nan)
-    )
+    shift = np.full_like(rest_px, np.nan)
+    shift[sound] = found_px[spot[sound]] - rest_px[sound]
     for _ in range(_ROUNDS):
         free = np.setdiff1d(np.arange(len(found_px)), spot[believed])
         open_ones = np.flatnonzero(~believed & np.all(np.isfinite(told_px), axis=1))
         if not len(free) or not len(open_ones):
             break
-        places = rest_px[open_ones] + told_px[open_ones]
-        distance = np.linalg.norm(places[:, None] - found_px[free][None], axis=-1)
-        nearest, back = distance.argmin(axis=1), distance.argmin(axis=0)
-        rows = np.arange(len(open_ones))
-        good = (back[nearest] == rows) & (distance[rows, nearest] < GATE * neighbours.pitch_px[open_ones])
+        places, reach_px = rest_px[open_ones] + told_px[open_ones], GATE * neighbours.pitch_px[open_ones]
+        nearest = _mutual(places, found_px[free], reach_px=reach_px)
+        good = nearest >= 0
         if not good.any():
             break
         taken = open_ones[good]

@@ -1,7 +1,6 @@
 """Following markers from the untouched sensor through a trial."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -24,15 +23,6 @@ _REACH = 0.3  # pitches, between two frames
 _CLEAR = 0.5  # pitches, from where a known marker should be
 
 
-@dataclass(frozen=True, kw_only=True)
-class NewPlaces:
-    """New markers of one frame, in the order they came."""
-
-    place_px: Float[np.ndarray, "new 2"]
-    radius_px: Float[np.ndarray, " new"]
-    status: UInt8[np.ndarray, " new"]
-
-
 class Newcomers:
     """Spots that no known marker accounts for, until they have stayed long enough to be markers."""
 
@@ -46,8 +36,8 @@ class Newcomers:
         self._waiting = []
         return len(self._known)
 
-    def update(self, spare: Markers, expected_px: Float[np.ndarray, "markers 2"]) -> NewPlaces:
-        """Follow the new markers and admit more.
+    def update(self, spare: Markers, expected_px: Float[np.ndarray, "markers 2"]) -> TrackedFrame:
+        """Follow the new markers, in the order they came, and admit more.
 
         `spare`: spots of the frame that no marker of the reference took; `expected_px`: where the markers of the
         reference are, or should be: a spot near one may be its remains.
@@ -78,7 +68,8 @@ class Newcomers:
         self._waiting = waiting
         seen = np.all(np.isfinite(place), axis=1)
         status = np.where(seen, MarkerStatus.NEW, MarkerStatus.MISSING).astype(np.uint8)
-        return NewPlaces(place_px=place, radius_px=radius, status=status)
+        deviation = np.full(len(status), np.nan)
+        return TrackedFrame(position_px=place, radius_px=radius, deviation_px=deviation, status=status)
 
 
 _FEWEST = 4
@@ -158,16 +149,12 @@ class Tracker:
 
     def _judge(self, found: Markers, pairing: Pairing) -> TrackedFrame:
         rest, spot = self.rest.centre_px, pairing.spot
-        changed, cut = self._spoiled(found, spot)
-        shift = _taken(found.centre_px, spot) - rest
-        sound, told = self._believable(shift, (spot >= 0) & ~changed & ~cut)
+        shift, changed, cut, sound, told = self._believe(found, spot)
         if not sound.all():
             spot = match_left_over(
                 self._neighbours, spot, sound | changed | cut, told, rest_px=rest, found_px=found.centre_px
             )
-            changed, cut = self._spoiled(found, spot)
-            shift = _taken(found.centre_px, spot) - rest
-            sound, told = self._believable(shift, (spot >= 0) & ~changed & ~cut)
+            shift, _, cut, sound, told = self._believe(found, spot)
         place = rest + shift
         deviation = np.linalg.norm(shift - told, axis=1)
         status = np.full(len(rest), MarkerStatus.MISSING, dtype=np.uint8)
@@ -178,36 +165,33 @@ class Tracker:
         status[cut | ((spot < 0) & self._leaves_view())] = MarkerStatus.OUTSIDE
         hidden = ~np.isin(status, (MarkerStatus.FOLLOWED, MarkerStatus.BROKEN))
         place[hidden] = np.nan
-        new = self._newcomers.update(_only(found, found.whole & ~_used(spot, len(found))), self._expected(place))
+        spare = found.whole & ~np.isin(np.arange(len(found)), spot)
+        new = self._newcomers.update(
+            _only(found, spare), np.where(np.isfinite(place), place, self.rest.centre_px + self._shift)
+        )
         return TrackedFrame(
-            position_px=np.concatenate([place, new.place_px]),
+            position_px=np.concatenate([place, new.position_px]),
             radius_px=np.concatenate([np.where(hidden, np.nan, _taken(found.radius_px, spot)), new.radius_px]),
-            deviation_px=np.concatenate([np.where(hidden, np.nan, deviation), np.full(len(new.status), np.nan)]),
+            deviation_px=np.concatenate([np.where(hidden, np.nan, deviation), new.deviation_px]),
             status=np.concatenate([status, new.status]),
         )
 
-    def _believable(
-        self, shift: Float[np.ndarray, "markers 2"], sound: Bool[np.ndarray, " markers"]
-    ) -> tuple[Bool[np.ndarray, " markers"], Float[np.ndarray, "markers 2"]]:
-        sound = drop_contradicting(self._neighbours, shift, sound)
-        return drop_strays(self._neighbours, shift, sound)
-
-    def _spoiled(
-        self, found: Markers, spot: Int[np.ndarray, " markers"]
-    ) -> tuple[Bool[np.ndarray, " markers"], Bool[np.ndarray, " markers"]]:
-        """Markers whose spot has changed too much to be measured, and those that the edge cuts."""
+    def _believe(self, found: Markers, spot: Int[np.ndarray, " markers"]) -> tuple[np.ndarray, ...]:
+        """Shift of each marker, whether its spot has changed too much to be measured, whether the edge cuts it, whether
+        it may be believed, and its displacement as its neighbours tell it.
+        """
         paired = spot >= 0
         cut = np.zeros_like(paired)
         cut[paired] = ~found.whole[spot[paired]]
-        return paired & _changed(self.rest, found, spot), cut
+        changed = paired & _changed(self.rest, found, spot)
+        shift = _taken(found.centre_px, spot) - self.rest.centre_px
+        sound = drop_contradicting(self._neighbours, shift, paired & ~changed & ~cut)
+        return shift, changed, cut, *drop_strays(self._neighbours, shift, sound)
 
     def _leaves_view(self) -> Bool[np.ndarray, " markers"]:
         place, edge = self.rest.centre_px + self._shift, (self.rest.radius_px + 1.5)[:, None]
         far = np.array([self._size[1] - 1, self._size[0] - 1])
         return np.any((place < edge) | (place > far - edge), axis=1)
-
-    def _expected(self, place: Float[np.ndarray, "markers 2"]) -> Float[np.ndarray, "markers 2"]:
-        return np.where(np.isfinite(place), place, self.rest.centre_px + self._shift)
 
 
 def track_markers(
@@ -255,12 +239,6 @@ def _taken(values: np.ndarray, spot: Int[np.ndarray, " markers"]) -> np.ndarray:
     taken = np.full((len(spot), *values.shape[1:]), np.nan)
     taken[spot >= 0] = values[spot[spot >= 0]]
     return taken
-
-
-def _used(spot: Int[np.ndarray, " markers"], spots: int) -> Bool[np.ndarray, " spots"]:
-    used = np.zeros(spots, dtype=bool)
-    used[spot[spot >= 0]] = True
-    return used
 
 
 def _changed(rest: Markers, found: Markers, spot: Int[np.ndarray, " markers"]) -> Bool[np.ndarray, " markers"]:
