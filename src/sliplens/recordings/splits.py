@@ -13,6 +13,8 @@ from glob import escape
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from sliplens._version import __version__
 from sliplens.errors import InputError
 from sliplens.files import write_json
@@ -23,7 +25,6 @@ from sliplens.recordings.trial import TrialFacts
 FACTS = ("trial", "day", "object", "condition", "sensor")
 """What is known of a trial before it is looked at: what rules ask for, and trials are grouped by."""
 _TEXTS = tuple(fact for fact in FACTS if fact != "day")
-_DEALING = ("share", "by", "seed")
 _SPLIT_NAME = re.compile(r"[a-z][a-z0-9_-]*")
 # shares are written with few digits: thirds as 0.3333 are to be mended by the one who wrote them
 _SUM_TOLERANCE = 1e-6
@@ -154,52 +155,38 @@ def _alike(text: str, pattern: str) -> bool:
     return text == pattern or fnmatchcase(text, pattern)
 
 
+_TEXT, _PATTERNS = (str, "give one text in quotes"), (tuple[str, ...], "give a text in quotes, or a list of them")
+_KEYS: dict[str, tuple[Any, str]] = {
+    "trial": _PATTERNS,
+    "day": (tuple[int, ...], "give a whole number, or a list of them, without quotes"),
+    "object": _PATTERNS,
+    "condition": _PATTERNS,
+    "sensor": _PATTERNS,
+    "name": _TEXT,
+    "share": (dict[str, float], "write it like { train = 0.8, validation = 0.2 }"),
+    "by": _TEXT,
+    "seed": (int, "give a whole number"),
+}
+"""Types of what a rule may hold, and what to write in place of another."""
+
+
 def _rule(row: Mapping[str, Any]) -> SplitRule:
-    keys = (*FACTS, "name", *_DEALING)
-    unknown = [key for key in row if key not in keys]
+    unknown = [key for key in row if key not in _KEYS]
     if unknown:
-        raise InputError(f"{unknown[0]!r} is no key of a rule; use {', '.join(keys[:-1])} or {keys[-1]}")
+        *keys, last = _KEYS
+        raise InputError(f"{unknown[0]!r} is no key of a rule; use {', '.join(keys)} or {last}")
     if "seed" in row and "share" not in row:
         raise InputError("seed goes with share; leave it out")
-    values: dict[str, Any] = {fact: _texts(row[fact], fact) for fact in _TEXTS if fact in row}
-    if "day" in row:
-        values["day"] = _some(row["day"], "day")
-        if not all(_is_integer(day) for day in values["day"]):
-            raise InputError(f"day is {row['day']!r}; give a whole number, or a list of them, without quotes")
-    for key in ("name", "by"):
-        if key in row:
-            if not isinstance(row[key], str):
-                raise InputError(f"{key} is {row[key]!r}; give one text in quotes")
-            values[key] = row[key]
-    if "seed" in row:
-        if not _is_integer(row["seed"]):
-            raise InputError(f"seed is {row['seed']!r}; give a whole number")
-        values["seed"] = row["seed"]
-    if "share" in row:
-        share = row["share"]
-        if not (isinstance(share, dict) and all(_is_integer(x) or isinstance(x, float) for x in share.values())):
-            raise InputError(f"share is {share!r}; write it like {{ train = 0.8, validation = 0.2 }}")
-        values["share"] = {split: float(part) for split, part in share.items()}
+    values = {}
+    for key, value in row.items():
+        if key in FACTS and value == []:
+            raise InputError(f"{key} is an empty list, which fits no trial; name some, or leave {key} out")
+        kind, cure = _KEYS[key]
+        try:
+            values[key] = msgspec.convert([value] if key in FACTS and not isinstance(value, list) else value, kind)
+        except msgspec.ValidationError:
+            raise InputError(f"{key} is {value!r}; {cure}") from None
     return SplitRule(**values)
-
-
-def _texts(value: Any, key: str) -> tuple[str, ...]:
-    texts = _some(value, key)
-    if not all(isinstance(text, str) for text in texts):
-        raise InputError(f"{key} is {value!r}; give a text in quotes, or a list of them")
-    return texts
-
-
-def _some(value: Any, key: str) -> tuple[Any, ...]:
-    """One value, or a list of them."""
-    values = tuple(value) if isinstance(value, list) else (value,)
-    if not values:
-        raise InputError(f"{key} is an empty list, which fits no trial; name some, or leave {key} out")
-    return values
-
-
-def _is_integer(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
 
 
 _VALIDATION_SHARE = 0.25
@@ -428,7 +415,7 @@ def _deal(rule: SplitRule, trials: Sequence[TrialFacts], *, where: str) -> tuple
         raise InputError(
             f"{where} deals by {rule.by}, but of {_names(untold)} it is not told; tell it on import, or deal by trial"
         )
-    groups = sorted(set(group_of.values()), key=lambda name: _hash(rule.seed, name))
+    groups = sorted(set(group_of.values()), key=lambda name: hashlib.sha256(f"{rule.seed}:{name}".encode()).digest())
     counts = _apportion(len(groups), rule.share)
     order = [split for split, count in counts.items() for _ in range(count)]
     split_of = dict(zip(groups, order, strict=True))
@@ -440,10 +427,6 @@ def _deal(rule: SplitRule, trials: Sequence[TrialFacts], *, where: str) -> tuple
     if untold:
         notes.append(f"{where}: the {rule.by} of {_names(untold)} is not told; dealt as if of one {rule.by}")
     return {trial: split_of[group] for trial, group in group_of.items()}, notes
-
-
-def _hash(seed: int, name: str) -> str:
-    return hashlib.sha256(f"{seed}:{name}".encode()).hexdigest()
 
 
 def _apportion(count: int, share: Mapping[str, float]) -> dict[str, int]:
