@@ -35,7 +35,7 @@ class Demo:
 
     def run(self) -> None:
         """Run every stage, and say where the page is as soon as it is there."""
-        from sliplens.demo import run_demo
+        from sliplens.demo import DEMO_SEED, run_demo
 
         if self.max_minutes <= 0:
             raise InputError(f"--max-minutes must be above 0, got {self.max_minutes:g}")
@@ -48,7 +48,6 @@ class Demo:
             pages.append(page)
 
         terminal = _WithoutNotes()
-        seed = {} if self.seed is None else {"seed": self.seed}
         page = run_demo(
             self.output,
             train_minutes=self.max_minutes if self.train else None,
@@ -57,7 +56,7 @@ class Demo:
             jobs=2,
             on_page=on_page,
             on_progress=terminal,
-            **seed,
+            seed=DEMO_SEED if self.seed is None else self.seed,
         )
         if terminal.notes:
             say(f"{len(terminal.notes)} note{'s' * (len(terminal.notes) > 1)} on what to be careful with: see the page")
