@@ -5,6 +5,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from sliplens.explainers.explanation import check_slopes
 from sliplens.report import load_results
 from sliplens.report.verdict import count_alarms, group_alarms, judge
 
@@ -27,6 +28,21 @@ def test_alarms_of_one_kind_are_one_line_with_a_count():
         ("The network is asleep.", 1),
     ]
     assert groups[0].sentences[0] == "Grad-CAM does not beat a random order: its symmetric gain is -0.1."
+
+
+def test_warnings_of_explainers_are_grouped_by_kind_not_told_frame_by_frame():
+    warnings = [
+        *check_slopes([0.001, 0.002], change=[-0.5, -0.6]),
+        *(f"f{row}: the map leaves 0.{row} of f(x) - f(reference) = -0.9 unexplained, more than 1%" for row in (1, 2)),
+        *(
+            f"f{row}: f(x) = 1 is within 0.02 of f(reference) = 1, so there is next to nothing to explain"
+            for row in (1, 2)
+        ),
+    ]
+
+    groups = group_alarms(warnings)
+
+    assert [len(group.sentences) for group in groups] == [2, 2, 2]
 
 
 def test_alarms_are_counted_by_network(workspace):

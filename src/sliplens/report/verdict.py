@@ -401,6 +401,12 @@ _KINDS = {
     r"at an end of the margin": "Answers at an end of the margin, which can move one way only",
     r"still correlates": "Maps that stay alike when all weights are new",
     r"rank nothing|NaN": "Maps that rank nothing",
+    r"unexplained, more than": "Maps that do not add up to the change that they explain",
+    r"next to nothing to explain": "Frames with next to nothing to explain",
+    r"is saturated there": "Frames where the network is saturated, so that gradients say little",
+    r"masked passes chose nothing": "Layers in which the passes of Poly-CAM chose nothing: activity only",
+    r"so the map is zero": "Maps in which nothing speaks for the answer",
+    r"expected to correlate": "Maps from some of the channels that may differ from the exact ones",
 }
 
 
