@@ -1,8 +1,8 @@
 """Class activation maps that keep their sign."""
 
-from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 import torch
 from jaxtyping import Float
@@ -16,11 +16,11 @@ from sliplens.explainers.frozen_model import FrozenModel
 from sliplens.explainers.maps import spread
 from sliplens.progress import OnProgress
 
+_Maps: TypeAlias = Float[Tensor, "batch channels rows columns"]
+_Cells: TypeAlias = Float[Tensor, "batch rows columns"]
 
-def grad_cam_map(
-    activations: Float[Tensor, "batch channels rows columns"],
-    gradients: Float[Tensor, "batch channels rows columns"],
-) -> Float[Tensor, "batch rows columns"]:
+
+def grad_cam_map(activations: _Maps, gradients: _Maps) -> _Cells:
     """Grad-CAM before any ReLU: sum over c of alpha_c A_c, alpha_c the mean over space of df/dA_c.
 
     In margin units for each cell: for a head f = bias + w . mean over space of A, alpha_c = w_c / (rows x columns), so
@@ -34,10 +34,7 @@ def grad_cam_map(
     return (gradients.mean(dim=(2, 3), keepdim=True) * activations).sum(dim=1)
 
 
-def hires_cam_map(
-    activations: Float[Tensor, "batch channels rows columns"],
-    gradients: Float[Tensor, "batch channels rows columns"],
-) -> Float[Tensor, "batch rows columns"]:
+def hires_cam_map(activations: _Maps, gradients: _Maps) -> _Cells:
     """HiResCAM: sum over c of df/dA_c A_c, cell by cell, in margin units; Grad-CAM where the gradient is constant.
 
     References
@@ -48,10 +45,7 @@ def hires_cam_map(
     return (gradients * activations).sum(dim=1)
 
 
-def layer_cam_map(
-    activations: Float[Tensor, "batch channels rows columns"],
-    gradients: Float[Tensor, "batch channels rows columns"],
-) -> Float[Tensor, "batch rows columns"]:
+def layer_cam_map(activations: _Maps, gradients: _Maps) -> _Cells:
     """LayerCAM before its last ReLU: sum over c of relu(df/dA_c) A_c, cell by cell, in margin units.
 
     References
@@ -77,15 +71,14 @@ class _Cam(Method):
     batch_size: int = 32
 
     method: ClassVar[str]
-    complete: ClassVar[bool]
-    """Whether the contrast adds up to f(x) - f(b) for a head linear in the mean over space."""
+    cells: ClassVar[Callable[[_Maps, _Maps], _Cells]]
+    """Relevance of the layer's cells in margin units, from activations and gradients."""
+    one_sided: ClassVar[bool] = False
+    """Whether gradients count along the change of the prediction, where some are left out. If not, the contrast adds
+    up to f(x) - f(b) for a head linear in the mean over space."""
 
     def __post_init__(self) -> None:
         require_at_least_one(type(self).__name__, batch_size=self.batch_size)
-
-    @abstractmethod
-    def _cells(self, activations: Tensor, gradients: Tensor, *, change: Tensor) -> Tensor:
-        """Relevance of the layer's cells in margin units."""
 
     def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
         layer = self._find_layer(frozen)
@@ -102,8 +95,9 @@ class _Cam(Method):
                 empty, reference_prediction = activations[len(part) :], prediction[len(part) :]
             activations, prediction = activations[: len(part)], prediction[: len(part)]
             change = (prediction - reference_prediction)[:, None, None, None]
-            cells = self._cells(activations - empty if self.contrast else activations, gradients, change=change)
-            maps.append(spread(cells, (frozen.images.shape[-2], frozen.images.shape[-1])))
+            sign = change.sign() if self.one_sided else torch.ones_like(change)
+            cells = type(self).cells(activations - empty if self.contrast else activations, sign * gradients)
+            maps.append(spread(sign[:, 0] * cells, (frozen.images.shape[-2], frozen.images.shape[-1])))
             predictions.append(prediction)
             reference_predictions.append(reference_prediction.expand_as(prediction))
             if on_progress is not None:
@@ -113,7 +107,7 @@ class _Cam(Method):
         return comparison.explanation(
             relevance,
             method=self.method,
-            complete=self.contrast and self.complete,
+            complete=self.contrast and not self.one_sided,
             target=f"{'f(x) - f(reference)' if self.contrast else 'f(x)'}, through layer {layer.name}",
             warnings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=comparison.change.tolist()),
         )
@@ -158,10 +152,7 @@ class GradCam(_Cam):
     """
 
     method: ClassVar[str] = "grad-cam"
-    complete: ClassVar[bool] = True
-
-    def _cells(self, activations: Tensor, gradients: Tensor, *, change: Tensor) -> Tensor:  # noqa: ARG002 (a slot)
-        return grad_cam_map(activations, gradients)
+    cells = staticmethod(grad_cam_map)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,10 +166,7 @@ class HiResCam(_Cam):
     """
 
     method: ClassVar[str] = "hires-cam"
-    complete: ClassVar[bool] = True
-
-    def _cells(self, activations: Tensor, gradients: Tensor, *, change: Tensor) -> Tensor:  # noqa: ARG002 (a slot)
-        return hires_cam_map(activations, gradients)
+    cells = staticmethod(hires_cam_map)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,8 +182,5 @@ class LayerCam(_Cam):
     """
 
     method: ClassVar[str] = "layer-cam"
-    complete: ClassVar[bool] = False
-
-    def _cells(self, activations: Tensor, gradients: Tensor, *, change: Tensor) -> Tensor:
-        sign = change.sign()
-        return sign[:, 0] * layer_cam_map(activations, sign * gradients)
+    cells = staticmethod(layer_cam_map)
+    one_sided: ClassVar[bool] = True

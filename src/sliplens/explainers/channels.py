@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import torch
 from jaxtyping import Float, Int
@@ -34,31 +35,11 @@ VARIANTS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class MaskedPredictions:
-    """Predictions of one image x, of what it is blended with, b, and of its masked versions, in margin units."""
-
-    image: Float[Tensor, ""]
-    """f(x)."""
-    empty: Float[Tensor, ""]
-    """f(b), the image with everything removed."""
-    variant: Variant
-    """What the rows of `points` are."""
-    points: Float[Tensor, "points channels"]
-    """What `measure` returns."""
-
-    @property
-    def kept(self) -> Float[Tensor, " channels"] | None:
-        """f(b + (x - b) M) for each channel's mask M, or None where the variant has no such pass."""
-        return self.points[0] if self.variant.keep else None
-
-    @property
-    def removed(self) -> Float[Tensor, " channels"] | None:
-        """f(b + (x - b)(1 - M)), or None."""
-        return self.points[-1] if self.variant.remove else None
+Points: TypeAlias = Float[Tensor, "points channels"]
+"""Predictions of the masked images of each channel in margin units, the kept and the removed ones; see `measure`."""
 
 
-def regression_support(predictions: MaskedPredictions) -> Float[Tensor, " channels"]:
+def regression_support(image: Tensor, empty: Tensor, points: Points, *, variant: Variant) -> Tensor:
     """Share of f(x) - f(b) that each channel's region supports: 0 for the empty mask, 1 for the full one.
 
     The mean of what the region adds to the reference, f(b + (x - b) M) - f(b), and of what the image loses without it,
@@ -66,16 +47,12 @@ def regression_support(predictions: MaskedPredictions) -> Float[Tensor, " channe
     softmax or sigmoid of the output it is signed and does not saturate. The division changes no map, since each is
     normalised, and keeps the numbers clear of the floor of 1e-12 in `combine`.
     """
-    effects = []
-    if predictions.kept is not None:
-        effects.append(predictions.kept - predictions.empty)
-    if predictions.removed is not None:
-        effects.append(predictions.image - predictions.removed)
-    effect, change = torch.stack(effects).mean(dim=0), predictions.image - predictions.empty
+    effects = [points[0] - empty] * variant.keep + [image - points[-1]] * variant.remove
+    effect, change = torch.stack(effects).mean(dim=0), image - empty
     return effect / change if change else torch.zeros_like(effect)
 
 
-def thesis_support(predictions: MaskedPredictions) -> Float[Tensor, " channels"]:
+def thesis_support(image: Tensor, _empty: Tensor, points: Points, *, variant: Variant) -> Tensor:
     """What the public code makes the weights of, for a network with one output.
 
     The score is a sigmoid s of the percentage. PCAM+: s(kept); PCAM-: s(image) - s(removed); PCAM+/-:
@@ -87,23 +64,15 @@ def thesis_support(predictions: MaskedPredictions) -> Float[Tensor, " channels"]
     Englebert, Cornu and De Vleeschouwer, *Poly-CAM*, ICPR 2022, eqs. 8 to 10, and its public code for the sigmoid of
     a single output.
     """
-    parts = []
-    if predictions.kept is not None:
-        parts.append(_sigmoid_of_percent(predictions.kept))
-    if predictions.removed is not None:
-        parts.append(_sigmoid_of_percent(predictions.image) - _sigmoid_of_percent(predictions.removed))
-    return torch.stack(parts).sum(dim=0)
-
-
-def _sigmoid_of_percent(margins: Tensor) -> Tensor:
-    return torch.sigmoid(100 * margins)
+    image, points = torch.sigmoid(100 * image), torch.sigmoid(100 * points)
+    return torch.stack([points[0]] * variant.keep + [image - points[-1]] * variant.remove).sum(dim=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
     """A way to weigh channels, with what belongs to it."""
 
-    support: Callable[[MaskedPredictions], Tensor]
+    support: Callable[..., Float[Tensor, " channels"]]
     """How far each channel speaks for the prediction; below 0 it speaks against it, and gets no weight."""
     layers: Callable[[nn.Module, Tensor], tuple[Layer, ...]]
     """Layers of a network, fine to coarse or as they run, found with one image."""

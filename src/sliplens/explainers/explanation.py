@@ -112,35 +112,24 @@ def check_maps(
     prediction: Float[Tensor, " batch"],
     reference_prediction: Float[Tensor, " batch"],
     completeness_gap: Float[Tensor, " batch"] | None,
-) -> tuple[str, ...]:
+) -> Iterator[str]:
     """What is wrong with each map, one sentence a finding, in the order of the images; all in margin units."""
-    findings = []
-    for index, (image_map, high, low) in enumerate(
-        zip(relevance, prediction.tolist(), reference_prediction.tolist(), strict=True)
-    ):
-        change = high - low
-        if abs(change) < CLOSE:
-            findings.append(
-                f"image {index}: f(x) = {high:.3g} is within {CLOSE} of f(reference) = {low:.3g}, "
-                "so there is next to nothing to explain"
-            )
-        if not LOWEST <= low <= HIGHEST:
-            findings.append(
-                f"image {index}: f(reference) = {low:.3g} is no safety margin, so the reference lies far from the data "
-                "and the map shows the way from there"
-            )
-        if not torch.isfinite(image_map).all():
-            findings.append(f"image {index}: the map holds NaN or infinity and must not be shown or scored")
-        elif not image_map.any():
-            findings.append(f"image {index}: the map is zero everywhere and says nothing about the image")
-        if completeness_gap is not None:
-            gap = float(completeness_gap[index])
-            if gap > GAP * abs(change):
-                findings.append(
-                    f"image {index}: the map leaves {gap:.2g} of f(x) - f(reference) = {change:.2g} unexplained, "
-                    f"more than {GAP:.0%}"
-                )
-    return tuple(findings)
+    gaps = torch.zeros_like(prediction) if completeness_gap is None else completeness_gap
+    numbers = (values.tolist() for values in (prediction, reference_prediction, gaps))
+    for index, (image_map, high, low, gap) in enumerate(zip(relevance, *numbers, strict=True)):
+        change, finite = high - low, bool(torch.isfinite(image_map).all())
+        findings = {
+            f"f(x) = {high:.3g} is within {CLOSE} of f(reference) = {low:.3g}, so there is next to nothing to "
+            "explain": abs(change) < CLOSE,
+            f"f(reference) = {low:.3g} is no safety margin, so the reference lies far from the data and the map shows "
+            "the way from there": not LOWEST <= low <= HIGHEST,
+            "the map holds NaN or infinity and must not be shown or scored": not finite,
+            "the map is zero everywhere and says nothing about the image": finite and not image_map.any(),
+            f"the map leaves {gap:.2g} of f(x) - f(reference) = {change:.2g} unexplained, more than {GAP:.0%}": (
+                gap > GAP * abs(change)
+            ),
+        }
+        yield from (f"image {index}: {finding}" for finding, holds in findings.items() if holds)
 
 
 def check_weights(
@@ -149,14 +138,13 @@ def check_weights(
     """What is wrong with the weights of the channels, one sentence for each image and layer."""
     for index, (shares, difference) in enumerate(zip(weights, change, strict=True)):
         for layer, weight in zip(layers, shares, strict=True):
-            bad = int((~weight.isfinite()).sum())
-            if bad:
+            if bad := int((~weight.isfinite()).sum()):
                 yield (
                     f"image {index}: {bad} of {len(weight)} channels of layer {layer} have no finite weight, "
                     "so the model cannot predict every masked image"
                 )
             elif difference and not weight.any():
-                yield (f"image {index}: no channel of layer {layer} supports f(x) - f(reference), so the map is zero")
+                yield f"image {index}: no channel of layer {layer} supports f(x) - f(reference), so the map is zero"
             elif difference and len(weight) > 1 and bool((weight == weight[0]).all()):
                 yield (
                     f"image {index}: every channel of layer {layer} has the weight {float(weight[0]):.3g}, "

@@ -144,22 +144,16 @@ class Comparison(FrozenModel):
         """Record of an explanation, with its warnings."""
         gap = (relevance.sum(dim=(1, 2)) - self.change).abs().float() if complete else None
         single = relevance.float()
-        of_maps = check_maps(
-            single,
-            prediction=self.prediction,
-            reference_prediction=self.reference_prediction,
-            completeness_gap=gap,
-        )
+        predictions = {"prediction": self.prediction, "reference_prediction": self.reference_prediction}
         return Explanation(
             images=self.images.float(),
             relevance=single,
             method=method,
             target=target,
-            prediction=self.prediction.float(),
-            reference_prediction=self.reference_prediction.float(),
+            **{name: values.float() for name, values in predictions.items()},
             completeness_gap=gap,
             seconds=0.0,  # known when the call ends
-            warnings=(*of_maps, *warnings),
+            warnings=(*check_maps(single, **predictions, completeness_gap=gap), *warnings),
             levels=levels,
             approximations=approximations,
             engine=engine,

@@ -1,5 +1,6 @@
 """Poly-CAM for a regressor: channel masks, scored by what they keep and what they remove."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -8,7 +9,7 @@ from torch import Tensor
 
 from sliplens.errors import InputError
 from sliplens.explainers.activations import Layer, capture, find_layers
-from sliplens.explainers.channels import SCORES, VARIANTS, MaskedPredictions, Regions, combine, measure, scale_to
+from sliplens.explainers.channels import SCORES, VARIANTS, Regions, combine, measure, scale_to
 from sliplens.explainers.contract import Method
 from sliplens.explainers.explanation import Approximation, Explanation, Level, check_approximations, check_weights
 from sliplens.explainers.frozen_model import Comparison, FrozenModel
@@ -92,7 +93,14 @@ class PolyCam(Method):
         comparison = frozen.compare()
         layers = self._find_layers(comparison)
         channels = sum(layer.channels for layer in layers)
-        count = _Count(total=len(comparison.images) * channels, on_progress=on_progress)
+        done = 0
+
+        def count(channels_done: int) -> None:
+            nonlocal done
+            done += channels_done
+            if on_progress is not None and channels_done:
+                on_progress(done, len(comparison.images) * channels)
+
         # one engine for all rounds and images
         engine = comparison.prepare(
             len(comparison.images) * round(self.budget * channels) * VARIANTS[self.variant].passes,
@@ -159,7 +167,7 @@ class PolyCam(Method):
         shown_at: Tensor,
         *,
         engine: Engine,
-        count: "_Count",
+        count: Callable[[int], None],
     ) -> tuple[list[Tensor], list[Approximation]]:
         """Weight >= 0 of each channel, layer by layer, and how far they are estimates."""
         score, variant = SCORES[self.score], VARIANTS[self.variant]
@@ -174,15 +182,15 @@ class PolyCam(Method):
         )
 
         def supports(points: Float[Tensor, "points some"]) -> Float[Tensor, " some"]:
-            return score.support(MaskedPredictions(image=image, empty=empty, variant=variant, points=points))
+            return score.support(image, empty, points, variant=variant)
 
         def measured(channels: Int[Tensor, " some"]) -> Float[Tensor, "points some"]:
-            return measure(regions, channels, engine=engine, variant=variant, on_channels=count.add)
+            return measure(regions, channels, engine=engine, variant=variant, on_channels=count)
 
         # an empty mask keeps nothing and removes nothing, which needs no pass
         at_empty = torch.stack([empty] * variant.keep + [image] * variant.remove)[:, None]
         active = regions.active()
-        count.add(sum(regions.layer_sizes) - len(active))
+        count(sum(regions.layer_sizes) - len(active))
         if self.budget < 1 and len(active):
             search = ChannelSearch(
                 activations,
@@ -194,7 +202,7 @@ class PolyCam(Method):
                 seed=self.seed,
             )
             weights, approximation = search.run(budget=self.budget, likeness=self.likeness)
-            count.add(len(active) - approximation.measured)
+            count(len(active) - approximation.measured)
             return weights, [approximation]
         points = at_empty.repeat(1, sum(regions.layer_sizes))
         points[:, active] = measured(active)
@@ -209,17 +217,3 @@ def _activations(comparison: Comparison, index: int, layers: tuple[Layer, ...]) 
     with capture(comparison.model, [layer.name for layer in layers]) as outputs:
         comparison.predict(comparison.images[index, None])
     return [outputs[layer.name][0] for layer in layers]
-
-
-@dataclass
-class _Count:
-    """Channels done."""
-
-    total: int
-    on_progress: OnProgress | None
-    done: int = 0
-
-    def add(self, channels: int) -> None:
-        self.done += channels
-        if self.on_progress is not None and channels:
-            self.on_progress(self.done, self.total)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import TypeAlias
 
 import numpy as np
@@ -23,73 +22,27 @@ Predict: TypeAlias = Callable[[Tensor], Tensor] | Engine
 which keeps all cores busy (`sliplens.models.engines.prepare`)."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Removal:
-    """One image, of which so many pixels of an order are gone."""
-
-    image: int
-    order: Int[np.ndarray, " pixels"]
-    """Flat pixel indices; removals that share one stand together, so that it is ranked once."""
-    pixels: int
-
-
 def answer_whole(predict: Predict, images: Tensor, *, batch_size: int) -> Float64[np.ndarray, " images"]:
     """Answers on whole images."""
     return _collect(predict, images.split(_size(predict, batch_size)), lambda _: None)
 
 
-def answer_removals(
-    predict: Predict,
-    paint: Painter,
-    removals: Sequence[Removal],
-    *,
-    shape: tuple[int, int],
-    device: torch.device,
-    batch_size: int,
-    on_progress: OnProgress | None = None,
-) -> Float64[np.ndarray, " removals"]:
-    """Answers on images of which parts are removed.
-
-    Parameters
-    ----------
-    paint
-        Makes the images, a batch in memory at a time.
-    removals
-        What to answer, in this order.
-    shape, device
-        Height and width of the images, and where they are.
-    on_progress
-        Called with the number of images done and of all; removals are given image by image.
-    """
-    images = {removal.image for removal in removals}
-    done = 0
-
-    def count(answers: Tensor) -> None:
-        nonlocal done
-        done += len(answers)
-        if on_progress is not None:
-            on_progress(done * len(images) // len(removals), len(images))
-
-    batches = _paint(paint, removals, shape=shape, device=device, batch_size=_size(predict, batch_size))
-    return _collect(predict, batches, count)
-
-
 def _paint(
-    paint: Painter, removals: Iterable[Removal], *, shape: tuple[int, int], device: torch.device, batch_size: int
+    paint: Painter, orders: np.ndarray, jobs: Sequence[tuple[int, int, int]], *, images: Tensor, batch_size: int
 ) -> Iterator[Tensor]:
+    """Images of which parts are gone, a batch in memory at a time; jobs are image, order and pixels removed."""
     ranked, rank = None, torch.empty(0)
-    left = iter(removals)
-    while batch := list(islice(left, batch_size)):
-        gone = torch.empty((len(batch), *shape), dtype=torch.bool)
-        for row, removal in enumerate(batch):
-            if removal.order is not ranked:
-                ranked = removal.order
-                rank = torch.empty(len(ranked), dtype=torch.int32)
-                rank[torch.from_numpy(ranked)] = torch.arange(len(ranked), dtype=torch.int32)
-                rank = rank.view(shape)
-            gone[row] = rank < removal.pixels
-        rows = torch.tensor([removal.image for removal in batch], device=device)
-        yield paint(rows, gone.to(device))
+    for start in range(0, len(jobs), batch_size):
+        batch = jobs[start : start + batch_size]
+        gone = torch.empty((len(batch), *images.shape[-2:]), dtype=torch.bool)
+        for row, (image, order, pixels) in enumerate(batch):
+            if ranked != (image, order):  # jobs that share one stand together, so that it is ranked once
+                ranked, rank = (image, order), torch.empty(orders.shape[-1], dtype=torch.int32)
+                rank[torch.from_numpy(orders[order, image])] = torch.arange(len(rank), dtype=torch.int32)
+                rank = rank.view(gone.shape[1:])
+            gone[row] = rank < pixels
+        rows = torch.tensor([image for image, _, _ in batch], device=images.device)
+        yield paint(rows, gone.to(images.device))
 
 
 def _size(predict: Predict, batch_size: int) -> int:
@@ -133,13 +86,7 @@ class RemovalCurves:
         return np.abs(self.answers - self.answers[..., :1])
 
     def lost(self, towards: Float[np.ndarray, " images"]) -> Float64[np.ndarray, "orders images steps"]:
-        """How much of what speaks for the target is gone: changes counted along it, below 0 where more speaks for it.
-
-        Parameters
-        ----------
-        towards
-            Sign of f(x) - f(untouched sensor) of each image.
-        """
+        """How much of what speaks for the target is gone: changes along the sign of f(x) - f(untouched sensor)."""
         return towards[:, None] * (self.answers[..., :1] - self.answers)
 
     @property
@@ -249,13 +196,7 @@ class Faithfulness:
         )
 
     def at(self, area: float) -> Float64[np.ndarray, "3 images"]:
-        """Changes where a share of the image is gone: most first, least first, random.
-
-        Raises
-        ------
-        InputError
-            If the curves have no such step.
-        """
+        """Changes where a share of the image, one of `areas`, is gone: most first, least first, random."""
         step = np.flatnonzero(np.isclose(self.areas, area))
         if not len(step):
             raise InputError(f"there is no step at {area:g} of the image; choose one of {self.areas.tolist()}")
@@ -297,36 +238,33 @@ def removal_curves(
     shares = np.asarray(areas, dtype=np.float64)
     if shares[0] != 0 or shares[-1] != 1 or np.any(np.diff(shares) <= 0):
         raise InputError(f"areas must rise from 0 to 1, got {list(areas)}")
-    shape = (images.shape[-2], images.shape[-1])
-    removed = np.round(shares * shape[0] * shape[1]).astype(np.int64)
-    jobs = list(_jobs(orders, removed))
-    answered = answer_removals(
-        predict,
+    removed = np.round(shares * images.shape[-2] * images.shape[-1]).astype(np.int64).tolist()
+    last, jobs = len(shares) - 1, []
+    for image in range(len(images)):
+        jobs += [(image, order, step) for order in range(len(orders)) for step in range(1, last)]
+        # what is left of the image when all is gone depends on no order: answered once
+        jobs.append((image, 0, last))
+    done = 0
+
+    def count(batch: Tensor) -> None:
+        nonlocal done
+        done += len(batch)
+        if on_progress is not None:
+            on_progress(done * len(images) // len(jobs), len(images))
+
+    batches = _paint(
         fill(images, references, seed),
-        [Removal(image=image, order=orders[order, image], pixels=int(removed[step])) for image, order, step in jobs],
-        shape=shape,
-        device=images.device,
-        batch_size=batch_size,
-        on_progress=on_progress,
+        orders,
+        [(image, order, removed[step]) for image, order, step in jobs],
+        images=images,
+        batch_size=_size(predict, batch_size),
     )
     answers = np.empty((len(orders), len(images), len(shares)))
+    image_of, order_of, step_of = np.transpose(jobs)
+    answers[order_of, image_of, step_of] = _collect(predict, batches, count)
     answers[:, :, 0] = answer_whole(predict, images, batch_size=batch_size)
-    for (image, order, step), value in zip(jobs, answered, strict=True):
-        answers[order, image, step] = value
     answers[:, :, -1] = answers[0, :, -1]
     return RemovalCurves(areas=shares, answers=answers)
-
-
-def _jobs(
-    orders: Int[np.ndarray, "orders images pixels"], removed: Int[np.ndarray, " steps"]
-) -> Iterator[tuple[int, int, int]]:
-    """What to answer, as image, order and step."""
-    last = len(removed) - 1
-    for image in range(orders.shape[1]):
-        for order in range(len(orders)):
-            yield from ((image, order, step) for step in range(1, last))
-        # what is left of the image when all is gone depends on no order: answered once
-        yield image, 0, last
 
 
 def score_maps(
@@ -347,19 +285,13 @@ def score_maps(
 ) -> dict[str, Faithfulness]:
     """Score the maps of several methods on the same images, against the same random orders.
 
+    Maps are larger where a method says that a part of the units (`pixel_units`, `tile_units`, `marker_units`) matters
+    more. Of signed relevance give the part that works towards the target, `relevance * sign(target)`, and `towards`,
+    the sign of f(x) - f(untouched sensor) of each image: changes count along it; by their size if None.
+
     Where maps are signed, what speaks against the target is the least influential, and removing it moves the answer the
     other way, as far as removing what speaks for it. By size the two are told apart by nothing: a map of what each
     marker really does then ranks below the same map half shuffled, which it does not along the target (docs/study.md).
-
-    Parameters
-    ----------
-    influence
-        Maps by method, larger where a method says that a part matters more. Of signed relevance give the part that
-        works towards the target, `relevance * sign(target)`, and `towards`.
-    units
-        What is removed at once, for each image (`pixel_units`, `tile_units`, `marker_units`).
-    towards
-        Sign of the target f(x) - f(untouched sensor) of each image: changes count along it; by their size if None.
 
     References
     ----------
