@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from sliplens.files import output_folder
@@ -46,9 +47,8 @@ def export_lerobot(
     """
     from sliplens.recordings.formats.lerobot_export import write_lerobot  # noqa: PLC0415 (Pillow and PyAV come with it)
 
-    # LeRobot reads what `meta` holds by name
-    kind = _Kind(name="lerobot", run_file="meta/sliplens/run.json", write=write_lerobot)
-    return _export(kind, data, Path(out), trials=trials, overwrite=overwrite, on_progress=on_progress)
+    export = partial(_export, "lerobot", write_lerobot, run_file="meta/sliplens/run.json")  # it reads `meta` by name
+    return export(data, Path(out), trials=trials, overwrite=overwrite, on_progress=on_progress)
 
 
 def export_mcap(
@@ -79,37 +79,30 @@ def export_mcap(
     """
     from sliplens.recordings.formats.mcap import write_mcap  # noqa: PLC0415 (not needed where nothing is exported)
 
-    # tools for MCAP open single files
-    kind = _Kind(name="mcap", run_file="run.json", write=write_mcap)
-    return _export(kind, data, Path(out), trials=trials, overwrite=overwrite, on_progress=on_progress)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Kind:
-    name: str
-    run_file: str
-    """Place of `run.json`, below the folder."""
-    write: Callable[..., None]
+    export = partial(_export, "mcap", write_mcap, run_file="run.json")  # tools for MCAP open single files
+    return export(data, Path(out), trials=trials, overwrite=overwrite, on_progress=on_progress)
 
 
 def _export(
-    kind: _Kind,
+    name: str,
+    write: Callable[..., None],
     data: Dataset | Path | str,
     out: Path,
     *,
+    run_file: str,
     trials: Sequence[str] | None,
     overwrite: bool,
     on_progress: OnProgress | None,
 ) -> Export:
     data = data if isinstance(data, Dataset) else load_dataset(data)
     chosen = data.trials if not trials else tuple(data.find(name) for name in dict.fromkeys(trials))
-    config = {"format": kind.name, "data_hash": data.hash, "trials": [info.trial for info in chosen]}
+    config = {"format": name, "data_hash": data.hash, "trials": [info.trial for info in chosen]}
     with output_folder(
-        out, stage="export", config=config, overwrite=overwrite, run_file=kind.run_file, resumable=False
+        out, stage="export", config=config, overwrite=overwrite, run_file=run_file, resumable=False
     ) as output:
         if not output.complete:
             with stage(on_progress, "Writing frames") as count:
-                kind.write(data, output.folder, trials=chosen, on_progress=count)
+                write(data, output.folder, trials=chosen, on_progress=count)
     frames = sum(info.frames for info in chosen)
     wrote(on_progress, out, f"{len(chosen)} trials, {frames:,} frames", kept=output.complete)
     return Export(folder=out, trials=tuple(info.trial for info in chosen), frames=frames)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from sliplens.errors import ImageError, InputError
 from sliplens.images import list_images, read_image
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.dataset import DATASET_FILE, Dataset, TrialInfo, trial_path
+from sliplens.recordings.dataset import DATASET_FILE, Dataset, TrialInfo, load_dataset, trial_path
 from sliplens.recordings.formats import open_captures, recognise
 from sliplens.recordings.formats.images import frame_size, read_frame
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
@@ -24,6 +24,7 @@ Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
 """RGB image of the camera."""
 Frames: TypeAlias = UInt8[np.ndarray, "frames height width 3"]
 """RGB images of the camera, one after another."""
+_Trial = TypeVar("_Trial")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,12 +95,12 @@ def open_source(
     options = ReadOptions() if options is None else options
     source = Path(source) if isinstance(source, str) else source
     if isinstance(source, Path) and format in {None, "sliplens"} and (source / DATASET_FILE).is_file():
-        source = Dataset.open(source)
+        source = load_dataset(source)
     if isinstance(source, Dataset):
         _require_nothing_given(source, reference, reference_frame, options)
-        trials = [partial(_stored, source.folder, info) for info in source.select(split=split)]
-        names = [info.trial for info in source.select(split=split)]
-        return tuple(open_trial() for open_trial in _chosen(trials, names, trial, source.folder))
+        infos = source.select(split=split)
+        chosen = _chosen(infos, [info.trial for info in infos], trial, source.folder)
+        return tuple(_stored(source.folder, info) for info in chosen)
     if split is not None:
         raise InputError(f"{_words(source)} is no data set of sliplens and has no splits; leave out --split")
     opened = [
@@ -112,7 +113,7 @@ def open_source(
 def _open(source: Path | Frames, format: str | None, options: ReadOptions) -> list[TrialFrames]:
     if not isinstance(source, Path):
         return [_array(source)]
-    if set(options.given()) <= {"frame_rate"} and _is_image_folder(source, format):
+    if set(options.given()) <= {"frame_rate"} and (format or recognise(source)) == "images":
         return [_images(source, options.frame_rate)]
     return [_recorded(capture) for capture in open_captures(source, format=format, options=options)]
 
@@ -126,7 +127,7 @@ def _require_nothing_given(
         raise InputError(f"{data.folder} is a data set of sliplens, which does not take {spoken(options.given())}")
 
 
-def _chosen(trials: list, names: list[str], trial: str | None, source: Path | Frames) -> list:
+def _chosen(trials: Sequence[_Trial], names: list[str], trial: str | None, source: Path | Frames) -> Sequence[_Trial]:
     if trial is None:
         return trials
     if trial not in names:
@@ -161,27 +162,18 @@ def _array(frames: Frames) -> TrialFrames:
     )
 
 
-def _is_image_folder(path: Path, format: str | None) -> bool:
-    if format is not None:
-        return format == "images"
-    return recognise(path) == "images"
-
-
 def _images(folder: Path, frame_rate: float | None) -> TrialFrames:
     """Images as one trial; unlike on import, their times may stay unknown."""
     paths = list_images(folder)
+    size = frame_size(paths[0])
     return TrialFrames(
         name=trial_name(folder.resolve().name),
         frames=len(paths),
-        frame_size=(size := frame_size(paths[0])),
-        read_frames=partial(_read_images, paths, size),
+        frame_size=size,
+        read_frames=lambda: (read_frame(path, size=size) for path in paths),
         time_s=None if frame_rate is None else evenly_spaced(len(paths), frame_rate=frame_rate),
         files=tuple(path.name for path in paths),
     )
-
-
-def _read_images(paths: Sequence[Path], size: tuple[int, int]) -> Iterator[Frame]:
-    return (read_frame(path, size=size) for path in paths)
 
 
 def _recorded(capture: Capture) -> TrialFrames:

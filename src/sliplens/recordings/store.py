@@ -267,7 +267,6 @@ def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Re
 class StoredLabels:
     """Times and labels of a stored trial."""
 
-    header: TrialHeader
     time_s: Float[np.ndarray, " frames"]
     labels: Labels
 
@@ -276,7 +275,7 @@ def load_labels(path: Path) -> StoredLabels:
     """Read the times and labels of a trial, without any image."""
     header, table = _read_columns(path, without={"image"} | _TRUTH_COLUMNS)
     time_s = table.column("time_s").to_numpy().astype(np.float64)
-    return StoredLabels(header=header, time_s=time_s, labels=Labels(**_label_values(table, header)))
+    return StoredLabels(time_s=time_s, labels=Labels(**_label_values(table, header)))
 
 
 def _facts(trial: TrialFacts) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from math import floor, isfinite, prod
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -536,56 +536,37 @@ def read_lerobot(
     force = _choose_force(layout, force_key)
     if force is None:
         notes.append("There are no forces: no feature of 3 or 6 numbers is named like one.")
-    read = _Reader(layout, camera=camera, force=force, notes=tuple(notes))
-    return [read.capture(one) for one in read_episodes(layout, camera_key=camera, only=episode)]
-
-
-class _Reader:
-    """Reads episodes one after another; those of one file share what was read of it."""
-
-    def __init__(self, layout: Layout, *, camera: str, force: str | None, notes: tuple[str, ...]) -> None:
-        self.layout, self.camera, self.force, self.notes = layout, camera, force, notes
-        self.rows = EpisodeRows(layout, ["timestamp", *([force] if force else [])])
-        self.videos: dict[Path, VideoInfo] = {}
-
-    def capture(self, episode: Episode) -> Capture:
-        rows = self.rows.of(episode)
-        time = rows.column("timestamp").to_numpy().astype(np.float64)
-        source = f"episode {episode.index} of {self.layout.folder}"
+    rows = EpisodeRows(layout, ["timestamp", *([force] if force else [])])
+    video_info = cache(read_video_info)  # episodes share files
+    captures = []
+    for one in read_episodes(layout, camera_key=camera, only=episode):
+        table, own_notes = rows.of(one), []
+        time = table.column("timestamp").to_numpy().astype(np.float64)
+        source = f"episode {one.index} of {layout.folder}"
         forces = None
-        if self.force is not None:
-            force = self.rows.vectors(rows, self.force, episode)[:, :3].copy()
-            forces = Forces(time_s=time, force_n=force, source=f"{self.force} of {source}")
-        size, read_frames, notes = self._frames(episode, time)
-        return Capture(
-            trial=trial_name(f"{self.layout.folder.resolve().name}-{episode.index:06d}"),
-            source=f"{self.camera} of {source}",
-            frame_time_s=time,
-            frame_size=size,
-            read_frames=read_frames,
-            forces=forces,
-            notes=(*self.notes, *notes),
+        if force is not None:
+            vectors = rows.vectors(table, force, one)[:, :3].copy()
+            forces = Forces(time_s=time, force_n=vectors, source=f"{force} of {source}")
+        if one.video_file is None:
+            size, read_frames = image_frames(one, camera)
+        else:
+            video = video_info(one.video_file)
+            if video.lossy:
+                own_notes.append(f"Frames are coded with loss ({video.codec}), which moves markers a little.")
+            size, tolerance_s, shown_s = video.frame_size, 0.5 / layout.fps, one.video_start_s + time
+            read_frames = partial(video_frames, one.video_file, shown_s, tolerance_s=tolerance_s, frame_size=size)
+        captures.append(
+            Capture(
+                trial=trial_name(f"{layout.folder.resolve().name}-{one.index:06d}"),
+                source=f"{camera} of {source}",
+                frame_time_s=time,
+                frame_size=size,
+                read_frames=read_frames,
+                forces=forces,
+                notes=(*notes, *own_notes),
+            )
         )
-
-    def _frames(
-        self, episode: Episode, time: Float[np.ndarray, " frames"]
-    ) -> tuple[tuple[int, int], Callable[[], Iterator[UInt8[np.ndarray, "height width 3"]]], list[str]]:
-        if episode.video_file is None:
-            return *image_frames(episode, self.camera), []
-        video = self.videos.get(episode.video_file)
-        if video is None:
-            video = self.videos[episode.video_file] = read_video_info(episode.video_file)
-        notes = []
-        if video.lossy:
-            notes.append(f"Frames are coded with loss ({video.codec}), which moves markers a little.")
-        read = partial(
-            video_frames,
-            episode.video_file,
-            episode.video_start_s + time,
-            tolerance_s=0.5 / self.layout.fps,
-            frame_size=video.frame_size,
-        )
-        return video.frame_size, read, notes
+    return captures
 
 
 def _choose_camera(layout: Layout, named: str | None) -> tuple[str, list[str]]:

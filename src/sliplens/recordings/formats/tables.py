@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
+from sliplens.recordings.labels.smoothing import typical_step
 
 _SEPARATORS = ("\t", ";", ",")  # a comma may be a decimal one where another separator is there
 _COMMENTS = ("#", "%")
@@ -308,17 +309,13 @@ def guess_time_unit(time: Float[np.ndarray, " samples"]) -> str:
     """
     size = float(np.abs(time[-1]))
     for unit, since_1970 in (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 1e8)):
-        if size >= since_1970 and (unit != "s" or _step(time) < 0.5):
+        if size >= since_1970 and (unit != "s" or typical_step(time) < 0.5):
             return unit
-    step = _step(time)
+    step = typical_step(time)
     for unit, most in (("s", 0.5), ("ms", 500.0), ("us", 5e5)):
         if step <= most:
             return unit
     return "ns"
-
-
-def _step(time: Float[np.ndarray, " samples"]) -> float:
-    return float(np.median(np.diff(time))) if len(time) > 1 else 0.0
 
 
 def _words(name: str) -> Sequence[str]:
