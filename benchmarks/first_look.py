@@ -54,10 +54,10 @@ def main() -> None:
     print(f"{seconds_to_page:.0f} s to the first page, {seconds_all:.0f} s to all of it")
 
 
-def time_demo(python: str, output: Path) -> tuple[float, float]:
+def time_demo(python: str, output: Path, *options: str) -> tuple[float, float]:
     """Seconds from the start of the demo to its first page, and to its end."""
     started = time.perf_counter()
-    process = subprocess.Popen([python, "-m", "sliplens", "demo", str(output)], stdout=sys.stderr)
+    process = subprocess.Popen([python, "-m", "sliplens", "demo", str(output), *options], stdout=sys.stderr)
     try:
         page = None
         while process.poll() is None:
