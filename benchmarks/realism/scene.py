@@ -8,7 +8,7 @@ import numpy as np
 from sliplens.images import absolute_difference, read_image
 from sliplens.simulation.filming import prepare_film
 from sliplens.simulation.loading import load_at_margins
-from sliplens.simulation.nuisances import Day, Grasp, nominal_unit
+from sliplens.simulation.nuisances import Day, Grasp, Unit
 from sliplens.simulation.sensor import CHROMATOUCH
 
 PUBLISHED = {51: np.nan, 80: 1.0, 357: 0.6, 433: 0.2, 547: 0.0}
@@ -40,6 +40,18 @@ def read_real(folder: Path) -> np.ndarray:
     labels = [100 if np.isnan(margin) else round(margin * 100) for margin in PUBLISHED.values()]
     names = [f"image_{number}.tiff_{label}.png" for number, label in zip(PUBLISHED, labels, strict=True)]
     return np.stack([read_image(folder / "difference" / name) for name in names])
+
+
+def nominal_unit(markers: int) -> Unit:
+    """Sensor built exactly as drawn, with so many markers."""
+    ones = np.ones(markers)
+    return Unit(
+        marker_jitter_px=np.zeros((markers, 2)),
+        marker_depth=0.0,
+        radius_factor=ones,
+        contrast_factor=ones,
+        texture_seed=0,
+    )
 
 
 def simulate(seed: int = 0) -> Simulated:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from realism.scene import nominal_unit
 from sliplens.errors import InputError
 from sliplens.files import output_folder
 from sliplens.recordings import Dataset, Recording
@@ -30,7 +31,7 @@ from sliplens.simulation.intervention import (
 )
 from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.motion import move_markers
-from sliplens.simulation.nuisances import Day, Grasp, nominal_unit
+from sliplens.simulation.nuisances import Day, Grasp
 
 REACH_PX = 17
 """Of what is drawn of a marker: half of its patch of 32 pixels, and the rounding of its place."""

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from realism.scene import nominal_unit
 from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SENSORS
 from sliplens.simulation.geometry import Dome, FlatPad, pixel_grid
-from sliplens.simulation.nuisances import nominal_unit
 from sliplens.simulation.sensor import MarkerLook, draw_look
 
 DOME, PAD = cast("Dome", CHROMATOUCH.geometry), cast("FlatPad", FLAT_GEL.geometry)

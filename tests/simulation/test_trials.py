@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from realism.scene import nominal_unit
 from sliplens.errors import InputError
 from sliplens.images import absolute_difference
 from sliplens.simulation import (
@@ -20,7 +21,7 @@ from sliplens.simulation import (
 from sliplens.simulation.filming import prepare_film
 from sliplens.simulation.geometry import FlatPad
 from sliplens.simulation.loading import load_at_margins
-from sliplens.simulation.nuisances import Day, Grasp, nominal_unit
+from sliplens.simulation.nuisances import Day, Grasp
 
 RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=30, seed=5)
 

@@ -13,8 +13,8 @@ from sliplens.simulation.geometry import pixel_grid
 from sliplens.simulation.loading import Loading
 from sliplens.simulation.motion import Motion, move_markers
 from sliplens.simulation.nuisances import Day, Grasp, Unit
-from sliplens.simulation.rendering import Scene, brightness, draw_texture, empty_view, haze, relief, render
-from sliplens.simulation.sensor import Noise, NoisePicks, Sensor, draw_look, pick_noise
+from sliplens.simulation.rendering import Scene, View, brightness, draw_texture, empty_view, haze, relief, render
+from sliplens.simulation.sensor import DrawnMarkers, Noise, NoisePicks, Sensor, draw_look, pick_noise
 
 _BATCHES = {"cpu": 4, "cuda": 512}
 """Frames drawn at once: few enough for a processor's caches, many enough for a GPU."""
@@ -36,11 +36,7 @@ class Film:
     blur_px: Float[np.ndarray, " frames_and_reference"]
     """Blur of the untouched sensor, then of each frame, as in the picks."""
     noise_picks: NoisePicks
-    texture: Float32[np.ndarray, "3 markers side side"]
-    light: Float32[np.ndarray, "3 height width"]
-    empty: Float32[np.ndarray, "3 height width"]
-    haze: Float32[np.ndarray, "3 height width"]
-    relief: Float32[np.ndarray, "3 height width"] | None
+    view: View
     rays: Float[np.ndarray, "height width 2"]
 
     def __len__(self) -> int:
@@ -48,37 +44,56 @@ class Film:
 
     def draw_reference(self, *, device: str | torch.device = "cpu") -> UInt8[Tensor, "height width 3"]:
         """Draw the untouched sensor."""
+        slope = None if self.view.relief is None else np.zeros((1, *self.rays.shape[:2]), dtype=np.float32)
         return self._draw(
             self.marker_rest_px[None],
-            scale=np.ones((1, len(self.marker_rest_px))),
-            pressure=np.zeros((1, len(self.marker_rest_px))),
+            self.look_at_rest(),
             touch=np.zeros(1),
-            slope=None if self.relief is None else np.zeros((1, *self.rays.shape[:2]), dtype=np.float32),
+            slope=slope,
             taken=slice(0, 1),
             device=device,
         )[0]
 
     def draw(self, frames: slice, *, device: str | torch.device = "cpu") -> UInt8[Tensor, "frames height width 3"]:
         """Draw some of the frames."""
-        motion = self.motion
         slope = None
-        if self.relief is not None:
+        if self.view.relief is not None:
             slope = np.asarray(
                 normal_slope(
                     np.sqrt(self._face_distance_squared(frames)),
-                    contact_radius_m=motion.contact_radius_m[frames, None, None],
+                    contact_radius_m=self.motion.contact_radius_m[frames, None, None],
                     sphere_radius_m=self.sensor.geometry.sphere_radius_m,
                 ),
                 dtype=np.float32,
             )
         return self._draw(
             self.marker_px[frames],
-            scale=motion.scale[frames],
-            pressure=motion.pressure[frames],
-            touch=motion.touch[frames],
+            self.look(frames),
+            touch=self.motion.touch[frames],
             slope=slope,
             taken=slice(frames.start + 1, frames.stop + 1),
             device=device,
+        )
+
+    def look_at_rest(self) -> DrawnMarkers:
+        """Look of the untouched sensor's markers."""
+        ones = np.ones((1, len(self.marker_rest_px)))
+        return self._look(ones, 0 * ones, np.zeros(1), slice(0, 1))
+
+    def look(self, frames: slice) -> DrawnMarkers:
+        """Look of the markers in some of the frames."""
+        motion, taken = self.motion, slice(frames.start + 1, frames.stop + 1)
+        return self._look(motion.scale[frames], motion.pressure[frames], motion.touch[frames], taken)
+
+    def _look(self, scale: np.ndarray, pressure: np.ndarray, touch: np.ndarray, taken: slice) -> DrawnMarkers:
+        return draw_look(
+            self.sensor.look,
+            geometry=self.sensor.geometry,
+            unit=self.unit,
+            scale=scale,
+            pressure=pressure,
+            touch=touch,
+            blur_px=self.blur_px[taken],
         )
 
     def contact_map(self, frames: slice) -> UInt8[np.ndarray, "frames height width"]:
@@ -99,35 +114,15 @@ class Film:
     def _draw(
         self,
         centres_px: Float[np.ndarray, "frames markers 2"],
+        markers: DrawnMarkers,
         *,
-        scale: Float[np.ndarray, "frames markers"],
-        pressure: Float[np.ndarray, "frames markers"],
         touch: Float[np.ndarray, " frames"],
         slope: Float32[np.ndarray, "frames height width"] | None,
         taken: slice,
         device: str | torch.device,
     ) -> UInt8[Tensor, "frames height width 3"]:
-        markers = draw_look(
-            self.sensor.look,
-            geometry=self.sensor.geometry,
-            unit=self.unit,
-            scale=scale,
-            pressure=pressure,
-            touch=touch,
-            blur_px=self.blur_px[taken],
-        )
-        scene = Scene(
-            centres_px=centres_px,
-            markers=markers,
-            texture=self.texture,
-            light=self.light,
-            empty=self.empty,
-            haze=self.haze,
-            touch=touch,
-            relief=self.relief,
-            slope=slope,
-            noise=self.noise_picks.at(taken),
-        )
+        picks = self.noise_picks.at(taken)
+        scene = Scene(view=self.view, centres_px=centres_px, markers=markers, touch=touch, slope=slope, noise=picks)
         return render(scene, sensor=self.sensor, noise=self.noise, device=device)
 
 
@@ -185,6 +180,14 @@ def prepare_film(
     contact_px = seat.see(geometry.project(geometry.skin_point(motion.contact_centre_m)))
     edge, apex = (geometry.project(geometry.skin_point(np.array([x, 0.0]))) for x in (motion.nominal_radius_m, 0.0))
     light = brightness(sensor, day=day)
+    grain = np.random.default_rng((unit.texture_seed, 1))
+    view = View(
+        texture=draw_texture(geometry.markers, rng=np.random.default_rng(unit.texture_seed)),
+        light=light,
+        empty=empty_view(sensor, day=day, light=light),
+        haze=haze(sensor, grasp=grasp, contact_px=contact_px, radius_px=float(edge[0] - apex[0]), rng=grain),
+        relief=relief(sensor, contact_px=contact_px),
+    )
     return Film(
         sensor=sensor,
         grasp=grasp,
@@ -197,16 +200,6 @@ def prepare_film(
         # drawn before the noise, so that a clean film differs in its noise alone
         blur_px=grasp.blur_px * rng.uniform(0.8, 1.2, frames + 1),
         noise_picks=pick_noise(frames + 1, rng=rng),
-        texture=draw_texture(geometry.markers, rng=np.random.default_rng(unit.texture_seed)),
-        light=light,
-        empty=empty_view(sensor, day=day, light=light),
-        haze=haze(
-            sensor,
-            grasp=grasp,
-            contact_px=contact_px,
-            radius_px=float(edge[0] - apex[0]),
-            rng=np.random.default_rng((unit.texture_seed, 1)),
-        ),
-        relief=relief(sensor, contact_px=contact_px),
+        view=view,
         rays=geometry.rays(seat.unsee(pixel_grid(sensor.image_size_px))),
     )

@@ -18,7 +18,7 @@ from sliplens.simulation.information import Touch, marker_sensitivity, prior_sig
 from sliplens.simulation.loading import Loading
 from sliplens.simulation.nuisances import Nuisances
 from sliplens.simulation.plan import FrameTotals, SimulationRecipe, TrialPlan, plan_trials
-from sliplens.simulation.sensor import SENSORS, NoisePicks, draw_look
+from sliplens.simulation.sensor import SENSORS
 from sliplens.simulation.trials import prepare_trial
 
 _ROUNDING = 1
@@ -139,9 +139,7 @@ def put_markers_back(film: Film, frame: int, back: Bool[np.ndarray, "variants ma
         ),
         marker_px=where_back(film.marker_rest_px, film.marker_px[frame]),
         blur_px=film.blur_px[np.append(0, taken)],
-        noise_picks=NoisePicks(
-            field=film.noise_picks.field[np.append(0, taken)], corner=film.noise_picks.corner[np.append(0, taken)]
-        ),
+        noise_picks=film.noise_picks.at(np.append(0, taken)),
     )
 
 
@@ -158,26 +156,11 @@ def draw_with_markers_back(
 
 def marker_outlines(film: Film, frame: int) -> Outlines:
     """Circles that the markers of a frame fill, and those that they filled at rest."""
-    motion, look = film.motion, film.sensor.look
-
-    def radius(scale: np.ndarray, pressure: np.ndarray, touch: np.ndarray, taken: int) -> np.ndarray:
-        drawn = draw_look(
-            look,
-            geometry=film.sensor.geometry,
-            unit=film.unit,
-            scale=scale[None],
-            pressure=pressure[None],
-            touch=touch,
-            blur_px=film.blur_px[taken : taken + 1],
-        )
-        return drawn.radius_px[0].max(axis=-1)
-
-    ones = np.ones(len(film.marker_rest_px))
     return Outlines(
         rest_px=film.marker_rest_px,
-        rest_radius_px=radius(ones, 0 * ones, np.zeros(1), 0),
+        rest_radius_px=film.look_at_rest().radius_px[0].max(axis=-1),
         now_px=film.marker_px[frame],
-        now_radius_px=radius(motion.scale[frame], motion.pressure[frame], motion.touch[frame : frame + 1], frame + 1),
+        now_radius_px=film.look(slice(frame, frame + 1)).radius_px[0].max(axis=-1),
     )
 
 

@@ -1,7 +1,8 @@
 """What differs between days, sensors, trials and frames, and how it is drawn."""
 
+import math
 from dataclasses import dataclass, fields
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -149,18 +150,6 @@ class Grasp:
     skin_grain: float = 1.5
 
 
-def nominal_unit(markers: int) -> Unit:
-    """Sensor built exactly as drawn, with so many markers."""
-    ones = np.ones(markers)
-    return Unit(
-        marker_jitter_px=np.zeros((markers, 2)),
-        marker_depth=0.0,
-        radius_factor=ones,
-        contrast_factor=ones,
-        texture_seed=0,
-    )
-
-
 def draw_day(nuisances: Nuisances, *, quantile: float, rng: np.random.Generator) -> Day:
     """Draw a day.
 
@@ -198,24 +187,18 @@ def draw_grasp(nuisances: Nuisances, *, day: Day, wet: bool, rng: np.random.Gene
     dry_factor, wet_friction = rng.uniform(*nuisances.dry_friction_factor), rng.uniform(*nuisances.wet_friction)
     drift = rng.uniform(*nuisances.wet_friction_drift)
     reach, bearing = rng.uniform(*nuisances.contact_offset), rng.uniform(-np.pi, np.pi)
+
+    def drawn(*names: str) -> dict[str, Any]:
+        return {name: rng.uniform(*getattr(nuisances, name)) for name in names}
+
     return Grasp(
         friction=wet_friction if wet else day.friction * dry_factor,
         friction_drift=drift if wet else 0.0,
-        kinetic_ratio=rng.uniform(*nuisances.kinetic_ratio),
-        stick_slip_share=rng.uniform(*nuisances.stick_slip_share),
-        stick_slip_hz=rng.uniform(*nuisances.stick_slip_hz),
-        normal_force_n=rng.uniform(*nuisances.normal_force_n),
-        normal_force_drift=rng.uniform(*nuisances.normal_force_drift),
+        **drawn("kinetic_ratio", "stick_slip_share", "stick_slip_hz", "normal_force_n", "normal_force_drift"),
         contact_offset=(float(reach * np.cos(bearing)), float(reach * np.sin(bearing))),
-        tilt_rad=(
-            float(np.radians(rng.uniform(*nuisances.tilt_deg))),
-            float(np.radians(rng.uniform(*nuisances.tilt_deg))),
-        ),
-        shear_direction_rad=float(np.radians(rng.uniform(*nuisances.shear_direction_deg))),
-        shear_exponent=rng.uniform(*nuisances.shear_exponent),
-        creep=rng.uniform(*nuisances.creep),
-        creep_time_s=rng.uniform(*nuisances.creep_time_s),
-        blur_px=rng.uniform(*nuisances.blur_px),
+        tilt_rad=(math.radians(rng.uniform(*nuisances.tilt_deg)), math.radians(rng.uniform(*nuisances.tilt_deg))),
+        shear_direction_rad=math.radians(rng.uniform(*nuisances.shear_direction_deg)),
+        **drawn("shear_exponent", "creep", "creep_time_s", "blur_px"),
         veil=_three(rng, nuisances.veil),
         glow=_three(rng, nuisances.glow),
         skin_grain=rng.uniform(*nuisances.skin_grain),

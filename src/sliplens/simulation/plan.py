@@ -218,7 +218,8 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
     # without days between, the first day has to give up some of its own
     candidates = sorted(between or [(number, 1) for number in range(1, dry[1] + 1)])
     count = max(1, round(recipe.validation_share * len(candidates)))
-    validation = {(day, number) for number, day in _every_few(candidates, count)}
+    evenly = (candidates[int((index + 0.5) * len(candidates) / count)] for index in range(count))
+    validation = {(day, number) for number, day in evenly}
 
     plans = []
     for day in range(1, recipe.days + 1):
@@ -276,11 +277,6 @@ def _spread(trials: int, *, days: int, tested: range) -> dict[int, int]:
             dealt[tested[-1]] -= 1
             dealt[1] += 1
     return dealt
-
-
-def _every_few(candidates: Sequence[tuple[int, int]], count: int) -> list[tuple[int, int]]:
-    """Pick so many candidates, evenly spaced."""
-    return [candidates[int((index + 0.5) * len(candidates) / count)] for index in range(count)]
 
 
 def _draw_days(recipe: SimulationRecipe) -> dict[int, Day]:

@@ -101,23 +101,30 @@ _PATCH = 32
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
-    """View of the camera in a batch of frames, before noise."""
+class View:
+    """View of the camera as far as it is the same in all frames of a trial."""
 
-    centres_px: Float[np.ndarray, "frames markers 2"]
-    markers: DrawnMarkers
     texture: Float32[np.ndarray, "3 markers side side"]
     """Grain of the print, from `draw_texture`."""
     light: Float32[np.ndarray, "3 height width"]
-    """Brightness over the sensor's, the same for all frames."""
+    """Brightness over the sensor's."""
     empty: Float32[np.ndarray, "3 height width"]
     """The untouched sensor without its markers, in grey levels."""
     haze: Float32[np.ndarray, "3 height width"]
     """Grey levels that full contact adds."""
-    touch: Float[np.ndarray, " frames"]
-    """Share of the haze that each frame has."""
     relief: Float32[np.ndarray, "3 height width"] | None
     """Relative change of brightness where the skin slopes by 1; None where slopes do not show."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """View of the camera in a batch of frames, before noise."""
+
+    view: View
+    centres_px: Float[np.ndarray, "frames markers 2"]
+    markers: DrawnMarkers
+    touch: Float[np.ndarray, " frames"]
+    """Share of the haze that each frame has."""
     slope: Float32[np.ndarray, "frames height width"] | None
     """Slope of the skin, downwards away from the contact's centre."""
     noise: NoisePicks
@@ -139,12 +146,12 @@ def render(
     Devices agree within one grey level: they round sums of four terms in another order.
     """
     # one plane a channel: a channel's constant then meets whole rows of pixels, which vectorises
-    shade = _shade(scene, size_px=sensor.image_size_px, noise=noise, device=device)
-    contrast = _tensor(scene.light, device)[:, None] * _channels(sensor.look.contrast, device)
-    frames = torch.addcmul(_tensor(scene.empty, device)[:, None], shade, contrast, value=-1)
-    if scene.relief is not None and scene.slope is not None:
-        frames *= 1 + _tensor(scene.slope, device) * _tensor(scene.relief, device)[:, None]
-    frames.addcmul_(_tensor(scene.touch, device)[:, None, None], _tensor(scene.haze, device)[:, None])
+    view, shade = scene.view, _shade(scene, size_px=sensor.image_size_px, noise=noise, device=device)
+    contrast = _tensor(view.light, device)[:, None] * _channels(sensor.look.contrast, device)
+    frames = torch.addcmul(_tensor(view.empty, device)[:, None], shade, contrast, value=-1)
+    if view.relief is not None and scene.slope is not None:
+        frames *= 1 + _tensor(scene.slope, device) * _tensor(view.relief, device)[:, None]
+    frames.addcmul_(_tensor(scene.touch, device)[:, None, None], _tensor(view.haze, device)[:, None])
     if noise is not None:
         background = _channels(noise.background, device)
         excess, share = _channels(noise.marker, device) - background, shade.clamp_(0, 1)
@@ -183,7 +190,7 @@ def _shade(
     if noise is None:
         patch = radius - distance
     else:
-        texture = _tensor(scene.texture, device)[:, torch.as_tensor(marker_index, device=device)]
+        texture = _tensor(scene.view.texture, device)[:, torch.as_tensor(marker_index, device=device)]
         patch = texture * _channels(noise.ragged_px, device)
         patch.add_(radius).sub_(distance)
     patch.div_(edge).sigmoid_()

@@ -45,7 +45,7 @@ class NoisePicks:
     field: Int[np.ndarray, "frames 2"]
     corner: Int[np.ndarray, "frames 2 2"]
 
-    def at(self, frames: slice) -> "NoisePicks":
+    def at(self, frames: slice | Int[np.ndarray, " frames"]) -> "NoisePicks":
         """Picks of some of the frames."""
         return NoisePicks(field=self.field[frames], corner=self.corner[frames])
 
