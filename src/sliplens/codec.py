@@ -80,14 +80,7 @@ def save_record(record: object, path: Path) -> None:
 
 
 def load_record(path: Path, kind: type[Record], *, command: str) -> Record:
-    """Read what `save_record` wrote.
-
-    Parameters
-    ----------
-    kind
-        Dataclass that it holds.
-    command
-        Command that makes the file again, for the sentence that tells of a mistake.
+    """Read what `save_record` wrote of a dataclass; a mistake names the command that makes the file again.
 
     Raises
     ------
@@ -142,12 +135,7 @@ def from_builtins(values: object, kind: type[Record], *, where: Path | str, comm
 def save_result(result: object, folder: Path) -> None:
     """Write a result into a folder: `result.json`, a Parquet file for each field of `Columns`, `arrays.npz` for arrays.
 
-    Parameters
-    ----------
-    result
-        Frozen dataclass; its `Columns` (or None) and array fields are stored beside the JSON, named as the fields are.
-    folder
-        Folder to write to; must exist.
+    What lies beside the JSON is named as its field is; the folder must exist.
     """
     assert is_dataclass(result)
     short, arrays = {}, {}
@@ -167,14 +155,7 @@ def save_result(result: object, folder: Path) -> None:
 
 
 def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
-    """Read what `save_result` wrote.
-
-    Parameters
-    ----------
-    kind
-        Dataclass that it holds.
-    command
-        Command that makes the folder again.
+    """Read what `save_result` wrote of a dataclass; a mistake names the command that makes the folder again.
 
     Raises
     ------
@@ -202,17 +183,18 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
         arrays = load_arrays(folder / ARRAYS_FILE, command=command)
         with jaxtyped("context"):  # "frames" of one array are as many as "frames" of another
             for name in (field.name for field in fields(kind) if field.name in beside):  # pyright: ignore[reportArgumentType]
-                picked, array_kind = _pick_arrays(arrays, name, declared[name])
-                for key, array in picked.items():
-                    if array is None:
+                alone = _is_array(declared[name])
+                array_kind = declared[name] if alone else get_args(declared[name])[1]
+                keys = [name] if alone else [key for key in arrays if key.startswith(f"{name}/")]
+                for key in keys:
+                    if key not in arrays:
                         raise InputError(f"{folder / ARRAYS_FILE} lacks {key!r}; make it again with `{command}`")
-                    if not isinstance(array, array_kind):
+                    if not isinstance(arrays[key], array_kind):
                         raise InputError(
-                            f"{folder / ARRAYS_FILE} holds {array.dtype} of shape {array.shape} as {key!r} where "
-                            f"{_shown(array_kind)} belongs; make it again with `{command}`"
+                            f"{folder / ARRAYS_FILE} holds {arrays[key].dtype} of shape {arrays[key].shape} as {key!r} "
+                            f"where {_shown(array_kind)} belongs; make it again with `{command}`"
                         )
-                whole = {key.removeprefix(f"{name}/"): array for key, array in picked.items()}
-                given[name] = picked[name] if _is_array(declared[name]) else whole
+                given[name] = arrays[name] if alone else {key.removeprefix(f"{name}/"): arrays[key] for key in keys}
     try:
         return kind(**given)
     except ValueError as error:  # of a record that checks what its fields have to do with one another
@@ -220,17 +202,7 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
 
 
 def keep_part(part: Path | None, kind: type[Record], make: Callable[[], Record]) -> Record:
-    """Make a piece of long work, or read it where an interrupted run has made it.
-
-    Parameters
-    ----------
-    part
-        Folder of the piece, made here; None to keep it in memory alone.
-    kind
-        Dataclass of the piece.
-    make
-        Makes it.
-    """
+    """Make a piece of long work, or read it from its folder where an interrupted run has made it; None keeps none."""
     if part is None:
         return make()
     if not (part / RESULT_FILE).is_file():
@@ -289,17 +261,7 @@ def load_columns(path: Path, kind: type[_Columns], *, command: str) -> _Columns:
 def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schema) -> pa.Table | None:
     """Write tables as row groups of one Parquet file, each as it comes; whole or not at all.
 
-    Parameters
-    ----------
-    tables
-        Rows, in their order.
-    path
-        File to write, one that is there is replaced; None to join the tables in memory.
-
-    Returns
-    -------
-    Table
-        All rows; None where they are in the file.
+    A file that is there is replaced; without a path the tables are joined in memory and given back.
 
     Raises
     ------
@@ -350,13 +312,6 @@ def load_arrays(path: Path, *, command: str) -> dict[str, np.ndarray]:
         raise InputError(f"{path} cannot be read as arrays ({_one_line(error)}); {cure}") from None
 
 
-def _pick_arrays(arrays: Mapping[str, np.ndarray], name: str, hint: Any) -> tuple[dict[str, np.ndarray | None], Any]:
-    """Arrays of a field by their names in the file, None where one is missing, and what each has to be."""
-    if _is_array(hint):
-        return {name: arrays.get(name)}, hint
-    return {key: array for key, array in arrays.items() if key.startswith(f"{name}/")}, get_args(hint)[1]
-
-
 def _columns_type(hint: object) -> type[Columns] | None:
     """Kind of columns that a field declares, `X` or `X | None`."""
     kinds = [kind for kind in get_args(hint) or (hint,) if kind is not NoneType]
@@ -390,8 +345,6 @@ def _decode(kind: Any, value: object) -> object:
         return value
     if kind is Path:
         return Path(str(value))
-    if kind is object:
-        return value
     raise NotImplementedError(f"{kind} has no form in JSON")
 
 

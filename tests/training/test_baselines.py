@@ -147,8 +147,8 @@ def test_trials_without_markers_are_named_and_answered_with_the_training_mean(
     blind = data.select(split="test", condition="dry")[0].trial
     lost = data.select(split="train")[0].trial
     for path in followed.iterdir():
-        if path.stem not in {blind, lost}:
-            shutil.copy(path, tmp_path)
+        if path.name not in {blind, lost}:
+            shutil.copytree(path, tmp_path / path.name)
 
     def find_none(*_: object) -> None:
         raise ImageError("the reference shows 0 whole markers")

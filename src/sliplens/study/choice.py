@@ -1,6 +1,7 @@
 """Choose what a study looks at: trials that the networks read well, and in each the frames along the margin."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -91,21 +92,12 @@ def choose_frames(
         if level in scored_levels or trial.trial in shown
     )
     qualified = sum(trial.qualified for trial, _ in candidates)
-    return Choice(
+    choice = Choice(
         trials_wanted=trials,
         tolerance=tolerance,
         considered=len(candidates),
         qualified=qualified,
-        summary=_summarise(
-            trials=len(infos),
-            considered=len(candidates),
-            qualified=qualified,
-            taken=[trial for trial, _ in taken],
-            wanted=trials,
-            tolerance=tolerance,
-            condition=condition,
-            networks=len(networks),
-        ),
+        summary="",
         source=data.source,
         condition=condition,
         inputs=tuple(networks),
@@ -114,6 +106,7 @@ def choose_frames(
         trials=tuple(trial for trial, _ in taken),
         frames=frames,
     )
+    return replace(choice, summary=_summarise(choice, len(infos)))
 
 
 def _check(
@@ -140,20 +133,13 @@ def _check(
         )
 
 
-def _summarise(
-    *,
-    trials: int,
-    considered: int,
-    qualified: int,
-    taken: Sequence[ChosenTrial],
-    wanted: int,
-    tolerance: float,
-    condition: str,
-    networks: int,
-) -> str:
+def _summarise(choice: Choice, trials: int) -> str:
+    networks, taken, wanted = len(choice.inputs), choice.trials, choice.trials_wanted
     who = "the network reads" if networks == 1 else "both networks read" if networks == 2 else "all networks read"
-    summary = f"Of {trials} {condition} trials {considered} have a frame near every level, and in {qualified} of those "
-    summary += f"{who} every such frame within {tolerance:.0%}."
+    summary = (
+        f"Of {trials} {choice.condition} trials {choice.considered} have a frame near every level, and in "
+        f"{choice.qualified} of those {who} every such frame within {choice.tolerance:.0%}."
+    )
     others = [trial for trial in taken if not trial.qualified]
     if others:
         worst = max(max(trial.worst_error.values()) for trial in others)
@@ -161,7 +147,7 @@ def _summarise(
             f" {wanted} were wanted, so the {len(others)} read best among the others were taken too; the worst of "
             f"their answers is off by {worst:.0%}."
         )
-    elif qualified > wanted:
+    elif choice.qualified > wanted:
         summary += f" The first {wanted} were taken."
     if len(taken) < wanted:
         summary += f" There were no more: {len(taken)} instead of {wanted}."

@@ -1,7 +1,7 @@
 """Deletion score of the thesis, and the remedies that the thesis proposes for it."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,7 +19,7 @@ from sliplens.faithfulness.deletion import deletion_steps, saliency_orders
 from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.models import TrainedModel
 from sliplens.progress import OnProgress, continued
-from sliplens.results.explanation import Explained
+from sliplens.results.explanation import Explained, ExplainedFrame
 from sliplens.results.faithfulness import (
     DeletionScores,
     DeletionTable,
@@ -39,17 +39,8 @@ BACKGROUND = {"difference": "black", "raw": "white"}
 _STOP = 0.5
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Curve:
-    """D of one frame, step by step."""
-
-    pixels_removed: Int[np.ndarray, " steps"]
-    predictions: Float[np.ndarray, " steps"]
-    scores: Float[np.ndarray, " steps"]
-
-
-_Curves = Mapping[str, Sequence[_Curve]]
-"""By method, for each frame; random orders among the methods."""
+_Curves = Mapping[str, Sequence[DeletionTable]]
+"""Curve of each frame, by method; random orders among the methods."""
 
 
 def require_same_network(trained: TrainedModel, explained: Explained) -> None:
@@ -99,7 +90,7 @@ def score_explanations(
         )
         for number, (name, order) in enumerate(orders.items())
     }
-    curves, control = {name: _split(own) for name, own in deleted.items()}, deleted[CONTROL]
+    curves, control = {name: _split(name, own, explained) for name, own in deleted.items()}, deleted[CONTROL]
     return DeletionScores(
         input=explained.input,
         source=explained.source,
@@ -114,7 +105,7 @@ def score_explanations(
             *saturated(control.base),
             *_method_alarms(curves),
         ),
-        table=DeletionTable.joined(list(_tables(curves, explained))),
+        table=DeletionTable.joined([curve for own in curves.values() for curve in own]),
     )
 
 
@@ -145,18 +136,19 @@ def score_remedies(
     total, done = 2 * len(orders) * len(inputs), 0
     predict = material.fast(total * steps)
 
-    def delete(fill: str, order: Int[np.ndarray, "frames pixels"]) -> list[_Curve]:
+    def delete(name: str, fill: str, order: Int[np.ndarray, "frames pixels"]) -> list[DeletionTable]:
         nonlocal done
         progress = continued(on_progress, before=done, total=total)
         done += len(inputs)
-        return _split(deletion_curves(predict, inputs, order, fill=get_fill(fill), steps=steps, on_progress=progress))
+        deleted = deletion_curves(predict, inputs, order, fill=get_fill(fill), steps=steps, on_progress=progress)
+        return _split(name, deleted, explained)
 
     curves: dict[str, _Curves] = {
         "stop-at-half": _stopped(grey, explained),
-        "background": {name: delete(background, order) for name, order in orders.items()},
+        "background": {name: delete(name, background, order) for name, order in orders.items()},
         # inserting k pixels of an order is deleting all the others
         "insertion": {
-            name: _inserted(delete("grey", order[:, ::-1].copy()), explained) for name, order in orders.items()
+            name: _inserted(delete(name, "grey", order[:, ::-1].copy()), explained) for name, order in orders.items()
         },
     }
     about = {
@@ -197,9 +189,10 @@ def score_remedies(
         ),
         table=VariantTable.joined(
             [
-                VariantTable(variant=np.repeat(name, len(table)), **vars(table))
-                for name, own in curves.items()
-                for table in _tables(own, explained)
+                VariantTable(variant=np.repeat(name, len(curve)), **vars(curve))
+                for name, by_method in curves.items()
+                for own in by_method.values()
+                for curve in own
             ]
         ),
     )
@@ -212,15 +205,31 @@ def _orders(explained: Explained, *, seed: int) -> dict[str, Int[np.ndarray, "fr
     return orders | {CONTROL: np.stack([random_order(shape, rng=rng) for _ in explained.frames])}
 
 
-def _split(curves: DeletionCurves) -> list[_Curve]:
-    return [
-        _Curve(pixels_removed=curves.pixels_removed, predictions=answers, scores=scores)
-        for answers, scores in zip(curves.predictions, curves.scores, strict=True)
-    ]
+def _curve(
+    method: str,
+    frame: ExplainedFrame,
+    removed: Int[np.ndarray, " steps"],
+    answers: Float[np.ndarray, " steps"],
+    scores: Float[np.ndarray, " steps"],
+) -> DeletionTable:
+    steps = len(scores)
+    return DeletionTable(
+        method=np.repeat(method, steps),
+        frame_id=np.repeat(frame.id, steps),
+        step=np.arange(steps),
+        pixels_removed=removed,
+        prediction=answers,
+        score=scores,
+    )
 
 
-def _score(curves: Sequence[_Curve]) -> MethodScore:
-    auc, last = np.array([(curve.scores.mean(), curve.scores[-1]) for curve in curves]).T
+def _split(method: str, curves: DeletionCurves, explained: Explained) -> list[DeletionTable]:
+    rows = zip(explained.frames, curves.predictions, curves.scores, strict=True)
+    return [_curve(method, frame, curves.pixels_removed, answers, scores) for frame, answers, scores in rows]
+
+
+def _score(curves: Sequence[DeletionTable]) -> MethodScore:
+    auc, last = np.array([(curve.score.mean(), curve.score[-1]) for curve in curves]).T
     return MethodScore(
         mean=float(auc.mean()), sd=float(auc.std()), last_step_mean=float(last.mean()), frames=len(curves)
     )
@@ -236,49 +245,30 @@ def _stopped(grey: DeletionScores, explained: Explained) -> _Curves:
         for frame, pixels in zip(explained.frames, counts.get(name, median), strict=True):
             answers = curve.predictions[curve.frame_ids.index(frame.id)]
             end = int(np.searchsorted(curve.pixels_removed, int(pixels))) + 1
-            stopped[name].append(
-                _Curve(
-                    pixels_removed=curve.pixels_removed[:end],
-                    predictions=answers[:end],
-                    scores=deletion_score(np.full(len(answers), frame.prediction), answers)[:end],
-                )
-            )
+            scores = deletion_score(np.full(len(answers), frame.prediction), answers)[:end]
+            stopped[name].append(_curve(name, frame, curve.pixels_removed[:end], answers[:end], scores))
     return stopped
 
 
-def _inserted(curves: Sequence[_Curve], explained: Explained) -> list[_Curve]:
+def _inserted(curves: Sequence[DeletionTable], explained: Explained) -> list[DeletionTable]:
     """Read deletion of the least salient pixels backwards, the whole image last."""
     turned = []
     for curve, frame in zip(curves, explained.frames, strict=True):
         removed = np.concatenate([[0], curve.pixels_removed[:-1]])[::-1]
-        answers = np.concatenate([[frame.prediction], curve.predictions[:-1]])[::-1]
+        answers = np.concatenate([[frame.prediction], curve.prediction[:-1]])[::-1]
         scores = deletion_score(np.full(len(answers), frame.prediction), answers)
-        turned.append(_Curve(pixels_removed=removed.copy(), predictions=answers.copy(), scores=scores))
+        turned.append(replace(curve, pixels_removed=removed.copy(), prediction=answers.copy(), score=scores))
     return turned
 
 
 def _method_alarms(curves: _Curves) -> Iterator[str]:
     """Say where the score does not measure the map: one that does not beat a random order has shown nothing."""
-    chance = float(np.mean([curve.scores.mean() for curve in curves[CONTROL]]))
+    chance = float(np.mean([curve.score.mean() for curve in curves[CONTROL]]))
     for name, own in curves.items():
         if name == CONTROL:
             continue
-        means, last = (np.array(values) for values in zip(*((c.scores.mean(), c.scores[-1]) for c in own), strict=True))
-        if len({len(curve.scores) for curve in own}) == 1:  # where curves stop early, the last step is the map's doing
+        means, last = (np.array(values) for values in zip(*((c.score.mean(), c.score[-1]) for c in own), strict=True))
+        if len({len(curve) for curve in own}) == 1:  # where curves stop early, the last step is the map's doing
             yield from follows_last_step(means, last, name=f"D of {name}")
         if means.mean() >= chance:
             yield f"{name} does not beat a random order ({means.mean():.3f} against {chance:.3f})"
-
-
-def _tables(curves: _Curves, explained: Explained) -> Iterator[DeletionTable]:
-    for method, own in curves.items():
-        for frame, curve in zip(explained.frames, own, strict=True):
-            steps = len(curve.scores)
-            yield DeletionTable(
-                method=np.repeat(method, steps),
-                frame_id=np.repeat(frame.id, steps),
-                step=np.arange(steps),
-                pixels_removed=curve.pixels_removed,
-                prediction=curve.predictions.astype(np.float64),
-                score=curve.scores.astype(np.float64),
-            )

@@ -3,6 +3,7 @@
 import hashlib
 import shutil
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -101,10 +102,11 @@ def explain_source(
     else:
         chosen = frames_from_folder(trained, source, reference=reference, labels_in_names=labels_in_names)
     explainers = _choose_explainers(trained, chosen, source, reference=reference, methods=methods, budget=budget)
+    explain = partial(explain_frames, trained, chosen, methods=methods, explainers=explainers)
     title = f"Explaining {len(chosen.ids)} frames ({trained.manifest.input}, {chosen.source})"
     if out is None:
         with stage(on_progress, title) as count:
-            return explain_frames(trained, chosen, methods=methods, explainers=explainers, on_progress=count)
+            return explain(on_progress=count)
     recipe = {
         "weights_sha256": trained.manifest.weights_sha256,
         "input": trained.manifest.input,
@@ -119,14 +121,7 @@ def explain_source(
     with output_folder(out, stage="explain", config=recipe, overwrite=overwrite) as output:
         if not output.complete:
             with stage(on_progress, title) as count:
-                explained = explain_frames(
-                    trained,
-                    chosen,
-                    methods=methods,
-                    explainers=explainers,
-                    parts=output.folder / "parts",
-                    on_progress=count,
-                )
+                explained = explain(parts=output.folder / "parts", on_progress=count)
             shutil.rmtree(output.folder / "parts")
             draw_explained(explained, output.folder, colours=colours)
             save_result(explained, output.folder)

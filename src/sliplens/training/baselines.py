@@ -1,12 +1,14 @@
 """What markers alone tell: model-based estimators, fitted on training trials and scored as a network is."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 
+from sliplens.codec import keep_part
 from sliplens.errors import InputError, RecordingError
 from sliplens.markers import KINDS, MarkerStatus, track_markers
 from sliplens.markers.estimators import FieldTrial, field_trial, get_estimator
@@ -33,10 +35,18 @@ class BaselinePlan:
 
 @dataclass(frozen=True, kw_only=True)
 class _Followed:
-    trial: FieldTrial
+    """A `FieldTrial`, and how well its markers were followed."""
+
+    rest_px: Float64[np.ndarray, "markers 2"]
+    displacement_px: Float64[np.ndarray, "frames markers 2"]
+    hold: int
     in_view: int
     """Markers of all frames that were in view."""
     followed: int
+
+    @property
+    def trial(self) -> FieldTrial:
+        return FieldTrial(rest_px=self.rest_px, displacement_px=self.displacement_px, hold=self.hold)
 
 
 def marker_kind(trials: Sequence[TrialInfo]) -> str:
@@ -65,8 +75,6 @@ def evaluate_baselines(
 
     Parameters
     ----------
-    plan
-        Estimators, the trials to fit on, and the kind of their markers.
     predictions
         The network's, for the trial, condition, frame, time and label of each frame.
     folder
@@ -79,7 +87,7 @@ def evaluate_baselines(
     failed: dict[str, str] = {}
     for info in counted(trials.values(), on_progress):
         try:
-            fields[info.trial] = _follow(data, info, plan.markers, folder)
+            fields[info.trial] = keep_part(folder / info.trial, _Followed, partial(_follow, data, info, plan.markers))
         except RecordingError:
             raise
         except InputError as error:
@@ -96,7 +104,11 @@ def evaluate_baselines(
     answers = {}
     for name, estimator in estimators.items():
         estimator.fit([fields[info.trial].trial for info in fitted], margins)
-        answers[name] = replace(predictions, prediction=_answer(estimator.estimate, fields, predictions, mean=mean))
+        prediction = np.full(len(predictions), mean)
+        for trial in tested & set(fields):
+            rows = predictions.trial == trial
+            prediction[rows] = estimator.estimate(fields[trial].trial)[predictions.frame[rows]]
+        answers[name] = replace(predictions, prediction=prediction)
     scores = Baselines(
         markers=plan.markers,
         hold="found in each trial as a whole, by find_hold",
@@ -119,48 +131,21 @@ def evaluate_baselines(
     )
 
 
-def _follow(data: Dataset, info: TrialInfo, kind: str, folder: Path) -> _Followed:
-    kept = folder / f"{info.trial}.npz"
-    if kept.is_file():
-        with np.load(kept) as saved:
-            hold, in_view, followed = saved["numbers"].tolist()
-            trial = FieldTrial(rest_px=saved["rest_px"], displacement_px=saved["displacement_px"], hold=hold)
-        return _Followed(trial=trial, in_view=in_view, followed=followed)
+def _follow(data: Dataset, info: TrialInfo, kind: str) -> _Followed:
     path = trial_path(data.folder, info.trial)
     reference = load_recording(path, truth=False, pixels=False).reference
     tracks = track_markers(stream_frames(path), reference, kind)
-    trial = field_trial(tracks)
-    in_view = int((tracks.status[:, tracks.from_reference] != MarkerStatus.OUTSIDE).sum())
-    followed = int(tracks.followed[:, tracks.from_reference].sum())
-    folder.mkdir(parents=True, exist_ok=True)
-    part = kept.with_name(f".{info.trial}.part.npz")
-    np.savez(
-        part,
-        rest_px=trial.rest_px,
-        displacement_px=trial.displacement_px,
-        numbers=np.array([trial.hold, in_view, followed]),
+    known = tracks.from_reference
+    return _Followed(
+        **vars(field_trial(tracks)),
+        in_view=int((tracks.status[:, known] != MarkerStatus.OUTSIDE).sum()),
+        followed=int(tracks.followed[:, known].sum()),
     )
-    part.replace(kept)
-    return _Followed(trial=trial, in_view=in_view, followed=followed)
 
 
 def _margins(data: Dataset, info: TrialInfo) -> Float[np.ndarray, " frames"]:
     recording = load_recording(trial_path(data.folder, info.trial), truth=False, pixels=False)
     return np.where(recording.labelled, recording.safety_margin, np.nan)
-
-
-def _answer(
-    estimate: Callable[[FieldTrial], Float[np.ndarray, " _"]],
-    fields: Mapping[str, _Followed],
-    predictions: Predictions,
-    *,
-    mean: float,
-) -> Float[np.ndarray, " frames"]:
-    answer = np.full(len(predictions), mean)
-    for name in set(predictions.trial.tolist()) & set(fields):
-        rows = predictions.trial == name
-        answer[rows] = estimate(fields[name].trial)[predictions.frame[rows]]
-    return answer
 
 
 def _score(answers: Predictions) -> BaselineScores:

@@ -219,14 +219,7 @@ class EpochShuffle(Sampler[int]):
     """A random order for each epoch that depends on the seed and the epoch alone, so that resuming repeats it.
 
     Of one order that all processes draw alike, each takes every `processes`-th frame, so that together the n-th batches
-    of all processes are the n-th batch of one.
-
-    Parameters
-    ----------
-    count
-        Frames there are; those that do not divide among the processes are left out of this epoch.
-    rank, processes
-        Number of this process, from 0, and how many there are.
+    of all processes are the n-th batch of one. Those that do not divide are left out of this epoch.
     """
 
     def __init__(self, count: int, *, seed: int, rank: int = 0, processes: int = 1) -> None:
@@ -254,15 +247,7 @@ class EpochShuffle(Sampler[int]):
 
 
 class EvenShares(Sampler[list[int]]):
-    """Batches of every frame once, over all processes, and as many in each: they must take each step together.
-
-    Parameters
-    ----------
-    count
-        Frames there are, at least one for each process.
-    rank, processes
-        Number of this process, from 0, and how many there are.
-    """
+    """Batches of every frame once, over all processes, and as many in each: they must take each step together."""
 
     def __init__(self, count: int, *, batch_size: int, rank: int = 0, processes: int = 1) -> None:
         largest_share = -(-count // processes)

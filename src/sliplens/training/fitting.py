@@ -4,7 +4,7 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +22,7 @@ from sliplens.models import Manifest, TrainedModel, build_model, load_checkpoint
 from sliplens.models.backbones import HistogramRegressor, histogram_targets
 from sliplens.models.calibration import LEVELS, Calibration, conformal_offset, fit_temperature, quantiles
 from sliplens.models.checkpoint import load
-from sliplens.models.encodings import get_encoding
+from sliplens.models.encodings import Encoding, get_encoding
 from sliplens.progress import OnProgress, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset
@@ -94,7 +94,15 @@ def train(
     if start is not None:
         require_same_kind(start, config, input)
     data = data if isinstance(data, Dataset) else load_dataset(data)
-    job = _Job(config=config, input=input, data=data, condition=condition, start=start, trainer=trainer)
+    job = _Job(
+        config=config,
+        encoding=get_encoding(input),
+        data=data,
+        condition=condition,
+        start=start,
+        trainer=trainer,
+        trials=_choose_trials(data, condition),
+    )
     if out is None:
         if trainer.world_size > 1:
             raise InputError("several processes need a folder that all can see; name one with out")
@@ -126,26 +134,18 @@ def train(
     return run
 
 
+@dataclass(frozen=True, kw_only=True)
 class _Job:
     """What every process of a training does alike."""
 
-    def __init__(
-        self,
-        *,
-        config: TrainConfig,
-        input: str,
-        data: Dataset,
-        condition: str | None,
-        start: TrainedModel | None,
-        trainer: lightning.Trainer,
-    ) -> None:
-        self.config = config
-        self.encoding = get_encoding(input)
-        self.data = data
-        self.condition = condition
-        self.start = start
-        self.trainer = trainer
-        self.train_trials, self.validation_trials = _choose_trials(data, condition)
+    config: TrainConfig
+    encoding: Encoding
+    data: Dataset
+    condition: str | None
+    start: TrainedModel | None
+    trainer: lightning.Trainer
+    trials: tuple[tuple[TrialInfo, ...], tuple[TrialInfo, ...]]
+    """To train and to validate on."""
 
     @property
     def origin(self) -> dict[str, str | None]:
@@ -162,10 +162,8 @@ class _Job:
     ) -> Training:
         """Read the frames and fit."""
         frames = []
-        for what, trials, share in (
-            ("training", self.train_trials, self.config.untouched_share),
-            ("validation", self.validation_trials, 0.0),
-        ):
+        shares = (self.config.untouched_share, 0.0)
+        for what, trials, share in zip(("training", "validation"), self.trials, shares, strict=True):
             with stage(on_progress, f"Reading {what} trials ({self.encoding.name})") as count:
                 frames.append(
                     load_frames(
@@ -178,7 +176,7 @@ class _Job:
                         on_progress=count,
                     )
                 )
-        info = self.train_trials[0]
+        info = self.trials[0][0]
         training = fit(
             self.config,
             frames[0],
@@ -187,7 +185,7 @@ class _Job:
             frame_size=(info.height, info.width),
             sensor=info.sensor,
             data_hash=self.data.hash,
-            trained_on=[trial.sha256[:12] for trial in (*self.train_trials, *self.validation_trials)],
+            trained_on=[trial.sha256[:12] for trials in self.trials for trial in trials],
             start=self.start,
             trainer=self.trainer,
             logger=logger,
@@ -228,24 +226,28 @@ def calibrate(model: nn.Module, validation: FrameSet, *, batch_size: int) -> Cal
     model.train(was_training)
     outputs, labels = torch.cat(answers), validation.safety_margin
     margins = labels.double().numpy()
-    if not isinstance(model, HistogramRegressor):
-        predictions = outputs.reshape(-1).double().numpy()
-        offsets = {str(level): conformal_offset(predictions, predictions, margins, level=level) for level in LEVELS}
-        mse = float(np.mean((predictions - margins) ** 2))
-        return Calibration(temperature=1.0, offsets=offsets, frames=len(margins), mse=mse)
-    edges = model.edges.cpu()
-    temperature = fit_temperature(outputs, histogram_targets(labels, edges))
-    model.temperature.fill_(temperature)
-    probabilities = torch.softmax(outputs / temperature, dim=-1).double().numpy()
-    offsets = {}
-    for level in LEVELS:
-        low, high = (
-            quantiles(probabilities, edges.double().numpy(), share) for share in ((1 - level) / 2, (1 + level) / 2)
-        )
-        offsets[str(level)] = conformal_offset(np.asarray(low), np.asarray(high), margins, level=level)
-    predictions = probabilities @ model.centres.double().cpu().numpy()
-    mse = float(np.mean((predictions - margins) ** 2))
-    return Calibration(temperature=temperature, offsets=offsets, frames=len(margins), mse=mse)
+    if isinstance(model, HistogramRegressor):
+        edges = model.edges.cpu()
+        temperature = fit_temperature(outputs, histogram_targets(labels, edges))
+        model.temperature.fill_(temperature)
+        probabilities = torch.softmax(outputs / temperature, dim=-1).double().numpy()
+        predictions = probabilities @ model.centres.double().cpu().numpy()
+        tails = {level: ((1 - level) / 2, (1 + level) / 2) for level in LEVELS}
+        bounds = {
+            level: tuple(np.asarray(quantiles(probabilities, edges.double().numpy(), share)) for share in shares)
+            for level, shares in tails.items()
+        }
+    else:
+        temperature, predictions = 1.0, outputs.reshape(-1).double().numpy()
+        bounds = dict.fromkeys(LEVELS, (predictions, predictions))
+    return Calibration(
+        temperature=temperature,
+        offsets={
+            str(level): conformal_offset(low, high, margins, level=level) for level, (low, high) in bounds.items()
+        },
+        frames=len(margins),
+        mse=float(np.mean((predictions - margins) ** 2)),
+    )
 
 
 _LAST = "last.ckpt"
