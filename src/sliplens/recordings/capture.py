@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -9,6 +10,9 @@ from jaxtyping import Float, UInt8
 from sliplens.errors import RecordingError
 from sliplens.recordings.labelling import Clip
 from sliplens.recordings.trial import Labels, TrialFacts
+
+Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
+"""RGB image of the camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +51,7 @@ class Capture(TrialFacts):
     """On the clock of the camera, from the same zero as the forces."""
     frame_size: tuple[int, int]
     """Height and width, in pixels."""
-    read_frames: Callable[[], Iterator[UInt8[np.ndarray, "height width 3"]]]
+    read_frames: Callable[[], Iterator[Frame]]
     """Begins anew at every call: one RGB image for each time, in their order."""
     forces: Forces | None
     """None where only images were recorded."""
@@ -55,7 +59,7 @@ class Capture(TrialFacts):
     """Assumptions and omissions of the reader, a sentence each, to be shown to the user."""
     labels: Labels | None = None
     """Labels that came with the frames; None where they are to be found."""
-    reference: UInt8[np.ndarray, "height width 3"] | None = None
+    reference: Frame | None = None
     """Image of the untouched sensor, where it was recorded apart from the frames."""
     reference_index: int | None = None
     """Frame that a source, or its reader, takes for the untouched one."""

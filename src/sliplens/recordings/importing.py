@@ -8,12 +8,11 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import output_folder
 from sliplens.progress import OnProgress, note, stage, wrote
-from sliplens.recordings.capture import Capture, Forces
+from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.dataset import Dataset, load_dataset, trial_info, trial_path, write_dataset_table
 from sliplens.recordings.formats import open_captures
 from sliplens.recordings.formats.stored import read_stored
@@ -292,7 +291,7 @@ def import_trial(
 
 def _find_labels(
     capture: Capture, forces: Forces, settings: LabelSettings, rng: np.random.Generator, index: int | None
-) -> tuple[UInt8[np.ndarray, "height width 3"], Labels]:
+) -> tuple[Frame, Labels]:
     labels = label_trial(capture.frame_time_s, measure_motion(_frames(capture)), forces, settings=settings, rng=rng)
     if capture.reference is not None and index is None:
         image, choice = capture.reference, ReferenceChoice(method="recorded apart from the frames")
@@ -303,9 +302,7 @@ def _find_labels(
     return image, replace(labels, labelling=replace(_tell_source(capture, choice), basis=labels.basis))
 
 
-def _given_labels(
-    capture: Capture, labels: Labels, index: int | None
-) -> tuple[UInt8[np.ndarray, "height width 3"], Labels]:
+def _given_labels(capture: Capture, labels: Labels, index: int | None) -> tuple[Frame, Labels]:
     if index is not None:
         if not 0 <= index < len(capture):
             raise RecordingError(f"the reference is frame {index} of {len(capture)}; name one from 0 on that is there")
@@ -327,7 +324,7 @@ def _tell_source(capture: Capture, reference: ReferenceChoice) -> Labelling:
     )
 
 
-def _frames(capture: Capture) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+def _frames(capture: Capture) -> Iterator[Frame]:
     """Frames of a capture, which must be as many as it promised and of one size."""
     read = 0
     for frame in capture.read_frames():

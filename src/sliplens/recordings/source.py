@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from sliplens.errors import ImageError, InputError
 from sliplens.images import list_images, read_image
-from sliplens.recordings.capture import Capture
+from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import DATASET_FILE, Dataset, TrialInfo, load_dataset, trial_path
 from sliplens.recordings.formats import open_captures, recognise
 from sliplens.recordings.formats.images import frame_size, read_frame
@@ -20,8 +20,6 @@ from sliplens.recordings.formats.tables import evenly_spaced, trial_name
 from sliplens.recordings.options import ReadOptions, spoken
 from sliplens.recordings.store import load_recording, read_reference, stream_frames
 
-Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
-"""RGB image of the camera."""
 Frames: TypeAlias = UInt8[np.ndarray, "frames height width 3"]
 """RGB images of the camera, one after another."""
 _Trial = TypeVar("_Trial")

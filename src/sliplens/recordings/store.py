@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 from sliplens.codec import from_builtins, to_builtins
 from sliplens.errors import RecordingError
 from sliplens.images.files import decode_png, encode_png
-from sliplens.recordings.capture import Forces
+from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.trial import OPTIONAL_LABELS, SIGNALS, ContactState, GroundTruth, Labels, Recording, TrialFacts
 
@@ -144,7 +144,7 @@ def _parse_header(metadata: dict[bytes, bytes] | None, path: Path) -> TrialHeade
     return from_builtins(values, TrialHeader, where=f"the header of {path}", command=_COMMAND)
 
 
-def read_reference(path: Path) -> UInt8[np.ndarray, "height width 3"]:
+def read_reference(path: Path) -> Frame:
     """Read the reference frame of a trial."""
     with reading(path):
         metadata = pq.read_metadata(path).metadata
@@ -177,7 +177,7 @@ def write_trial(
     facts: TrialFacts,
     time_s: Float[np.ndarray, " frames"],
     labels: Labels,
-    reference: UInt8[np.ndarray, "height width 3"],
+    reference: Frame,
     truth: GroundTruth | None = None,
 ) -> None:
     """Write the Parquet file of a trial, chunk by chunk; it appears when complete.
@@ -306,7 +306,7 @@ def _label_values(table: pa.Table, header: TrialHeader) -> dict[str, Any]:
     }
 
 
-def stream_frames(path: Path) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+def stream_frames(path: Path) -> Iterator[Frame]:
     """Frames of a stored trial one at a time, a row group of them in memory."""
     header, file, first = read_header(path), _open_images(path), 0
     with file:

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Unpack
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from PIL import Image
 
 from sliplens.errors import ImageError, RecordingError
 from sliplens.images.files import list_images, read_image
-from sliplens.recordings.capture import Capture
+from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.formats.tables import (
     TIME_UNITS,
     ForceColumns,
@@ -47,7 +47,7 @@ def frame_size(path: Path) -> tuple[int, int]:
         raise ImageError(f"{path} cannot be read as an image ({error}); copy or export it again") from None
 
 
-def read_frame(path: Path, *, size: tuple[int, int]) -> UInt8[np.ndarray, "height width 3"]:
+def read_frame(path: Path, *, size: tuple[int, int]) -> Frame:
     """Read an image as a frame."""
     try:
         with Image.open(path) as image:
@@ -188,7 +188,7 @@ def read_image_folder(
     size = common_size(paths)
     clock = place_on_clock(time, forces=forces, start_s=start_s, source=folder.name, **columns)
 
-    def read_frames() -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    def read_frames() -> Iterator[Frame]:
         return (read_frame(path, size=size) for path in paths)
 
     return Capture(

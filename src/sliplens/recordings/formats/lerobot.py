@@ -17,11 +17,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from av.container import InputContainer
 from av.error import FFmpegError
-from jaxtyping import Bool, Float, Int64, UInt8
+from jaxtyping import Bool, Float, Int64
 from PIL import Image
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.capture import Capture, Forces
+from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.formats.stored import ExportedTrial
 from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.store import DAMAGED_PARQUET, load_forces, one_line
@@ -279,7 +279,7 @@ def read_video_info(path: Path) -> VideoInfo:
 
 def video_frames(
     path: Path, wanted_s: Float[np.ndarray, " frames"], *, tolerance_s: float, frame_size: tuple[int, int]
-) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+) -> Iterator[Frame]:
     """Decode the frames nearest to some stamps of a video."""
     with _open_video(path) as container:
         shown = _decode_from(container, float(wanted_s[0]) - tolerance_s)
@@ -300,9 +300,7 @@ def video_frames(
             yield frame.to_ndarray(format="rgb24")
 
 
-def image_frames(
-    episode: Episode, key: str
-) -> tuple[tuple[int, int], Callable[[], Iterator[UInt8[np.ndarray, "height width 3"]]]]:
+def image_frames(episode: Episode, key: str) -> tuple[tuple[int, int], Callable[[], Iterator[Frame]]]:
     """Find the height and width of the frames of an episode that lie in a Parquet file, and how they are read."""
     read = partial(_stored_images, episode.data_file, key, episode.index)
     first = next(read(frame_size=None), None)
@@ -312,9 +310,7 @@ def image_frames(
     return (height, width), partial(read, frame_size=(height, width))
 
 
-def _stored_images(
-    path: Path, key: str, episode: int, *, frame_size: tuple[int, int] | None
-) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+def _stored_images(path: Path, key: str, episode: int, *, frame_size: tuple[int, int] | None) -> Iterator[Frame]:
     index = 0
     try:
         file = pq.ParquetFile(path)
@@ -353,7 +349,7 @@ def _row_groups(file: pq.ParquetFile, episode: int) -> list[int]:
     return found
 
 
-def decode_image(data: bytes, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
+def decode_image(data: bytes, *, where: str) -> Frame:
     """Pixels of a PNG or JPEG; a grey one gets three equal channels."""
     try:
         with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Int64, Shaped, UInt8
+from jaxtyping import Int64, Shaped
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import require_folder, write_json
 from sliplens.images.files import encode_png, write_png
 from sliplens.progress import OnProgress
-from sliplens.recordings.capture import Capture
+from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import Dataset, TrialInfo
 from sliplens.recordings.formats.lerobot import (
     CAMERA,
@@ -51,7 +51,7 @@ class PixelCount:
         self.levels: Int64[np.ndarray, "3 256"] = np.zeros((3, 256), dtype=np.int64)
         self.frames = 0
 
-    def add(self, frame: UInt8[np.ndarray, "height width 3"]) -> None:
+    def add(self, frame: Frame) -> None:
         """Count the pixels of a frame."""
         self.levels += [np.bincount(frame[..., channel].ravel(), minlength=256) for channel in range(3)]
         self.frames += 1

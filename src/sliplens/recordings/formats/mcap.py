@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt8
+from jaxtyping import Float, Int64
 
 from sliplens._version import __version__
 from sliplens.errors import InputError, RecordingError
@@ -16,7 +16,7 @@ from sliplens.extras import require_packages
 from sliplens.files import require_folder
 from sliplens.images.files import encode_png
 from sliplens.progress import OnProgress
-from sliplens.recordings.capture import Capture, Forces
+from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.dataset import Dataset, TrialInfo
 from sliplens.recordings.formats.stored import ExportedTrial, read_stored_trial
 from sliplens.recordings.formats.tables import require_trial_name
@@ -220,7 +220,7 @@ def _label(labels: Labels, index: int) -> dict[str, Any]:
     }
 
 
-def _encoded(frames: Iterator[UInt8[np.ndarray, "height width 3"]]) -> Iterator[bytes]:
+def _encoded(frames: Iterator[Frame]) -> Iterator[bytes]:
     """PNG of each frame, a few of them made side by side."""
     with ThreadPoolExecutor() as pool:
         while batch := list(islice(frames, _BATCH)):

@@ -15,12 +15,12 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt8
+from jaxtyping import Float, Int64
 from PIL import Image
 
 from sliplens.errors import RecordingError, SliplensError
 from sliplens.extras import require_packages
-from sliplens.recordings.capture import Capture, Forces
+from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.formats.mcap import (
     IMAGE,
     LABELS,
@@ -71,7 +71,7 @@ def image_size(message: Any, *, where: str) -> tuple[int, int]:
     return message.height, message.width
 
 
-def image_pixels(message: Any, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
+def image_pixels(message: Any, *, where: str) -> Frame:
     """Pixels of an image as RGB; grey is repeated in all three channels."""
     if message.__msgtype__ == COMPRESSED:
         with _open_compressed(message, where=where) as image:
@@ -372,7 +372,7 @@ class _Scan:
     size: tuple[int, int] | None = None
     force_n: array = field(default_factory=lambda: array("d"))
     force_time_s: array = field(default_factory=lambda: array("d"))
-    reference: UInt8[np.ndarray, "height width 3"] | None = None
+    reference: Frame | None = None
     references: int = 0
     numbers: array = field(default_factory=lambda: array("d"))
     valid: list[bool] = field(default_factory=list)
@@ -429,9 +429,7 @@ def _scan(
     return found
 
 
-def _read_frames(
-    path: Path, images: str, *, kinds: Mapping[str, str] | None = None
-) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+def _read_frames(path: Path, images: str, *, kinds: Mapping[str, str] | None = None) -> Iterator[Frame]:
     for index, (_, _, message) in enumerate(bag_messages(path, {images}, kinds=kinds)):
         yield image_pixels(message, where=_where(index, images, path))
 

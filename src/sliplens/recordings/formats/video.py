@@ -13,10 +13,10 @@ from av.error import FFmpegError
 from av.stream import Disposition
 from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
-from jaxtyping import Float, Float32, Int64, UInt8
+from jaxtyping import Float, Float32, Int64
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.capture import Capture
+from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.formats.tables import ForceColumns, evenly_spaced, place_on_clock, trial_name
 
 HEAD = 13
@@ -29,7 +29,7 @@ _FROZEN = 0.75  # grey levels: no more than noise and coding change
 _WAKES = 1.015  # a camera that adapts its exposure when it is started grows brighter by more
 
 
-def stale_frames(frames: Iterable[UInt8[np.ndarray, "height width 3"]]) -> int:
+def stale_frames(frames: Iterable[Frame]) -> int:
     """Count the frames at the start that belong to another scene.
 
     A camera that was just started hands out dark frames, and then what lay in its buffers: frozen frames of an earlier
@@ -40,7 +40,7 @@ def stale_frames(frames: Iterable[UInt8[np.ndarray, "height width 3"]]) -> int:
     return count_stale(small_copies(frames))
 
 
-def small_copies(frames: Iterable[UInt8[np.ndarray, "height width 3"]]) -> Float32[np.ndarray, "frames rows columns 3"]:
+def small_copies(frames: Iterable[Frame]) -> Float32[np.ndarray, "frames rows columns 3"]:
     """Reduce frames to the means of blocks, enough to tell scenes apart and small enough to keep."""
     copies = [_block_means(frame) for frame in islice(frames, HORIZON)]
     return np.stack(copies) if copies else np.empty((0, *_BLOCKS, 3), dtype=np.float32)
@@ -73,7 +73,7 @@ def least_contact(copies: Float32[np.ndarray, "frames rows columns 3"]) -> int:
     return int(np.argmin(np.abs(colour - smooth).mean(axis=(1, 2, 3))))
 
 
-def _block_means(frame: UInt8[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "rows columns 3"]:
+def _block_means(frame: Frame) -> Float32[np.ndarray, "rows columns 3"]:
     rows, columns = (min(most, size) for most, size in zip(_BLOCKS, frame.shape[:2], strict=True))
     height, width = frame.shape[0] // rows, frame.shape[1] // columns
     whole = frame[: rows * height, : columns * width]
@@ -222,7 +222,7 @@ def _ends_early(
     return float(time_s[-1]) + 1.5 * max(steps) < container.duration / av.time_base
 
 
-def decode_video(file: VideoFile) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+def decode_video(file: VideoFile) -> Iterator[Frame]:
     """Decode the frames in the order they are shown."""
     path, count = file.path, 0
     to_rgb = VideoReformatter()  # one for all: preparing it costs as much as a frame
@@ -287,7 +287,7 @@ def read_video(
     if skipped:
         notes.append(f"{path.name}: the first {skipped} of {file.frames} frames were left out.")
 
-    def read_frames() -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    def read_frames() -> Iterator[Frame]:
         return islice(decode_video(file), skipped, None)
 
     return Capture(

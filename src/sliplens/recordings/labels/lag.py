@@ -4,10 +4,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.capture import Forces
+from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Lag
 from sliplens.recordings.labels.axes import infer_axes
 from sliplens.recordings.labels.smoothing import mean_force, typical_step
@@ -16,7 +16,7 @@ _MOTION_BLOCKS = 28
 """Blocks across the shorter side: wide enough to average the camera's noise, narrower than a marker's spacing."""
 
 
-def soften(frame: UInt8[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "rows columns 3"]:
+def soften(frame: Frame) -> Float32[np.ndarray, "rows columns 3"]:
     """Means of square blocks of a frame, in grey levels; what fills no block at the right and below is left out."""
     height, width, _ = frame.shape
     side = max(1, min(height, width) // _MOTION_BLOCKS)
@@ -30,12 +30,12 @@ def soften(frame: UInt8[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "r
     return (blocks / np.float32(side * side)).astype(np.float32)
 
 
-def image_motion(previous: UInt8[np.ndarray, "height width 3"], frame: UInt8[np.ndarray, "height width 3"]) -> float:
+def image_motion(previous: Frame, frame: Frame) -> float:
     """Mean absolute difference of two softened frames, in grey levels."""
     return float(np.mean(np.abs(soften(frame) - soften(previous))))
 
 
-def measure_motion(frames: Iterable[UInt8[np.ndarray, "height width 3"]]) -> Float[np.ndarray, " frames"]:
+def measure_motion(frames: Iterable[Frame]) -> Float[np.ndarray, " frames"]:
     """How much each frame differs from the one before it (`image_motion`); 0 for the first."""
     motion: list[float] = []
     previous = None

@@ -4,9 +4,10 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 
 from sliplens.errors import RecordingError
+from sliplens.recordings.capture import Frame
 from sliplens.recordings.labelling import ReferenceChoice
 from sliplens.recordings.labels.lag import measure_motion, soften
 from sliplens.recordings.options import REFERENCE_METHODS
@@ -22,7 +23,7 @@ _SMOOTH = 9
 
 
 def choose_reference(
-    read_frames: Callable[[], Iterator[UInt8[np.ndarray, "height width 3"]]],
+    read_frames: Callable[[], Iterator[Frame]],
     untouched: Bool[np.ndarray, " frames"],
     *,
     index: int | None = None,
