@@ -14,8 +14,8 @@ from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_
 from sliplens.recordings.store import forces_path, load_recording, read_header
 from sliplens.recordings.trial import SIGNALS, ContactState, Recording
 
+# margins are stored in double precision; labels made in single precision may differ by this much from their forces
 _ROUNDING = 1e-6
-"""Margins are stored in double precision; labels made in single precision may differ by this much from their forces."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -119,8 +119,7 @@ class Dataset:
         return (self.load(info, truth=truth) for info in trials)
 
 
-_NAMED = 10
-"""Trials named in a message before the rest is counted."""
+_NAMED = 10  # trials named in a message before the rest is counted
 
 
 def load_dataset(folder: Path | str) -> Dataset:

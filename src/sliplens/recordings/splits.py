@@ -269,8 +269,7 @@ __all__ = [
 SPLITS_FILE = "splits.json"
 """Keeps, in the folder of a data set, the rules that its splits come from."""
 _NEEDED = ("train", "validation", "test")
-_NAMED = 5
-"""So many names are told before the rest is counted."""
+_NAMED = 5  # so many names are told before the rest is counted
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -251,8 +251,7 @@ class EpisodeRows:
 
 # what FFmpeg would guess from the content may be a play list that leads to other files and hosts
 _CONTAINERS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska", ".webm": "webm"}
-_MOST_PIXELS = 100_000_000
-"""Of a frame: a larger one is a damaged header."""
+_MOST_PIXELS = 100_000_000  # of a frame: a larger one is a damaged header
 _DAMAGED_IMAGE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning)
 
 

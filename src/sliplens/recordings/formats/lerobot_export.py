@@ -285,10 +285,8 @@ def frame_places(frames: int, *, first: int, episode: int, task: int) -> dict[st
     }
 
 
-_BATCH = 16
-"""Frames that are encoded side by side and written together."""
-_RATE_WHERE_NONE = 30
-"""Where every trial is one frame."""
+_BATCH = 16  # frames that are encoded side by side and written together
+_RATE_WHERE_NONE = 30  # where every trial is one frame
 
 
 def write_lerobot(

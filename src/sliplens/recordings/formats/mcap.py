@@ -74,12 +74,9 @@ def trial_types() -> "Typestore":
 
 
 _FRAME_ID = "tactile"
-_LAST_S = 2**31
-"""A stamp of ROS counts seconds in 32 bits."""
-_BATCH = 16
-"""Frames that are encoded side by side."""
-_BLOCK = 1000
-"""Times of wrenches in a message."""
+_LAST_S = 2**31  # a stamp of ROS counts seconds in 32 bits
+_BATCH = 16  # frames that are encoded side by side
+_BLOCK = 1000  # times of wrenches in a message
 
 
 def write_mcap(

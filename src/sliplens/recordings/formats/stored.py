@@ -64,8 +64,7 @@ FORMAT, VERSION = "sliplens trial", 2
 """What the text of an exported trial calls itself."""
 EXPORTED_OPTIONAL = ("safety_margin_sigma", "valid", "reason")
 """Labels that a trial may lack, though the formats of others have room for them."""
-_LONGEST = 2**24
-"""Characters of a text that is parsed; those of a trial are some thousands."""
+_LONGEST = 2**24  # characters of a text that is parsed; those of a trial are some thousands
 
 
 @dataclass(frozen=True, kw_only=True)

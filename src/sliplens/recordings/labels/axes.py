@@ -10,30 +10,20 @@ from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import AXES, ForceAxes, Found, Vector
 from sliplens.recordings.labels.smoothing import mean_force, noise_sigma
 
-_WINDOW_S = 0.03
-"""Time over which the force is averaged to find the touch: a press takes longer, a spike is shorter."""
-_FIRST_S = 0.1
-"""How long the sensor must be untouched at the start for its tare to be read."""
-_TOUCH_SIGMAS = 6.0
-"""A departure from the tare by so many standard deviations of the averaged noise is a touch."""
-_TOUCH_SHARE = 0.05
-"""And by so much of the largest force: drift and vibration are no touch."""
-_GUARD_S = 0.15
-"""Samples before the touch that are left out of the tare: a soft press begins before it is noticed."""
+_WINDOW_S = 0.03  # time over which the force is averaged to find the touch: a press takes longer, a spike is shorter
+_FIRST_S = 0.1  # how long the sensor must be untouched at the start for its tare to be read
+_TOUCH_SIGMAS = 6.0  # a departure from the tare by so many standard deviations of the averaged noise is a touch
+_TOUCH_SHARE = 0.05  # and by so much of the largest force: drift and vibration are no touch
+_GUARD_S = 0.15  # samples before the touch that are left out of the tare: a soft press begins before it is noticed
+# share of the contact, from its start, in which the object is pressed and held but not yet pulled far
 _PRESS_SHARE = 0.25
-"""Share of the contact, from its start, in which the object is pressed and held but not yet pulled far."""
 
 
-_SPIKE_SIGMAS = 4.0
-"""A still sample further from the median is a spike."""
-_MOST = 0.9
-"""Share of the still samples that cannot all be spikes."""
-_FEW_STILL = 10
-"""Fewer still samples tell no tare."""
-_STRETCHES = 10
-"""Parts of the still samples whose means are compared."""
-_DOUBTFUL = 0.6
-"""A second axis that departs by this share of the first makes the normal axis doubtful."""
+_SPIKE_SIGMAS = 4.0  # a still sample further from the median is a spike
+_MOST = 0.9  # share of the still samples that cannot all be spikes
+_FEW_STILL = 10  # fewer still samples tell no tare
+_STRETCHES = 10  # parts of the still samples whose means are compared
+_DOUBTFUL = 0.6  # a second axis that departs by this share of the first makes the normal axis doubtful
 
 
 def infer_axes(
@@ -154,8 +144,7 @@ def _find_touch(forces: Forces, *, tare_n: Vector | None) -> tuple[float, float]
     return touch, touch - min(_GUARD_S, (touch - start) / 2)
 
 
-_FEW_MEANS = 20
-"""Fewer means tell no spread."""
+_FEW_MEANS = 20  # fewer means tell no spread
 
 
 @dataclass(frozen=True, kw_only=True)

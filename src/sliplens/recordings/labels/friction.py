@@ -11,20 +11,14 @@ from sliplens.recordings.labelling import Found, FrictionEstimate
 from sliplens.recordings.labels.axes import ContactForces, magnitude
 from sliplens.recordings.labels.smoothing import mean_force, typical_step
 
-_REACH_S = 0.08
-"""How far the break may lie from the rough guess."""
-_TRIES = 41
-"""Breaks tried over that reach."""
+_REACH_S = 0.08  # how far the break may lie from the rough guess
+_TRIES = 41  # breaks tried over that reach
+# lengths of the fall that are tried, from a sudden drop to that of a soft fingertip
 _FALLS_S = (0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056, 0.08)
-"""Lengths of the fall that are tried, from a sudden drop to that of a soft fingertip."""
-_LEAST_BEFORE, _LEAST_AFTER = 6, 3
-"""Samples that the two sides of a break need."""
-_PARAMETERS = 7
-"""What a fit takes from the noise: five numbers, and where the break and the end of the fall lie."""
-_MEMORY = 0.2
-"""Residuals that correlate by more are drawn together."""
-_LONGEST_BLOCK = 0.1
-"""Longest block, as a share of the samples."""
+_LEAST_BEFORE, _LEAST_AFTER = 6, 3  # samples that the two sides of a break need
+_PARAMETERS = 7  # what a fit takes from the noise: five numbers, and where the break and the end of the fall lie
+_MEMORY = 0.2  # residuals that correlate by more are drawn together
+_LONGEST_BLOCK = 0.1  # longest block, as a share of the samples
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,28 +122,19 @@ def _blocks(
     return (starts + np.arange(length)[:, None]).reshape(-1, draws)[:count]
 
 
+# times over which the forces are averaged to find roughly where the ratio breaks off: the longer finds faint falls
 _WINDOWS_S = (0.03, 0.1)
-"""Times over which the forces are averaged to find roughly where the ratio breaks off: the longer finds faint falls."""
-_DROP_SIGMAS = 5.0
-"""A fall of the averaged ratio by so many standard deviations of its noise is no chance."""
-_DROP_SHARE = 0.03
-"""And by so much of the ratio: less is a wobble of the hand that pulls."""
-_DROP_S = 0.25
-"""Time in which the ratio must have fallen: slip is sudden, letting go is slow."""
-_PULLED_SHARE = 0.5
-"""A slip is looked for where the ratio is this share of its largest or more."""
+_DROP_SIGMAS = 5.0  # a fall of the averaged ratio by so many standard deviations of its noise is no chance
+_DROP_SHARE = 0.03  # and by so much of the ratio: less is a wobble of the hand that pulls
+_DROP_S = 0.25  # time in which the ratio must have fallen: slip is sudden, letting go is slow
+_PULLED_SHARE = 0.5  # a slip is looked for where the ratio is this share of its largest or more
+# and where the normal force is this share of its largest: in a light touch the ratio is all noise
 _PRESSED_SHARE = 0.25
-"""And where the normal force is this share of its largest: in a light touch the ratio is all noise."""
-_STEP_S = 0.06
-"""Time over which the ratio before and after a fall is compared to place it."""
-_BEFORE_S, _AFTER_S = 0.6, 0.2
-"""What of the ratio is fitted, before and after its break."""
-_BAND = (0.16, 0.84)
-"""Quantiles that hold 68 %."""
-_SEEN_SIGMAS = 3.0
-"""An image that moves by so many standard deviations more than before sees the slip."""
-_QUIET_S = 0.5
-"""Time before the onset that tells how much the image moves without slip."""
+_STEP_S = 0.06  # time over which the ratio before and after a fall is compared to place it
+_BEFORE_S, _AFTER_S = 0.6, 0.2  # what of the ratio is fitted, before and after its break
+_BAND = (0.16, 0.84)  # quantiles that hold 68 %
+_SEEN_SIGMAS = 3.0  # an image that moves by so many standard deviations more than before sees the slip
+_QUIET_S = 0.5  # time before the onset that tells how much the image moves without slip
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,8 +12,8 @@ from sliplens.recordings.labelling import Lag
 from sliplens.recordings.labels.axes import infer_axes
 from sliplens.recordings.labels.smoothing import mean_force, typical_step
 
+# blocks across the shorter side: wide enough to average the camera's noise, narrower than a marker's spacing
 _MOTION_BLOCKS = 28
-"""Blocks across the shorter side: wide enough to average the camera's noise, narrower than a marker's spacing."""
 
 
 def soften(frame: Frame) -> Float32[np.ndarray, "rows columns 3"]:
@@ -46,20 +46,14 @@ def measure_motion(frames: Iterable[Frame]) -> Float[np.ndarray, " frames"]:
     return np.array(motion, dtype=np.float64)
 
 
-_STEPS_A_FRAME = 16
-"""Lags tried in the time of a frame; between them the peak is a parabola's."""
-_BLOCKS = 24
-"""Stretches of a trial that are drawn anew: long enough to hold a slip whole, many enough to draw from."""
+_STEPS_A_FRAME = 16  # lags tried in the time of a frame; between them the peak is a parabola's
+_BLOCKS = 24  # stretches of a trial that are drawn anew: long enough to hold a slip whole, many enough to draw from
 _LEAST_INTERVALS = 2 * _BLOCKS
 _LEAST_CORRELATION = 0.3
-_OVERLAP = 0.7
-"""Share of the frames that must have forces for a lag to be tried."""
-_LOAD_WINDOW_S = 0.03
-"""Time over which the load is averaged to see it let go."""
-_PART = (0.25, 0.75)
-"""Shares of the load in hold between which a release is timed."""
-_SUDDEN_STEPS = 2.0
-"""A fall between these within so many frames tells the time however the gel yields."""
+_OVERLAP = 0.7  # share of the frames that must have forces for a lag to be tried
+_LOAD_WINDOW_S = 0.03  # time over which the load is averaged to see it let go
+_PART = (0.25, 0.75)  # shares of the load in hold between which a release is timed
+_SUDDEN_STEPS = 2.0  # a fall between these within so many frames tells the time however the gel yields
 
 
 def given_lag(lag_s: float, *, sigma_s: float = 0.0) -> Lag:

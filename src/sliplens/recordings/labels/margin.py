@@ -17,8 +17,7 @@ from sliplens.recordings.labels.smoothing import half_window, mean_force, typica
 from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.trial import ContactState, Labels
 
-_NO_FLAG = 1e-6
-"""Rounding of a mean of flags that are all 0."""
+_NO_FLAG = 1e-6  # rounding of a mean of flags that are all 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,16 +90,12 @@ def _out_of_range(
     return mean_force(forces.time_s, full, time_s, window_s=window_s)[:, 0] > _NO_FLAG
 
 
-_CONTACT_SIGMAS = 8.0
-"""Least normal force of a contact, in standard deviations of its noise."""
-_CONTACT_SHARE = 0.05
-"""And as a share of the trial's largest: of a lighter touch the margin would be all noise."""
-_GAP_STEPS = 4.0
-"""Samples further apart than so many typical steps miss others between them."""
-_STUCK_SIGMAS = 2.0
-"""A margin nearer to 1 than so many standard deviations cannot be told from full stick."""
+_CONTACT_SIGMAS = 8.0  # least normal force of a contact, in standard deviations of its noise
+_CONTACT_SHARE = 0.05  # and as a share of the trial's largest: of a lighter touch the margin would be all noise
+_GAP_STEPS = 4.0  # samples further apart than so many typical steps miss others between them
+_STUCK_SIGMAS = 2.0  # a margin nearer to 1 than so many standard deviations cannot be told from full stick
+# frames on either side from which it is read how fast the margin changes: fewer would show the noise's changes
 _RATE_STEPS = 3.0
-"""Frames on either side from which it is read how fast the margin changes: fewer would show the noise's changes."""
 
 
 class Reason(StrEnum):

@@ -12,14 +12,11 @@ from sliplens.recordings.labelling import ReferenceChoice
 from sliplens.recordings.labels.lag import measure_motion, soften
 from sliplens.recordings.options import REFERENCE_METHODS
 
-_STILL_TIMES = 1.5
-"""A frame that moves by so many times what the stillest quarter of its fellows do is not still."""
-_COMPARED = 200
-"""Untouched frames that are compared at most: memory stays small where hours are untouched."""
-_ENDS = 10
-"""Frames at either end of the untouched ones that are compared for drift."""
+_STILL_TIMES = 1.5  # a frame that moves by so many times what the stillest quarter of its fellows do is not still
+_COMPARED = 200  # untouched frames that are compared at most: memory stays small where hours are untouched
+_ENDS = 10  # frames at either end of the untouched ones that are compared for drift
+# blocks over which the slow part of an image is taken: wider than a contact's rim, narrower than the light's fall
 _SMOOTH = 9
-"""Blocks over which the slow part of an image is taken: wider than a contact's rim, narrower than the light's fall."""
 
 
 def choose_reference(

@@ -3,8 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-_MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a Gaussian over its median absolute deviation."""
+_MAD_TO_SIGMA = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 
 
 def typical_step(time_s: Float[np.ndarray, " samples"]) -> float:
