@@ -90,14 +90,7 @@ _NAMES = {"cv2": "OpenCV", "rerun": "Rerun"}
 def missing_packages(*names: str, extra: str) -> str | None:
     """What to say of packages that are not installed, with the command that installs them; None if all are there.
 
-    Nothing is imported.
-
-    Parameters
-    ----------
-    names
-        Packages, as they are imported.
-    extra
-        Extra of sliplens that installs them; several are divided by commas.
+    Packages are named as they are imported, extras of sliplens divided by commas. Nothing is imported.
     """
     # find_spec fails for what is known to be missing: None among the modules
     missing = [
@@ -110,13 +103,7 @@ def missing_packages(*names: str, extra: str) -> str | None:
 
 
 def require_packages(*names: str, extra: str, purpose: str) -> None:
-    """Check that packages of an extra are installed.
-
-    Parameters
-    ----------
-    purpose
-        What needs them, as the message begins.
-    """
+    """Check that packages of an extra are installed; the message begins with what needs them."""
     if missing := missing_packages(*names, extra=extra):
         raise InputError(f"{purpose} needs {missing}")
 

@@ -151,7 +151,6 @@ def require_new_file(path: Path, *, suffix: str | None = None, overwrite: bool =
 class Output:
     """A folder being written: `folder` lies beside the target until everything is in it."""
 
-    target: Path
     folder: Path
     complete: bool
     """True when the target was already made by the same recipe; then there is nothing to do."""
@@ -216,7 +215,7 @@ def output_folder(
     if target.exists() and not overwrite:
         if read_json(target / run_file).get("config_hash") != config_hash:
             raise InputError(f"{target} holds a result of other settings; choose another folder or pass --overwrite")
-        yield Output(target=target, folder=target, complete=True)
+        yield Output(folder=target, complete=True)
         return
     partial = partial_folder(target)
     state = partial / ".recipe"
@@ -229,7 +228,7 @@ def output_folder(
     if resumable:
         state.write_text(config_hash)
     try:
-        yield Output(target=target, folder=partial, complete=False)
+        yield Output(folder=partial, complete=False)
     except BaseException:
         # what is finished stays for the next try; where nothing is, nothing is left behind
         if not resumable or all(path == state for path in partial.iterdir()):

@@ -176,12 +176,7 @@ def judge_curves(
 ) -> tuple[tuple[RemovalScore, ...], tuple[Comparison, ...]]:
     """Scores with intervals, and methods compared with each other and with the best control.
 
-    Parameters
-    ----------
-    curves
-        By setting and method, controls included.
-    trials
-        Trial of each frame; whole trials are resampled.
+    The curves are those of controls too; whole trials are resampled.
     """
     rng = np.random.default_rng(seed)
     scores, comparisons = [], []

@@ -109,13 +109,7 @@ def frames_at(trained: TrainedModel, data: Dataset, rows: Mapping[str, Sequence[
 
 
 def nearest_frame(margin: Float[np.ndarray, " frames"], level: float) -> int:
-    """Frame whose margin is nearest to a level, next to the change where many are: the last one above, the first below.
-
-    Parameters
-    ----------
-    margin
-        Label of each frame, NaN where there is none; one at least has one.
-    """
+    """Frame whose margin is nearest to a level, next to the change where many are: the last above, the first below."""
     distance = np.abs(margin - level)
     nearest = np.flatnonzero(distance == np.nanmin(distance))
     return int(nearest[-1] if level >= 0.5 else nearest[0])

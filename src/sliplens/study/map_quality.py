@@ -28,12 +28,8 @@ def measure_maps(
     """Measure resolution, smoothness, sparsity and stability of the maps.
 
     Stability is the correlation with the map of the same frame under other camera noise, as large as what differs
-    between frames that follow each other, and with the map of the next frame.
-
-    Parameters
-    ----------
-    repeated
-        How many frames, from the first on, are explained twice more.
+    between frames that follow each other, and with the map of the next frame; so the first `repeated` frames are
+    explained twice more.
     """
     explained, rng = material.explained, np.random.default_rng(seed)
     noisy, following, noise_sd = _once_more(material.trained, data, material.chosen[:repeated], rng=rng)

@@ -29,14 +29,10 @@ _AS_PUBLISHED = Likeness(pearson_r=0.999, top_overlap=0.97)
 
 
 def study_explainers(methods: Sequence[str] = STUDY_METHODS, *, budget: float = STUDY_BUDGET) -> dict[str, Explainer]:
-    """Explainers of a study by name.
+    """Explainers of a study by name, with a budget for Poly-CAM.
 
-    Parameters
-    ----------
-    methods
-        Rows of `EXPLAINERS`, or `poly-cam-thesis`: the public code's score, layers, and the map that the thesis scored.
-    budget
-        Of Poly-CAM, with either score; see `PolyCam`.
+    Besides rows of `EXPLAINERS` there is `poly-cam-thesis`: the public code's score, layers, and the map that the
+    thesis scored.
     """
     table = {
         **EXPLAINERS,
@@ -129,13 +125,7 @@ def gather(
     markers: Mapping[str, MarkedFrame],
     explainers: Mapping[str, Explainer],
 ) -> Material:
-    """Gather what the scores need of some of the explained frames.
-
-    Parameters
-    ----------
-    chosen
-        Frames that count, each of which is explained.
-    """
+    """Gather what the scores need of the chosen frames, each of which is explained."""
     places = {frame.id: at for at, frame in enumerate(explained.frames)}
     counted = explained.take([places[frame.id] for frame in chosen])
     by_trial: dict[str, list[int]] = {}

@@ -22,17 +22,10 @@ _PIPES: dict[str, Connection] = {}
 def run_together(
     work: Callable[[str, OnProgress], object], names: Sequence[str], *, threads: int, on_progress: OnProgress | None
 ) -> None:
-    """Do a piece of work for every name, each in a process of its own.
+    """Do a piece of work, which must be picklable, for every name, each in a process with so many threads of torch.
 
     Where one fails or this process is interrupted, the others are ended too, as if the machine had stopped: the work
     must leave nothing behind that it cannot go on from.
-
-    Parameters
-    ----------
-    work
-        Takes a name, and what shows its stages and progress; must be picklable.
-    threads
-        Of torch, in each process.
     """
     context = multiprocessing.get_context("spawn")  # a fork would inherit locks of torch's threads
     pipes = {name: context.Pipe(duplex=False) for name in names}

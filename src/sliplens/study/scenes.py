@@ -65,13 +65,7 @@ class Places:
 def stage_frames(
     trained: TrainedModel, explained: Explained, data: Dataset, *, recipe: SimulationRecipe | None = None
 ) -> tuple[StagedFrame, ...]:
-    """Make the frames of a study ready to be drawn anew.
-
-    Parameters
-    ----------
-    recipe
-        What simulated it; read from its folder if None.
-    """
+    """Make frames of a study ready to be drawn anew; the data set's folder has the recipe where none is given."""
     if not data.simulated or explained.source != "simulated":
         raise InputError(f"{data.folder} was recorded: what each marker does is known of simulated frames alone")
     infos = {info.trial: info for info in data.trials}

@@ -19,11 +19,6 @@ def show_states(choice: Choice, data: Dataset, *, on_progress: OnProgress | None
 
     The simulator knows the markers' places; in recorded trials they are followed from the untouched sensor on. A trial
     in which they cannot be followed has none, and the result says why.
-
-    Parameters
-    ----------
-    data
-        Data set that it was chosen from.
     """
     infos = {info.trial: info for info in data.trials}
     tables: list[MarkerTable] = [_NO_MARKERS]
@@ -97,20 +92,10 @@ _NO_MARKERS = _table("", MarkedFrame(rest_px=np.empty((0, 2)), now_px=np.empty((
 def network_places(
     marked: MarkedFrame, *, frame_size: tuple[int, int], image_size: int
 ) -> tuple[Float[np.ndarray, "seen 2"], float]:
-    """Where a network sees the markers, and how far each one's surroundings reach, in its own pixels.
+    """Where a network sees the markers (x, y), and how far each one's surroundings reach, in its own pixels.
 
-    A difference image shows a marker where it was and where it is; so its place is half-way, and half of the pitch
-    reaches both.
-
-    Parameters
-    ----------
-    marked
-        Markers in camera pixels; those not followed are left out.
-
-    Returns
-    -------
-    centres, reach
-        x and y, and half of the median distance between neighbours.
+    A difference image shows a marker where it was and where it is; so its place is half-way, and half of the pitch, the
+    median distance between neighbours, reaches both. Markers that were not followed are left out.
     """
     middle = (marked.rest_px + marked.now_px) / 2
     middle = middle[np.isfinite(middle).all(axis=1)]

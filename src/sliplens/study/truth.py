@@ -265,13 +265,7 @@ def true_curves(
     seed: int = 0,
     on_progress: OnProgress | None = None,
 ) -> dict[str, Faithfulness]:
-    """Removal curves under the true fill: markers put back, most or least influential first, or in random orders.
-
-    Parameters
-    ----------
-    random_orders, seed
-        How many random orders, and what they are drawn from.
-    """
+    """Removal curves under the true fill: markers put back, most or least influential first, or in random orders."""
     frames, places = _stage(trained, explained, data, recipe=recipe)
     inputs = network_inputs(trained, explained)
     passes = len(frames) * (2 * len(maps) + random_orders) * (len(SHARES) - 2)

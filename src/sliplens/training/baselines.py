@@ -73,12 +73,7 @@ def evaluate_baselines(
 ) -> tuple[Baselines, BaselinePredictions]:
     """Follow markers, fit estimators on training trials, and score them on the very frames a network was scored on.
 
-    Parameters
-    ----------
-    predictions
-        The network's, for the trial, condition, frame, time and label of each frame.
-    folder
-        Keeps the field of each trial: those that are there are not followed again.
+    The folder keeps the field of each trial: those that are there are not followed again.
     """
     estimators = {name: get_estimator(name) for name in plan.estimators}
     tested = set(predictions.trial.tolist())

@@ -57,14 +57,8 @@ def open_logger(
     """Open a logger that keeps its files in the run's folder, and close it so that the folder can take its name.
 
     TensorBoard and MLflow write there, MLflow elsewhere if `MLFLOW_TRACKING_URI` says so. Weights & Biases too writes
-    there alone, for `wandb sync` to send, unless `WANDB_MODE` says `online`: nothing leaves the machine unasked.
-
-    Parameters
-    ----------
-    name
-        `csv` for none besides `metrics.csv`, or one of `LOGGERS`.
-    run_name
-        What the logger calls the run.
+    there alone, for `wandb sync` to send, unless `WANDB_MODE` says `online`: nothing leaves the machine unasked. `csv`
+    opens none, for `metrics.csv` is always written.
     """
     if name == "csv":
         yield None
