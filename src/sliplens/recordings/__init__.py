@@ -14,26 +14,17 @@ if TYPE_CHECKING:
     from sliplens.recordings.trial import ContactState, GroundTruth, Labels, Recording, TrialFacts
 
 # where each name lives: asking for options alone, as the command line's help does, reads no file format
-_MODULES = {
-    "ContactState": "trial",
-    "Dataset": "dataset",
-    "Export": "exporting",
-    "GroundTruth": "trial",
-    "LabelSettings": "options",
-    "Labelling": "labelling",
-    "Labels": "trial",
-    "ReadOptions": "options",
-    "Recording": "trial",
-    "TrialFacts": "trial",
-    "TrialInfo": "dataset",
-    "check_dataset": "check",
-    "export_lerobot": "exporting",
-    "export_mcap": "exporting",
-    "import_recordings": "importing",
-    "label_dataset": "importing",
-    "load_dataset": "dataset",
-    "split_dataset": "splits",
+_NAMES = {
+    "check": ("check_dataset",),
+    "dataset": ("Dataset", "TrialInfo", "load_dataset"),
+    "exporting": ("Export", "export_lerobot", "export_mcap"),
+    "importing": ("import_recordings", "label_dataset"),
+    "labelling": ("Labelling",),
+    "options": ("LabelSettings", "ReadOptions"),
+    "splits": ("split_dataset",),
+    "trial": ("ContactState", "GroundTruth", "Labels", "Recording", "TrialFacts"),
 }
+_MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [
     "ContactState",

@@ -81,8 +81,8 @@ class Labels:
     def __post_init__(self) -> None:
         self._require_one_each(len(self.safety_margin), f"there are {len(self.safety_margin)} safety margins but")
 
-    def _require_one_each(self, count: int, begin: str) -> None:
-        for name in (*LABEL_SIGNALS, "contact_state", *OPTIONAL_LABELS):
+    def _require_one_each(self, count: int, begin: str, *more: str) -> None:
+        for name in (*LABEL_SIGNALS, "contact_state", *OPTIONAL_LABELS, *more):
             values = getattr(self, name)
             if values is not None and len(values) != count:
                 raise RecordingError(f"{begin} {len(values)} values of {name}; give one value a frame")
@@ -223,9 +223,7 @@ class Recording(TrialFacts, Labels):
                 f"{self.reference.shape[:2]}; record both with the same camera settings"
             )
         begin = f"trial {self.trial} has {count} frames but"
-        self._require_one_each(count, begin)
-        if len(self.time_s) != count:
-            raise RecordingError(f"{begin} {len(self.time_s)} values of time_s; give one value a frame")
+        self._require_one_each(count, begin, "time_s")
         if self.truth is not None and len(self.truth.marker_px) != count:
             raise RecordingError(f"{begin} the truth of {len(self.truth.marker_px)}; give the truth of every frame")
         if not np.all(np.diff(self.time_s) > 0):

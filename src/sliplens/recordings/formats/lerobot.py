@@ -397,27 +397,20 @@ NUMBERS = {
 }
 """Features of one number, by the labels they hold."""
 VALID, STATE, REASON = "observation.valid", "observation.contact_state", "observation.invalid_reason"
+KEPT = Path("meta", "sliplens")
+"""Folder of what LeRobot has no place for; its `trials.jsonl` has a line an episode."""
 _COLUMNS = [TIME, FORCE, *NUMBERS.values(), VALID, STATE, REASON]
 
 
-def trials_path(folder: Path) -> Path:
-    """File with a line of JSON an episode."""
-    return folder / "meta" / "sliplens" / "trials.jsonl"
-
-
-def reference_path(folder: Path, episode: int) -> Path:
-    """Reference frame of an episode."""
-    return folder / "meta" / "sliplens" / f"reference-{episode:06d}.png"
-
-
-def samples_path(folder: Path, episode: int) -> Path:
-    """Samples of the force sensor of an episode."""
-    return folder / "meta" / "sliplens" / f"forces-{episode:06d}.parquet"
+def kept_path(folder: Path, name: str, episode: int) -> Path:
+    """File of an episode with what LeRobot has no place for: "reference", or "forces" as the sensor sampled them."""
+    suffix = {"reference": "png", "forces": "parquet"}[name]
+    return folder / KEPT / f"{name}-{episode:06d}.{suffix}"
 
 
 def read_kept(layout: Layout) -> tuple[ExportedTrial, ...] | None:
     """Read what is kept of the trials, one an episode; None where nothing is."""
-    path = trials_path(layout.folder)
+    path = layout.folder / KEPT / "trials.jsonl"
     try:
         lines = path.read_text(encoding="utf-8").rstrip("\n").split("\n")
     except (FileNotFoundError, NotADirectoryError):
@@ -441,7 +434,7 @@ def kept_captures(layout: Layout, trials: tuple[ExportedTrial, ...], *, episode:
     episodes = read_episodes(layout, camera_key=CAMERA)
     exported = [(index, trial.frames) for index, trial in enumerate(trials)]
     if [(one.index, one.length) for one in episodes] != exported:
-        path = trials_path(layout.folder)
+        path = layout.folder / KEPT / "trials.jsonl"
         raise RecordingError(
             f"the episodes of {layout.folder} are no longer those that {path} tells of; export the trials again, or "
             "remove that file to read the data set without labels"
@@ -458,7 +451,7 @@ def _capture(layout: Layout, rows: EpisodeRows, episode: Episode, trial: Exporte
     time = rows.numbers(table, TIME, episode)
     if not np.isfinite(time).all():
         raise RecordingError(f"{TIME} of {source} is not a number everywhere; copy the data set again")
-    path = reference_path(layout.folder, episode.index)
+    path = kept_path(layout.folder, "reference", episode.index)
     try:
         png = path.read_bytes()
     except OSError as error:
@@ -469,7 +462,7 @@ def _capture(layout: Layout, rows: EpisodeRows, episode: Episode, trial: Exporte
         frame_time_s=time,
         frame_size=size,
         read_frames=read_frames,
-        forces=_forces(samples_path(layout.folder, episode.index), trial) if trial.force_samples else None,
+        forces=_forces(kept_path(layout.folder, "forces", episode.index), trial) if trial.force_samples else None,
         labels=_labels(rows, table, episode, trial, source),
         reference=decode_image(png, where=f"{path}"),
         split=trial.split,

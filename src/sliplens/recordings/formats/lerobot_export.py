@@ -24,14 +24,13 @@ from sliplens.recordings.formats.lerobot import (
     CAMERA,
     FORCE,
     FORCE_AXES,
+    KEPT,
     NUMBERS,
     REASON,
     STATE,
     TIME,
     VALID,
-    reference_path,
-    samples_path,
-    trials_path,
+    kept_path,
 )
 from sliplens.recordings.formats.stored import STATES, ExportedTrial, read_stored_trial
 from sliplens.recordings.formats.tables import require_trial_name
@@ -399,7 +398,7 @@ def _make_room(folder: Path) -> None:
     for name in ("data", "meta"):
         if (folder / name).is_dir():
             shutil.rmtree(folder / name)
-    trials_path(folder).parent.mkdir(parents=True)
+    (folder / KEPT).mkdir(parents=True)
 
 
 def _frame_rate(data: Dataset, trials: Sequence[TrialInfo]) -> int | float:
@@ -437,10 +436,10 @@ def _keep(folder: Path, episode: int, capture: Capture) -> None:
     labels, forces = capture.labels, capture.forces
     assert labels is not None
     assert capture.reference is not None
-    write_png(reference_path(folder, episode), capture.reference)
+    write_png(kept_path(folder, "reference", episode), capture.reference)
     if forces is not None:
-        save_forces(forces, samples_path(folder, episode))
-    with trials_path(folder).open("a", encoding="utf-8", newline="\n") as lines:
+        save_forces(forces, kept_path(folder, "forces", episode))
+    with (folder / KEPT / "trials.jsonl").open("a", encoding="utf-8", newline="\n") as lines:
         lines.write(ExportedTrial.of(capture).dump() + "\n")
 
 
