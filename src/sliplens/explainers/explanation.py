@@ -90,13 +90,8 @@ class Explanation:
     def frame(self) -> pa.Table:
         """Arrow table of the predictions, a row an image, in margin units; a gap that is not promised is NaN."""
         gap = torch.full_like(self.change, torch.nan) if self.completeness_gap is None else self.completeness_gap
-        columns = {
-            "prediction": self.prediction,
-            "reference_prediction": self.reference_prediction,
-            "change": self.change,
-            "completeness_gap": gap,
-        }
-        return pa.table({name: values.cpu().numpy() for name, values in columns.items()})
+        columns = {name: getattr(self, name) for name in ("prediction", "reference_prediction", "change")}
+        return pa.table({name: values.cpu().numpy() for name, values in (columns | {"completeness_gap": gap}).items()})
 
 
 CLOSE = 0.02  # margin units; a difference below the regressor's own error explains nothing
@@ -166,10 +161,9 @@ def check_approximations(approximations: Sequence[Approximation]) -> Iterator[st
 def check_slopes(sizes: Sequence[float], *, change: Sequence[float]) -> Iterator[str]:
     """Where the gradients at an image are next to nothing, though there is something to explain.
 
-    Gradient times contrast is as large as what it explains where the network is linear: the sum of its sizes is then at
-    least |f(x) - f(reference)|. Where that sum is below a tenth of it, the gradients would not explain more than a
-    tenth even if all of them pulled one way: the network is saturated at the image, and its slope there has little to
-    do with how the prediction came about.
+    Where the network is linear, the sizes of gradient times contrast add up to |f(x) - f(reference)| at least. Where
+    they make less than a tenth of it even if all pulled one way, the network is saturated at the image, and its slope
+    there has little to do with how the prediction came about.
     """
     for index, (size, difference) in enumerate(zip(sizes, change, strict=True)):
         if abs(difference) >= CLOSE and size < FLAT * abs(difference):

@@ -166,16 +166,8 @@ def freeze(
 ) -> Iterator[FrozenModel]:
     """Check the images and freeze the network.
 
-    Inside, gradients of the output are on and autocast is off, whatever the caller's mode.
-
-    Parameters
-    ----------
-    model
-        Network from images (batch, 3, height, width) to (batch,) or (batch, 1).
-    images
-        Images x, float in [0, 1], shape (batch, 3, height, width).
-    reference
-        Reference b, float in [0, 1], shape (3, height, width) or the images' own; None for zeros.
+    Inside, gradients of the output are on and autocast is off, whatever the caller's mode. Arguments are those of
+    `Explainer`.
     """
     require_images(images)
     reference = _require_reference(reference, images=images)

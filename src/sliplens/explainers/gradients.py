@@ -90,12 +90,9 @@ class IntegratedGradients(Method):
         slopes = []
 
         def integral(index: int) -> Tensor:
+            images = comparison.images[index], comparison.reference[index]
             line = self.integrate(
-                comparison,
-                image=comparison.images[index],
-                reference=comparison.reference[index],
-                prediction=comparison.prediction[index],
-                reference_prediction=comparison.reference_prediction[index],
+                comparison, *images, comparison.prediction[index], comparison.reference_prediction[index]
             )
             slopes.append(line.slope)
             return line.relevance
@@ -110,7 +107,6 @@ class IntegratedGradients(Method):
     def integrate(
         self,
         frozen: FrozenModel,
-        *,
         image: Float[Tensor, "3 height width"],
         reference: Float[Tensor, "3 height width"],
         prediction: Float[Tensor, ""],
@@ -220,12 +216,7 @@ class ExpectedGradients(Method):
         def mean_over(index: int) -> Tensor:
             image, prediction = comparison.images[index], comparison.prediction[index]
             pairs = zip(frames[index], heights[index], strict=True)
-            lines = [
-                self.integrated.integrate(
-                    comparison, image=image, reference=frame, prediction=prediction, reference_prediction=height
-                )
-                for frame, height in pairs
-            ]
+            lines = [self.integrated.integrate(comparison, image, frame, prediction, height) for frame, height in pairs]
             return torch.stack([line.relevance for line in lines]).mean(dim=0)
 
         only = ("no background was given, so the reference alone stands for it, as in integrated gradients",)

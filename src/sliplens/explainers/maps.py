@@ -106,12 +106,7 @@ def pearson_r(first: Float[Tensor, "height width"], second: Float[Tensor, "heigh
 def top_overlap(
     one: Float[Tensor, "height width"], other: Float[Tensor, "height width"], *, share: float = 0.1
 ) -> float:
-    """Share of the strongest pixels of one map that are among the strongest of another.
-
-    Parameters
-    ----------
-    share
-        Of the pixels, that count as strongest.
+    """Share of the strongest pixels of one map, such as a tenth of all, that are among the strongest of another.
 
     Examples
     --------

@@ -91,15 +91,8 @@ def marker_regions(
 ) -> Int[Tensor, "height width"]:
     """Number of the marker that each pixel belongs to, and one number more for the pixels between the markers.
 
-    Parameters
-    ----------
-    size
-        Height and width of the image in pixels.
-    centres_px
-        x and y of the markers in the image that the network sees; pixel centres lie at whole numbers.
-    radius_px
-        How far a marker reaches; by default half of the median distance between neighbours. A pixel within reach of
-        two belongs to the nearer.
+    Places are x and y in the image that the network sees; pixel centres lie at whole numbers. A marker reaches, by
+    default, half of the median distance between neighbours; a pixel within reach of two belongs to the nearer.
     """
     rows, columns = (torch.arange(length, dtype=torch.float64) for length in size)
     pixels = torch.stack(torch.broadcast_tensors(columns, rows[:, None]), dim=-1).reshape(-1, 2)

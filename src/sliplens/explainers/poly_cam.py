@@ -107,9 +107,12 @@ class PolyCam(Method):
             engine=self.engine,
             batch_size=self.batch_size,
         )
+        names = [layer.name for layer in layers]
         weights, saliencies, shown, approximations = [], [], [], []
         for index in range(len(comparison.images)):
-            activations = _activations(comparison, index, layers)
+            with capture(comparison.model, names) as outputs:
+                comparison.predict(comparison.images[index, None])
+            activations = [outputs[name][0] for name in names]
             shown_at = self._shown_at(comparison, index)
             shares, estimated = self._weights(comparison, index, activations, shown_at, engine=engine, count=count)
             weights.append(shares)
@@ -129,7 +132,7 @@ class PolyCam(Method):
             method="poly-cam",
             complete=True,
             warnings=(
-                *check_weights([layer.name for layer in layers], weights, change=comparison.change.tolist()),
+                *check_weights(names, weights, change=comparison.change.tolist()),
                 *check_approximations(approximations),
             ),
             levels=levels if self.levels else (),
@@ -211,9 +214,3 @@ class PolyCam(Method):
 
 def _size(image: Tensor) -> tuple[int, int]:
     return image.shape[-2], image.shape[-1]
-
-
-def _activations(comparison: Comparison, index: int, layers: tuple[Layer, ...]) -> list[Tensor]:
-    with capture(comparison.model, [layer.name for layer in layers]) as outputs:
-        comparison.predict(comparison.images[index, None])
-    return [outputs[layer.name][0] for layer in layers]

@@ -48,12 +48,8 @@ class GaussianProcess:
     """The effects of all channels as a Gaussian process, of which some are measured one after another.
 
     The factor L of the covariance is built column by column (a pivoted Cholesky decomposition), so that the variance
-    that is left after each choice is known before anything is measured.
-
-    Parameters
-    ----------
-    kernel
-        Covariance of the effects up to a factor, ones on the diagonal.
+    that is left after each choice is known before anything is measured. The kernel is the covariance of the effects up
+    to a factor, with ones on the diagonal.
 
     References
     ----------
@@ -163,20 +159,8 @@ class ChannelSearch:
     Rounds go on after the budget is spent until what the map is expected to miss is half of what it may. The draws know
     what was left open under this kernel, not how wrong the kernel is: hence the half.
 
-    Parameters
-    ----------
-    activations
-        Activations of each layer, fine to coarse.
-    kernel
-        How alike the supports of the active channels should be.
-    active
-        Channels whose mask is not empty, all layers in a row.
-    at_empty
-        Support of a channel whose mask is empty.
-    measure
-        Supports of channels, in rising order; see `Score.support`.
-    to_map
-        The map that weights of each layer give.
+    Active are the channels whose mask is not empty, all layers in a row; the support of the others is `at_empty`.
+    `measure` gives supports of channels in rising order (`Score.support`), `to_map` the map that weights make.
     """
 
     def __init__(
@@ -244,14 +228,9 @@ class ChannelSearch:
         if not self._process.chosen:
             return torch.cat([norm / norm.norm().clamp_min(FLOOR) for norm in self._norms])[self._active]
         estimate, deviation = self._process.estimate()
-        strength = torch.cat(
-            [
-                norm / layer_map(activation, weights).norm().clamp_min(FLOOR)
-                for norm, activation, weights in zip(
-                    self._norms, self._activations, self._weights(estimate), strict=True
-                )
-            ]
-        )[self._active]
+        layers = zip(self._norms, self._activations, self._weights(estimate), strict=True)
+        shares = [norm / layer_map(maps, weights).norm().clamp_min(FLOOR) for norm, maps, weights in layers]
+        strength = torch.cat(shares)[self._active]
         odds = estimate / deviation.clamp_min(FLOOR)
         return strength.clamp_max(1 / FLOOR) * torch.special.ndtr(odds)
 

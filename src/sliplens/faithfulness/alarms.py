@@ -1,6 +1,7 @@
 """Alarms: where a score of faithfulness does not measure the explanation."""
 
 from collections.abc import Mapping
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
@@ -19,12 +20,11 @@ _FEWEST = 3
 def fill_decides(whole: Float[np.ndarray, " images"], filled: Float[np.ndarray, " images"], *, fill: str) -> list[str]:
     """Say in how many images the fill alone is answered like the whole image: there no map can move the answer."""
     near = int(np.sum(np.abs(whole - filled) < FILL_DECIDES))
-    if not near:
-        return []
-    return [
+    sentence = (
         f"the fill decides in {near} of {len(whole)} frames: an image of nothing but {fill} is answered within "
         f"{FILL_DECIDES:.0%} of the whole frame"
-    ]
+    )
+    return [sentence] if near else []
 
 
 def follows_last_step(
@@ -57,30 +57,24 @@ def flat_maps(maps: Mapping[str, Float[np.ndarray, "images height width"]]) -> l
 
 
 def rankings_disagree(scores: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """Say which fills rank the methods differently, by Kendall's tau.
-
-    Parameters
-    ----------
-    scores
-        By fill, then by method; larger is better.
+    """Say which fills rank the methods differently, by Kendall's tau; scores by fill, then by method.
 
     References
     ----------
     Kendall, *A new measure of rank correlation* (1938).
     """
-    alarms, names = [], list(scores)
-    for number, first in enumerate(names):
-        for second in names[number + 1 :]:
-            methods = sorted(set(scores[first]) & set(scores[second]))
-            if len(methods) < _FEWEST:
-                continue
-            ranked = ([scores[fill][method] for method in methods] for fill in (first, second))
-            tau = float(np.asarray(kendalltau(*ranked))[0])
-            if not tau >= _SAME_ORDER:
-                alarms.append(
-                    f"{first} and {second} rank the methods differently (Kendall's tau {tau:.2f}): which is best "
-                    "depends on what removed pixels become"
-                )
+    alarms = []
+    for first, second in combinations(scores, 2):
+        methods = sorted(set(scores[first]) & set(scores[second]))
+        if len(methods) < _FEWEST:
+            continue
+        ranked = ([scores[fill][method] for method in methods] for fill in (first, second))
+        tau = float(np.asarray(kendalltau(*ranked))[0])
+        if not tau >= _SAME_ORDER:
+            alarms.append(
+                f"{first} and {second} rank the methods differently (Kendall's tau {tau:.2f}): which is best depends "
+                "on what removed pixels become"
+            )
     return alarms
 
 

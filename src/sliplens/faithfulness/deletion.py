@@ -16,22 +16,16 @@ from sliplens.progress import OnProgress
 
 @dataclass(frozen=True, kw_only=True)
 class DeletionCurves:
-    """Answers of a network while pixels are removed, for several images.
-
-    Attributes
-    ----------
-    pixels_removed
-        Pixels that are gone at each step.
-    base, predictions
-        Answer on the whole image, and at each step, in margin units.
-    control
-        The same in random order, where it was asked for: a method that does not beat it has shown nothing.
-    """
+    """Answers of a network while pixels are removed, for several images."""
 
     pixels_removed: Int[np.ndarray, " steps"]
+    """Pixels that are gone at each step."""
     base: Float64[np.ndarray, " images"]
+    """Answer on the whole image, in margin units."""
     predictions: Float64[np.ndarray, "images steps"]
+    """Answer at each step, in margin units."""
     control: "DeletionCurves | None" = None
+    """The same in random order, where it was asked for: a method that does not beat it has shown nothing."""
 
     @property
     def scores(self) -> Float64[np.ndarray, "images steps"]:
@@ -124,20 +118,14 @@ def deletion_curves(
 ) -> DeletionCurves:
     """Answers of a network while pixels are removed in a given order.
 
+    Parameters are those of `removal_curves`, but for these.
+
     Parameters
     ----------
-    predict
-        From inputs (batch, 3, height, width) to answers (batch,), in margin units; or an engine made ready.
-    images
-        Inputs in [0, 1].
     orders
         Flat pixel indices for each image, first to be removed first (`deletion_order`, `random_order`).
-    references
-        Inputs of the untouched sensor, for the fill that needs them.
     steps
         Number of steps; the image's height if None, as in the thesis.
-    batch_size
-        Masked images that are made and answered at a time: bounds the memory.
 
     Examples
     --------

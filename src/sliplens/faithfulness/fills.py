@@ -29,14 +29,9 @@ def noisy_linear(
     """Fill removed pixels so that each is the weighted mean of its eight neighbours, then add noise to them.
 
     The equations of all removed pixels are solved together, by conjugate gradients: they are those of a symmetric,
-    positive definite matrix. An image of which nothing is left becomes its own mean.
-
-    Parameters
-    ----------
-    noise
-        Standard normal numbers; scaled to ROAD's 0.01 and added where pixels were filled. None without noise.
-    tolerance
-        Largest distance of a filled pixel from the mean of its neighbours.
+    positive definite matrix, until no filled pixel is farther than the tolerance from the mean of its neighbours. An
+    image of which nothing is left becomes its own mean. Noise is given as standard normal numbers and scaled to ROAD's
+    0.01.
 
     References
     ----------

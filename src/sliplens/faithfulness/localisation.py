@@ -12,11 +12,6 @@ def relevance_mass(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "
 
     A map that knows nothing has the share of the image that the truth covers.
 
-    Parameters
-    ----------
-    saliency
-        Map of what matters, not negative.
-
     References
     ----------
     Arras, Osman and Samek, *CLEVR-XAI* (2022): relevance mass accuracy.

@@ -55,14 +55,7 @@ def resolution(saliency: Float[np.ndarray, "height width"], markers_px: Float[np
     """How far neighbouring markers can be told apart: depth of the valley between them over the lower of their peaks.
 
     1 where the map falls to nothing between any two neighbours, 0 where it does not fall at all. Pairs of which one has
-    no relevance are left out; NaN if there is no other.
-
-    Parameters
-    ----------
-    saliency
-        Map in [0, 1].
-    markers_px
-        Centres of the markers as x, y.
+    no relevance are left out; NaN if there is no other. The map lies in [0, 1], markers are given as x, y.
     """
     if len(markers_px) < 2:
         raise InputError("resolution needs two markers or more")

@@ -48,16 +48,10 @@ def cascade(
 
     Normalisation layers go back to their start too: to no scale, and to the statistics of some images. With statistics
     of 0 and 1, which is where they start before any training, new weights shrink what passes through them layer by
-    layer, until a deep network gives one answer to every image and there is nothing to explain.
+    layer, until a deep network gives one answer to every image and there is nothing to explain. Give two images at
+    least; without any the statistics are 0 and 1.
 
-    Parameters
-    ----------
-    model
-        Network; left as it is.
-    stages
-        Number of steps, evenly spread, the last of which has all weights new; every layer if None.
-    images
-        Images whose statistics new normalisation layers get, two at least; None for 0 and 1.
+    Steps are as many as `stages`, evenly spread, the last with all weights new; one a layer if None.
 
     References
     ----------
@@ -67,9 +61,8 @@ def cascade(
     modules = dict(changed.named_modules())
     names = weighted_layers(changed)[::-1]
     count = len(names)
-    shown = (
-        set(range(count)) if stages is None else {round((stage + 1) * count / stages) - 1 for stage in range(stages)}
-    )
+    stages = count if stages is None else stages
+    shown = {round((stage + 1) * count / stages) - 1 for stage in range(stages)}
     for number, name in enumerate(names):
         with torch.random.fork_rng(devices=[]):
             # by name, so that a layer gets the same weights whatever came before it
@@ -98,23 +91,16 @@ def _settle(model: nn.Module, changed: list[nn.Module], images: Tensor) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class RandomisationScores:
-    """What becomes of the maps of one method as a network loses what it has learned.
-
-    Attributes
-    ----------
-    layers
-        Layers with new weights, by stage.
-    similarity
-        Pearson's correlation with the maps of the trained network, by stage and image. An explanation that does not
-        fall towards 0 does not look at the network.
-    complexity_rise
-        By image: how much the entropy of the map's histogram rises from the trained to the wholly random network, over
-        that of the trained one. A faithful map gets more complex.
-    """
+    """What becomes of the maps of one method as a network loses what it has learned."""
 
     layers: tuple[int, ...]
+    """Layers with new weights, by stage."""
     similarity: Float[np.ndarray, "stages images"]
+    """Pearson's correlation with the maps of the trained network; an explanation that does not fall towards 0 does not
+    look at the network."""
     complexity_rise: Float[np.ndarray, " images"]
+    """How much the entropy of the map's histogram rises from the trained to the wholly random network, over that of the
+    trained one. A faithful map gets more complex."""
 
 
 def randomisation_scores(
@@ -128,12 +114,7 @@ def randomisation_scores(
 ) -> RandomisationScores:
     """Explain a network whose weights are drawn anew from the output on, and compare with the trained one.
 
-    Parameters
-    ----------
-    model
-        The trained network; left as it is.
-    before
-        Maps of the trained network, where they are there already.
+    Give the maps of the trained network (`before`) where they are there already.
 
     References
     ----------

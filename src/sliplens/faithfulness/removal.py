@@ -67,18 +67,12 @@ RANDOM_ORDERS = 20
 
 @dataclass(frozen=True, kw_only=True)
 class RemovalCurves:
-    """Answers of a network while parts of an image are removed in several orders.
-
-    Attributes
-    ----------
-    areas
-        Share of the image that is gone at each step, from 0 to 1.
-    answers
-        In margin units, by order, image and step; at step 0 the answers on the whole images.
-    """
+    """Answers of a network while parts of an image are removed in several orders."""
 
     areas: Float64[np.ndarray, " steps"]
+    """Share of the image that is gone at each step, from 0 to 1."""
     answers: Float64[np.ndarray, "orders images steps"]
+    """Answers in margin units; at step 0 those on the whole images."""
 
     @property
     def changes(self) -> Float64[np.ndarray, "orders images steps"]:
@@ -99,20 +93,6 @@ class RemovalCurves:
 class Faithfulness:
     """What the removal of parts says of the maps of one method, image by image, in margin units.
 
-    Attributes
-    ----------
-    areas
-        Share of the image that is gone at each step, from 0 to 1.
-    curves
-        Change of the answer at each step: the most, the least influential parts, and random ones removed first (the
-        mean over the random orders). Along the target where it was given, else its size.
-    method, fill
-        Names of what was scored, and of what removed pixels became; empty where nobody named them.
-    controls
-        The same of maps that know nothing of the network, by name (`CONTROLS`), where they were scored too.
-    alarms
-        Why the score may not measure the maps, a sentence each.
-
     Examples
     --------
     >>> import numpy as np
@@ -124,11 +104,18 @@ class Faithfulness:
     """
 
     areas: Float64[np.ndarray, " steps"]
+    """Share of the image that is gone at each step, from 0 to 1."""
     curves: Float64[np.ndarray, "3 images steps"]
+    """Change of the answer at each step: the most, the least influential parts, and random ones removed first (the mean
+    over the random orders). Along the target where it was given, else its size."""
     method: str = ""
+    """Name of what was scored, where it has one."""
     fill: str = ""
+    """Name of what removed pixels became, where it has one."""
     controls: Mapping[str, "Faithfulness"] = field(default_factory=dict)
+    """The same of maps that know nothing of the network, by name (`CONTROLS`), where they were scored too."""
     alarms: tuple[str, ...] = ()
+    """Why the score may not measure the maps, a sentence each."""
 
     @classmethod
     def of_orders(

@@ -32,14 +32,8 @@ def marker_curves(
 ) -> RemovalCurves:
     """Answers of a network while markers are put back, in several orders each.
 
-    The areas of the result are `SHARES` of the markers. What several orders ask for is drawn once.
-
-    Parameters
-    ----------
-    orders
-        Places among an image's markers, first to be put back first.
-    batch_size
-        Images that are drawn and answered at a time: bounds the memory.
+    Orders are places among an image's markers, first to be put back first. The areas of the result are `SHARES` of the
+    markers. What several orders ask for is drawn once, `batch_size` images at a time, which bounds the memory.
     """
     areas, (_, images, markers) = np.asarray(SHARES), orders.shape
     counts = np.round(areas * markers).astype(np.int64)
@@ -77,16 +71,7 @@ def score_maps_by_marker(
     batch_size: int = 64,
     on_progress: OnProgress | None = None,
 ) -> dict[str, Faithfulness]:
-    """Score the maps of several methods by putting markers back, against the same random orders.
-
-    Parameters
-    ----------
-    influence
-        How much each marker matters, by method (`unit_means`): larger goes first. Of signed relevance give the part
-        that works towards the target, `relevance * sign(target)`.
-    towards
-        As `score_maps` takes it.
-    """
+    """Score how much each marker matters to several methods (`unit_means`) by putting them back; see `score_maps`."""
     for name, values in influence.items():
         if not np.isfinite(values).all():
             raise InputError(f"{name} gives some marker no finite influence; leave out markers that no pixel shows")

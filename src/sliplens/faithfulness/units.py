@@ -35,10 +35,7 @@ def tile_units(shape: tuple[int, int], *, size: int) -> Units:
 def marker_units(shape: tuple[int, int], centres_px: Float[np.ndarray, "markers 2"], *, reach_px: float) -> Units:
     """Each pixel goes to the nearest marker; those farther from all than `reach_px` are one unit, the last.
 
-    Parameters
-    ----------
-    reach_px
-        How far a marker's unit reaches: its radius, and as far as it moves.
+    A marker's unit should reach as far as its radius, and as far as it moves.
     """
     if not len(centres_px):
         raise InputError("there is no marker to remove; choose pixels or tiles")
@@ -55,14 +52,9 @@ def unit_means(values: Float[np.ndarray, "height width"], units: Units) -> Float
 def unit_order(
     influence: Float[np.ndarray, "_ _"], units: Units, *, least_first: bool = False
 ) -> Int[np.ndarray, " pixels"]:
-    """Flat pixel indices, unit by unit, from the most to the least influential.
+    """Flat pixel indices, unit by unit, from the most to the least influential, or the other way round.
 
-    Parameters
-    ----------
-    influence
-        Map to rank by: the mean of a unit counts, so that large units have no advantage.
-    least_first
-        From the least to the most influential.
+    The mean of the map over a unit counts, so that large units have no advantage.
 
     Examples
     --------
