@@ -110,11 +110,6 @@ class TrainedModel:
         answers = [self.model(batch.to(self.device)).reshape(len(batch)) for batch in inputs.split(batch_size)]
         return torch.cat(answers).cpu() if answers else torch.empty(0)
 
-    @property
-    def calibration(self) -> Calibration | None:
-        """How sure the network may be; None for one that was never calibrated."""
-        return self.manifest.calibration
-
     @torch.no_grad()
     def estimate(self, inputs: Float[Tensor, "batch 3 size size"], *, batch_size: int = 64) -> "Estimate":
         """Safety margin of encoded frames, with how sure it is."""
@@ -133,7 +128,7 @@ class TrainedModel:
             margin=margin.double().cpu().numpy(),
             probabilities=None if probabilities is None else probabilities.double().cpu().numpy(),
             edges=bin_edges(self.model),
-            calibration=self.calibration,
+            calibration=self.manifest.calibration,
         )
 
 
@@ -153,8 +148,7 @@ class Estimate:
         """Standard deviation of each distribution; None where there is none."""
         if self.probabilities is None or self.edges is None:
             return None
-        centres = (self.edges[1:] + self.edges[:-1]) / 2
-        spread = (centres[None] - self.margin[:, None]) ** 2
+        spread = ((self.edges[1:] + self.edges[:-1]) / 2 - self.margin[:, None]) ** 2
         return np.sqrt((self.probabilities * spread).sum(axis=1))
 
     def interval(self, level: float) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]] | None:
@@ -170,9 +164,8 @@ class Estimate:
         offset = self.calibration.offset(level)
         low = high = self.margin
         if self.probabilities is not None and self.edges is not None:
-            low, high = (
-                quantiles(self.probabilities, self.edges, share) for share in ((1 - level) / 2, (1 + level) / 2)
-            )
+            ends = (1 - level) / 2, (1 + level) / 2
+            low, high = (quantiles(self.probabilities, self.edges, share) for share in ends)
         # a label lies in [0, 1], so cutting there loses none
         return np.clip(low - offset, 0, 1), np.clip(high + offset, 0, 1)
 
@@ -208,8 +201,11 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> TrainedModel:
         If the manifest is of another schema, the weights were changed or damaged, or they do not fit the backbone.
     """
     require_folder(folder, what="the run")
-    manifest = _read_manifest(folder / MANIFEST_FILE)
-    weights = folder / WEIGHTS_FILE
+    path, weights = folder / MANIFEST_FILE, folder / WEIGHTS_FILE
+    manifest = load_record(path, Manifest, command="sliplens train")
+    if manifest.schema_version != SCHEMA_VERSION:
+        raise CheckpointError(f"{path} is not a sliplens manifest of schema {SCHEMA_VERSION}; train the network again")
+    get_encoding(manifest.input)
     if not weights.is_file():
         raise CheckpointError(f"{weights} is missing; train the network again or copy the whole folder")
     if hash_file(weights) != manifest.weights_sha256:
@@ -228,14 +224,6 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> TrainedModel:
     told = (folder / "curve.parquet").is_file()
     training = load_result(folder, Training, command="sliplens train") if told else None
     return TrainedModel(model=model, manifest=manifest, training=training)
-
-
-def _read_manifest(path: Path) -> Manifest:
-    manifest = load_record(path, Manifest, command="sliplens train")
-    if manifest.schema_version != SCHEMA_VERSION:
-        raise CheckpointError(f"{path} is not a sliplens manifest of schema {SCHEMA_VERSION}; train the network again")
-    get_encoding(manifest.input)
-    return manifest
 
 
 def shipped_names() -> list[str]:
@@ -275,16 +263,13 @@ def find_run(run: Path) -> Path:
     """Folder of a network: the one that is named, else the one of that name that comes with the package."""
     if run.exists():
         return run
-    if str(run) in shipped_names():
+    names = shipped_names()
+    if str(run) in names:
         return _weights() / str(run)
-    shipped = f", or name {_choices()}, which comes with sliplens" if shipped_names() else ""
+    shipped = f", or name {' or '.join(names)}, which comes with sliplens" if names else ""
     raise InputError(f"the run {run} does not exist; check the path{shipped}")
 
 
 def _weights() -> Path:
     # the package is installed as files, never as an archive: its weights are mapped into memory from there
     return Path(str(files("sliplens"))) / "weights"
-
-
-def _choices() -> str:
-    return " or ".join(shipped_names()) or "none"

@@ -234,16 +234,12 @@ def fold_batch_norm(model: nn.Module) -> nn.Module:
     """
     copied = deepcopy(model)
     if isinstance(copied, HistogramRegressor):
-        copied.backbone = _fold(copied.backbone)
+        copied.backbone = fold_batch_norm(copied.backbone)
         return copied
-    return _fold(copied)
-
-
-def _fold(model: nn.Module) -> nn.Module:
     try:
-        folded = fuse(model)
+        folded = fuse(copied)
     except (TraceError, TypeError, NotImplementedError):  # branches on values, or takes a tensor apart
-        return model
+        return copied
     # folding makes new kernels; channels last as `load_checkpoint` has them
     return folded.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
@@ -281,10 +277,6 @@ _BUILT: WeakKeyDictionary[nn.Module, tuple[tuple[Any, ...], RunBatches]] = WeakK
 """What was built last of each network; it must not hold the network itself, which would never die."""
 
 
-def _no_obstacle(_: torch.device) -> None:
-    return None
-
-
 def _compiler_obstacle(device: torch.device) -> str | None:
     if device.type != "cpu":  # Triton brings its own
         return None
@@ -313,18 +305,6 @@ def _run_torch(network: nn.Module, device: torch.device) -> RunBatches:
             yield answers
 
     return run
-
-
-def _eager(model: nn.Module, job: EngineJob) -> RunBatches:
-    return _run_torch(Answers(model), job.images.device)
-
-
-def _folded(model: nn.Module, job: EngineJob) -> RunBatches:
-    return _run_torch(Answers(fold_batch_norm(model)), job.images.device)
-
-
-def _compiled(model: nn.Module, job: EngineJob) -> RunBatches:
-    return _run_torch(torch.compile(Answers(fold_batch_norm(model))), job.images.device)  # pyright: ignore
 
 
 def _run_in_streams(submit: Callable[[Tensor], Callable[[], tuple[Tensor, ...]]], streams: int) -> RunBatches:
@@ -415,21 +395,28 @@ def _batch_in_cache(images: Tensor) -> int:
 _CONVERTED = ("onnxruntime", "openvino")
 _ROWS = {
     "eager": EngineKind(
-        words="torch as it is", pays_after=0, batch_size=_batch_of_torch, obstacle=_no_obstacle, build=_eager
+        words="torch as it is",
+        pays_after=0,
+        batch_size=_batch_of_torch,
+        obstacle=lambda _: None,
+        build=lambda model, job: _run_torch(Answers(model), job.images.device),
     ),
     "folded": EngineKind(
         words="torch, batch normalisation folded into the convolutions",
         pays_after=100,  # it takes as long as 20 passes
         batch_size=_batch_of_torch,
-        obstacle=_no_obstacle,
-        build=_folded,
+        obstacle=lambda _: None,
+        build=lambda model, job: _run_torch(Answers(fold_batch_norm(model)), job.images.device),
     ),
     "compiled": EngineKind(
         words="torch.compile of the folded network",
         pays_after=None,  # it takes minutes
         batch_size=_batch_of_torch,
         obstacle=_compiler_obstacle,
-        build=_compiled,
+        build=lambda model, job: _run_torch(
+            torch.compile(Answers(fold_batch_norm(model))),  # pyright: ignore[reportArgumentType]
+            job.images.device,
+        ),
     ),
     "onnxruntime": EngineKind(
         words="ONNX Runtime",

@@ -181,8 +181,7 @@ def difference(found: np.ndarray, expected: np.ndarray) -> float:
 def trial_inputs(size: int) -> Iterator[Float[Tensor, "batch 3 size size"]]:
     """Inputs that a network and its copies are compared on: black, white and noise, alone and in a batch."""
     generator = torch.Generator().manual_seed(0)
-    for batch in (1, 7):
-        shape = batch, 3, size, size
+    for shape in ((1, 3, size, size), (7, 3, size, size)):
         yield from (torch.zeros(shape), torch.ones(shape), torch.rand(shape, generator=generator))
 
 

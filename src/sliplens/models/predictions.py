@@ -174,12 +174,11 @@ def _require_comparable(trained: TrainedModel, trial: TrialFrames) -> Iterator[s
 
 
 def _schema(trials: Sequence[TrialFrames], metadata: dict[str, str]) -> pa.Schema:
-    absent = set()
-    if all(trial.files is None for trial in trials):
-        absent.add("file")
-    if all(trial.safety_margin is None for trial in trials):
-        absent.add("safety_margin")
-    columns = [pa.field(name, kind) for name, kind in _COLUMNS.items() if name not in absent]
+    known = {
+        "file": any(trial.files is not None for trial in trials),
+        "safety_margin": any(trial.safety_margin is not None for trial in trials),
+    }
+    columns = [pa.field(name, kind) for name, kind in _COLUMNS.items() if known.get(name, True)]
     return pa.schema(columns, metadata={"sliplens.version": __version__, **metadata})
 
 
@@ -230,10 +229,9 @@ def _columns(estimate: Estimate, trial: TrialFrames, first: int) -> dict[str, pa
         "time_s": _numbers(trial.time_s, here, count),
         "safety_margin": _numbers(trial.safety_margin, here, count),
         "prediction": pa.array(estimate.margin),
-        **{
-            name: _numbers(values, slice(None), count)
-            for name, values in (("sigma", estimate.sigma), ("low_90", low), ("high_90", high))
-        },
+        "sigma": _numbers(estimate.sigma, slice(None), count),
+        "low_90": _numbers(low, slice(None), count),
+        "high_90": _numbers(high, slice(None), count),
     }
 
 

@@ -101,12 +101,9 @@ class Dome:
                 f"markers {depth_m:.3g} m under the skin lie outside a dome of radius {self.radius_m:.3g} m; "
                 "give a depth from 0 to less than the radius"
             )
-        polar, azimuth = [], []
-        for ring, count in enumerate(self.ring_counts):
-            polar += [ring * math.radians(self.ring_spacing_deg)] * count
-            # rows run down, so straight up is -90 degrees
-            azimuth += [2 * math.pi * index / count - math.pi / 2 for index in range(count)]
-        theta, phi = np.asarray(polar), np.asarray(azimuth)
+        theta = np.repeat(np.arange(len(self.ring_counts)) * math.radians(self.ring_spacing_deg), self.ring_counts)
+        # rows run down, so straight up is -90 degrees
+        phi = np.concatenate([2 * math.pi * np.arange(count) / count - math.pi / 2 for count in self.ring_counts])
         direction = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
         return direction * (self.radius_m - depth_m)
 

@@ -202,7 +202,7 @@ def _label(
         carried_friction=carried,
         stick_margin=stick_margin,
         held_s=held_s,
-        contact_state=tuple(_state(value) for value in margin),
+        contact_state=tuple(map(_state, margin)),
     )
 
 

@@ -24,7 +24,7 @@ from sliplens.simulation.plan import SimulationRecipe, TrialPlan, make_recipe, p
 
 def prepare_trial(plan: TrialPlan) -> tuple[Loading, Film]:
     """Load a trial and make it ready to be drawn."""
-    recipe = plan.recipe
+    recipe, unit_rng = plan.recipe, np.random.default_rng(plan.unit_seed)
     grasp_rng, load_rng, film_rng = np.random.default_rng(plan.seed).spawn(3)
     grasp = draw_grasp(recipe.nuisances, day=plan.day_draw, wet=plan.condition == "wet", rng=grasp_rng)
     loading = load_grasp(grasp, frames=plan.frames, rng=load_rng, release=recipe.release)
@@ -33,9 +33,7 @@ def prepare_trial(plan: TrialPlan) -> tuple[Loading, Film]:
         loading=loading,
         grasp=grasp,
         day=plan.day_draw,
-        unit=draw_unit(
-            recipe.nuisances, markers=recipe.sensor.geometry.markers, rng=np.random.default_rng(plan.unit_seed)
-        ),
+        unit=draw_unit(recipe.nuisances, markers=recipe.sensor.geometry.markers, rng=unit_rng),
         rng=film_rng,
         noise=recipe.sensor.noise,
         displacement=recipe.resolved_displacement,
