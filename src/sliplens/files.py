@@ -73,13 +73,9 @@ class Provenance:
 
 
 def to_builtins(value: object) -> Any:
-    """What JSON can hold of a record: mappings, lists, texts, numbers.
+    """What JSON can hold of a record, or of anything made of records, mappings, sequences, paths, texts and numbers.
 
-    Parameters
-    ----------
-    value
-        Record, or anything made of records, mappings, sequences, paths, texts and numbers. Arrays have no
-        form in JSON: declare short ones as tuples, and long ones as fields of a result (`codec.save_result`).
+    Arrays have no form in JSON: declare short ones as tuples, long ones as fields of a result (`codec.save_result`).
     """
     return msgspec.to_builtins(value, enc_hook=_encode, str_keys=True)
 

@@ -31,27 +31,31 @@ def choose_frames(
     shown_trials: int = 1,
     on_progress: OnProgress | None = None,
 ) -> Choice:
-    """Choose trials in which every network reads the frames along the margin within a tolerance.
+    """Choose trials in which every network reads the frames along the margin within a tolerance, in margin units.
 
     An explanation of a wrong answer explains the error. Where fewer trials qualify than are wanted, those whose worst
-    error is smallest are taken too; where more do, the first of them in the data set's order.
-
-    Parameters
-    ----------
-    tolerance
-        Largest error of an answer, in margin units.
-    levels
-        Safety margins at which frames are shown; for each the nearest frame is taken.
-    scored_levels
-        Those of them that count in the scores.
-    shown_trials
-        How many trials the panels show, the best read first.
+    error is smallest are taken too; where more do, the first of them in the data set's order. In each the frames
+    nearest to the levels are taken: those at scored levels, and all where the panels show the trial, the best read
+    first.
 
     References
     ----------
     Polak, section 4: 14 trials read within 3 %, 6 levels, 42 frames to score.
     """
-    _check(networks, trials=trials, tolerance=tolerance, levels=levels, scored_levels=scored_levels)
+    if not networks:
+        raise InputError("a study needs a network; name one for difference images, for raw ones, or both")
+    if trials < 1:
+        raise InputError(f"a study of {trials} trials is impossible; ask for 1 or more")
+    if not 0 <= tolerance <= 1:
+        raise InputError(f"the tolerance is {tolerance:g}; give a share of the margin between 0 and 1")
+    if any(not 0 <= level <= 1 for level in levels):
+        raise InputError(f"levels must lie in [0, 1], got {', '.join(f'{level:g}' for level in levels)}")
+    absent = [level for level in scored_levels if level not in levels]
+    if absent or not scored_levels:
+        raise InputError(
+            f"scored levels must be some of the levels {', '.join(f'{level:g}' for level in levels)}, got "
+            f"{', '.join(f'{level:g}' for level in scored_levels) or 'none'}"
+        )
     infos = data.select(split=split, condition=condition)
     candidates: list[tuple[ChosenTrial, list[tuple[int, float]]]] = []
     for info in counted(infos, on_progress):
@@ -107,30 +111,6 @@ def choose_frames(
         frames=frames,
     )
     return replace(choice, summary=_summarise(choice, len(infos)))
-
-
-def _check(
-    networks: Mapping[str, TrainedModel],
-    *,
-    trials: int,
-    tolerance: float,
-    levels: Sequence[float],
-    scored_levels: Sequence[float],
-) -> None:
-    if not networks:
-        raise InputError("a study needs a network; name one for difference images, for raw ones, or both")
-    if trials < 1:
-        raise InputError(f"a study of {trials} trials is impossible; ask for 1 or more")
-    if not 0 <= tolerance <= 1:
-        raise InputError(f"the tolerance is {tolerance:g}; give a share of the margin between 0 and 1")
-    if any(not 0 <= level <= 1 for level in levels):
-        raise InputError(f"levels must lie in [0, 1], got {', '.join(f'{level:g}' for level in levels)}")
-    absent = [level for level in scored_levels if level not in levels]
-    if absent or not scored_levels:
-        raise InputError(
-            f"scored levels must be some of the levels {', '.join(f'{level:g}' for level in levels)}, got "
-            f"{', '.join(f'{level:g}' for level in scored_levels) or 'none'}"
-        )
 
 
 def _summarise(choice: Choice, trials: int) -> str:

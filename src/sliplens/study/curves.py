@@ -85,14 +85,12 @@ def score_removal(
     parts: Path | None = None,
     on_progress: OnProgress | None = None,
 ) -> RemovalScores:
-    """Remove parts in the order of every map, under every setting.
+    """Remove parts in the order of every map, under every setting whose unit is known of every frame.
 
     Parameters
     ----------
     maps
         Influence by method, controls included (`influences`).
-    settings
-        What to remove, and what to put there; those whose unit is not known of every frame are left out.
     further
         What finds curves in another way, such as by drawing the scene anew; they are judged with the others.
     parts

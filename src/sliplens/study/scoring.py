@@ -119,12 +119,7 @@ def score_remedies(
 ) -> Remedies:
     """Score maps by deletion that stops at half of the saliency, by deletion to the background, and by insertion.
 
-    Parameters
-    ----------
-    grey
-        The same frames scored as the thesis does, by deletion to grey: stopping early needs no pass of its own.
-    steps
-        Steps of the others until every pixel is gone.
+    The same frames scored by deletion to grey, as the thesis does, are given: stopping early needs no pass of its own.
 
     References
     ----------

@@ -172,13 +172,11 @@ def judge_by_truth(
 
     Parameters
     ----------
-    data
-        The simulated data set that they are from.
     maps
         Influence by method, controls included: signed relevance times the sign of the answer's change from the
         untouched sensor.
     fills
-        Names of the fills under which a map that knows the effects is held against one that knows half of them.
+        Those under which a map that knows the effects is held against one that knows half of them.
     recipe
         What simulated the data set; read from its folder if None.
     parts

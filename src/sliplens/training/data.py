@@ -142,18 +142,16 @@ def load_frames(
 
     Frames without contact have no safety margin and are left out, as in the thesis.
 
+    Frames that would take more than half of the free memory go into a file in the folder `scratch`, if there is one,
+    which is read as needed and gone when the frames are.
+
     Parameters
     ----------
-    encoding, image_size
-        Input of the network, and its height and width in pixels.
     untouched_share
         For training: add the untouched sensor itself, with the label 1, this often for each labelled frame and at least
         once a trial. Without a pull the safety margin is 1 however light the touch, so 1 is its limit; and a network
         that was shown the untouched sensor gives explanations a reference that means something: "why 20 % rather than
         100 %?". Never for an evaluation.
-    scratch
-        Folder for what does not fit into memory: frames that would take more than half of what is free go into a file
-        there, which is read as needed and gone when the frames are. Always in memory if None.
     """
     sizes = {(info.height, info.width) for info in trials}
     if len(sizes) > 1:

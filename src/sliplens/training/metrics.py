@@ -121,28 +121,24 @@ def regression_scores(
         raise RecordingError("labels must lie in [0, 1]; give the safety margin as a fraction, not in percent")
     squared = (predictions - labels) ** 2
     spread = np.sum((labels - labels.mean()) ** 2)
+    # times ten, rounded: 0.3 * 10 must fall in bin 3 although 0.3 is not exact in binary
+    bins = np.minimum(np.floor(np.round(labels * _BINS, 9)), _BINS - 1)
+    errors = [squared[bins == index] for index in range(_BINS)]
     return RegressionScores(
         frames=len(labels),
         trials=trials,
         mse=float(squared.mean()),
         r2=float(1 - squared.sum() / spread) if spread > 0 else None,
         mae=float(np.abs(predictions - labels).mean()),
-        bins=_bin_scores(labels, squared),
-    )
-
-
-def _bin_scores(labels: Float[np.ndarray, " frames"], squared: Float[np.ndarray, " frames"]) -> tuple[BinScore, ...]:
-    # times ten, rounded: 0.3 * 10 must fall in bin 3 although 0.3 is not exact in binary
-    bins = np.minimum(np.floor(np.round(labels * _BINS, 9)), _BINS - 1)
-    errors = [squared[bins == index] for index in range(_BINS)]
-    return tuple(
-        BinScore(
-            low=index / _BINS,
-            high=(index + 1) / _BINS,
-            frames=len(inside),
-            mse=float(inside.mean()) if len(inside) else None,
-        )
-        for index, inside in enumerate(errors)
+        bins=tuple(
+            BinScore(
+                low=index / _BINS,
+                high=(index + 1) / _BINS,
+                frames=len(inside),
+                mse=float(inside.mean()) if len(inside) else None,
+            )
+            for index, inside in enumerate(errors)
+        ),
     )
 
 
