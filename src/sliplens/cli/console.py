@@ -19,8 +19,6 @@ from sliplens.progress import OnProgress
 OUT = Console()
 ERR = Console(stderr=True)
 
-_NAME_COLUMNS = 26  # names are as wide as they are, up to a third of 80 columns
-
 
 def fail(message: str) -> None:
     """Print an error, in one line however narrow the terminal."""
@@ -34,8 +32,7 @@ def say(message: str) -> None:
 
 def wrote(path: Path, what: str, *, kept: bool = False) -> None:
     """Say what was written where, or that it was there already."""
-    what = "made before with the same settings; --overwrite makes it again" if kept else what
-    verb = "kept" if kept else "wrote"
+    verb, what = ("kept", "made before with the same settings; --overwrite makes it again") if kept else ("wrote", what)
     OUT.print(f"[green]{verb}[/] {escape(str(path))}  [dim]{escape(what)}[/]", soft_wrap=True, highlight=False)
 
 
@@ -78,14 +75,11 @@ class Terminal:
         finally:
             with self._lock:
                 self._open.remove(task)
-                # the last frame of the screen keeps the bar of a stage that stands alone
-                if self._open:
-                    self._bars.remove_task(task)
-                else:
+                if not self._open:
+                    # stopped before its bar goes: the last frame of the screen keeps it
                     self._bars.stop()
-                    for left in self._bars.task_ids:
-                        self._bars.remove_task(left)
                     self._tell_notes()
+                self._bars.remove_task(task)
 
     wrote = staticmethod(wrote)
 
@@ -137,12 +131,11 @@ class _Column(NamedTuple):
 
 def _column(name: str, cells: Sequence[str], *, names: bool) -> _Column:
     """Fit a column to its cells; a column of names may be broken at spaces, numbers may not."""
-    longest = max(map(len, name.split()), default=0)
-    widest = max(map(len, cells), default=0)
-    width = max(longest, min(widest, _NAME_COLUMNS) if names else widest)
+    longest, widest = (max(map(len, texts), default=0) for texts in (name.split(), cells))
+    # names are as wide as they are, up to a third of 80 columns
+    width = max(longest, min(widest, 26) if names else widest)
     head, *broken = ("\n".join(wrap(text, width, break_long_words=False)) for text in (name, *cells))
-    lines = [len(line) for cell in broken for line in cell.split("\n")]
-    return _Column(escape(head), broken, max([longest, *lines]))
+    return _Column(escape(head), broken, max(longest, *(len(line) for cell in broken for line in cell.split("\n")), 0))
 
 
 def _fitting(columns: Sequence[_Column], width: int) -> Iterator[list[_Column]]:

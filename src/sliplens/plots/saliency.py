@@ -14,7 +14,7 @@ from sliplens.results.explanation import ExplainedFrame
 
 # perceptually uniform, rises in lightness, and read alike under every common colour blindness
 COLORMAP = "inferno"
-_DIM = 0.55  # of the picture's lightness: leaves the bright end of the colours to the saliency
+DIM = 0.55  # of the picture's lightness: leaves the bright end of the colours to the saliency
 _OPAQUE_FROM = 0.4  # saliency from which the picture no longer shines through
 FULL_COLOUR_PERCENTILE = 99.5
 """Percentile of a map that gets the brightest colour: a few outlying pixels would leave the rest of the map black."""
@@ -25,18 +25,11 @@ def overlay_saliency(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Picture in dimmed grey with the saliency in colour on top.
 
-    The picture loses its own colours, so that every colour seen is saliency; where the saliency is low the picture
+    The picture loses its own colours, so that every colour seen is saliency, in [0, 1]; where it is low the picture
     shows through.
-
-    Parameters
-    ----------
-    picture
-        What the network saw, as RGB.
-    saliency
-        Importance of each pixel in [0, 1], of the picture's height and width.
     """
     value = np.clip(require_saliency(saliency, picture.shape[:2]), 0, 1)
-    return np.round(255 * _blend(_DIM * _lightness(picture), value)).astype(np.uint8)
+    return np.round(255 * _blend(DIM * lightness(picture), value)).astype(np.uint8)
 
 
 def stretch_saliency(saliency: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
@@ -57,14 +50,15 @@ def plot_overlay(
 def plot_colour_bar(*, ax: Axes) -> Axes:
     """Draw the colours of `overlay_saliency` from least to most important, over a mid-grey picture."""
     value = np.linspace(0, 1, 256)[None]
-    ax.imshow(_blend(np.full_like(value, _DIM / 2), value), extent=(0, 1, 0, 1), aspect="auto")
+    ax.imshow(_blend(np.full_like(value, DIM / 2), value), extent=(0, 1, 0, 1), aspect="auto")
     ax.set(xlabel="Saliency (share of its own picture's 99.5th percentile)", yticks=[], xticks=[0, 0.25, 0.5, 0.75, 1])
     ax.grid(visible=False)
     return ax
 
 
-def _lightness(picture: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
-    return picture @ np.array([0.299, 0.587, 0.114]) / 255  # luma weights of ITU-R BT.601
+def lightness(picture: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
+    """Luma of a picture, 0 to 1, by the weights of ITU-R BT.601."""
+    return picture @ np.array([0.299, 0.587, 0.114]) / 255
 
 
 def _blend(
@@ -83,13 +77,6 @@ def overlay_jet(
     """Picture under half of the saliency in Jet, divided by the brightest value, as the thesis's figures have it.
 
     Jet has bright bands where nothing changes and is not read alike by everyone; use it to compare with those figures.
-
-    Parameters
-    ----------
-    picture
-        What the network saw, as RGB.
-    saliency
-        Importance of each pixel in [0, 1].
 
     References
     ----------

@@ -38,7 +38,7 @@ from sliplens.plots.style import (
     source_name,
 )
 from sliplens.report.comparisons import controls, settings
-from sliplens.report.plates import Plate, columns
+from sliplens.report.plates import Plate, named_columns
 from sliplens.report.workspace import Results
 from sliplens.results.faithfulness import DeletionScores, RemovalCurve, RemovalScores
 
@@ -86,7 +86,7 @@ def plate_bins(results: Results) -> Plate:
         alt=f"Bars of the mean squared error in bins of Γ; largest, {'; '.join(told)}",
         caption=f"Mean squared error by bins of the true safety margin. Largest error, {'; '.join(told)}. A bin "
         "without bars holds no test frame.",
-        numbers=columns(("condition", "input", "low", "high", "frames", "mse"), rows),
+        numbers=named_columns(("condition", "input", "low", "high", "frames", "mse"), rows),
     )
 
 
@@ -122,7 +122,7 @@ def plate_predictions(results: Results) -> Plate:
         alt=f"Predicted against true Γ: {listed([f'{input_name(one[0])}, {one[1]}' for one in shown])}",
         caption=f"Predicted against true safety margin, {len(answers)} answers on frames of test trials. A perfect "
         "network would put every dot on the dashed line.",
-        numbers=columns(("input", "trial", "condition", "frame", "safety_margin", "prediction"), rows),
+        numbers=named_columns(("input", "trial", "condition", "frame", "safety_margin", "prediction"), rows),
     )
 
 
@@ -156,7 +156,7 @@ def plate_over_time(results: Results) -> Plate | None:
         alt=f"True and predicted Γ over time through the test trials {told}",
         caption="Safety margin through one test trial of each condition: the trial whose mean error is the median of "
         f"all, neither the best nor the worst. Shown: {told}.",
-        numbers=columns(("input", "trial", "time_s", "safety_margin", "prediction"), rows),
+        numbers=named_columns(("input", "trial", "time_s", "safety_margin", "prediction"), rows),
     )
 
 
@@ -183,7 +183,7 @@ def plate_learning(results: Results) -> Plate:
         figure=figure,
         alt=f"Training and validation error by epoch. {told}",
         caption=f"Learning curves. {told}.",
-        numbers=columns(("input", "epoch", "train_mse", "validation_mse"), rows),
+        numbers=named_columns(("input", "epoch", "train_mse", "validation_mse"), rows),
     )
 
 
@@ -289,7 +289,7 @@ def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
         f"least supporting first, and in {faithful.random_orders} random orders; the band holds the middle half of "
         f"{faithful.frames} frames. The area between the first two is the symmetric gain. "
         f"{_tell_gains(faithful, methods)}",
-        numbers=columns(("fill", "unit", "method", "area", "most_first", "least_first", "random"), numbers),
+        numbers=named_columns(("fill", "unit", "method", "area", "most_first", "least_first", "random"), numbers),
     )
 
 
@@ -329,7 +329,7 @@ def plate_randomisation(results: Results) -> Plate:
         caption="Similarity of each method's map to that of the trained network while layers get new weights: a map "
         "that stays alike does not show what was learned. With the last layer tested new: "
         f"{', '.join(told) or 'not defined'}.",
-        numbers=columns(("input", "method", "layers", "similarity"), rows),
+        numbers=named_columns(("input", "method", "layers", "similarity"), rows),
     )
 
 
@@ -383,7 +383,7 @@ def _deletion_numbers(scores: Mapping[str, DeletionScores]) -> dict[str, list]:
             strict=True,
         )
     ]
-    return columns(names, rows)
+    return named_columns(names, rows)
 
 
 def _plot_removal(curve: RemovalCurve, method: str, *, ax: Axes) -> None:

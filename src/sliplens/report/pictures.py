@@ -32,10 +32,10 @@ from sliplens.report.plates import (
     Plate,
     ShownFrame,
     bright_pictures,
-    columns,
     draw_grid,
     explained_of,
     gone,
+    named_columns,
     show_map,
     shown_frames,
     told_frame,
@@ -204,7 +204,7 @@ class _Saliencies:
             "input", "method", "frame_id", "level", "safety_margin", "prediction", "share_above_half", "centre_x_px",
             "centre_y_px",
         )  # fmt: skip
-        return columns(names, self._rows)
+        return named_columns(names, self._rows)
 
     def tell_spread(self) -> str:
         parts = [f"{method_name(row[1])} {percent(row[6])} ({short_input_name(row[0]).lower()})" for row in self._rows]
@@ -261,7 +261,7 @@ def plate_removal(results: Results, method: str) -> Plate | None:
         alt=f"What {method_name(method)} calls most important is removed step by step. {'. '.join(told)}",
         caption=f"{method_name(method)}: what is gone, the answer y and the score D at each step of the thesis's "
         f"deletion ({fill} fill). {'. '.join(told)}.",
-        numbers=columns(_STEP_COLUMNS, numbers),
+        numbers=named_columns(_STEP_COLUMNS, numbers),
         pixels=True,
     )
 
@@ -297,7 +297,7 @@ def plate_highlighted(results: Results) -> Plate | None:
         figure=draw_grid(rows, heads=heads, cell_in=1.25 * CELL_IN).figure,
         alt=f"One frame without what each method highlights. {'. '.join(told)}",
         caption=f"All pixels with a saliency above 0.5 removed, the answer y and the score D then. {'. '.join(told)}.",
-        numbers=columns(_STEP_COLUMNS, numbers),
+        numbers=named_columns(_STEP_COLUMNS, numbers),
         pixels=True,
     )
 

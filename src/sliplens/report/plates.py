@@ -9,7 +9,7 @@ from textwrap import fill
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -51,7 +51,6 @@ def draw_grid(
     below_in: float = 0.0,
     bar: bool = False,
     cell_in: float = CELL_IN,
-    least_width_in: float = 0.0,
 ) -> Grid:
     """Draw pictures in rows."""
     columns = max(len(cells) for _, cells in rows)
@@ -60,16 +59,14 @@ def draw_grid(
     high = cell_in * shape[0] / shape[1]
     head = _HEAD_IN if heads else _EDGE_IN
     rest = len(rows) * (high + _GAP_IN) + sum(worded) * _WORDS_IN
-    width = max(least_width_in, _LEFT_IN + columns * (cell_in + _GAP_IN) + _EDGE_IN)
+    width = _LEFT_IN + columns * (cell_in + _GAP_IN) + _EDGE_IN
     height = head + rest + below_in + (_BAR_IN if bar else 0) + _EDGE_IN
     with drawing_style():
         figure = Figure(figsize=(width, height))
         axes, top = [], head
         for (name, cells), has_words in zip(rows, worded, strict=True):
-            place_text(
-                figure, _LEFT_IN - 0.1, top + high / 2, name, ha="right", va="center", fontsize=9, wrap=True,
-                parse_math=False,
-            )  # fmt: skip
+            aside = {"ha": "right", "va": "center", "fontsize": 9, "wrap": True, "parse_math": False}
+            place_text(figure, _LEFT_IN - 0.1, top + high / 2, name, **aside)
             axes.append([])
             for column, cell in enumerate(cells):
                 left = _LEFT_IN + column * (cell_in + _GAP_IN)
@@ -77,10 +74,8 @@ def draw_grid(
                 _show(cell.picture, ax=ax)
                 axes[-1].append(ax)
                 if cell.words:
-                    place_text(
-                        figure, left + cell_in / 2, top + high + 0.03, cell.words, ha="center", fontsize=7.5,
-                        parse_math=False,
-                    )  # fmt: skip
+                    below = {"ha": "center", "fontsize": 7.5, "parse_math": False}
+                    place_text(figure, left + cell_in / 2, top + high + 0.03, cell.words, **below)
             top += high + _GAP_IN + (_WORDS_IN if has_words else 0)
         for column, words in enumerate(heads):
             place = _LEFT_IN + column * (cell_in + _GAP_IN) + cell_in / 2
@@ -111,39 +106,26 @@ def _show(picture: UInt8[np.ndarray, "height width 3"] | None, *, ax: Axes) -> N
 FOLDER = "figures"
 """Beside the page."""
 
-_THESIS_FIGURE = re.compile(r"fig-(\d+)-")
-
 Numbers = Mapping[str, Sequence[Any] | np.ndarray]
 """Columns of equal length, by name."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plate:
-    """A figure with all that goes with it.
-
-    Attributes
-    ----------
-    name
-        Of its files, without suffix.
-    alt
-        What it shows, in words.
-    caption
-        Written from the numbers.
-    numbers
-        What is drawn.
-    pixels
-        Whether it is made of photographs.
-    """
+    """A figure with all that goes with it."""
 
     name: str
+    """Name of its files, without suffix."""
     figure: Figure
     alt: str
+    """What it shows, in words."""
     caption: str
     numbers: Numbers
     pixels: bool = False
+    """Whether it is made of photographs."""
 
 
-def columns(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> dict[str, list]:
+def named_columns(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> dict[str, list]:
     """Turn rows into named columns."""
     return {name: [row[place] for row in rows] for place, name in enumerate(names)}
 
@@ -153,7 +135,6 @@ class ShownPlate:
     """A plate as the page holds it, and where its files are found."""
 
     layout: ClassVar[str] = "plate"
-
     picture: Picture
     caption: str
     files: str
@@ -164,16 +145,10 @@ def show_plate(plate: Plate) -> ShownPlate:
     picture = figure_picture(plate.figure, alt=plate.alt, pixels=plate.pixels)
     # what was laid out stays: doing so again for the PDF takes longer than drawing
     plate.figure.set_layout_engine("none")
-    return ShownPlate(
-        picture=picture,
-        caption=plate.caption,
-        files=f"{_tell_thesis(plate.name)} {FOLDER}/{plate.name}.pdf, numbers in {plate.name}.csv.",
-    )
-
-
-def _tell_thesis(name: str) -> str:
-    found = _THESIS_FIGURE.match(name)
-    return f"Fig. {int(found[1])} of the thesis, for this data;" if found else "Also"
+    found = re.match(r"fig-(\d+)-", plate.name)
+    told = f"Fig. {int(found[1])} of the thesis, for this data;" if found else "Also"
+    files = f"{told} {FOLDER}/{plate.name}.pdf, numbers in {plate.name}.csv."
+    return ShownPlate(picture=picture, caption=plate.caption, files=files)
 
 
 def write_plates(plates: Sequence[Plate], folder: Path) -> tuple[Path, ...]:
@@ -250,13 +225,8 @@ def told_frame(explained: Explained, curves: dict[str, DeletionCurve]) -> int | 
     return min(labels, key=lambda index: (round(labels[index], 2), index), default=None)
 
 
-def removal_order(saliency: np.ndarray) -> Int[np.ndarray, " pixels"]:
-    """Flat indices from most to least salient, ties to the later pixel first, as the score removes them."""
-    return np.argsort(saliency.ravel(), kind="stable")[::-1]
-
-
 def gone(saliency: np.ndarray, pixels: int) -> Bool[np.ndarray, "height width"]:
-    """Mark the most salient pixels of a map."""
+    """Mark the most salient pixels of a map, ties to the later pixel first, as the score removes them."""
     mask = np.zeros(saliency.size, dtype=bool)
-    mask[removal_order(saliency)[:pixels]] = True
+    mask[np.argsort(saliency.ravel(), kind="stable")[::-1][:pixels]] = True
     return mask.reshape(saliency.shape)

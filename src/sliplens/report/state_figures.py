@@ -10,6 +10,7 @@ from sliplens.markers import DisplacementField, interpolate_field
 from sliplens.plots.contact_sheet import TIMES, brighten, brightening
 from sliplens.plots.layout import place_axes
 from sliplens.plots.markers import ARROWS, MarkedFrame, draw_fields_beside_saliency, plot_arrows, plot_field
+from sliplens.plots.saliency import DIM, lightness
 from sliplens.plots.style import (
     CONTROLS,
     ORANGE,
@@ -29,6 +30,7 @@ from sliplens.report.plates import (
     bright_pictures,
     draw_grid,
     explained_of,
+    named_columns,
     show_map,
     shown_frames,
 )
@@ -53,7 +55,7 @@ def plate_contact_states(states: States) -> Plate | None:
     if not lengths:
         return None
     factor = brightening([frame.difference[None] for frame in chosen])
-    size = (chosen[0].raw.shape[0], chosen[0].raw.shape[1])
+    size = chosen[0].raw.shape[:2]
     rows = [
         (f"Camera, arrows\n{TIMES}\N{NO-BREAK SPACE}{ARROWS:g}", [Cell(picture=frame.raw) for frame in chosen]),
         ("Field of the\nmarkers", [Cell(picture=None if fields[frame.id] is None else frame.raw) for frame in chosen]),
@@ -95,33 +97,25 @@ def plate_fields_beside_saliency(results: Results) -> Plate | None:
     if states is None or explained is None or _METHOD not in explained.saliency:
         return None
     known = {explained.frames[one.index].id: one for one in shown_frames(results, explained)}
-    marked, numbers = [], {name: [] for name in ("frame_id", "safety_margin", "moves_px", "saliency_moves_share")}
+    marked, rows = [], []
     for frame in states.frames:
         field = _field(frame)
         if frame.id not in known or field is None:
             continue
-        saliency = explained.saliency[_METHOD][known[frame.id].index]
-        fitted = _resized(saliency, (frame.raw.shape[0], frame.raw.shape[1]))
-        marked.append(
-            MarkedFrame(title=f"Γ {percent(frame.safety_margin)}", frame=frame.raw, field=field, saliency=fitted)
-        )
-        for name, value in zip(
-            numbers, (frame.id, frame.safety_margin, _longest(field), _share_on_moving(fitted, field)), strict=True
-        ):
-            numbers[name].append(value)
+        fitted = _resized(explained.saliency[_METHOD][known[frame.id].index], frame.raw.shape[:2])
+        title = f"Γ {percent(frame.safety_margin)}"
+        marked.append(MarkedFrame(title=title, frame=frame.raw, field=field, saliency=fitted))
+        rows.append((frame.id, frame.safety_margin, _longest(field), _share_on_moving(fitted, field)))
     if not marked:
         return None
-    shares = ", ".join(
-        f"{percent(share)} at Γ {percent(margin)}"
-        for share, margin in zip(numbers["saliency_moves_share"], numbers["safety_margin"], strict=True)
-    )
+    shares = ", ".join(f"{percent(share)} at Γ {percent(margin)}" for _, margin, _, share in rows)
     return Plate(
         name="fig-12-poly-cam-raw",
         figure=draw_fields_beside_saliency(marked),
         alt=f"Raw frame, displacement field and Poly-CAM map side by side at {listed([one.title for one in marked])}",
         caption="Poly-CAM on raw images beside the displacement of the markers. Share of the saliency that lies where "
         f"the skin moves by more than half of that frame's largest displacement: {shares}.",
-        numbers=numbers,
+        numbers=named_columns(("frame_id", "safety_margin", "moves_px", "saliency_moves_share"), rows),
         pixels=True,
     )
 
@@ -135,9 +129,7 @@ def _one_a_state(states: States) -> list[StateFrame]:
 
 def _field(frame: StateFrame) -> DisplacementField | None:
     try:
-        return interpolate_field(
-            frame.rest_px, frame.now_px - frame.rest_px, size=(frame.raw.shape[0], frame.raw.shape[1])
-        )
+        return interpolate_field(frame.rest_px, frame.now_px - frame.rest_px, size=frame.raw.shape[:2])
     except InputError:
         return None  # too few markers were followed into this frame
 
@@ -172,12 +164,11 @@ def _tell_motion(frame: StateFrame, field: DisplacementField | None) -> str:
 
 def _marker_numbers(frames: list[StateFrame]) -> dict[str, np.ndarray]:
     counts = [len(frame.rest_px) for frame in frames]
-    rest = np.concatenate([frame.rest_px for frame in frames])
-    now = np.concatenate([frame.now_px for frame in frames])
+    rest, now = (np.concatenate([getattr(frame, name) for frame in frames]) for name in ("rest_px", "now_px"))
+    named = ("contact_state", "safety_margin")
     return {
         "frame_id": np.repeat([frame.id for frame in frames], counts),
-        "contact_state": np.repeat([frame.contact_state for frame in frames], counts),
-        "safety_margin": np.repeat([frame.safety_margin for frame in frames], counts),
+        **{name: np.repeat([getattr(frame, name) for frame in frames], counts) for name in named},
         "rest_x_px": rest[:, 0],
         "rest_y_px": rest[:, 1],
         "x_px": now[:, 0],
@@ -192,7 +183,6 @@ def _bare(ax) -> None:  # noqa: ANN001
 
 _FRAMES = 3
 _METHODS = 3
-_DIM = 0.55
 
 
 def plate_truth(results: Results, name: str) -> Plate | None:
@@ -210,23 +200,13 @@ def plate_truth(results: Results, name: str) -> Plate | None:
     for frame_id in chosen:
         index, row = places[frame_id], truth.frame_ids.index(frame_id)
         picture, own = pictures[index], explained.frames[index]
-        rows.append(
-            (
-                f"Γ {percent(own.safety_margin)}\nread {percent(own.prediction)}",
-                [
-                    Cell(picture=picture),
-                    Cell(
-                        picture=paint_effects(picture, truth.network_maps[row]),
-                        words=f"up to {_points(truth.network_maps[row])} points",
-                    ),
-                    Cell(
-                        picture=paint_effects(picture, truth.margin_maps[row]),
-                        words=f"up to {_points(truth.margin_maps[row])} points",
-                    ),
-                    *(Cell(picture=show_map(picture, explained.saliency[method][index])) for method in methods),
-                ],
-            )
-        )
+        effects = (truth.network_maps[row], truth.margin_maps[row])
+        cells = [
+            Cell(picture=picture),
+            *(Cell(picture=paint_effects(picture, one), words=f"up to {_points(one)} points") for one in effects),
+            *(Cell(picture=show_map(picture, explained.saliency[method][index])) for method in methods),
+        ]
+        rows.append((f"Γ {percent(own.safety_margin)}\nread {percent(own.prediction)}", cells))
     heads = [called, "What moves the\nanswer", "What moves the\nmargin", *(method_name(one) for one in methods)]
     return Plate(
         name=f"truth-{name}",
@@ -255,12 +235,7 @@ def paint_effects(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Lay signed effects over a picture in dimmed grey: orange below zero, blue above, the stronger the less grey.
 
-    Parameters
-    ----------
-    picture
-        What the network saw, as RGB.
-    effects
-        Signed, of the picture's height and width or of another: cells are then repeated.
+    Effects of another height and width than the picture's are repeated.
     """
     high, wide = picture.shape[:2]
     rows = np.arange(high) * effects.shape[0] // high
@@ -268,8 +243,7 @@ def paint_effects(
     fitted = effects[rows][:, columns].astype(np.float64)
     size = np.abs(fitted).max()
     value = fitted / size if size > 0 else fitted
-    # Rec. 601 weights, as in `overlay_saliency`
-    grey = _DIM * (picture @ np.array([0.299, 0.587, 0.114]) / 255)[..., None]
+    grey = (DIM * lightness(picture))[..., None]
     alpha = np.abs(value)[..., None]
     # bright on dark, and told apart under every common colour blindness
     colour = np.where(value[..., None] < 0, to_rgb(ORANGE), to_rgb(SKY))
