@@ -29,7 +29,7 @@ from sliplens.plots.contact_sheet import (
     plot_margin,
 )
 from sliplens.plots.layout import written_whole
-from sliplens.plots.style import BLACK, GREY, PURPLE, SKY, drawing_style, percent
+from sliplens.plots.style import BLACK, GREY, PURPLE, SKY, VERMILLION, YELLOW, drawing_style, percent
 from sliplens.progress import OnProgress
 from sliplens.recordings import Recording
 from sliplens.recordings.trial import OUTSIDE, STICKS
@@ -56,11 +56,7 @@ class _Stage:
 
 
 def write_clip(
-    recording: Recording,
-    path: Path,
-    *,
-    frames_per_s: float | None = None,
-    on_progress: OnProgress | None = None,
+    recording: Recording, path: Path, *, frames_per_s: float | None = None, on_progress: OnProgress | None = None
 ) -> None:
     """Write a trial as an MP4 that plays at real speed; it appears when complete.
 
@@ -101,10 +97,7 @@ def natural_rate(time_s: Float[np.ndarray, " frames"]) -> float:
 def clip_frames(time_s: Float[np.ndarray, " frames"], frames_per_s: float) -> Int[np.ndarray, " shown"]:
     """Index of the recorded frame that each frame of the clip shows: the nearest in time.
 
-    Parameters
-    ----------
-    time_s
-        When each frame was recorded, in seconds; the last one is shown for the typical time between two.
+    The last one is shown for the typical time between two.
     """
     duration = time_s[-1] - time_s[0] + _interval(time_s, otherwise=1 / frames_per_s)
     moments = time_s[0] + np.arange(max(1, round(duration * frames_per_s))) / frames_per_s
@@ -145,6 +138,7 @@ def _set_stage(recording: Recording) -> _Stage:
     first, last = _HEAD + _STATUS, height - _FOOT
     middle = first + round(0.55 * (last - first))
     told = f"{recording.trial}: {recording.condition}, day {recording.day}, {recording.sensor}"
+    small = {"fontsize": 8, "ha": "right", "color": GREY}
     with drawing_style():
         figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
         canvas = FigureCanvasAgg(figure)
@@ -159,12 +153,7 @@ def _set_stage(recording: Recording) -> _Stage:
             (_EDGE, 32, told, {"fontsize": 13, "fontweight": "bold", "parse_math": False}),
             (_EDGE, _HEAD - 8, "camera", {}),
             (second, _HEAD - 8, f"difference $|T_n - T_0|$ {TIMES} {factor:g}", {}),
-            (
-                second + columns,
-                height - 20,
-                "for the eye only: lossy video",
-                {"fontsize": 8, "ha": "right", "color": GREY},
-            ),
+            (second + columns, height - 20, "for the eye only: lossy video", small),
         ):
             figure.text(x / width, 1 - y / height, text, **settings)
         at = (_EDGE / width, 16 / height)
@@ -230,12 +219,7 @@ def _grow(zone: Bool[np.ndarray, "rows columns"], steps: int) -> Bool[np.ndarray
     return zone
 
 
-# Okabe and Ito's palette, told apart under every common colour blindness; as the figures
-_COLOURS = {
-    MarkerStatus.FOLLOWED: "#F0E442",
-    MarkerStatus.BROKEN: "#D55E00",
-    MarkerStatus.NEW: "#56B4E9",
-}
+_COLOURS = {MarkerStatus.FOLLOWED: YELLOW, MarkerStatus.BROKEN: VERMILLION, MarkerStatus.NEW: SKY}
 _LEAST_SIDE = 640
 _MAGNIFIED = 3  # arrows, so that a pixel of motion shows
 
@@ -248,18 +232,9 @@ def draw_tracked(
     scale: int = 1,
     magnified: float = _MAGNIFIED,
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Frame with a ring round every marker that is seen and an arrow along its displacement.
+    """Frame, enlarged, with a ring round every marker that is seen and an arrow, magnified, along its displacement.
 
     Yellow was followed, orange is broken, blue is new; what is missing has no ring.
-
-    Parameters
-    ----------
-    rest_px
-        Where those of the reference frame were.
-    scale
-        Whole factor by which the picture is enlarged.
-    magnified
-        Length of an arrow over the displacement.
     """
     image = Image.fromarray(frame).resize((frame.shape[1] * scale, frame.shape[0] * scale), Image.Resampling.BICUBIC)
     draw = ImageDraw.Draw(image)
@@ -299,19 +274,8 @@ def clip_writer(
 ) -> Iterator[Callable[[UInt8[np.ndarray, "height width 3"], TrackedFrame, Float[np.ndarray, "markers 2"]], None]]:
     """Write an MP4 of frames with their markers; it appears when complete, and not at all when something fails.
 
-    It is for the eye only: lossy video moves markers, so measure in the table, never in its clip.
-
-    Parameters
-    ----------
-    size
-        Height and width of the frames, in pixels.
-    frames_per_s
-        Frames a second of the clip, 1 to 120.
-
-    Yields
-    ------
-    Callable
-        Takes a frame, its markers and where they were at rest.
+    It is for the eye only: lossy video moves markers, so measure in the table, never in its clip. What is given takes a
+    frame of that height and width, its markers and where they were at rest.
     """
     scale = max(1, _LEAST_SIDE // max(size))
     # H.264 keeps one colour for two by two pixels

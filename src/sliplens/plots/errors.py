@@ -1,4 +1,4 @@
-"""The learning curve of one training, as a picture."""
+"""Errors of a network: by margin, frame, trial and epoch."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -43,13 +43,7 @@ MARGIN_LABEL = "Safety margin Γ (%)"
 
 
 def plot_bins(bins: Mapping[str, tuple[BinScore, ...]], *, ax: Axes) -> Axes:
-    """Draw the MSE in each bin of the safety margin as bars, one colour an input (thesis, Fig. 7).
-
-    Parameters
-    ----------
-    bins
-        Bin scores by input; a bin without frames stays empty.
-    """
+    """Draw the MSE in each bin of the safety margin as bars, one colour an input (thesis, Fig. 7)."""
     names = inputs_in_order(bins)
     width = 0.8 / max(1, len(names))
     for index, name in enumerate(names):
@@ -107,11 +101,6 @@ def plot_faithfulness(curves: Mapping[str, DeletionCurve], *, pixels: int, ax: A
     """Draw the mean deletion score D while pixels go, most salient first (thesis, Fig. 9).
 
     The band holds the middle half of the frames.
-
-    Parameters
-    ----------
-    curves
-        Deletion curves by method, the random control among them.
     """
     for name in methods_in_order(curves):
         curve, colour = curves[name], METHOD_COLOURS.get(name, PURPLE)
@@ -132,13 +121,7 @@ def plot_faithfulness(curves: Mapping[str, DeletionCurve], *, pixels: int, ax: A
 
 
 def plot_margin_over_time(trials: Mapping[str, Predictions], *, ax: Axes) -> Axes:
-    """Draw the label and each network's answer through one trial.
-
-    Parameters
-    ----------
-    trials
-        Frames of the same trial by input.
-    """
+    """Draw the label and each network's answer through one trial, its frames by input."""
     names = inputs_in_order(trials)
     label = trials[names[0]]
     order = np.argsort(label.time_s)
@@ -191,12 +174,10 @@ def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
     estimators = {} if evaluation.baselines is None else evaluation.baselines.estimators
     with drawing_style():
         figure = Figure(figsize=(_WIDTH, _HEIGHT + (0.9 + _READER * (len(estimators) + 1) if estimators else 0)))
-        charts = []
-        for index in range(6):
-            row, column = divmod(index, 3)
-            left = _LEFT + column * (_CHART[0] + _GAP)
-            top = _TOP + row * (_CHART[1] + 1.05)
-            charts.append(place_axes(figure, left, top, *_CHART))
+        corners = [
+            (_LEFT + at * (_CHART[0] + _GAP), _TOP + row * (_CHART[1] + 1.05)) for row in (0, 1) for at in range(3)
+        ]
+        charts = [place_axes(figure, left, top, *_CHART) for left, top in corners]
         predictions = evaluation.predictions
         plot_answers(predictions, conditions, ax=charts[0])
         _plot_bins(evaluation.conditions, conditions, ax=charts[1])
@@ -260,11 +241,8 @@ def _plot_trials(predictions: Predictions, conditions: list[str], *, ax: Axes) -
 def _plot_coverage(reliability: Mapping[str, Reliability], conditions: list[str], *, ax: Axes) -> None:
     known = {name: reliability[name].coverage for name in conditions if reliability[name].coverage}
     for name, shares in known.items():
-        levels = sorted(shares, key=float)
-        drawn = {"color": _COLOURS.get(name, GREEN), "marker": "o", "markersize": 4}
-        ax.plot(
-            [100 * float(level) for level in levels], [100 * shares[level] for level in levels], label=name, **drawn
-        )
+        promised, held = zip(*sorted((100 * float(level), 100 * share) for level, share in shares.items()), strict=True)
+        ax.plot(promised, held, label=name, color=_COLOURS.get(name, GREEN), marker="o", markersize=4)
     ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="as promised")
     ax.set(xlabel="Promised (% of the frames)", ylabel="Held (%)", xlim=(40, 100), ylim=(0, 102), title="Intervals")
     if not known:
@@ -337,16 +315,11 @@ def _summary(evaluation: Evaluation, conditions: list[str]) -> str:
     for name in conditions:
         scores, lead = evaluation.conditions[name], evaluation.lead_times[name]
         r2 = "none" if scores.r2 is None else f"{scores.r2:.3f}"
-        words = f"{name}: {scores.frames:,} frames, MSE {scores.mse:.4f}, R² {r2}"
-        words += f", MAE {100 * scores.mae:.1f} points"
+        words = f"{name}: {scores.frames:,} frames, MSE {scores.mse:.4f}, R² {r2}, MAE {100 * scores.mae:.1f} points"
         if lead.median_ms is not None:
             words += f", warns {lead.median_ms:.0f} ms before the slip (the true Γ: {lead.ideal_ms:.0f} ms)"
         parts.append(f"{words}, {lead.false_per_minute:.1f} false alarms a minute")
     return "\n".join(parts)
-
-
-_FEW = 40
-"""Epochs up to which each has a dot: one epoch alone makes no line."""
 
 
 def draw_learning_curve(training: Training, path: Path, *, title: str) -> None:
@@ -366,8 +339,8 @@ def draw_learning_curve(training: Training, path: Path, *, title: str) -> None:
 
 
 def _plot(ax: Axes, epoch: np.ndarray, train: np.ndarray, validation: np.ndarray, *, best: int, colour: str) -> None:
-    marker = "o" if len(epoch) <= _FEW else ""
-    style = {"color": colour, "marker": marker, "markersize": 3}
+    # few epochs have a dot each: one alone makes no line
+    style = {"color": colour, "marker": "o" if len(epoch) <= 40 else "", "markersize": 3}
     ax.plot(epoch, train, linestyle=":", label="training, augmented", **style)
     ax.plot(epoch, validation, label="validation", **style)
     ax.plot(

@@ -48,16 +48,10 @@ def plot_arrows(
     ax: Axes,
     magnified: float = ARROWS,
 ) -> Axes:
-    """Draw a frame with an arrow from each marker's place at rest along its displacement.
+    """Draw a frame with an arrow from each marker's place at rest along its displacement, where that is known.
 
     Parameters
     ----------
-    frame
-        T_n, RGB.
-    rest_px
-        x, y of the markers in T_0.
-    displacement_px
-        x, y of their displacements; markers where it is NaN have no arrow.
     magnified
         Length of an arrow over the displacement.
     """
@@ -85,11 +79,6 @@ def plot_field(
         Height and width of the frame, in pixels.
     longest_px
         Displacement that gets the lightest colour; the field's own longest if None.
-
-    Returns
-    -------
-    matplotlib.cm.ScalarMappable
-        For a colour bar, in pixels.
     """
     sure = field.confidence > _SURE
     length = np.linalg.norm(field.displacement_px, axis=-1)
@@ -124,23 +113,13 @@ def choose_states(recording: Recording) -> dict[ContactState, int]:
 
 
 def draw_contact_states(recording: Recording, tracks: Tracks) -> Figure:
-    """Draw raw frame with arrows, field, and difference image across the contact states (thesis, Fig. 4).
-
-    Parameters
-    ----------
-    tracks
-        Its markers, from the recording's own reference.
-
-    References
-    ----------
-    Polak, *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning*, Fig. 4.
-    """
+    """Draw raw frame with arrows, field, and difference image across the contact states (thesis, Fig. 4)."""
     if len(tracks) != len(recording):
         raise InputError(f"{len(tracks)} frames were tracked but the trial has {len(recording)}; track it anew")
     chosen = choose_states(recording)
     if not chosen:
         raise InputError(f"no frame of trial {recording.trial} has a known contact state; label it first")
-    size = (recording.reference.shape[0], recording.reference.shape[1])
+    size = recording.reference.shape[:2]
     fields = {state: compute_field(tracks, at, size=size) for state, at in chosen.items()}
     lengths = [np.linalg.norm(one.displacement_px, axis=-1)[one.confidence > _SURE].max() for one in fields.values()]
     differences = {
@@ -165,12 +144,7 @@ def draw_contact_states(recording: Recording, tracks: Tracks) -> Figure:
 
 
 def draw_fields_beside_saliency(frames: Sequence[MarkedFrame]) -> Figure:
-    """Draw each frame, its field and the saliency on it side by side, a row a frame (thesis, Fig. 12).
-
-    References
-    ----------
-    Polak, *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning*, Fig. 12.
-    """
+    """Draw each frame, its field and the saliency on it side by side, a row a frame (thesis, Fig. 12)."""
     if not frames:
         raise InputError("there is no frame to draw; name one or more")
     fields = [one.field for one in frames]
@@ -182,9 +156,8 @@ def draw_fields_beside_saliency(frames: Sequence[MarkedFrame]) -> Figure:
         axes = np.array([[figure.add_subplot(grid[row, column]) for column in range(3)] for row in range(len(frames))])
         mappable = None
         for one, row in zip(frames, axes, strict=True):
-            size = (one.frame.shape[0], one.frame.shape[1])
             row[0].imshow(one.frame)
-            mappable = plot_field(one.field, size=size, ax=row[1], longest_px=longest)
+            mappable = plot_field(one.field, size=one.frame.shape[:2], ax=row[1], longest_px=longest)
             plot_overlay(one.frame, stretch_saliency(one.saliency), ax=row[2])
             row[2].set_axis_on()
         _share_axes(axes, tuple(one.title for one in frames))

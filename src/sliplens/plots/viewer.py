@@ -490,12 +490,7 @@ def log_trial(
 
 
 def _log_whole(
-    stream: "RecordingStream",
-    data: Dataset,
-    info: TrialInfo,
-    on_progress: OnProgress | None,
-    *,
-    otherwise: str,
+    stream: "RecordingStream", data: Dataset, info: TrialInfo, on_progress: OnProgress | None, *, otherwise: str
 ) -> None:
     try:
         log_trial(stream, data, info, on_progress=on_progress)

@@ -38,15 +38,12 @@ from sliplens.plots.style import (
     source_name,
 )
 from sliplens.report.comparisons import controls, settings
-from sliplens.report.plates import Plate, named_columns
+from sliplens.report.plates import Plate, named_columns, rows_of
 from sliplens.report.workspace import Results
 from sliplens.results.faithfulness import DeletionScores, RemovalCurve, RemovalScores
 
 _EACH_FIGURES = {"difference": "fig-17-faithfulness-difference", "raw": "fig-18-faithfulness-raw"}
-_FEW = 4
-"""Charts in a row."""
-_LETTERS = 20
-"""Of a line beside a chart."""
+_FEW = 4  # charts in a row
 
 
 def plate_bins(results: Results) -> Plate:
@@ -109,13 +106,8 @@ def plate_predictions(results: Results) -> Plate:
             r2 = decimals(results.evaluations[name].conditions[condition].r2, 2)
             plot_predictions(frames, colour=INPUT_COLOURS.get(name, PURPLE), ax=ax).set(ylim=(low - 5, high + 5))
             ax.set_title(f"{short_input_name(name)}, {condition} (R² {r2})", parse_math=False)
-            rows += [
-                (name, *values)
-                for values in zip(
-                    frames.trial.tolist(), frames.condition.tolist(), frames.frame.tolist(),
-                    frames.safety_margin.tolist(), frames.prediction.tolist(), strict=True,
-                )
-            ]  # fmt: skip
+            answered = (frames.trial, frames.condition, frames.frame, frames.safety_margin, frames.prediction)
+            rows += [(name, *values) for values in rows_of(*answered)]
     return Plate(
         name="predictions",
         figure=figure,
@@ -135,19 +127,16 @@ def plate_over_time(results: Results) -> Plate | None:
     rows = []
     with drawing_style():
         for ax, (condition, trial) in zip(axes, chosen.items(), strict=True):
-            shown = {
-                name: all_frames.where((all_frames.trial == trial) & (all_frames.condition == condition))
+            own = {
+                name: one.predictions.where((one.predictions.trial == trial) & (one.predictions.condition == condition))
                 for name, one in results.evaluations.items()
-                for all_frames in [one.predictions]
-                if ((all_frames.trial == trial) & (all_frames.condition == condition)).any()
             }
+            shown = {name: frames for name, frames in own.items() if len(frames.trial)}
             plot_margin_over_time(shown, ax=ax).set_title(condition.capitalize(), parse_math=False)
             rows += [
                 (name, trial, *values)
                 for name, frames in shown.items()
-                for values in zip(
-                    frames.time_s.tolist(), frames.safety_margin.tolist(), frames.prediction.tolist(), strict=True
-                )
+                for values in rows_of(frames.time_s, frames.safety_margin, frames.prediction)
             ]
     told = ", ".join(f"{trial} ({condition})" for condition, trial in chosen.items())
     return Plate(
@@ -174,9 +163,7 @@ def plate_learning(results: Results) -> Plate:
     rows = [
         (name, *values)
         for name, one in trainings.items()
-        for values in zip(
-            one.curve.epoch.tolist(), one.curve.train_mse.tolist(), one.curve.validation_mse.tolist(), strict=True
-        )
+        for values in rows_of(one.curve.epoch, one.curve.train_mse, one.curve.validation_mse)
     ]
     return Plate(
         name="learning",
@@ -188,13 +175,7 @@ def plate_learning(results: Results) -> Plate:
 
 
 def plate_faithfulness(scores: Mapping[str, DeletionScores]) -> Plate:
-    """Draw the mean deletion score while pixels go, a chart an input (thesis, Fig. 9).
-
-    Parameters
-    ----------
-    scores
-        By input, all of one source.
-    """
+    """Draw the mean deletion score while pixels go, a chart an input, all of one source (thesis, Fig. 9)."""
     figure, axes = _charts(len(scores), each=(4.6, 3.5))
     with drawing_style():
         for ax, (name, one) in zip(axes, scores.items(), strict=True):
@@ -242,8 +223,7 @@ def plate_each_frame(scored: DeletionScores) -> Plate:
 
 def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
     """Draw change against area, most and least influential first and at random, by method and fill; None without."""
-    known = controls(faithful)
-    methods = methods_in_order({method for _, _, method in faithful.curves} - known - set(CONTROLS))
+    methods = methods_in_order({method for _, _, method in faithful.curves} - controls(faithful) - set(CONTROLS))
     fills = settings(faithful)
     if not methods or not fills:
         return None
@@ -259,9 +239,9 @@ def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
                 curve = faithful.curves.get((fill, unit, method))
                 if curve is None:
                     ax.set_axis_off()
-                    continue
-                _plot_removal(curve, method, ax=ax)
-            line[0].set_ylabel(wrap(method_name(method), _LETTERS), fontsize=8.5)
+                else:
+                    _plot_removal(curve, method, ax=ax)
+            line[0].set_ylabel(wrap(method_name(method), 20), fontsize=8.5)
         for ax, (fill, unit) in zip(axes[0], fills, strict=True):
             ax.set_title(fill_name(fill, unit).capitalize().replace(" (", "\n("), fontsize=8.5)
         axes[0, 0].set(ylim=(1.15 * min(bottom, 0.0), 1.15 * max(top, 1e-3)), xlim=(0, 100), xticks=[0, 50, 100])
@@ -273,10 +253,8 @@ def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
     numbers = [
         (*key, *values)
         for key, curve in faithful.curves.items()
-        for values in zip(
-            curve.areas.tolist(),
-            *(line.mean(axis=0).tolist() for line in (curve.most_first, curve.least_first, curve.random)),
-            strict=True,
+        for values in rows_of(
+            curve.areas, *(line.mean(axis=0) for line in (curve.most_first, curve.least_first, curve.random))
         )
     ]
     return Plate(
@@ -313,10 +291,9 @@ def plate_randomisation(results: Results) -> Plate:
                     label=method_name(method),
                 )
                 rows += [(name, method, layer, value) for layer, value in zip(one.layers, one.similarity, strict=True)]
-                if one.similarity and one.similarity[-1] is not None:
-                    told.append(
-                        f"{method_name(method)} {signed(one.similarity[-1], 2)} ({short_input_name(name).lower()})"
-                    )
+                last = one.similarity[-1] if one.similarity else None
+                if last is not None:
+                    told.append(f"{method_name(method)} {signed(last, 2)} ({short_input_name(name).lower()})")
             ax.axhline(0, color=BLACK, linewidth=0.8, linestyle=":")
             ax.set(xlabel="Layers with new weights, from the output", ylabel="Similarity of the map (no unit)")
             ax.set_title(input_name(name))
@@ -374,13 +351,12 @@ def _deletion_numbers(scores: Mapping[str, DeletionScores]) -> dict[str, list]:
         for name, one in scores.items()
         for method in methods_in_order(one.curves)
         for curve in [one.curves[method]]
-        for values in zip(
-            curve.pixels_removed.tolist(),
-            (curve.pixels_removed / _pixels(one)).tolist(),
-            curve.scores.mean(axis=0).tolist(),
-            *np.quantile(curve.scores, [0.25, 0.75], axis=0).tolist(),
-            curve.scores.std(axis=0).tolist(),
-            strict=True,
+        for values in rows_of(
+            curve.pixels_removed,
+            curve.pixels_removed / _pixels(one),
+            curve.scores.mean(axis=0),
+            *np.quantile(curve.scores, [0.25, 0.75], axis=0),
+            curve.scores.std(axis=0),
         )
     ]
     return named_columns(names, rows)
@@ -403,7 +379,6 @@ def _tell_gains(faithful: RemovalScores, methods: list[str]) -> str:
         for method in methods
         if (fill, unit, method) in faithful.curves
     }
-    told = ", ".join(
-        f"{method_name(one)} {signed(gains[one], 3)}" for one in sorted(gains, key=lambda one: -gains[one])
-    )
+    ranked = sorted(gains, key=lambda one: -gains[one])
+    told = ", ".join(f"{method_name(one)} {signed(gains[one], 3)}" for one in ranked)
     return f"Under {fill_name(fill, unit)} it is {told}."

@@ -47,7 +47,6 @@ from sliplens.results.strip import Strip
 
 SHARES = (0.01, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Of the image, that are gone in the columns of a figure."""
-_TOLD_METHOD = "poly-cam"
 _TOLD = (0.05, 0.2, 1.0)
 _HALF = "stop-at-half"
 _STEP_COLUMNS = ("input", "method", "frame_id", "pixels_removed", "share_removed", "prediction", "score")
@@ -185,7 +184,7 @@ class _Saliencies:
     """Numbers of each map drawn: where its weight lies, and on how much of the image."""
 
     def __init__(self) -> None:
-        self._rows: list[tuple[str, str, str, float | None, float, float, float, float, float]] = []
+        self._rows: list[tuple[Any, ...]] = []
 
     def add(self, explained: Explained, method: str, frame: ShownFrame) -> None:
         own = explained.frames[frame.index]
@@ -196,8 +195,7 @@ class _Saliencies:
         right, down = (float((saliency * axis).sum() / total) if total > 0 else float("nan") for axis in (x, y))
         label = float("nan") if own.safety_margin is None else own.safety_margin
         above = float((saliency > 0.5).mean())
-        row = (explained.input, method, own.id, frame.level, label, own.prediction, above, right, down)
-        self._rows.append(row)
+        self._rows.append((explained.input, method, own.id, frame.level, label, own.prediction, above, right, down))
 
     def columns(self) -> dict[str, list]:
         names = (
@@ -236,7 +234,7 @@ def plate_deletion(results: Results) -> Plate | None:
     for explained, scored, index in _materials(results):
         methods = [one for one in methods_in_order(scored.curves) if one in explained.saliency]
         if methods:
-            method = _TOLD_METHOD if _TOLD_METHOD in methods else methods[-1]
+            method = "poly-cam" if "poly-cam" in methods else methods[-1]
             return _illustrate(explained, scored, method, index)
     return None
 

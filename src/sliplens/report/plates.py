@@ -130,6 +130,11 @@ def named_columns(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> dict[s
     return {name: [row[place] for row in rows] for place, name in enumerate(names)}
 
 
+def rows_of(*arrays: np.ndarray) -> list[tuple[Any, ...]]:
+    """Turn columns of equal length into rows of Python's own values."""
+    return list(zip(*(one.tolist() for one in arrays), strict=True))
+
+
 @dataclass(frozen=True, kw_only=True)
 class ShownPlate:
     """A plate as the page holds it, and where its files are found."""
