@@ -144,9 +144,8 @@ def _tell_frames(recording: Recording) -> Fact:
 
 def _tell_friction(friction: FrictionEstimate, slip_s: float | None) -> Fact:
     exact, moved = friction.low == friction.high, friction.image_sigmas
-    interval = (
-        "taken as exact" if exact else f"68 % interval {decimals(friction.low, 3)} to {decimals(friction.high, 3)}"
-    )
+    ends = f"{decimals(friction.low, 3)} to {decimals(friction.high, 3)}"
+    interval = "taken as exact" if exact else f"68 % interval {ends}"
     image = [] if moved is None else [f"image moves {moved:.1f} σ more at the slip"]  # noqa: RUF001 (sigma is meant)
     slip = "never slips" if slip_s is None else f"slips at {slip_s:.3f} s on the clock of the forces"
     unseen = friction.found == Found.INFERRED and (moved is None or moved < _SEEN_SIGMAS)
@@ -191,7 +190,7 @@ def plot_contact_forces(recording: Recording, threshold_n: float | None, *, ax: 
         ax.axhline(threshold_n, color=BLACK, linestyle=":", linewidth=1.3, label=told)
     ax.set(ylabel="Force (N)", xmargin=0)
     if not np.isfinite(recording.normal_force_n).any():
-        _say(ax, "no forces were recorded")
+        _leave_empty(ax, "no forces were recorded")
 
 
 def plot_force_ratio(recording: Recording, friction: FrictionEstimate | None, *, ax: Axes) -> None:
@@ -218,7 +217,7 @@ def plot_force_ratio(recording: Recording, friction: FrictionEstimate | None, *,
     ceiling = max(_HIGHEST * mu, *known) if mu else 2.0
     ax.set(ylabel="$F_t/F_n$", xmargin=0, ylim=(0, 1.12 * max([min(largest, ceiling), *known]) or 1))
     if not np.isfinite(ratio).any():
-        _say(ax, "F_t / F_n is not known")
+        _leave_empty(ax, "F_t / F_n is not known")
 
 
 def plot_labels(recording: Recording, *, ax: Axes) -> None:
@@ -239,8 +238,7 @@ def plot_labels(recording: Recording, *, ax: Axes) -> None:
         write_over(ax, "no frame has a label")
 
 
-def _say(ax: Axes, words: str) -> None:
-    """Say over an empty chart why it is empty."""
+def _leave_empty(ax: Axes, words: str) -> None:
     ax.set(yticks=[])
     write_over(ax, words, parse_math=False)
 
@@ -310,13 +308,7 @@ def write_audit(
 
 
 def write_audits(data: Dataset, folder: Path, *, on_progress: OnProgress | None = None) -> int:
-    """Draw the audit of every trial of a data set, `TRIAL.png`; pages newer than their trial stay.
-
-    Returns
-    -------
-    int
-        Number of pages drawn.
-    """
+    """Draw the audit of every trial of a data set, `TRIAL.png`, and count them; pages newer than their trial stay."""
     for info in data.trials:
         if read_header(trial_path(data.folder, info.trial)).labelling is None:
             raise InputError(

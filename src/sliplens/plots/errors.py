@@ -174,10 +174,8 @@ def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
     estimators = {} if evaluation.baselines is None else evaluation.baselines.estimators
     with drawing_style():
         figure = Figure(figsize=(_WIDTH, _HEIGHT + (0.9 + _READER * (len(estimators) + 1) if estimators else 0)))
-        corners = [
-            (_LEFT + at * (_CHART[0] + _GAP), _TOP + row * (_CHART[1] + 1.05)) for row in (0, 1) for at in range(3)
-        ]
-        charts = [place_axes(figure, left, top, *_CHART) for left, top in corners]
+        lefts, tops = [_LEFT + at * (_CHART[0] + _GAP) for at in range(3)], (_TOP, _TOP + _CHART[1] + 1.05)
+        charts = [place_axes(figure, left, top, *_CHART) for top in tops for left in lefts]
         predictions = evaluation.predictions
         plot_answers(predictions, conditions, ax=charts[0])
         _plot_bins(evaluation.conditions, conditions, ax=charts[1])

@@ -195,30 +195,16 @@ def lay_out(shown: Shown) -> "Blueprint":
 
 def _chart(origin: str, name: str, legend: str, span: tuple[float, float] | None = None) -> "TimeSeriesView":
     rrb = require_rerun().blueprint
-    return rrb.TimeSeriesView(
-        origin=origin,
-        name=name,
-        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
-        axis_y=rrb.ScalarAxis(range=span) if span else None,
-        plot_legend=rrb.PlotLegend(corner=legend),
-    )
+    across, up = rrb.TimeAxis(link="LinkToGlobal"), rrb.ScalarAxis(range=span) if span else None
+    corner = rrb.PlotLegend(corner=legend)
+    return rrb.TimeSeriesView(origin=origin, name=name, axis_x=across, axis_y=up, plot_legend=corner)
 
 
 _MARKS = re.compile(r"([\\`*_{}\[\]<>#|~])")
 
 
 def describe_trial(trial: Recording, info: TrialInfo, labelling: Labelling | None, *, truth: str | None) -> str:
-    """Tell in Markdown what a trial is, and what its labels rest on.
-
-    Parameters
-    ----------
-    trial
-        Its labels; frames are not looked at.
-    labelling
-        How its labels were made; None where that is not told.
-    truth
-        Which model moved the markers of a simulated trial; None of any other.
-    """
+    """Tell in Markdown what a trial is, and what its labels rest on; `truth` names what moved simulated markers."""
     span = float(trial.time_s[-1] - trial.time_s[0])
     told = {
         "sensor": info.sensor,
@@ -236,16 +222,12 @@ def describe_trial(trial: Recording, info: TrialInfo, labelling: Labelling | Non
 def _facts(trial: Recording, labelling: Labelling | None, *, truth: str | None) -> list[Fact]:
     if truth is not None:
         nominal = "nominal" if truth == "calibrated" else "exact"
-        words = [
-            "labels are the mechanics' own, without error",
-            f"markers moved as {truth}: the stick zone is {nominal}",
-        ]
-        return [Fact("Simulated", words)]
+        moved = f"markers moved as {truth}: the stick zone is {nominal}"
+        return [Fact("Simulated", ["labels are the mechanics' own, without error", moved])]
     if labelling is None:
         return [Fact("Not told", ["nothing is kept of where they come from"], doubtful=True)]
     sources = [words for words in (labelling.source, labelling.forces) if words]
-    recorded = [Fact("Recorded", sources)]
-    return [*recorded, *audit_facts(trial, labelling)]
+    return [Fact("Recorded", sources), *audit_facts(trial, labelling)]
 
 
 def _paragraph(fact: Fact) -> str:

@@ -21,7 +21,6 @@ from sliplens.report.verdict import Statement, count_alarms, judge
 from sliplens.report.workspace import Results
 
 PAGE = "report.html"
-_TEMPLATE = "report.html.j2"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,11 +149,6 @@ def build_page(
 
 def render_page(page: Page) -> str:
     """Lay a page out as HTML; every text is escaped."""
-    environment = Environment(
-        loader=PackageLoader("sliplens.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template(_TEMPLATE).render(page=page, interval=tell_interval)
+    loader, tight = PackageLoader("sliplens.report"), {"trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, **tight)
+    return environment.get_template("report.html.j2").render(page=page, interval=tell_interval)

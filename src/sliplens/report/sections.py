@@ -43,25 +43,18 @@ class Section:
 
 @dataclass(frozen=True, kw_only=True)
 class Outline:
-    """A section as it could be.
-
-    Attributes
-    ----------
-    command
-        Command that makes its results, in a workspace that is no study.
-    build
-        Makes its blocks; None for one that is not there. Without any, the section is left out.
-    needs
-        Inputs that its results are there for; one that is missing is named.
-    """
+    """A section as it could be."""
 
     id: str
     title: str
     short_title: str
     intro: str | Callable[[Results], str]
     command: str
+    """Command that makes its results, in a workspace that is no study."""
     build: Callable[[Results, np.random.Generator], Iterable[Block | None]]
+    """Makes its blocks; None for one that is not there. Without any, the section is left out."""
     needs: Callable[[Results], Collection[str]] | None = None
+    """Inputs that its results are there for; one that is missing is named."""
 
 
 def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Section, ...]:
@@ -186,11 +179,9 @@ def _truth(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
 
 def _recipe(results: Results, absent: dict[str, list[str]]) -> Section:
     simulation = results.simulation
+    again = " `sliplens study` with the same options goes on where it stopped, and" if results.study else ""
     intro = (
-        "Every stage is kept in a folder of its own; `sliplens study` with the same options goes on where it stopped, "
-        "and `sliplens report` draws this page from the folders alone."
-        if results.study
-        else "Every stage is kept in a folder of its own; `sliplens report` draws this page from the folders alone."
+        f"Every stage is kept in a folder of its own;{again} `sliplens report` draws this page from the folders alone."
     )
     if simulation is not None:
         counts = "; ".join(

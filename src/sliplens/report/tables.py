@@ -47,17 +47,12 @@ _TRUTHS = ("oracle", "degraded-oracle")
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """Text of a cell, and what it is: a name, a number, the best number of its group, or a figure of the thesis.
-
-    Attributes
-    ----------
-    shade
-        How dark its ground is, from 0 (as the page) to 4, where a table is read as a map of heat.
-    """
+    """Text of a cell, and what it is: a name, a number, the best number of its group, or a figure of the thesis."""
 
     text: str
     kind: Kind = "number"
     shade: int = 0
+    """How dark its ground is, from 0 (as the page) to 4, where a table is read as a map of heat."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,8 +77,8 @@ def make_table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str | 
         head=heads,
         rows=tuple(
             tuple(
-                cell if isinstance(cell, Cell) else Cell(text=cell, kind=kind)
-                for cell, kind in zip(row, kinds, strict=True)
+                one if isinstance(one, Cell) else Cell(text=one, kind=kind)
+                for one, kind in zip(row, kinds, strict=True)
             )
             for row in rows
         ),
@@ -285,16 +280,12 @@ def table_equal_areas(faithful: RemovalScores) -> Table | None:
         area: max((one.at[area] for one in scores.values() if area in one.at and not one.control), default=None)
         for area in areas
     }
+
+    def lost(score: RemovalScore, area: float) -> Cell:
+        return _best(decimals(score.at.get(area), 3), not score.control and score.at.get(area, np.nan) == top[area])
+
     rows = [
-        (
-            method_name(method),
-            *(
-                _best(decimals(score.at.get(area), 3), not score.control and score.at.get(area, np.nan) == top[area])
-                for area in areas
-            ),
-        )
-        for method in methods_in_order(scores)
-        for score in [scores[method]]
+        (method_name(method), *(lost(scores[method], area) for area in areas)) for method in methods_in_order(scores)
     ]
     curve = next(curve for key, curve in faithful.curves.items() if key[:2] == (fill, unit))
     chance = (f"{faithful.random_orders} random orders", *(decimals(mean_at(curve, area)[1], 3) for area in areas))

@@ -168,27 +168,20 @@ def _faithfulness(scored: DeletionScores, *, rng: np.random.Generator) -> Statem
 
 
 def _what_deletion_measures(results: Results) -> Statement:
-    last = [
-        f"{decimals(value, 2)} ({input_name(name).lower()}, {source_name(source)}, {scored.fill})"
-        for (name, source), scored in sorted(results.scores.items(), key=lambda item: (item[0][1] == "real", item[0]))
-        for value in [_last_step(scored)]
-        if value is not None
-    ]
+    last = []
+    for (name, source), scored in sorted(results.scores.items(), key=lambda item: (item[0][1] == "real", item[0])):
+        values = [one.last_step_mean for one in scored.methods.values() if one.last_step_mean is not None]
+        if values:
+            told = f"{input_name(name).lower()}, {source_name(source)}, {scored.fill}"
+            last.append(f"{decimals(float(np.mean(values)), 2)} ({told})")
     text = (
         "The deletion score depends on what a removed pixel becomes. It says how far the answer moves, not that the "
         "map shows what slip is, and its sign is lost."
     )
     if last:
-        text += (
-            f" With every pixel filled, where no map has a part, D is {listed(last)}: a score near "
-            "that tells of the fill."
-        )
+        text += f" With every pixel filled, where no map has a part, D is {listed(last)}"
+        text += ": a score near that tells of the fill."
     return Statement(topic="How far to trust D", text=text, tone="caution")
-
-
-def _last_step(scored: DeletionScores) -> float | None:
-    values = [one.last_step_mean for one in scored.methods.values() if one.last_step_mean is not None]
-    return float(np.mean(values)) if values else None
 
 
 def _real_touch(explained: Explained) -> Statement:
@@ -219,12 +212,12 @@ def _tell_scale(results: Results) -> list[Statement]:
     if not results.trainings:
         return []
     one = results.trainings[inputs_in_order(results.trainings)[-1]]
-    parts = [
-        f"Each network was trained on {one.train_frames} frames" if one.train_frames else "Each network was trained"
-    ]
+    text = "Each network was trained"
+    if one.train_frames:
+        text += f" on {one.train_frames} frames"
     if one.minutes is not None:
-        parts.append(f"for {decimals(one.minutes, 1)} minutes")
-    text = " ".join(parts) + f", on images of {one.image_size} px"
+        text += f" for {decimals(one.minutes, 1)} minutes"
+    text += f", on images of {one.image_size} px"
     if one.frame_size and max(one.frame_size) > one.image_size:
         text += f", shrunk from the camera's {' x '.join(map(str, one.frame_size))}"
     if one.image_size != NETWORK_PIXELS:
@@ -288,10 +281,12 @@ def _believe(faithful: RemovalScores, results: Results) -> Statement:
         return Statement(topic=topic, text=_tell_none(ranked) + _tell_unfit(truth), tone="caution")
     score = next(one for one in faithful.scores if one.key == (*best.beaten[0], best.method))
     others = [one for one in ranked[1:] if one.qualifies]
+    lost = [fill_name(*one) for one in best.tested if one not in best.beaten]
+    but = f", but not under {listed(lost)}" if lost else ""
     text = (
         f"Believe {method_name(best.method)}. Under {len(best.beaten)} of {len(best.tested)} fills it finds what "
         "the answer rests on, better than chance and than the best map that knows nothing of the network, beyond the "
-        f"95 % interval{_tell_open(best)}. "
+        f"95 % interval{but}. "
         f"Under {fill_name(score.fill, score.unit)} its symmetric gain is {tell_interval(score.srg)} in margin units."
     )
     text += _tell_lead(faithful, best, others) + _tell_truth(results, faithful.input, best.method)
@@ -342,11 +337,6 @@ def _against(faithful: RemovalScores, method: str, rival: str) -> dict[tuple[str
         elif (one.first, one.second) == (rival, method):
             gaps[one.fill, one.unit] = reversed_gap(one.gap)
     return gaps
-
-
-def _tell_open(best: Standing) -> str:
-    lost = [fill_name(*one) for one in best.tested if one not in best.beaten]
-    return f", but not under {listed(lost)}" if lost else ""
 
 
 def _unfit_fills(truth: Truth | None) -> list[str]:
