@@ -149,6 +149,6 @@ def build_page(
 
 def render_page(page: Page) -> str:
     """Lay a page out as HTML; every text is escaped."""
-    loader, tight = PackageLoader("sliplens.report"), {"trim_blocks": True, "lstrip_blocks": True}
-    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, **tight)
-    return environment.get_template("report.html.j2").render(page=page, interval=tell_interval)
+    loader = PackageLoader("sliplens.report")
+    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    return pages.get_template("report.html.j2").render(page=page, interval=tell_interval)
