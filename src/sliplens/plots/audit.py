@@ -274,12 +274,7 @@ def draw_audit(recording: Recording, labelling: Labelling, *, read_frames: ReadF
 
     Forces, their ratio beside the static friction, and the safety margin with its uncertainty, on the camera's clock;
     beneath them the reference and five frames from full stick down to the slip, each with its absolute difference; at
-    the left what was declared, found and assumed.
-
-    Parameters
-    ----------
-    read_frames
-        Gives the frames of these numbers, for a trial that was loaded without its pixels; its own if None.
+    the left what was declared, found and assumed. `read_frames` is for a trial that was loaded without its pixels.
     """
     height = float(np.clip(_PICTURE * recording.reference.shape[0] / recording.reference.shape[1], *_PICTURE_HEIGHT))
     top = _HEIGHT - _FOOT - 2 * height - _GAP

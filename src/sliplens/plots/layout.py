@@ -81,13 +81,7 @@ class Picture:
 
 
 def figure_picture(figure: Figure, *, alt: str, pixels: bool = False) -> Picture:
-    """Hold a figure.
-
-    Parameters
-    ----------
-    pixels
-        Hold it as PNG: smaller where it is made of photographs. As SVG otherwise.
-    """
+    """Hold a figure as SVG, or as PNG: smaller where it is made of photographs."""
     buffer = io.BytesIO()
     with drawing_style():
         if pixels:

@@ -48,13 +48,7 @@ def plot_arrows(
     ax: Axes,
     magnified: float = ARROWS,
 ) -> Axes:
-    """Draw a frame with an arrow from each marker's place at rest along its displacement, where that is known.
-
-    Parameters
-    ----------
-    magnified
-        Length of an arrow over the displacement.
-    """
+    """Draw a frame with an arrow from each marker's place at rest along its displacement, where that is known."""
     known = np.all(np.isfinite(displacement_px), axis=1) & np.all(np.isfinite(rest_px), axis=1)
     place, way = rest_px[known], displacement_px[known]
     ax.imshow(frame)
@@ -73,12 +67,7 @@ def plot_field(
 ) -> ScalarMappable:
     """Draw the length of the displacement in colour and its direction as streamlines; what is a guess stays grey.
 
-    Parameters
-    ----------
-    size
-        Height and width of the frame, in pixels.
-    longest_px
-        Displacement that gets the lightest colour; the field's own longest if None.
+    The lightest colour stands for `longest_px`, or for the field's own longest displacement.
     """
     sure = field.confidence > _SURE
     length = np.linalg.norm(field.displacement_px, axis=-1)

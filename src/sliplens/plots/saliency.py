@@ -89,13 +89,7 @@ def overlay_jet(
 def draw_panel(
     rows: Mapping[str, Sequence[UInt8[np.ndarray, "height width 3"] | None]], *, titles: Sequence[str]
 ) -> Figure:
-    """Draw a table of pictures.
-
-    Parameters
-    ----------
-    rows
-        Pictures by the name of their row; None leaves a cell empty.
-    """
+    """Draw a table of pictures, each row under its name; None leaves a cell empty."""
     figure = Figure(figsize=(_CELL_IN * len(titles) + 0.4, _CELL_IN * len(rows) + 0.5), dpi=120, layout="constrained")
     axes = figure.subplots(len(rows), len(titles), squeeze=False)
     for line, (name, pictures) in zip(axes, rows.items(), strict=True):

@@ -18,12 +18,7 @@ THESIS_POLY_CAM = "poly-cam-thesis"
 def thesis_row(method: str, among: Collection[str]) -> str | None:
     """Name the method of the thesis that one of ours stands beside; None if there is none.
 
-    Its Poly-CAM stands beside ours run as in the thesis, and beside our own only where that was not run.
-
-    Parameters
-    ----------
-    among
-        All that were run.
+    Its Poly-CAM stands beside ours run as in the thesis, and beside our own only where that was not among those run.
     """
     if method == THESIS_POLY_CAM:
         return "poly-cam"
