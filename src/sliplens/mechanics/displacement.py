@@ -61,7 +61,7 @@ def hertz_displacement(
     r = np.asarray(require_not_negative(distance_m, name="distance from the contact's axis", unit="m"))
     a, unit = _radius_and_unit(contact_radius_m)
     s = r / unit
-    disc = _sum_over_disc(s**2, _depth_in(unit, depth_m))
+    disc = _sum_over_disc(s**2, require_not_negative(depth_m, name="depth", unit="m") / unit)
     # p0 a / (4 G), for p0 / G = 4 a / (pi (1 - nu) R)
     scale = a**2 / (np.pi * (1 - nu) * sphere_radius_m)
     u_r = scale * s * (disc.lean - (1 - 2 * nu) * disc.spread)
@@ -102,7 +102,7 @@ def shear_displacement(
     nu = require_poisson_ratio(poisson_ratio)
     a, unit = _radius_and_unit(contact_radius_m)
     x, y = x_m / unit, y_m / unit
-    disc = _sum_over_disc(x**2 + y**2, _depth_in(unit, depth_m))
+    disc = _sum_over_disc(x**2 + y**2, require_not_negative(depth_m, name="depth", unit="m") / unit)
     even = (2 - nu) * disc.newton - disc.sink / 2
     odd = disc.bend + nu * disc.splay
     scale = a * peak_strain / 4
@@ -209,8 +209,3 @@ def _radius_and_unit(contact_radius_m: Numbers) -> tuple[Float[np.ndarray, "..."
     """Give the contact radius and the unit of length: the same, but 1 m where nothing touches and all fields are 0."""
     a = np.asarray(require_not_negative(contact_radius_m, name="contact radius", unit="m"))
     return a, np.where(a > _POINT, a, 1)
-
-
-def _depth_in(unit_m: Numbers, depth_m: Numbers) -> Numbers:
-    """Give z / a."""
-    return require_not_negative(depth_m, name="depth", unit="m") / unit_m

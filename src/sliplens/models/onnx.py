@@ -148,9 +148,8 @@ def _describe(proto: "ModelProto", trained: TrainedModel) -> None:
 @torch.no_grad()
 def check_parity(path: Path, trained: TrainedModel) -> None:
     """Check that ONNX Runtime answers as the network does, on black, white and noise, alone and in a batch."""
-    runtime = import_onnxruntime()
+    runtime, network = import_onnxruntime(), Answers(trained.model)
     names, differences = list(answer_names(trained.model)), []
-    network = Answers(trained.model)
     try:
         session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
         for inputs in trial_inputs(trained.manifest.image_size):

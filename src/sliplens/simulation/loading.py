@@ -212,7 +212,7 @@ def _phase_ends(frames: int, rng: np.random.Generator, *, release: bool) -> tupl
     lengths = np.round(frames * shares * rng.uniform(0.8, 1.2, len(shares))).astype(int)
     lengths[shares > 0] = np.maximum(1, lengths[shares > 0])
     lengths[3] += frames - lengths.sum()
-    touch, pressed, pull, slip, let_go, gone, _ = (int(end) for end in np.cumsum(lengths))
+    touch, pressed, pull, slip, let_go, gone, _ = np.cumsum(lengths).tolist()
     return touch, pressed, pull, slip, let_go, gone
 
 
