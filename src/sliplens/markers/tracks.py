@@ -26,10 +26,6 @@ class MarkerStatus(IntEnum):
     """Seen, but not in the reference frame: it has a place and no displacement."""
 
 
-SEEN = (MarkerStatus.FOLLOWED, MarkerStatus.BROKEN, MarkerStatus.NEW)
-"""States of a marker whose place was measured."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class TrackedFrame:
     """Markers of one frame, in the order of the reference frame, new ones after them."""
