@@ -17,7 +17,7 @@ from sliplens.explainers.frozen_model import frozen
 
 @contextmanager
 def capture(model: nn.Module, names: Sequence[str], *, differentiable: bool = False) -> Iterator[dict[str, Tensor]]:
-    """Keep the output of each named module of every forward pass made inside, and always take the hooks off again.
+    """Keep the output of each named module of every forward pass made inside, by name, and always take the hooks off.
 
     Parameters
     ----------
@@ -26,11 +26,6 @@ def capture(model: nn.Module, names: Sequence[str], *, differentiable: bool = Fa
     differentiable
         Start the graph anew at each kept output, so that the gradient of the prediction with respect to it can be
         taken and the backward pass stops there. With several modules only the last one's gradient is whole.
-
-    Yields
-    ------
-    dict[str, Tensor]
-        Outputs by name, filled by the forward pass.
     """
     outputs: dict[str, Tensor] = {}
     modules = dict(model.named_modules())
@@ -94,12 +89,10 @@ def find_layers(
     module or a function. For TorchVision's ShuffleNetV2 these are conv1, stage2, stage3, stage4 and conv5, for its
     ResNet-18 relu and layer1 to layer4.
 
+    The network is `frozen` for the pass, for which one image is enough.
+
     Parameters
     ----------
-    model
-        Network; it is `frozen` for the pass.
-    images
-        Images to run it on; one is enough.
     names
         Take these modules instead, by their names in `model.named_modules()`.
 

@@ -119,13 +119,14 @@ class PolyCam(Method):
             approximations += estimated
             saliencies.append(combine(activations, shares, size=_size(shown_at)))
             shown.append(saliencies[-1][self._place] * shown_at)
+        kept = layers if self.levels else ()
         levels = tuple(
             Level(
                 layer=layer.name,
                 saliency=torch.stack([maps[depth] for maps in saliencies]).float(),
                 weights=torch.stack([shares[depth] for shares in weights]).float(),
             )
-            for depth, layer in enumerate(layers)
+            for depth, layer in enumerate(kept)
         )
         return comparison.explanation(
             scale_to(torch.stack(shown), total=comparison.change),
@@ -135,7 +136,7 @@ class PolyCam(Method):
                 *check_weights(names, weights, change=comparison.change.tolist()),
                 *check_approximations(approximations),
             ),
-            levels=levels if self.levels else (),
+            levels=levels,
             approximations=tuple(approximations),
             engine=engine.name,
         )
