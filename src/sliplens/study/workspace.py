@@ -107,12 +107,13 @@ def explain_source(
     if out is None:
         with stage(on_progress, title) as count:
             return explain(on_progress=count)
+    images = chosen.images.numpy().tobytes() + chosen.references.numpy().tobytes()
     recipe = {
         "weights_sha256": trained.manifest.weights_sha256,
         "input": trained.manifest.input,
         "source": chosen.source,
         "ids": chosen.ids,
-        "images_sha256": _hash_images(chosen),
+        "images_sha256": hashlib.sha256(images).hexdigest(),
         "method": tuple(methods),
         "budget": budget,
         "colours": colours,
@@ -177,7 +178,7 @@ def score_explained(
             return score_explanations(trained, explained, fill=fill, steps=steps, seed=seed, on_progress=count)
     recipe = {
         "weights_sha256": trained.manifest.weights_sha256,
-        "maps_sha256": _hash_maps(explained),
+        "maps_sha256": hashlib.sha256(b"".join(maps.tobytes() for maps in explained.saliency.values())).hexdigest(),
         "input": explained.input,
         "source": explained.source,
         "fill": fill,
@@ -269,11 +270,3 @@ def _occlude_markers(
             )
         places = [markers_in_frame(frame, image_size=size) for trial in opened_trials for frame in trial.read_frames()]
     return [Occlusion(markers_px=centres) for centres in places]
-
-
-def _hash_images(chosen: ChosenFrames) -> str:
-    return hashlib.sha256(chosen.images.numpy().tobytes() + chosen.references.numpy().tobytes()).hexdigest()
-
-
-def _hash_maps(explained: Explained) -> str:
-    return hashlib.sha256(b"".join(maps.tobytes() for maps in explained.saliency.values())).hexdigest()

@@ -250,9 +250,6 @@ def calibrate(model: nn.Module, validation: FrameSet, *, batch_size: int) -> Cal
     )
 
 
-_LAST = "last.ckpt"
-
-
 def fit(
     config: TrainConfig,
     train: FrameSet,
@@ -385,7 +382,7 @@ def fit(
     try:
         title = f"Training ({train.encoding.name})"
         with torch.random.fork_rng(devices=[]), stage(on_progress if first else None, title) as clock.count:
-            run_trainer(trainer, module, loaders, checkpoints / _LAST)
+            run_trainer(trainer, module, loaders, checkpoints / "last.ckpt")
     except DivergedError as error:
         if not first or not best.best_model_path:
             raise
