@@ -74,7 +74,10 @@ def plot_readings(strip: Strip, *, ax: Axes) -> Axes:
         ax.annotate(str(number), (time_s[frame], 106), ha="center", fontsize=9, annotation_clip=False)
     slipping = readings.contact_state == "full slip"
     if slipping.any():
-        ax.axvspan(time_s[slipping][0], time_s[slipping][-1], color=VERMILLION, alpha=0.12, linewidth=0, label="slips")
+        first = float(time_s[slipping][0])
+        ax.axvspan(
+            first, float(time_s[-1]), color=VERMILLION, alpha=0.15, linewidth=0, label="from the first full slip"
+        )
     ax.set(xlabel="Time (s)", ylabel="Safety margin (%)", ylim=(-4, 104), xlim=(time_s[0], time_s[-1]))
     ax.legend(loc="lower left")
     return ax
