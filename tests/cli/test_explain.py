@@ -15,7 +15,7 @@ from sliplens.explainers.occlusion import marker_regions
 from sliplens.files import read_json
 from sliplens.images import list_images, read_image
 from sliplens.recordings import Dataset
-from sliplens.study import load_explained
+from sliplens.results import load_explained
 
 QUICK = ("--method", "grad-cam", "occlusion")
 

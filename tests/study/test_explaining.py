@@ -11,8 +11,9 @@ from sliplens.errors import CheckpointError, InputError, SaliencyError
 from sliplens.files import output_folder
 from sliplens.models import TrainedModel, load_checkpoint
 from sliplens.recordings import Dataset
+from sliplens.results import Explained, load_explained
 from sliplens.results.faithfulness import DeletionScores
-from sliplens.study import Explained, explain_frames, frames_from_dataset, load_explained, score_explanations
+from sliplens.study import explain_frames, frames_from_dataset, score_explanations
 from sliplens.study.explaining import network_inputs
 
 METHODS = ("grad-cam", "integrated-gradients")

@@ -17,12 +17,13 @@ from sliplens.faithfulness.units import unit_means
 from sliplens.files import output_folder
 from sliplens.models import Manifest, TrainedModel
 from sliplens.recordings import Dataset
+from sliplens.results import Explained, ExplainedFrame
 from sliplens.results.explanation import MethodNotes
 from sliplens.results.study import Truth
 from sliplens.simulation import CHROMATOUCH, SimulationRecipe, simulate_dataset
 from sliplens.simulation.information import visible_markers
 from sliplens.simulation.intervention import draw_with_markers_back, marker_readings
-from sliplens.study import Explained, ExplainedFrame, frames_from_dataset
+from sliplens.study import frames_from_dataset
 from sliplens.study.explaining import network_inputs
 from sliplens.study.scenes import find_places, redrawing, stage_frames
 from sliplens.study.truth import judge_by_truth, shuffle_half, true_curves

@@ -7,7 +7,8 @@ import pytest
 
 from sliplens.errors import CheckpointError, InputError
 from sliplens.recordings import Dataset
-from sliplens.study import explain_source, load_explained, score_explained
+from sliplens.results import load_explained
+from sliplens.study import explain_source, score_explained
 
 LEVELS = (1.0, 0.0)
 

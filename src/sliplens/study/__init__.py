@@ -1,6 +1,5 @@
 """The experiment: pick frames, explain them, score the explanations, keep what was found."""
 
-from sliplens.results.explanation import Explained, ExplainedFrame, load_explained
 from sliplens.study.explaining import (
     ChosenFrames,
     explain_frames,
@@ -14,14 +13,11 @@ from sliplens.study.workspace import explain_source, score_explained
 
 __all__ = [
     "ChosenFrames",
-    "Explained",
-    "ExplainedFrame",
     "explain_frames",
     "explain_source",
     "explain_trial",
     "frames_from_dataset",
     "frames_from_folder",
-    "load_explained",
     "run_study",
     "score_explained",
     "score_explanations",
