@@ -2,10 +2,11 @@
 
 import os
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from sliplens.codec import load_result, save_result
+from sliplens.codec import load_record, load_result, save_record, save_result
 from sliplens.errors import InputError
 from sliplens.files import output_folder, require_folder
 from sliplens.models.checkpoint import load
@@ -20,7 +21,7 @@ from sliplens.training import evaluate, train
 
 INPUTS = ("difference", "raw")
 METHODS = ("grad-cam", "integrated-gradients", "poly-cam-thesis", "poly-cam")
-"""The three methods of the thesis as it ran them, and Poly-CAM for a regressor."""
+"""The three methods of the thesis, of which Poly-CAM alone is as it was run there, and Poly-CAM for a regressor."""
 STRIP_METHOD = "poly-cam"
 """Method of the first picture: the one whose maps are quickest to read."""
 _SETTINGS = (Setting(fill="reference", unit="pixel"), Setting(fill="noisy-linear", unit="pixel"))
@@ -89,7 +90,7 @@ def run_demo(
     """
     folder = Path(out)
     real = find_real_frames(real_frames)
-    _require_demo_folder(folder)
+    _open_folder(folder, _Settings(train_minutes=train_minutes, image_size=image_size, real_frames=real, seed=seed))
 
     def show(*waiting: str) -> Path:
         with stage(on_progress, "Writing the page"):
@@ -153,10 +154,29 @@ def find_real_frames(folder: Path | str | None = None) -> Path | None:
     return images if images.is_dir() else None
 
 
-def _require_demo_folder(folder: Path) -> None:
-    made = [path for path in folder.iterdir() if not path.name.startswith(".")] if folder.is_dir() else []
-    if (folder.exists() and not folder.is_dir()) or (made and not (folder / "data" / "run.json").is_file()):
+@dataclass(frozen=True, kw_only=True)
+class _Settings:
+    """Settings that a demo was begun with."""
+
+    train_minutes: float | None
+    image_size: int
+    real_frames: Path | None
+    seed: int
+
+
+def _open_folder(folder: Path, settings: _Settings) -> None:
+    """Make the folder of a demo, or go on in one that was begun with the same settings."""
+    path = folder / "demo.json"
+    if settings.real_frames is not None:  # the same folder, named from elsewhere
+        settings = replace(settings, real_frames=settings.real_frames.resolve())
+    if path.is_file():
+        if load_record(path, _Settings, command="sliplens demo") != settings:
+            raise InputError(f"{folder} holds a demo of other settings; choose another folder or delete it")
+        return
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder} exists and is no demo; choose another folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    save_record(settings, path)
 
 
 def _make_strip(out: Path, data: Dataset, network: str, *, on_progress: OnProgress | None) -> Strip:

@@ -75,6 +75,28 @@ def test_a_folder_that_is_no_demo_is_left_alone(tmp_path: Path, capsys: pytest.C
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
 
 
+def test_a_workspace_of_ones_own_is_no_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    words = ("--dry-trials", 3, "--wet-trials", 1, "--frames-per-trial", 24, "--days", 2)
+    assert run("simulate", tmp_path / "mine" / "data", *words) == 0
+    capsys.readouterr()
+    assert "is no demo; choose another folder" in refused(capsys, "demo", tmp_path / "mine")
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["data"]
+
+
+def test_a_demo_of_other_settings_is_refused_with_a_cure_that_exists(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def stop(*arguments: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sliplens.demo, "simulate", stop)
+    assert run("demo", tmp_path / "demo") == 130
+    assert run("demo", tmp_path / "demo") == 130  # the same goes on
+    capsys.readouterr()
+    sentence = refused(capsys, "demo", tmp_path / "demo", "--seed", 1)
+    assert "holds a demo of other settings; choose another folder or delete it" in sentence
+
+
 def test_wrong_options_are_refused_before_anything_is_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert "--max-minutes must be above 0" in refused(capsys, "demo", tmp_path / "a", "--train", "--max-minutes", "0")
     assert "folder of real frames" in refused(capsys, "demo", tmp_path / "a", "--real-frames", tmp_path / "none")
