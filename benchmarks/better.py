@@ -33,7 +33,7 @@ from sliplens.faithfulness.removal import score_maps
 from sliplens.faithfulness.units import Units, pixel_units, tile_units
 from sliplens.files import machine, versions
 from sliplens.intervals import paired_difference
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.models.checkpoint import load
 from sliplens.models.engines import prepare
 from sliplens.recordings import Dataset, Recording
@@ -61,7 +61,7 @@ class Case:
     """Where the truth lies, at the network's size."""
 
 
-def find_cases(trained: TrainedModel, data: Dataset, *, options: argparse.Namespace) -> Iterator[Case]:
+def find_cases(trained: Run, data: Dataset, *, options: argparse.Namespace) -> Iterator[Case]:
     """Frames at the wanted margins, of trials spread over the data set; every other trial has every other margin."""
     infos = [info for info in data.trials if info.split == "test"] or list(data.trials)
     step = max(1, len(infos) // options.trials)
@@ -90,7 +90,7 @@ def true_regions(recording: Recording, row: int, *, size: int) -> dict[str, np.n
     return {name: region for name, region in (("markers", markers), ("slip", slips)) if region.any()}
 
 
-def make_maps(trained: TrainedModel, case: Case, *, options: argparse.Namespace) -> dict[str, Tensor]:
+def make_maps(trained: Run, case: Case, *, options: argparse.Namespace) -> dict[str, Tensor]:
     """Maps of one frame by name, larger where a pixel supports the change more."""
     model, image, reference = trained.model, case.image[None], case.reference
     added = (case.image - reference).abs().mean(dim=0)
@@ -125,7 +125,7 @@ def unit_weights(model: torch.nn.Module, image: Tensor, names: list[str]) -> lis
     return combine(activations, ones, size=(image.shape[-2], image.shape[-1]))
 
 
-def judge(trained: TrainedModel, case: Case, *, options: argparse.Namespace) -> dict[str, dict[str, float]]:
+def judge(trained: Run, case: Case, *, options: argparse.Namespace) -> dict[str, dict[str, float]]:
     """Scores of one frame by map; keys of a score are its name, its fill or region, and its unit."""
     maps = {name: one.float().numpy() for name, one in make_maps(trained, case, options=options).items()}
     scores: dict[str, dict[str, float]] = {name: {} for name in maps}

@@ -27,7 +27,7 @@ from sliplens.errors import SliplensError
 from sliplens.explainers import Explanation, PolyCam, capture, find_layers
 from sliplens.explainers.maps import pearson_r, resize, to_masks, top_overlap
 from sliplens.files import machine, versions
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.models.checkpoint import load
 from sliplens.recordings import Dataset
 from sliplens.simulation import SimulationRecipe, simulate_dataset
@@ -39,7 +39,7 @@ BUDGET = 0.25
 RECIPE = SimulationRecipe(dry_trials=8, wet_trials=0, frames_per_trial=24, seed=7)
 
 
-def choose_frames(trained: TrainedModel, data: Dataset, *, real: Path, count: int) -> tuple[Tensor, Tensor]:
+def choose_frames(trained: Run, data: Dataset, *, real: Path, count: int) -> tuple[Tensor, Tensor]:
     """Inputs and references: real difference images where the network takes them, then simulated frames."""
     chosen = [frames_from_dataset(trained, data, split="test")]
     if trained.manifest.input == "difference" and real.is_dir():
@@ -85,9 +85,7 @@ def check_effects(explanation: Explanation, effects: list[dict[int, float]], *, 
     return worst
 
 
-def measure(
-    trained: TrainedModel, images: Tensor, references: Tensor, *, options: argparse.Namespace
-) -> dict[str, Any]:
+def measure(trained: Run, images: Tensor, references: Tensor, *, options: argparse.Namespace) -> dict[str, Any]:
     """Times, errors and likeness on the frames of one network, frame by frame."""
     model, rows = trained.model, []
     # torch alone and in batches: the loop's own map where its passes are too many to make them all
@@ -139,7 +137,7 @@ def measure(
     }
 
 
-def gpu_milliseconds(trained: TrainedModel, image: Tensor, reference: Tensor, *, budget: float) -> float | None:
+def gpu_milliseconds(trained: Run, image: Tensor, reference: Tensor, *, budget: float) -> float | None:
     """Milliseconds an image on a graphics card, warmed up and waited for; None without one."""
     if not torch.cuda.is_available():
         return None

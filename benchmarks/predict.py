@@ -22,7 +22,7 @@ from torch.nn import functional
 
 from sliplens.errors import SliplensError
 from sliplens.files import machine, versions
-from sliplens.models import Manifest, TrainedModel, build_model
+from sliplens.models import Manifest, Run, build_model
 from sliplens.models.engines import ENGINES, Engine, make_engine
 from sliplens.models.onnx import difference
 
@@ -31,7 +31,7 @@ ENCODED = ((224, 224), (480, 640))
 """Heights and widths of camera frames."""
 
 
-def build(*, size: int, head: str) -> TrainedModel:
+def build(*, size: int, head: str) -> Run:
     """Make an untrained network whose batch normalisation has seen images, and whose answers vary with them."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -54,7 +54,7 @@ def build(*, size: int, head: str) -> TrainedModel:
         head=head,
     )
     model = model.to(memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
-    return TrainedModel(model=model, manifest=manifest)
+    return Run(model=model, manifest=manifest)
 
 
 def clouds(count: int, *, size: int, seed: int) -> Tensor:
@@ -64,7 +64,7 @@ def clouds(count: int, *, size: int, seed: int) -> Tensor:
 
 
 def make_ready(
-    names: Sequence[str], trained: TrainedModel, inputs: Tensor
+    names: Sequence[str], trained: Run, inputs: Tensor
 ) -> tuple[dict[str, Engine], dict[str, float], dict[str, str]]:
     """Engines that can be used here, the seconds until each has answered once, and why the others cannot."""
     engines, seconds, missing = {}, {}, {}
@@ -94,7 +94,7 @@ def time_rounds(work: dict[str, Callable[[], object]], *, rounds: int) -> dict[s
     return {name: np.array(times[WARM_UP:]) for name, times in found.items()}
 
 
-def encoders(trained: TrainedModel) -> dict[str, Callable[[], object]]:
+def encoders(trained: Run) -> dict[str, Callable[[], object]]:
     """Encoding of one frame, by the size of the camera's frames."""
     rng, work = np.random.default_rng(0), {}
     encode = partial(trained.encoding.encode, image_size=trained.manifest.image_size)
@@ -104,7 +104,7 @@ def encoders(trained: TrainedModel) -> dict[str, Callable[[], object]]:
     return work
 
 
-def parity(trained: TrainedModel, engine: Engine, eager: Engine, inputs: Tensor) -> float:
+def parity(trained: Run, engine: Engine, eager: Engine, inputs: Tensor) -> float:
     """Largest difference between the margins of an engine and those of `eager`."""
     return difference(engine.estimate(trained, inputs).margin, eager.estimate(trained, inputs).margin)
 

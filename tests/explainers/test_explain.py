@@ -7,7 +7,7 @@ import torch
 import sliplens
 from sliplens.errors import ImageError, InputError
 from sliplens.explainers import GradCam, PolyCam, get_explainer
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.models.checkpoint import Manifest
 
 SIZE = 64
@@ -17,11 +17,11 @@ UNTOUCHED = np.full((SIZE, SIZE, 3), 7, dtype=np.uint8)
 
 @pytest.fixture
 def trained(network):
-    def with_input(kind: str) -> TrainedModel:
+    def with_input(kind: str) -> Run:
         manifest = Manifest(
             backbone="gap", input=kind, image_size=SIZE, frame_size=(SIZE, SIZE), sensor="", data_hash=""
         )
-        return TrainedModel(model=network("gap").float(), manifest=manifest)
+        return Run(model=network("gap").float(), manifest=manifest)
 
     return with_input
 

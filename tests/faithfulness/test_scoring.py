@@ -9,7 +9,7 @@ import sliplens
 from sliplens.errors import InputError, SaliencyError
 from sliplens.faithfulness import score_by_deletion
 from sliplens.faithfulness.removal import AREAS
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.models.checkpoint import Manifest
 
 SIZE = 10
@@ -29,11 +29,11 @@ class Linear(nn.Module):
 
 
 @pytest.fixture
-def run() -> TrainedModel:
+def run() -> Run:
     manifest = Manifest(
         backbone="linear", input="amplitude", image_size=SIZE, frame_size=(SIZE, SIZE), sensor="", data_hash=""
     )
-    return TrainedModel(model=Linear().eval(), manifest=manifest)
+    return Run(model=Linear().eval(), manifest=manifest)
 
 
 EFFECTS = SLOPES.numpy() * FRAMES.astype(np.float64).mean(axis=-1) / 255

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sliplens.models import Manifest, TrainedModel, build_model, load_checkpoint, save_checkpoint
+from sliplens.models import Manifest, Run, build_model, load_checkpoint, save_checkpoint
 from sliplens.models.backbones import HistogramRegressor
 from sliplens.models.calibration import Calibration
 from sliplens.models.onnx import export_onnx
@@ -63,7 +63,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="session")
-def networks(runs: dict[str, Path]) -> dict[str, TrainedModel]:
+def networks(runs: dict[str, Path]) -> dict[str, Run]:
     return {head: load_checkpoint(folder) for head, folder in runs.items()}
 
 
@@ -74,7 +74,7 @@ def images() -> Tensor:
 
 
 @pytest.fixture(scope="session")
-def onnx_files(networks: dict[str, TrainedModel], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def onnx_files(networks: dict[str, Run], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Each network as it is exported, once."""
     pytest.importorskip("onnxscript")
     folder = tmp_path_factory.mktemp("onnx")

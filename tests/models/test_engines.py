@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sliplens.errors import InputError, ModelError
-from sliplens.models import Manifest, TrainedModel
+from sliplens.models import Manifest, Run
 from sliplens.models.backbones import HistogramRegressor
 from sliplens.models.engines import ENGINES, fold_batch_norm, make_engine
 
@@ -25,7 +25,7 @@ def skip_without(name: str) -> None:
         pytest.skip(obstacle)
 
 
-def small_network(*, head: str) -> TrainedModel:
+def small_network(*, head: str) -> Run:
     """Seconds to compile: a convolution, batch normalisation and a linear layer."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
@@ -42,10 +42,10 @@ def small_network(*, head: str) -> TrainedModel:
         torch.nn.init.normal_(model[-1].get_parameter("weight"), std=10)
     whole = HistogramRegressor(model) if head == "histogram" else model
     manifest = Manifest(backbone="small", input="raw", image_size=32, frame_size=(32, 32), sensor="", data_hash="")
-    return TrainedModel(model=whole.eval(), manifest=manifest)
+    return Run(model=whole.eval(), manifest=manifest)
 
 
-def assert_alike(name: str, trained: TrainedModel, images: Tensor, *, onnx_file: Path | None = None) -> None:
+def assert_alike(name: str, trained: Run, images: Tensor, *, onnx_file: Path | None = None) -> None:
     engine, eager = make_engine(name, trained, onnx_file=onnx_file), make_engine("eager", trained)
     assert eager.estimate(trained, images).margin.std() > 100 * ATOL  # else nothing would be shown
     for batch in (images, images[:1], torch.cat([images] * 4)):
@@ -61,7 +61,7 @@ def assert_alike(name: str, trained: TrainedModel, images: Tensor, *, onnx_file:
 
 
 @pytest.mark.parametrize("head", ["point", "histogram"])
-def test_eager_answers_as_the_network(head: str, networks: dict[str, TrainedModel], images: Tensor):
+def test_eager_answers_as_the_network(head: str, networks: dict[str, Run], images: Tensor):
     found = make_engine("eager", networks[head]).estimate(networks[head], images)
     expected = networks[head].estimate(images)
     # the same operations on the same numbers
@@ -73,14 +73,14 @@ def test_eager_answers_as_the_network(head: str, networks: dict[str, TrainedMode
 
 
 @pytest.mark.parametrize("head", ["point", "histogram"])
-def test_folded_answers_as_eager(head: str, networks: dict[str, TrainedModel], images: Tensor):
+def test_folded_answers_as_eager(head: str, networks: dict[str, Run], images: Tensor):
     assert_alike("folded", networks[head], images)
 
 
 @pytest.mark.parametrize("head", ["point", "histogram"])
 @pytest.mark.parametrize("name", ["onnxruntime", "openvino"])
 def test_engines_of_onnx_files_answer_as_eager(
-    name: str, head: str, networks: dict[str, TrainedModel], onnx_files: dict[str, Path], images: Tensor
+    name: str, head: str, networks: dict[str, Run], onnx_files: dict[str, Path], images: Tensor
 ):
     skip_without(name)
     assert_alike(name, networks[head], images, onnx_file=onnx_files[head])
@@ -97,7 +97,7 @@ def test_compiled_answers_as_eager(images: Tensor):
     assert_alike("compiled", small_network(head="histogram"), images)
 
 
-def test_answers_of_a_call_outlive_the_next(networks: dict[str, TrainedModel], onnx_files: dict[str, Path], images):
+def test_answers_of_a_call_outlive_the_next(networks: dict[str, Run], onnx_files: dict[str, Path], images):
     for name in ("onnxruntime", "openvino"):
         skip_without(name)
         engine = make_engine(name, networks["histogram"], onnx_file=onnx_files["histogram"])
@@ -107,7 +107,7 @@ def test_answers_of_a_call_outlive_the_next(networks: dict[str, TrainedModel], o
         np.testing.assert_array_equal(first.margin, before)
 
 
-def test_folding_leaves_no_batch_normalisation_and_the_network_as_it_was(networks: dict[str, TrainedModel]):
+def test_folding_leaves_no_batch_normalisation_and_the_network_as_it_was(networks: dict[str, Run]):
     for trained in networks.values():
         before = {name: value.clone() for name, value in trained.model.state_dict().items()}
         folded = fold_batch_norm(trained.model)
@@ -131,30 +131,30 @@ def test_a_network_that_cannot_be_traced_is_run_as_it_is(images: Tensor):
         assert torch.equal(fold_batch_norm(model)(images), model(images))
 
 
-def test_an_unknown_engine_is_refused(networks: dict[str, TrainedModel]):
+def test_an_unknown_engine_is_refused(networks: dict[str, Run]):
     with pytest.raises(InputError, match="no engine named 'tensorrt'; choose one of eager, folded, compiled,"):
         make_engine("tensorrt", networks["point"])
 
 
-def test_a_missing_package_is_told(networks: dict[str, TrainedModel], monkeypatch: pytest.MonkeyPatch):
+def test_a_missing_package_is_told(networks: dict[str, Run], monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("sliplens.extras.find_spec", lambda name: None if name == "openvino" else name)
     with pytest.raises(InputError, match=r"needs openvino, which is not .* `pip install \"sliplens\[openvino\]\"`"):
         make_engine("openvino", networks["point"])
 
 
-def test_a_missing_compiler_is_told(networks: dict[str, TrainedModel], monkeypatch: pytest.MonkeyPatch):
+def test_a_missing_compiler_is_told(networks: dict[str, Run], monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CXX", raising=False)
     with pytest.raises(InputError, match="needs a C\\+\\+ compiler and there is none"):
         make_engine("compiled", networks["point"])
 
 
-def test_a_file_of_another_network_is_refused(networks: dict[str, TrainedModel], onnx_files: dict[str, Path]):
+def test_a_file_of_another_network_is_refused(networks: dict[str, Run], onnx_files: dict[str, Path]):
     with pytest.raises(InputError, match="holds another network"):
         make_engine("onnxruntime", networks["point"], onnx_file=onnx_files["histogram"])
 
 
-def test_a_damaged_file_is_told(networks: dict[str, TrainedModel], onnx_files: dict[str, Path], tmp_path: Path):
+def test_a_damaged_file_is_told(networks: dict[str, Run], onnx_files: dict[str, Path], tmp_path: Path):
     onnx = pytest.importorskip("onnx")
     model = onnx.load(onnx_files["point"])
     del model.graph.node[3]
@@ -182,7 +182,7 @@ def test_the_fastest_engine_is_that_which_pays(monkeypatch: pytest.MonkeyPatch):
     assert chosen(100_000) == "folded"
 
 
-def test_a_file_that_was_made_before_pays_at_once(networks: dict[str, TrainedModel], onnx_files: dict[str, Path]):
+def test_a_file_that_was_made_before_pays_at_once(networks: dict[str, Run], onnx_files: dict[str, Path]):
     skip_without("openvino")
     assert make_engine("auto", networks["point"], frames=1, onnx_file=onnx_files["point"]).name == "openvino"
 

@@ -12,7 +12,7 @@ import pytest
 
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.images import absolute_difference, write_png
-from sliplens.models import TrainedModel, load_checkpoint
+from sliplens.models import Run, load_checkpoint
 from sliplens.models.predictions import predict as predict_source
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.formats.lerobot_export import write_lerobot
@@ -23,7 +23,7 @@ TRIAL = "test-wet-7"
 
 
 @pytest.fixture
-def trained(networks: dict[str, TrainedModel]) -> TrainedModel:
+def trained(networks: dict[str, Run]) -> Run:
     return networks["histogram"]
 
 
@@ -32,14 +32,12 @@ def wet(small_dataset: Dataset) -> Recording:
     return small_dataset.load(small_dataset.select(split="test", condition="wet")[0])
 
 
-def predict(
-    source: Path, trained: TrainedModel, path: Path, *, batch_size: int = 5, **options: object
-) -> dict[str, list]:
+def predict(source: Path, trained: Run, path: Path, *, batch_size: int = 5, **options: object) -> dict[str, list]:
     predict_source(trained, source, out=path, batch_size=batch_size, engine="eager", **options)  # pyright: ignore
     return pq.read_table(path).to_pydict()
 
 
-def one_by_one(trained: TrainedModel, frames: np.ndarray, reference: np.ndarray) -> np.ndarray:
+def one_by_one(trained: Run, frames: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """The slow way: each frame by itself."""
     return np.array([trained.estimate(trained.encode(frame[None], reference)).margin[0] for frame in frames])
 
@@ -64,9 +62,7 @@ def write_video(path: Path, frames: np.ndarray) -> Path:
     return path
 
 
-def test_a_data_set_is_predicted_frame_by_frame(
-    trained: TrainedModel, small_dataset: Dataset, wet: Recording, tmp_path: Path
-):
+def test_a_data_set_is_predicted_frame_by_frame(trained: Run, small_dataset: Dataset, wet: Recording, tmp_path: Path):
     rows = predict(small_dataset.folder, trained, tmp_path / "a.parquet", split="test")
     assert list(rows) == [
         "trial",
@@ -89,7 +85,7 @@ def test_a_data_set_is_predicted_frame_by_frame(
 
 
 def test_how_sure_the_network_is_comes_from_its_distribution(
-    trained: TrainedModel, small_dataset: Dataset, wet: Recording, tmp_path: Path
+    trained: Run, small_dataset: Dataset, wet: Recording, tmp_path: Path
 ):
     rows = predict(small_dataset.folder, trained, tmp_path / "a.parquet", split="test")
     estimate = trained.estimate(trained.encode(wet.frames, wet.reference))
@@ -102,7 +98,7 @@ def test_how_sure_the_network_is_comes_from_its_distribution(
 
 
 def test_a_network_with_one_number_tells_nothing_of_it(
-    networks: dict[str, TrainedModel], small_dataset: Dataset, tmp_path: Path
+    networks: dict[str, Run], small_dataset: Dataset, tmp_path: Path
 ):
     rows = predict(small_dataset.folder, networks["point"], tmp_path / "a.parquet", split="test")
     assert {*rows["sigma"], *rows["low_90"], *rows["high_90"]} == {None}
@@ -110,23 +106,19 @@ def test_a_network_with_one_number_tells_nothing_of_it(
 
 
 @pytest.mark.parametrize("batch_size", [1, 7, 64])
-def test_predictions_do_not_depend_on_the_batch(
-    batch_size: int, trained: TrainedModel, small_dataset: Dataset, tmp_path: Path
-):
+def test_predictions_do_not_depend_on_the_batch(batch_size: int, trained: Run, small_dataset: Dataset, tmp_path: Path):
     first = predict(small_dataset.folder, trained, tmp_path / "a.parquet", batch_size=5)
     second = predict(small_dataset.folder, trained, tmp_path / "b.parquet", batch_size=batch_size)
     np.testing.assert_allclose(first["prediction"], second["prediction"], atol=1e-5)  # as above
     assert first["frame"] == second["frame"]
 
 
-def test_all_trials_are_predicted_unless_a_split_is_named(
-    trained: TrainedModel, small_dataset: Dataset, tmp_path: Path
-):
+def test_all_trials_are_predicted_unless_a_split_is_named(trained: Run, small_dataset: Dataset, tmp_path: Path):
     rows = predict(small_dataset.folder, trained, tmp_path / "a.parquet")
     assert list(dict.fromkeys(rows["trial"])) == [info.trial for info in small_dataset.trials]
 
 
-def test_a_folder_of_frames_and_its_differences_are_the_same(trained: TrainedModel, wet: Recording, tmp_path: Path):
+def test_a_folder_of_frames_and_its_differences_are_the_same(trained: Run, wet: Recording, tmp_path: Path):
     frames = write_frames(tmp_path / "frames", wet.frames)
     compared = write_frames(tmp_path / "compared", absolute_difference(wet.frames, wet.reference))
     write_png(tmp_path / "untouched.png", wet.reference)
@@ -139,13 +131,13 @@ def test_a_folder_of_frames_and_its_differences_are_the_same(trained: TrainedMod
     np.testing.assert_allclose(first["prediction"], one_by_one(trained, wet.frames, wet.reference), atol=1e-5)
 
 
-def test_images_have_times_where_their_rate_is_told(trained: TrainedModel, wet: Recording, tmp_path: Path):
+def test_images_have_times_where_their_rate_is_told(trained: Run, wet: Recording, tmp_path: Path):
     frames = write_frames(tmp_path / "frames", wet.frames)
     rows = predict(frames, trained, tmp_path / "a.parquet", reference_frame=0, options=ReadOptions(frame_rate=8.0))
     assert rows["time_s"] == [index / 8 for index in range(12)]
 
 
-def test_a_video_is_compared_with_a_frame_of_it_or_an_image(trained: TrainedModel, wet: Recording, tmp_path: Path):
+def test_a_video_is_compared_with_a_frame_of_it_or_an_image(trained: Run, wet: Recording, tmp_path: Path):
     video = write_video(tmp_path / "touch.mkv", wet.frames)
     write_png(tmp_path / "third.png", wet.frames[3])
     first = predict(video, trained, tmp_path / "a.parquet", reference_frame=3)
@@ -166,20 +158,18 @@ def test_raw_frames_need_no_reference(raw_run: Path, wet: Recording, tmp_path: P
     assert rows["prediction"] == again["prediction"]
 
 
-def test_what_the_images_were_taken_for_is_noted(trained: TrainedModel, wet: Recording, tmp_path: Path):
+def test_what_the_images_were_taken_for_is_noted(trained: Run, wet: Recording, tmp_path: Path):
     frames = write_frames(tmp_path / "frames", wet.frames)
     assert "taken for difference images" in predict_source(trained, frames).notes[0]
     assert not predict_source(trained, frames, reference_frame=0).notes
 
 
-def refused(source: Path, trained: TrainedModel, kind: type[Exception], message: str, **options: object) -> None:
+def refused(source: Path, trained: Run, kind: type[Exception], message: str, **options: object) -> None:
     with pytest.raises(kind, match=message):
         predict_source(trained, source, **options)  # pyright: ignore[reportArgumentType]
 
 
-def test_what_is_missing_or_too_much_is_told(
-    trained: TrainedModel, small_dataset: Dataset, wet: Recording, tmp_path: Path
-):
+def test_what_is_missing_or_too_much_is_told(trained: Run, small_dataset: Dataset, wet: Recording, tmp_path: Path):
     video, image = write_video(tmp_path / "touch.mkv", wet.frames), tmp_path / "untouched.png"
     write_png(image, wet.reference)
     refused(video, trained, InputError, "with --reference IMAGE, or a frame of it with --reference-frame N")
@@ -198,7 +188,7 @@ def test_what_is_missing_or_too_much_is_told(
     refused(frames, trained, InputError, "does not take --image-topic", options=ReadOptions(image_topic="/image"))
 
 
-def test_frames_of_another_size_are_refused(trained: TrainedModel, wet: Recording, tmp_path: Path):
+def test_frames_of_another_size_are_refused(trained: Run, wet: Recording, tmp_path: Path):
     cut = np.ascontiguousarray(wet.frames[:, :40])
     refused(write_video(tmp_path / "touch.mkv", cut), trained, ImageError, "40 x 48 pixels", reference_frame=0)
     with pytest.raises(ImageError, match="frames are 40 x 48 pixels"):
@@ -206,10 +196,10 @@ def test_frames_of_another_size_are_refused(trained: TrainedModel, wet: Recordin
     assert not (tmp_path / "a.parquet").exists()
 
 
-def test_signed_images_need_a_reference(wet: Recording, tmp_path: Path, networks: dict[str, TrainedModel]):
+def test_signed_images_need_a_reference(wet: Recording, tmp_path: Path, networks: dict[str, Run]):
     trained = networks["point"]
     manifest = type(trained.manifest)(**{**vars(trained.manifest), "input": "signed"})
-    signed = TrainedModel(model=trained.model, manifest=manifest)
+    signed = Run(model=trained.model, manifest=manifest)
     frames = write_frames(tmp_path / "frames", wet.frames)
     refused(frames, signed, InputError, "a network on signed images compares the frames")
     rows = predict(frames, signed, tmp_path / "a.parquet", reference_frame=0)
@@ -230,7 +220,7 @@ def frames_of(recording: Recording, read_frames: Callable[[], Iterator[np.ndarra
     )
 
 
-def test_a_source_that_fails_leaves_what_was_there(trained: TrainedModel, wet: Recording, tmp_path: Path):
+def test_a_source_that_fails_leaves_what_was_there(trained: Run, wet: Recording, tmp_path: Path):
     def broken() -> Iterator[np.ndarray]:
         yield from wet.frames[:6]
         raise RecordingError("the disk is gone")
@@ -244,7 +234,7 @@ def test_a_source_that_fails_leaves_what_was_there(trained: TrainedModel, wet: R
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_only_one_batch_of_frames_is_held(trained: TrainedModel, wet: Recording, tmp_path: Path):
+def test_only_one_batch_of_frames_is_held(trained: Run, wet: Recording, tmp_path: Path):
     alive, most = 0, 0
 
     def die() -> None:
@@ -275,21 +265,21 @@ def test_only_one_batch_of_frames_is_held(trained: TrainedModel, wet: Recording,
     assert seen == [(done, 60) for done in range(4, 61, 4)]
 
 
-def test_rows_in_memory_are_those_of_the_file(trained: TrainedModel, small_dataset: Dataset, tmp_path: Path):
+def test_rows_in_memory_are_those_of_the_file(trained: Run, small_dataset: Dataset, tmp_path: Path):
     written = predict_source(trained, small_dataset, split="test", out=tmp_path / "a.parquet")
     kept = predict_source(trained, small_dataset, split="test")
     assert kept.frame().equals(written.frame(), check_metadata=True)
     assert kept.frames == kept.frame().num_rows == 24
 
 
-def test_an_array_is_a_trial(trained: TrainedModel, wet: Recording):
+def test_an_array_is_a_trial(trained: Run, wet: Recording):
     rows = predict_source(trained, wet.frames, reference=wet.reference).frame().to_pydict()
     np.testing.assert_allclose(rows["prediction"], one_by_one(trained, wet.frames, wet.reference), atol=1e-5)
     assert "file" not in rows
 
 
 def test_a_recording_brings_its_own_reference_and_labels_unless_told_otherwise(
-    trained: TrainedModel, small_dataset: Dataset, wet: Recording, tmp_path: Path
+    trained: Run, small_dataset: Dataset, wet: Recording, tmp_path: Path
 ):
     (made := tmp_path / "lerobot").mkdir()
     write_lerobot(small_dataset, made, trials=small_dataset.select(condition="wet"))

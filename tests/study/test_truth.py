@@ -15,7 +15,7 @@ from sliplens.faithfulness.controls import CONTROLS
 from sliplens.faithfulness.true_fill import SHARES
 from sliplens.faithfulness.units import unit_means
 from sliplens.files import output_folder
-from sliplens.models import Manifest, TrainedModel
+from sliplens.models import Manifest, Run
 from sliplens.recordings import Dataset
 from sliplens.results import Explained, ExplainedFrame
 from sliplens.results.explanation import MethodNotes
@@ -59,7 +59,7 @@ def data(tmp_path_factory) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def trained() -> TrainedModel:
+def trained() -> Run:
     manifest = Manifest(
         backbone="none",
         # the size of the difference to the untouched sensor, as it is
@@ -70,11 +70,11 @@ def trained() -> TrainedModel:
         data_hash="none",
         weights_sha256="of these weights",
     )
-    return TrainedModel(model=Linear().eval(), manifest=manifest)
+    return Run(model=Linear().eval(), manifest=manifest)
 
 
 @pytest.fixture(scope="module")
-def explained(trained: TrainedModel, data: Dataset) -> Explained:
+def explained(trained: Run, data: Dataset) -> Explained:
     chosen = frames_from_dataset(trained, data, levels=LEVELS)
     inputs = trained.encoding.normalise(chosen.images)
     assert isinstance(trained.model, Linear)
@@ -105,12 +105,12 @@ def explained(trained: TrainedModel, data: Dataset) -> Explained:
 
 
 @pytest.fixture(scope="module")
-def given(trained: TrainedModel, explained: Explained, data: Dataset) -> tuple[TrainedModel, Explained, Dataset]:
+def given(trained: Run, explained: Explained, data: Dataset) -> tuple[Run, Explained, Dataset]:
     return trained, explained, data
 
 
 @pytest.fixture(scope="module")
-def maps(trained: TrainedModel, explained: Explained) -> dict[str, np.ndarray]:
+def maps(trained: Run, explained: Explained) -> dict[str, np.ndarray]:
     inputs = network_inputs(trained, explained)
     return {"attribution": explained.relevance["attribution"] * explained.towards[:, None, None]} | {
         name: control(inputs).double().numpy() for name, control in CONTROLS.items()
@@ -213,7 +213,7 @@ def test_the_meta_test_tells_fills_apart(judged):
 
 
 def test_an_interrupted_judgement_goes_on_after_the_last_frame(
-    given: tuple[TrainedModel, Explained, Dataset], maps: dict[str, np.ndarray], judged: Truth, tmp_path: Path
+    given: tuple[Run, Explained, Dataset], maps: dict[str, np.ndarray], judged: Truth, tmp_path: Path
 ):
     def interrupt(done: int, total: int) -> None:
         assert total == len(LEVELS)

@@ -18,7 +18,7 @@ from sliplens.explainers.lrp import Lrp
 from sliplens.explainers.occlusion import Occlusion, find_markers
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.extras import Table
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.models.checkpoint import load
 from sliplens.progress import OnProgress
 
@@ -42,7 +42,7 @@ An installed package adds its own by the entry point `sliplens.explainers`.
 
 
 def explain(
-    run: TrainedModel | Path | str,
+    run: Run | Path | str,
     frames: UInt8[np.ndarray, "batch height width 3"],
     *,
     reference: UInt8[np.ndarray, "height width 3"] | None = None,
@@ -94,9 +94,9 @@ def explain(
     return explainer(trained.model, inputs, reference=empty.to(trained.device), on_progress=on_progress)
 
 
-def open_run(run: TrainedModel | Path | str, *, device: str = "cpu") -> TrainedModel:
+def open_run(run: Run | Path | str, *, device: str = "cpu") -> Run:
     """Network that a caller named: itself, its folder, or the name of one that comes with sliplens."""
-    return run if isinstance(run, TrainedModel) else load(run, device=device)
+    return run if isinstance(run, Run) else load(run, device=device)
 
 
 def get_explainer(method: str, **options: Any) -> Explainer:
@@ -129,7 +129,7 @@ def get_explainer(method: str, **options: Any) -> Explainer:
 
 
 def network_images(
-    trained: TrainedModel,
+    trained: Run,
     frames: UInt8[np.ndarray, "batch height width 3"],
     reference: UInt8[np.ndarray, "height width 3"] | None,
 ) -> tuple[UInt8[Tensor, "batch 3 size size"], Float[Tensor, "3 size size"]]:

@@ -25,7 +25,7 @@ from sliplens.faithfulness.deletion import (
 from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import AREAS, RANDOM_ORDERS, Faithfulness, score_maps
 from sliplens.faithfulness.units import pixel_units, tile_units
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.models.engines import Engine, prepare
 from sliplens.progress import OnProgress
 
@@ -37,7 +37,7 @@ _TILES_ACROSS = 14
 
 
 def score(
-    run: TrainedModel | Path | str,
+    run: Run | Path | str,
     frames: Frames,
     maps: Maps,
     *,
@@ -119,7 +119,7 @@ def score(
 
 
 def score_by_deletion(
-    run: TrainedModel | Path | str,
+    run: Run | Path | str,
     frames: Frames,
     maps: Maps,
     *,
@@ -175,14 +175,14 @@ def score_by_deletion(
     return replace(own, control=control)
 
 
-def prepare_passes(trained: TrainedModel, inputs: Float[Tensor, "images 3 size size"], passes: int) -> Engine:
+def prepare_passes(trained: Run, inputs: Float[Tensor, "images 3 size size"], passes: int) -> Engine:
     """Make an engine ready for so many passes of a network, checked on a few of its inputs, on the network's device."""
     some = inputs[:_CHECKED_IMAGES].to(trained.device)
     return prepare(trained.model, some, trained.predict(some).to(trained.device), passes=passes)
 
 
 def _inputs(
-    trained: TrainedModel, frames: Frames, reference: UInt8[np.ndarray, "_ _ 3"] | None
+    trained: Run, frames: Frames, reference: UInt8[np.ndarray, "_ _ 3"] | None
 ) -> tuple[Float[Tensor, "images 3 size size"], Float[Tensor, "3 size size"]]:
     images, empty = network_images(trained, frames, reference)
     return trained.encoding.normalise(images).to(trained.device), empty.to(trained.device)

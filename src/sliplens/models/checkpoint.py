@@ -51,7 +51,7 @@ class Manifest:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainedModel:
+class Run:
     """A trained network, in evaluation mode, with what it is and how it was trained."""
 
     model: nn.Module
@@ -190,7 +190,7 @@ def save_checkpoint(folder: Path, model: nn.Module, manifest: Manifest) -> None:
     save_record(replace(manifest, weights_sha256=hash_file(weights)), folder / MANIFEST_FILE)
 
 
-def load_checkpoint(folder: Path, *, device: str = "cpu") -> TrainedModel:
+def load_checkpoint(folder: Path, *, device: str = "cpu") -> Run:
     """Load a checkpoint written by `save_checkpoint`.
 
     Raises
@@ -223,7 +223,7 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> TrainedModel:
     # the networks of the package come without their learning curve
     told = (folder / "curve.parquet").is_file()
     training = load_result(folder, Training, command="sliplens train") if told else None
-    return TrainedModel(model=model, manifest=manifest, training=training)
+    return Run(model=model, manifest=manifest, training=training)
 
 
 def shipped_names() -> list[str]:
@@ -231,7 +231,7 @@ def shipped_names() -> list[str]:
     return sorted(folder.name for folder in _weights().iterdir() if (folder / MANIFEST_FILE).is_file())
 
 
-def load(run: str | Path, *, device: str = "cpu") -> TrainedModel:
+def load(run: str | Path, *, device: str = "cpu") -> Run:
     """Load a network: one that comes with the package by its name, or that of a run by its folder.
 
     Parameters

@@ -22,7 +22,7 @@ from torch.fx.proxy import TraceError
 from sliplens.errors import InputError, ModelError
 from sliplens.extras import ONNX_PACKAGES, Table, import_onnxruntime, import_openvino, missing_packages
 from sliplens.models.backbones import Answers, HistogramRegressor, answer_names
-from sliplens.models.checkpoint import Estimate, TrainedModel
+from sliplens.models.checkpoint import Estimate, Run
 from sliplens.models.onnx import INPUT, TOLERANCE, convert_network, difference, require_file_of, trial_inputs
 
 RunBatches: TypeAlias = Callable[[Iterable[Tensor]], Iterator[tuple[Tensor, ...]]]
@@ -44,7 +44,7 @@ class Engine:
         """Safety margins of batches of images, in their order; a few batches are under way at once."""
         return (margins for margins, *_ in self.answers(batches))
 
-    def estimate(self, trained: TrainedModel, inputs: Float[Tensor, "batch 3 size size"]) -> Estimate:
+    def estimate(self, trained: Run, inputs: Float[Tensor, "batch 3 size size"]) -> Estimate:
         """Safety margins of encoded images, with how sure the network is.
 
         Parameters
@@ -52,7 +52,7 @@ class Engine:
         trained
             The network that the engine was made of.
         inputs
-            As `TrainedModel.encode` makes them.
+            As `Run.encode` makes them.
         """
         answers = zip(*self.answers(inputs.split(self.batch_size)), strict=True)
         return trained.to_estimate(*(torch.cat(parts) for parts in answers))
@@ -169,7 +169,7 @@ def prepare(
 
 def make_engine(
     name: str,
-    trained: TrainedModel,
+    trained: Run,
     *,
     frames: int = 1,
     batch_size: int = 8,

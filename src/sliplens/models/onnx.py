@@ -18,7 +18,7 @@ from sliplens.errors import InputError, ModelError
 from sliplens.extras import ONNX_PACKAGES, import_onnxruntime, require_packages
 from sliplens.files import require_new_file, to_builtins
 from sliplens.models.backbones import Answers, answer_names, bin_edges
-from sliplens.models.checkpoint import TrainedModel, load
+from sliplens.models.checkpoint import Run, load
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -43,7 +43,7 @@ _COMPARED = {
 }
 
 
-def export_onnx(run: TrainedModel | Path | str, out: Path | str, *, overwrite: bool = False) -> Path:
+def export_onnx(run: Run | Path | str, out: Path | str, *, overwrite: bool = False) -> Path:
     """Write a network as an ONNX file; it appears when ONNX Runtime gives the same answers, or not at all.
 
     Input `image` is float32 (batch, 3, size, size), encoded and normalised; outputs are `margin` (batch,) and, for a
@@ -67,7 +67,7 @@ def export_onnx(run: TrainedModel | Path | str, out: Path | str, *, overwrite: b
     path = Path(out)
     require_new_file(path, suffix=".onnx", overwrite=overwrite)
     require_packages(*ONNX_PACKAGES, extra="onnx", purpose="an ONNX file")
-    trained = run if isinstance(run, TrainedModel) else load(run)
+    trained = run if isinstance(run, Run) else load(run)
     size = trained.manifest.image_size
     proto = convert_network(trained.model, torch.zeros(1, 3, size, size))
     _describe(proto, trained)
@@ -115,7 +115,7 @@ def convert_network(model: nn.Module, images: Float[Tensor, "batch 3 height widt
     return program.model_proto
 
 
-def _describe(proto: "ModelProto", trained: TrainedModel) -> None:
+def _describe(proto: "ModelProto", trained: Run) -> None:
     # torch notes where in whose source files each node was made
     values = (*proto.graph.input, *proto.graph.output, *proto.graph.value_info, *proto.graph.initializer)
     for part in (proto, proto.graph, *proto.graph.node, *values):
@@ -146,7 +146,7 @@ def _describe(proto: "ModelProto", trained: TrainedModel) -> None:
 
 
 @torch.no_grad()
-def check_parity(path: Path, trained: TrainedModel) -> None:
+def check_parity(path: Path, trained: Run) -> None:
     """Check that ONNX Runtime answers as the network does, on black, white and noise, alone and in a batch."""
     runtime, network = import_onnxruntime(), Answers(trained.model)
     names, differences = list(answer_names(trained.model)), []
@@ -184,7 +184,7 @@ def trial_inputs(size: int) -> Iterator[Float[Tensor, "batch 3 size size"]]:
         yield from (torch.zeros(shape), torch.ones(shape), torch.rand(shape, generator=generator))
 
 
-def require_file_of(path: Path, trained: TrainedModel) -> None:
+def require_file_of(path: Path, trained: Run) -> None:
     """Check that an ONNX file holds a network, and not another one."""
     require_packages("onnx", extra="onnx", purpose="an ONNX file")
     import onnx  # noqa: PLC0415 (an extra)

@@ -15,7 +15,7 @@ from sliplens._version import __version__
 from sliplens.codec import write_tables
 from sliplens.errors import InputError
 from sliplens.files import hash_json, require_new_file
-from sliplens.models.checkpoint import Estimate, TrainedModel, load
+from sliplens.models.checkpoint import Estimate, Run, load
 from sliplens.models.engines import Engine, make_engine
 from sliplens.progress import OnProgress, note, stage
 from sliplens.recordings import Dataset
@@ -64,7 +64,7 @@ class Predictions:
 
 
 def predict(
-    run: TrainedModel | Path | str,
+    run: Run | Path | str,
     source: Path | str | Frames | Dataset | Sequence[TrialFrames],
     *,
     reference: Path | str | Frame | None = None,
@@ -129,7 +129,7 @@ def predict(
         raise InputError(f"--batch-size must be at least 1, got {batch_size}")
     if onnx_file is not None and engine not in {"auto", "onnxruntime", "openvino"}:
         raise InputError(f"--onnx is for onnxruntime and openvino, not for {engine}; leave it out")
-    trained = run if isinstance(run, TrainedModel) else load(run, device=device)
+    trained = run if isinstance(run, Run) else load(run, device=device)
     if isinstance(source, Path | str | np.ndarray | Dataset):
         with stage(on_progress, "Opening the source"):
             source = open_source(
@@ -158,7 +158,7 @@ def predict(
     return Predictions(frames=total, engine=ready.name, path=path, rows=rows, notes=notes)
 
 
-def _require_comparable(trained: TrainedModel, trial: TrialFrames) -> Iterator[str]:
+def _require_comparable(trained: Run, trial: TrialFrames) -> Iterator[str]:
     """Refuse a trial that the network cannot read; gives what is assumed of one that it can."""
     trained.require_frame_size(trial.frame_size)
     encoding = trained.encoding
@@ -183,7 +183,7 @@ def _schema(trials: Sequence[TrialFrames], metadata: dict[str, str]) -> pa.Schem
 
 
 def _tables(
-    engine: Engine, trained: TrainedModel, trials: Sequence[TrialFrames], schema: pa.Schema, on_progress: OnProgress
+    engine: Engine, trained: Run, trials: Sequence[TrialFrames], schema: pa.Schema, on_progress: OnProgress
 ) -> Iterator[pa.Table]:
     # plain numbers: small arrays kept between the large ones of each batch would leave holes in the memory
     waiting: dict[str, list] = {name: [] for name in schema.names}
@@ -206,7 +206,7 @@ def _tables(
 
 
 def _encode(
-    trained: TrainedModel, trials: Sequence[TrialFrames], batch_size: int, encoded: deque[tuple[TrialFrames, int]]
+    trained: Run, trials: Sequence[TrialFrames], batch_size: int, encoded: deque[tuple[TrialFrames, int]]
 ) -> Iterator[Tensor]:
     """Batches of encoded frames; trial and first frame of each are appended to `encoded`."""
     for trial in trials:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from sliplens.errors import InputError, RecordingError
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
 from sliplens.results.study import Choice, ChosenFrame, ChosenTrial
@@ -19,7 +19,7 @@ _REACH = 0.05
 
 
 def choose_frames(
-    networks: Mapping[str, TrainedModel],
+    networks: Mapping[str, Run],
     data: Dataset,
     *,
     split: str = "test",

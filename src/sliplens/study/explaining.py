@@ -15,7 +15,7 @@ from sliplens.codec import keep_part
 from sliplens.errors import InputError, RecordingError
 from sliplens.explainers import EXPLAINERS, Explainer
 from sliplens.explainers.table import network_images
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
 from sliplens.recordings.source import open_source
@@ -45,7 +45,7 @@ class ChosenFrames:
 
 
 def frames_from_dataset(
-    trained: TrainedModel,
+    trained: Run,
     data: Dataset,
     *,
     split: str = "test",
@@ -82,7 +82,7 @@ def frames_from_dataset(
     return frames_at(trained, data, rows)
 
 
-def frames_at(trained: TrainedModel, data: Dataset, rows: Mapping[str, Sequence[int]]) -> ChosenFrames:
+def frames_at(trained: Run, data: Dataset, rows: Mapping[str, Sequence[int]]) -> ChosenFrames:
     """Frames of a data set by trial and number."""
     infos = {info.trial: info for info in data.trials}
     images, references, labels, names = [], [], [], []
@@ -116,7 +116,7 @@ def nearest_frame(margin: Float[np.ndarray, " frames"], level: float) -> int:
 
 
 def frames_from_folder(
-    trained: TrainedModel, folder: Path, *, reference: Path | None = None, labels_in_names: bool = False
+    trained: Run, folder: Path, *, reference: Path | None = None, labels_in_names: bool = False
 ) -> ChosenFrames:
     """Images of a folder, in natural order, or the frames of whatever recording `open_source` opens.
 
@@ -200,7 +200,7 @@ class _Map:
 
 
 def explain_frames(
-    trained: TrainedModel,
+    trained: Run,
     chosen: ChosenFrames,
     *,
     methods: Sequence[str] = DEFAULT_METHODS,
@@ -281,7 +281,7 @@ def _note(maps: Sequence[_Map], ids: Sequence[str]) -> MethodNotes:
     )
 
 
-def network_inputs(trained: TrainedModel, explained: Explained) -> Float[Tensor, "frames 3 size size"]:
+def network_inputs(trained: Run, explained: Explained) -> Float[Tensor, "frames 3 size size"]:
     """What the network got of explained frames, in [0, 1], on its device."""
     return trained.encoding.normalise(torch.from_numpy(explained.images)).to(trained.device)
 

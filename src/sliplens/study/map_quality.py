@@ -11,7 +11,7 @@ from torch import Tensor
 from sliplens.explainers import Explainer
 from sliplens.faithfulness.map_quality import gini, resolution, stability, total_variation
 from sliplens.intervals import paired_difference
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
 from sliplens.results.study import ChosenFrame, MapMeasures, MapQuality, Roughness
@@ -75,7 +75,7 @@ def measure_maps(
 
 
 def _once_more(
-    trained: TrainedModel, data: Dataset, chosen: Sequence[ChosenFrame], *, rng: np.random.Generator
+    trained: Run, data: Dataset, chosen: Sequence[ChosenFrame], *, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor, float]:
     """The frames with more camera noise, and the frames that follow them, as the network gets them; grey levels."""
     infos = {info.trial: info for info in data.trials}

@@ -11,7 +11,7 @@ from torch import Tensor
 from sliplens.explainers import EXPLAINERS, Explainer, Likeness, PolyCam
 from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.faithfulness.units import Units, marker_units, pixel_units, tile_units
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.models.engines import Engine
 from sliplens.recordings import Dataset
 from sliplens.results.explanation import Explained
@@ -72,7 +72,7 @@ _TILE_PX = 16
 class Material:
     """Explanations of some frames with all that belongs to them."""
 
-    trained: TrainedModel
+    trained: Run
     explained: Explained
     inputs: Float[Tensor, "frames 3 size size"]
     """What the network got, in [0, 1]."""
@@ -117,7 +117,7 @@ class Material:
 
 
 def gather(
-    trained: TrainedModel,
+    trained: Run,
     explained: Explained,
     data: Dataset,
     chosen: tuple[ChosenFrame, ...],

@@ -16,7 +16,7 @@ from sliplens.errors import InputError
 from sliplens.explainers import Explainer, IntegratedGradients
 from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness
 from sliplens.files import hash_json, output_folder
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.models.checkpoint import load
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset
@@ -47,7 +47,7 @@ from sliplens.study.truth import TRUE_FILL, judge_by_truth, true_curves
 from sliplens.training.evaluation import evaluate
 
 _COMMAND = "sliplens study"
-Network: TypeAlias = TrainedModel | Path | str
+Network: TypeAlias = Run | Path | str
 _Result = TypeVar("_Result")
 _Work: TypeAlias = Callable[[Path, OnProgress], _Result]
 """Takes a folder for parts, and what is called with the steps done and their number."""
@@ -187,9 +187,9 @@ def run_study(
     )
 
 
-def load_network(network: Network, name: str, *, device: str = "cpu") -> TrainedModel:
+def load_network(network: Network, name: str, *, device: str = "cpu") -> Run:
     """Network of a study by what it reads."""
-    run = network if isinstance(network, TrainedModel) else load(str(network), device=device)
+    run = network if isinstance(network, Run) else load(str(network), device=device)
     if run.manifest.input != name:
         raise InputError(
             f"--{name} names a network on {run.manifest.input} images; give one that was trained on {name}"
@@ -229,7 +229,7 @@ class _Stages:
 
     folder: Path
     data: Dataset
-    networks: Mapping[str, TrainedModel]
+    networks: Mapping[str, Run]
     explainers: Mapping[str, Explainer]
     tests: frozenset[str]
     settings: tuple[Setting, ...]

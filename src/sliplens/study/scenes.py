@@ -10,7 +10,7 @@ from torch import Tensor
 from sliplens.errors import InputError
 from sliplens.faithfulness.true_fill import Redraw
 from sliplens.faithfulness.units import Units
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.recordings import Dataset
 from sliplens.recordings.trial import SLIPS
 from sliplens.results.explanation import Explained
@@ -63,7 +63,7 @@ class Places:
 
 
 def stage_frames(
-    trained: TrainedModel, explained: Explained, data: Dataset, *, recipe: SimulationRecipe | None = None
+    trained: Run, explained: Explained, data: Dataset, *, recipe: SimulationRecipe | None = None
 ) -> tuple[StagedFrame, ...]:
     """Make frames of a study ready to be drawn anew; the data set's folder has the recipe where none is given."""
     if not data.simulated or explained.source != "simulated":
@@ -107,7 +107,7 @@ def _number(name: str, trial: str, *, frames: int) -> int:
     return int(number)
 
 
-def redrawing(trained: TrainedModel, frames: Sequence[StagedFrame]) -> Redraw:
+def redrawing(trained: Run, frames: Sequence[StagedFrame]) -> Redraw:
     """Draw frames with some of their `markers` put back, as the network gets them, on its device."""
 
     def redraw(image: int, back: Bool[np.ndarray, "variants markers"]) -> Float[Tensor, "variants 3 size size"]:

@@ -17,7 +17,7 @@ from sliplens.faithfulness import (
 from sliplens.faithfulness.alarms import fill_decides, flat_maps, follows_last_step, saturated
 from sliplens.faithfulness.deletion import deletion_steps, saliency_orders
 from sliplens.faithfulness.scoring import prepare_passes
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.progress import OnProgress, continued
 from sliplens.results.explanation import Explained, ExplainedFrame
 from sliplens.results.faithfulness import (
@@ -43,7 +43,7 @@ _Curves = Mapping[str, Sequence[DeletionTable]]
 """Curve of each frame, by method; random orders among the methods."""
 
 
-def require_same_network(trained: TrainedModel, explained: Explained) -> None:
+def require_same_network(trained: Run, explained: Explained) -> None:
     """Refuse explanations of another network."""
     if explained.weights_sha256 != trained.manifest.weights_sha256:
         raise CheckpointError(
@@ -52,7 +52,7 @@ def require_same_network(trained: TrainedModel, explained: Explained) -> None:
 
 
 def score_explanations(
-    trained: TrainedModel,
+    trained: Run,
     explained: Explained,
     *,
     fill: str = "grey",

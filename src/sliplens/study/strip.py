@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from sliplens.errors import RecordingError
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.progress import OnProgress
 from sliplens.recordings import Recording
 from sliplens.results.strip import Strip, StripReadings
@@ -18,7 +18,7 @@ _CONFIDENCE = 0.9
 
 
 def explain_trial(
-    run: TrainedModel,
+    run: Run,
     recording: Recording,
     *,
     source: str,

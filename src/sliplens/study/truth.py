@@ -23,7 +23,7 @@ from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.faithfulness.true_fill import SHARES, influence_orders, marker_curves, score_maps_by_marker
 from sliplens.faithfulness.units import unit_means, unit_order
 from sliplens.intervals import Difference, paired_difference
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
 from sliplens.results.explanation import Explained
@@ -153,7 +153,7 @@ def _summarise(meta: Sequence[MetaTest], agreement: Difference | None) -> str:
 
 
 def judge_by_truth(
-    trained: TrainedModel,
+    trained: Run,
     explained: Explained,
     data: Dataset,
     *,
@@ -253,7 +253,7 @@ def _table(frames: Sequence[StagedFrame], places: Sequence[Places], effects: Seq
 
 
 def true_curves(
-    trained: TrainedModel,
+    trained: Run,
     explained: Explained,
     data: Dataset,
     *,
@@ -279,7 +279,7 @@ def true_curves(
 
 
 def _stage(
-    trained: TrainedModel, explained: Explained, data: Dataset, *, recipe: SimulationRecipe | None
+    trained: Run, explained: Explained, data: Dataset, *, recipe: SimulationRecipe | None
 ) -> tuple[tuple[StagedFrame, ...], list[Places]]:
     require_same_network(trained, explained)
     frames = stage_frames(trained, explained, data, recipe=recipe)
@@ -291,7 +291,7 @@ def _paint(places: Sequence[Places], values: Sequence[Float[np.ndarray, " marker
 
 
 def _find_effects(
-    trained: TrainedModel,
+    trained: Run,
     explained: Explained,
     frames: Sequence[StagedFrame],
     places: Sequence[Places],

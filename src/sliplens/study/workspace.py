@@ -17,7 +17,7 @@ from sliplens.explainers.table import open_run
 from sliplens.faithfulness import get_fill
 from sliplens.files import output_folder
 from sliplens.images import write_png
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.plots.saliency import draw_panel, overlay_jet, overlay_saliency, stretch_saliency
 from sliplens.plots.style import drawing_style, method_name, percent
 from sliplens.progress import OnProgress, note, stage, wrote
@@ -42,7 +42,7 @@ _FULL_STICK = 0.9
 
 
 def explain_source(
-    run: TrainedModel | Path | str,
+    run: Run | Path | str,
     source: Dataset | Path,
     *,
     reference: Path | None = None,
@@ -133,7 +133,7 @@ def explain_source(
 
 
 def score_explained(
-    run: TrainedModel | Path | str,
+    run: Run | Path | str,
     explanations: Explained | Path,
     *,
     fill: str = "grey",
@@ -230,7 +230,7 @@ def _warned(explained: Explained) -> dict[str, list[str]]:
 
 
 def _choose_explainers(
-    trained: TrainedModel,
+    trained: Run,
     chosen: ChosenFrames,
     source: Dataset | Path,
     *,
@@ -251,7 +251,7 @@ def _choose_explainers(
 
 
 def _occlude_markers(
-    trained: TrainedModel, chosen: ChosenFrames, source: Dataset | Path, *, reference: Path | None
+    trained: Run, chosen: ChosenFrames, source: Dataset | Path, *, reference: Path | None
 ) -> list[Explainer]:
     """Occlusion by marker, frame by frame: where the simulator put them, else where they are found."""
     size = trained.manifest.image_size

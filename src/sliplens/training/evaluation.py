@@ -15,7 +15,7 @@ from sliplens.extras import import_cv2
 from sliplens.files import output_folder, scratch_folder
 from sliplens.markers.detect import get_kind
 from sliplens.markers.estimators import ESTIMATORS, get_estimator
-from sliplens.models import TrainedModel
+from sliplens.models import Run
 from sliplens.models.checkpoint import Estimate, join_estimates, load
 from sliplens.progress import OnProgress, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
@@ -27,7 +27,7 @@ from sliplens.training.metrics import auroc, coverage, find_lead_times, score_pr
 
 
 def evaluate(
-    run: TrainedModel | Path | str,
+    run: Run | Path | str,
     data: Dataset | Path | str,
     out: Path | str | None = None,
     *,
@@ -65,7 +65,7 @@ def evaluate(
     RecordingError
         If no frame has a label.
     """
-    run = run if isinstance(run, TrainedModel) else load(run)
+    run = run if isinstance(run, Run) else load(run)
     data = data if isinstance(data, Dataset) else load_dataset(data)
     trials = data.select(split=split)
     for trial in trials:
@@ -94,7 +94,7 @@ def evaluate(
 
 
 def _evaluate(
-    run: TrainedModel,
+    run: Run,
     data: Dataset,
     trials: Sequence[TrialInfo],
     plan: BaselinePlan | None,
@@ -120,7 +120,7 @@ def _evaluate(
     return replace(evaluation, baselines=replace(scores, known_trials=known), baseline_predictions=answers)
 
 
-def _count_known(trials: Sequence[TrialInfo], run: TrainedModel) -> int:
+def _count_known(trials: Sequence[TrialInfo], run: Run) -> int:
     return sum(trial.sha256[:12] in run.manifest.trained_on for trial in trials)
 
 
@@ -144,7 +144,7 @@ def _plan_baselines(
 
 
 def evaluate_frames(
-    run: TrainedModel,
+    run: Run,
     frames: FrameSet,
     *,
     split: str = "test",

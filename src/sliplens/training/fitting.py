@@ -18,7 +18,7 @@ from torch import nn
 from sliplens.codec import save_result
 from sliplens.errors import InputError, ModelError, RecordingError
 from sliplens.files import output_folder, partial_folder, scratch_folder, versions
-from sliplens.models import Manifest, TrainedModel, build_model, load_checkpoint, save_checkpoint
+from sliplens.models import Manifest, Run, build_model, load_checkpoint, save_checkpoint
 from sliplens.models.backbones import HistogramRegressor, histogram_targets
 from sliplens.models.calibration import LEVELS, Calibration, conformal_offset, fit_temperature, quantiles
 from sliplens.models.checkpoint import load
@@ -40,7 +40,7 @@ def train(
     *,
     input: str = "difference",
     recipe: str = "default",
-    start_from: TrainedModel | Path | str | None = None,
+    start_from: Run | Path | str | None = None,
     condition: str | None = None,
     accelerator: Literal["auto", "cpu", "gpu"] = "auto",
     devices: int = 1,
@@ -49,7 +49,7 @@ def train(
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
     **changes: Any,
-) -> TrainedModel:
+) -> Run:
     """Train a network on the training trials of a data set, and keep the weights that read its validation trials best.
 
     Interrupted, it goes on after the last whole epoch when it is called again with the same `out`.
@@ -142,7 +142,7 @@ class _Job:
     encoding: Encoding
     data: Dataset
     condition: str | None
-    start: TrainedModel | None
+    start: Run | None
     trainer: lightning.Trainer
     trials: tuple[tuple[TrialInfo, ...], tuple[TrialInfo, ...]]
     """To train and to validate on."""
@@ -260,7 +260,7 @@ def fit(
     sensor: str,
     data_hash: str,
     trained_on: Sequence[str] = (),
-    start: TrainedModel | None = None,
+    start: Run | None = None,
     trainer: lightning.Trainer | None = None,
     logger: Logger | None = None,
     on_progress: OnProgress | None = None,
@@ -406,7 +406,7 @@ def _check_frames(config: TrainConfig, train: FrameSet, validation: FrameSet, pr
         raise InputError(f"trial {min(shared)} is in both training and validation; split by trial")
 
 
-def require_same_kind(start: TrainedModel, config: TrainConfig, encoding: str) -> None:
+def require_same_kind(start: Run, config: TrainConfig, encoding: str) -> None:
     """Refuse to start from a network whose weights would mean something else."""
     kept = start.manifest
     asked = {"input": encoding, "backbone": config.backbone, "head": config.head}
