@@ -2,8 +2,9 @@
 
 The exact map must be that of the loop; the fast one, which starts with a budget and goes on until it expects to be like
 the exact one, must be like it. All times are taken in this run, on the same frames, and those of the last frame once
-more beside another process that keeps one core busy. The plain loop is timed on every n-th channel of each layer,
-`--loop-passes` in all, and its time scaled up: a pass costs the same whatever its mask.
+more beside another process that keeps one core busy. The plain loop runs in a process of its own, with threads that
+wait as suits it best; it is timed on every n-th channel of each layer, `--loop-passes` in all, and its time scaled up:
+a pass costs the same whatever its mask.
 """
 
 import argparse
@@ -19,10 +20,11 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that spin take the cores from the engine's own
 
+import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from busy import busy_process
+from fairness import at_its_best, busy_process
 from sliplens.errors import SliplensError
 from sliplens.explainers import Explanation, PolyCam, capture, find_layers
 from sliplens.explainers.maps import pearson_r, resize, to_masks, top_overlap
@@ -53,10 +55,10 @@ def choose_frames(trained: Run, data: Dataset, *, real: Path, count: int) -> tup
 
 @torch.no_grad()
 def plain_loop(
-    model: nn.Module, image: Tensor, reference: Tensor, *, passes: int
+    run: Path, pixels: np.ndarray, untouched: np.ndarray, passes: int
 ) -> tuple[float, list[dict[int, float]]]:
     """Seconds that a loop of one masked image at a time takes for all channels, and effects by layer and channel."""
-    model.eval()
+    model, image, reference = load(run).model, torch.from_numpy(pixels), torch.from_numpy(untouched)
     names = [layer.name for layer in find_layers(model, image[None])]
     with capture(model, names) as outputs:
         whole = model(image[None])
@@ -85,9 +87,10 @@ def check_effects(explanation: Explanation, effects: list[dict[int, float]], *, 
     return worst
 
 
-def measure(trained: Run, images: Tensor, references: Tensor, *, options: argparse.Namespace) -> dict[str, Any]:
+def measure(run: Path, images: Tensor, references: Tensor, *, options: argparse.Namespace) -> dict[str, Any]:
     """Times, errors and likeness on the frames of one network, frame by frame."""
-    model, rows = trained.model, []
+    trained, rows = load(run), []
+    model = trained.model
     # torch alone and in batches: the loop's own map where its passes are too many to make them all
     plain = PolyCam(engine="eager")
     exact = PolyCam(levels=True)
@@ -95,7 +98,7 @@ def measure(trained: Run, images: Tensor, references: Tensor, *, options: argpar
     with_engine = exact(model, images[:1], reference=references[:1])  # prepares the engine, as the first frame does
     preparation = with_engine.seconds
     for image, reference in zip(images, references, strict=True):
-        loop_s, effects = plain_loop(model, image, reference, passes=options.loop_passes)
+        loop_s, effects = at_its_best(plain_loop, run, image.numpy(), reference.numpy(), options.loop_passes)
         whole = exact(model, image[None], reference=reference[None])
         quick = fast(model, image[None], reference=reference[None])
         oracle = plain(model, image[None], reference=reference[None]) if options.oracle else None
@@ -118,7 +121,7 @@ def measure(trained: Run, images: Tensor, references: Tensor, *, options: argpar
         )
         print(" ".join(f"{key} {value:.4g}" for key, value in rows[-1].items()), flush=True)
     with busy_process():
-        busy_loop_s, _ = plain_loop(model, images[-1], references[-1], passes=options.loop_passes)
+        busy_loop_s, _ = at_its_best(plain_loop, run, images[-1].numpy(), references[-1].numpy(), options.loop_passes)
         busy_exact_s = exact(model, images[-1:], reference=references[-1:]).seconds
     return {
         "exact_speedup_beside_busy": busy_loop_s / busy_exact_s,
@@ -172,7 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for run in options.run:
                 trained = load(run)
                 images, references = choose_frames(trained, data, real=options.real, count=options.frames)
-                found[str(run)] = measure(trained, images, references, options=options)
+                found[str(run)] = measure(run, images, references, options=options)
                 gpu.append(
                     [gpu_milliseconds(trained, images[-1], references[-1], budget=one) for one in (1.0, options.budget)]
                 )
