@@ -3,7 +3,6 @@
 import os
 import sys
 from collections.abc import Sequence
-from typing import Annotated
 
 import tyro
 
@@ -27,24 +26,9 @@ from sliplens.cli.train import Train
 from sliplens.cli.view import View
 from sliplens.errors import SliplensError
 
-Command = (
-    Annotated[Demo, tyro.conf.subcommand("demo")]
-    | Annotated[Simulate, tyro.conf.subcommand("simulate")]
-    | Annotated[Import, tyro.conf.subcommand("import")]
-    | Annotated[Label, tyro.conf.subcommand("label")]
-    | Annotated[Split, tyro.conf.subcommand("split")]
-    | Annotated[Check, tyro.conf.subcommand("check")]
-    | Annotated[View, tyro.conf.subcommand("view")]
-    | Annotated[Track, tyro.conf.subcommand("track")]
-    | Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Predict, tyro.conf.subcommand("predict")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-    | Annotated[Explain, tyro.conf.subcommand("explain")]
-    | Annotated[Score, tyro.conf.subcommand("score")]
-    | Annotated[Study, tyro.conf.subcommand("study")]
-    | Annotated[Report, tyro.conf.subcommand("report")]
-)
+_Recordings = Simulate | Import | Label | Split | Check | View | Track
+_Networks = Train | Evaluate | Predict | Export
+Command = Demo | _Recordings | _Networks | Explain | Score | Study | Report
 
 _DESCRIPTION = """sliplens tells how close a soft robotic fingertip is to losing its grip, from the images of the camera
 inside it, and shows why the network says so. Start with `sliplens demo runs/demo`; every stage it runs is a command

@@ -1,11 +1,8 @@
 """`sliplens check`."""
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
-import tyro
-
+from sliplens.cli.command import Data
 from sliplens.cli.console import Terminal, print_table, say
 from sliplens.errors import RecordingError
 
@@ -17,8 +14,7 @@ class Check:
     Exit code 0 when all is well, 2 when something is not; then every finding is listed.
     """
 
-    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
-    """Data set to read."""
+    data: Data
 
     def run(self) -> None:
         """Check and say what is wrong, and where."""

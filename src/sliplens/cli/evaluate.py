@@ -1,19 +1,17 @@
 """`sliplens evaluate`."""
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import tyro
-
-from sliplens.cli.console import Terminal, print_table, say
+from sliplens.cli.command import Command, Data, Device, Network, Output
+from sliplens.cli.console import print_table, say
 
 if TYPE_CHECKING:
     from sliplens.results.evaluation import Baselines, Evaluation, RegressionScores
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate:
+class Evaluate(Command):
     """Measure how well a network reads the safety margin, dry and wet.
 
     MSE, R2, MAE, the MSE in ten bins of the margin, by day and trial; whether its intervals hold, whether it knows when
@@ -21,11 +19,9 @@ class Evaluate:
     read from the markers of the same frames stands beside it.
     """
 
-    model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="RUN")]
-    """Folder of a trained network, or the name of one that comes with sliplens."""
-    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
-    """Data set with labels."""
-    output: Annotated[Path, tyro.conf.arg(aliases=("-o",))]
+    model: Network
+    data: Data
+    output: Output
     """Folder to make: the table and every prediction."""
     split: str = "test"
     """Which trials of the data set."""
@@ -35,10 +31,7 @@ class Evaluate:
     """How many training trials they are fitted on, spread evenly over those of the data set."""
     markers: str | None = None
     """What markers look like: chromatouch, gelsight-mini, tactip or auto; by the sensor's name if not given."""
-    device: str = "cpu"
-    """Where the network runs: cpu, cuda or cuda:1."""
-    overwrite: bool = False
-    """Replace the folder if it exists."""
+    device: Device = "cpu"
 
     def run(self) -> None:
         """Evaluate, draw the scores and print them."""
@@ -46,17 +39,7 @@ class Evaluate:
         from sliplens.plots.errors import draw_evaluation
         from sliplens.training import evaluate
 
-        evaluation = evaluate(
-            load(self.model, device=self.device),
-            self.data,
-            self.output,
-            split=self.split,
-            baselines=self.baselines,
-            baseline_trials=self.baseline_trials,
-            markers=self.markers,
-            overwrite=self.overwrite,
-            on_progress=Terminal(),
-        )
+        evaluation = self.call(evaluate, run=load(self.model, device=self.device), out=self.output)
         picture = self.output / "evaluation.png"
         if not picture.is_file():
             title = f"{self.model.name}, {self.split} trials of {self.data.name}"

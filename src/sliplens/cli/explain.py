@@ -6,12 +6,13 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sliplens.cli.console import Terminal, print_table
+from sliplens.cli.command import Command, Device
+from sliplens.cli.console import print_table
 from sliplens.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explain:
+class Explain(Command):
     """Show which parts of a frame made the network answer as it did, rather than as for the untouched sensor.
 
     Explains frames of a data set along the safety margin, or a folder of images (`--frames`). The folder holds the maps
@@ -47,10 +48,7 @@ class Explain:
     """How many trials."""
     levels: tuple[float, ...] = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
     """Safety margins at which frames are taken."""
-    device: str = "cpu"
-    """Where the network runs: cpu, cuda or cuda:1."""
-    overwrite: bool = False
-    """Replace the folder if it exists."""
+    device: Device = "cpu"
 
     def run(self) -> None:
         """Explain and write the maps."""
@@ -69,23 +67,7 @@ class Explain:
             raise InputError("name either a data set or --frames FOLDER, to say which frames to explain")
         from sliplens.study.workspace import explain_source
 
-        explain_source(
-            self.model,
-            source,
-            reference=self.reference,
-            labels_in_names=self.labels_in_names,
-            methods=self.method,
-            budget=self.budget,
-            split=self.split,
-            condition=self.condition,
-            trials=self.trials,
-            levels=self.levels,
-            out=self.output,
-            colours=self.colours,
-            device=self.device,
-            overwrite=self.overwrite,
-            on_progress=Terminal(),
-        )
+        self.call(explain_source, run=self.model, source=source, methods=self.method, out=self.output)
 
 
 def _print_methods() -> None:

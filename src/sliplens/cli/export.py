@@ -6,12 +6,13 @@ from typing import Annotated
 
 import tyro
 
-from sliplens.cli.console import OUT, Terminal, wrote
+from sliplens.cli.command import Command, Output
+from sliplens.cli.console import OUT, wrote
 from sliplens.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export:
+class Export(Command):
     """Write a network or a data set for other programs.
 
     A network becomes an ONNX file (--onnx), checked against the network before it appears; needs the extra `onnx`. A
@@ -20,7 +21,7 @@ class Export:
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """Folder of a trained network, or data set."""
-    output: Annotated[Path, tyro.conf.arg(aliases=("-o",))]
+    output: Output
     """File to write (--onnx), or folder to make."""
     onnx: bool = False
     """The network as an ONNX file, for ONNX Runtime or OpenVINO, from C++ or Python."""
@@ -30,8 +31,6 @@ class Export:
     """The data set as MCAP files of ROS 2 messages, one a trial."""
     trials: tuple[str, ...] = ()
     """Names of trials of the data set; all if not given."""
-    overwrite: bool = False
-    """Replace the output if it exists."""
 
     def run(self) -> None:
         """Export."""
@@ -73,7 +72,7 @@ class Export:
                 f"{self.source} is a run, and --{kind} writes a data set; name a data set, or choose --onnx"
             )
         export = export_mcap if kind == "mcap" else export_lerobot
-        export(self.source, self.output, trials=self.trials, overwrite=self.overwrite, on_progress=Terminal())
+        self.call(export, data=self.source, out=self.output)
 
 
 def _is_run(source: Path) -> bool:

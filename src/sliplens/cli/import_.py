@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from sliplens.cli.command import Command, Output
 from sliplens.cli.console import Terminal, print_table, say, wrote
 from sliplens.recordings.options import LabelSettings, ReadOptions
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Import:
+class Import(Command):
     """Import recordings of your own sensor and label every frame with its safety margin.
 
     Reads ROS 2 bags (no ROS needed), LeRobot v3 data sets, videos and folders of images beside a table of forces. Tare,
@@ -27,7 +28,7 @@ class Import:
 
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """Recordings: one trial each, or all episodes of a LeRobot data set."""
-    output: Annotated[Path, tyro.conf.arg(aliases=("-o",))]
+    output: Output
     """Folder to make: a data set for `sliplens train`."""
     sensor: str | None = None
     """Name of the sensor; a network is trained for one. Needed unless the source tells it."""
@@ -49,30 +50,13 @@ class Import:
     labelling: Annotated[LabelSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=LabelSettings)
     audit: bool = True
     """Draw a page for each trial, in `audit/` of the folder, from which to judge its labels."""
-    overwrite: bool = False
-    """Replace the folder if it exists."""
 
     def run(self) -> None:
         """Read, label, write, and show what was found."""
         from sliplens.recordings.importing import import_recordings
 
         terminal = Terminal()
-        data = import_recordings(
-            self.sources,
-            out=self.output,
-            sensor=self.sensor,
-            day=self.day,
-            condition=self.condition,
-            object=self.object,
-            format=self.format,
-            splits=self.splits,
-            validation_trials=self.validation_trials,
-            test_trials=self.test_trials,
-            reading=self.reading,
-            labelling=self.labelling,
-            overwrite=self.overwrite,
-            on_progress=terminal,
-        )
+        data = self.call(import_recordings, out=self.output, on_progress=terminal)
         if self.audit:
             draw_audits(data, data.folder / "audit", terminal)
         show_labelling("Imported", data)

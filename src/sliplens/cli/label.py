@@ -6,13 +6,14 @@ from typing import Annotated
 
 import tyro
 
+from sliplens.cli.command import Command, Data
 from sliplens.cli.console import Terminal
 from sliplens.cli.import_ import draw_audits, show_labelling
 from sliplens.recordings.options import LabelSettings
 
 
 @dataclass(frozen=True, kw_only=True)
-class Label:
+class Label(Command):
     """Label the trials of a data set anew, from the frames and the force samples that it keeps.
 
     For another friction, axis or threshold than on import, or to see how well the labels of a simulated data set come
@@ -20,8 +21,7 @@ class Label:
     labels, once all of them are there.
     """
 
-    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
-    """Data set, imported or simulated."""
+    data: Data
     output: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None
     """Folder to make with the new labels; the data set itself if not given."""
     labelling: Annotated[LabelSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=LabelSettings)
@@ -29,8 +29,6 @@ class Label:
     """Draw a page for each trial, in `audit/` of the folder, from which to judge its labels."""
     audit_only: bool = False
     """Change no label: draw the audit pages of the labels that are there, into `audit/` of the output folder."""
-    overwrite: bool = False
-    """Replace the output folder if it exists."""
 
     def run(self) -> None:
         """Label anew, write, and show what was found."""
@@ -41,9 +39,7 @@ class Label:
         if self.audit_only:
             draw_audits(data, out / "audit", terminal)
             return
-        labelled = label_dataset(
-            data, out=out, labelling=self.labelling, overwrite=self.overwrite, on_progress=terminal
-        )
+        labelled = self.call(label_dataset, data=data, out=out, on_progress=terminal)
         if self.audit:
             draw_audits(labelled, out / "audit", terminal)
         show_labelling("Labelled", labelled)

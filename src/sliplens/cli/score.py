@@ -6,49 +6,36 @@ from typing import Annotated
 
 import tyro
 
-from sliplens.cli.console import Terminal, print_table, say
+from sliplens.cli.command import Command, Device, Network, Output
+from sliplens.cli.console import print_table, say
 
 
 @dataclass(frozen=True, kw_only=True)
-class Score:
+class Score(Command):
     """Score explanations by deletion: remove the most salient pixels first and watch the answer.
 
     D = (1 - |y_base - y_mask|)^2 at each step, averaged over the steps (thesis, eq. 2): lower is more faithful. A
     random order is scored beside every method; one that does not beat it has shown nothing.
     """
 
-    model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="RUN")]
-    """Folder of the network that was explained."""
+    model: Network
     explanations: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="EXPLANATIONS")]
     """Folder that `sliplens explain` made."""
-    output: Annotated[Path, tyro.conf.arg(aliases=("-o",))]
+    output: Output
     """Folder to make: curves and table."""
     fill: str = "grey"
     """What removed pixels become: grey, black, white, background, blur or noisy-linear."""
     steps: int | None = None
     """Steps until every pixel is gone; the image's height if not given."""
-    device: str = "cpu"
-    """Where the network runs: cpu, cuda or cuda:1."""
+    device: Device = "cpu"
     seed: int = 0
     """Seed of the random order."""
-    overwrite: bool = False
-    """Replace the folder if it exists."""
 
     def run(self) -> None:
         """Score and write the curves."""
         from sliplens.study.workspace import score_explained
 
-        scores = score_explained(
-            self.model,
-            self.explanations,
-            fill=self.fill,
-            steps=self.steps,
-            seed=self.seed,
-            out=self.output,
-            device=self.device,
-            overwrite=self.overwrite,
-            on_progress=Terminal(),
-        )
+        scores = self.call(score_explained, run=self.model, out=self.output)
         print_table(
             f"deletion score, {scores.input} images ({scores.source}), fill {self.fill}: lower is more faithful",
             ("method", "D_AUC", "+-", "last step", "frames"),

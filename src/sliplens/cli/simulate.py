@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from sliplens.cli.command import Command
 from sliplens.cli.console import Terminal, print_table
 from sliplens.errors import InputError
 
@@ -16,7 +17,7 @@ _CLIP_FRAMES_PER_S = 30
 
 
 @dataclass(frozen=True, kw_only=True)
-class Simulate:
+class Simulate(Command):
     """Simulate trials of a fingertip, with known safety margin, stick zone and marker motion.
 
     Each trial presses the fingertip on an object, holds, pulls until it slips, and slides on. The last day is the test
@@ -58,8 +59,6 @@ class Simulate:
     """Picture to write: a contact sheet of four trials (PNG, PDF or SVG)."""
     video: Path | None = None
     """Clip to write: one trial with its forces and margin beside it (MP4)."""
-    overwrite: bool = False
-    """Replace the folder if it exists."""
 
     def run(self) -> None:
         """Draw what was asked for; simulate and write the data set."""

@@ -4,11 +4,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
-import tyro
 from rich.markup import escape
 
+from sliplens.cli.command import Data
 from sliplens.cli.console import print_table, say, wrote
 from sliplens.errors import InputError
 
@@ -27,8 +27,7 @@ class Split:
     of the data set, in splits.json.
     """
 
-    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
-    """Data set to split."""
+    data: Data
     rules: Path | None = None
     """File of rules (TOML): the first that fits a trial decides."""
     preset: Literal["thesis", "objects", "trials"] | None = None

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sliplens.cli.console import Terminal
+from sliplens.cli.command import Command, Device, Output
 from sliplens.cli.report import Report
 from sliplens.cli.simulate import Simulate
 from sliplens.errors import InputError
@@ -18,7 +18,7 @@ _NONE = "none"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Study:
+class Study(Command):
     """Find out which explanation of a network can be believed: the experiment of the thesis, and the controls it lacks.
 
     Picks trials that the networks read well, explains frames from full stick to full slip, scores the explanations by
@@ -28,7 +28,7 @@ class Study:
 
     data: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[DATA]")] = None
     """Data set with labels; leave out with --preset."""
-    output: Annotated[Path, tyro.conf.arg(aliases=("-o",))]
+    output: Output
     """Folder to make, one subfolder a stage; the page is report.html in it."""
     difference: str = "chromatouch-difference"
     """Network on difference images: a folder, or a name of one that comes with sliplens; none to leave it out."""
@@ -52,15 +52,12 @@ class Study:
     """Share of the channels that Poly-CAM measures at first, more where its map asks for it; 1 for all."""
     random_orders: int = 20
     """Random orders that every method has to beat."""
-    device: str = "cpu"
-    """Where the networks run: cpu, cuda or cuda:1."""
+    device: Device = "cpu"
     jobs: int | None = None
     """Networks to judge at the same time, each by a process with its share of the cores; one after the other with 1. If
     not given, both at once where they run on a processor."""
     seed: int = 0
     """Seed of the random orders, of new weights and of noise."""
-    overwrite: bool = False
-    """Make every stage again."""
 
     def run(self) -> None:
         """Run every stage that is not there yet, and draw the report."""
@@ -75,23 +72,15 @@ class Study:
         networks = {name: load_network(run, name, device=self.device) for name, run in given.items()}
         study_explainers(methods := self.method or STUDY_METHODS, budget=self.budget)
         data = self.data or self._simulate()
-        run_study(
-            data,
+        self.call(
+            run_study,
+            data=data,
             difference=networks.get("difference"),
             raw=networks.get("raw"),
             out=self.output,
             methods=methods,
             split=self.split or ("train" if self.preset else "test"),
-            condition=self.condition,
-            trials=self.trials,
-            tolerance=self.tolerance,
-            budget=self.budget,
-            random_orders=self.random_orders,
-            device=self.device,
             jobs=self.jobs if self.jobs is not None else 1 if self.device != "cpu" else 2,
-            seed=self.seed,
-            overwrite=self.overwrite,
-            on_progress=Terminal(),
         )
         Report(workspace=self.output).run()
 

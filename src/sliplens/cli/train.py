@@ -1,24 +1,22 @@
 """`sliplens train`."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import tyro
-
+from sliplens.cli.command import Command, Data, Output
 from sliplens.cli.console import Terminal
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train:
+class Train(Command):
     """Train a network to read the safety margin from raw frames or from difference images.
 
     Interrupted, it goes on after the last whole epoch when the same command is given again.
     """
 
-    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
-    """Data set, as `sliplens simulate` makes it."""
-    output: Annotated[Path, tyro.conf.arg(aliases=("-o",))]
+    data: Data
+    output: Output
     """Folder to make: weights, manifest, learning curve."""
     recipe: Literal["default", "thesis"] = "default"
     """default: a distribution over the margin, AdamW. thesis: as the thesis trained, one output and Ranger21. The
@@ -62,18 +60,15 @@ class Train:
     logger: Literal["csv", "tensorboard", "wandb", "mlflow"] = "csv"
     """Where the numbers go besides metrics.csv. All keep them in the output folder and send nothing, unless
     WANDB_MODE=online or MLFLOW_TRACKING_URI asks for it."""
-    overwrite: bool = False
-    """Replace the folder if it exists."""
 
     def run(self) -> None:
         """Train, and draw the learning curve; of several processes the first writes and speaks, the others help."""
         from sliplens.plots.errors import draw_learning_curve
         from sliplens.training import train
 
-        words = {item.name: getattr(self, item.name) for item in fields(self)}
-        data, output = words.pop("data"), words.pop("output")
-        run = train(data, output, **words, on_progress=Terminal())
-        picture = output / "curves.png"
+        options = {name: value for name, value in vars(self).items() if name != "output"}
+        run = train(out=self.output, **options, on_progress=Terminal())
+        picture = self.output / "curves.png"
         if run.training is not None and not picture.is_file():
-            title = f"{output.name}, {self.input} images of {data.name}"
+            title = f"{self.output.name}, {self.input} images of {self.data.name}"
             draw_learning_curve(run.training, picture, title=title)

@@ -6,26 +6,24 @@ from typing import Annotated
 
 import tyro
 
+from sliplens.cli.command import Command, Data
 from sliplens.cli.console import Terminal, say, wrote
 from sliplens.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
-class View:
+class View(Command):
     """Look at a trial in the Rerun viewer: frames, differences, forces and labels on one clock.
 
     Needs the extra `view`: pip install "sliplens[view]". The viewer opens on this machine and listens to it alone; with
     --output a file is written instead, to be opened with `rerun FILE.rrd` wherever Rerun is installed.
     """
 
-    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
-    """Data set to read."""
+    data: Data
     trial: str | None = None
     """Name of the trial; the first of the data set if not given."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="FILE.rrd")] = None
     """File to write instead of opening the viewer."""
-    overwrite: bool = False
-    """Write the file anew if it exists."""
 
     def run(self) -> None:
         """Open the viewer, or write its file."""

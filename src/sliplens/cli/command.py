@@ -1,0 +1,65 @@
+"""What commands share: options that mean the same in several, and the call that hands options to the library."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from inspect import signature
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+
+import tyro
+
+from sliplens.cli.console import Terminal
+
+if TYPE_CHECKING:
+    from sliplens.recordings.options import ReadOptions
+
+Result = TypeVar("Result")
+_NETWORK = "Folder of a trained network, or the name of one that comes with sliplens."
+Network = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="RUN", help=_NETWORK)]
+Data = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA", help="Data set to read.")]
+Output = Annotated[Path, tyro.conf.arg(aliases=("-o",))]
+_SOURCE = "Data set, folder of images, video, ROS 2 bag, or whatever `sliplens import` reads."
+Source = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE", help=_SOURCE)]
+TableFile = Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="FILE.parquet", help="File to write.")]
+Device = Annotated[str, tyro.conf.arg(help="Where the network runs: cpu, cuda or cuda:1.")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """A command that writes; its options are named as the parameters of the library's calls are."""
+
+    overwrite: bool = False
+    """Replace what is there."""
+
+    def call(self, function: Callable[..., Result], **others: Any) -> Result:
+        """Call the library with every option that it has a parameter for, and with what is named here."""
+        options = {"on_progress": Terminal(), **vars(self)}
+        takes = signature(function).parameters
+        return function(**{**{name: value for name, value in options.items() if name in takes}, **others})
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceCommand(Command):
+    """A command that reads frames of any source."""
+
+    reference: Path | None = None
+    """Image of the untouched sensor."""
+    reference_frame: int | None = None
+    """Number of the frame that shows the untouched sensor, in place of --reference."""
+    split: str | None = None
+    """Trials of a data set; all if not given."""
+    format: str | None = None
+    """rosbag, lerobot, thesis, gelsight, images or video; recognised if not given."""
+    frame_rate: float | None = None
+    """Frames a second, for images, or where a video's stamps are missing or wrong."""
+    image_topic: str | None = None
+    """Topic of the images; the only one if not given."""
+    camera_key: str | None = None
+    """Feature of a LeRobot data set with the images."""
+
+    @property
+    def options(self) -> "ReadOptions":
+        """What is said of the source, as the library takes it."""
+        from sliplens.recordings.options import ReadOptions
+
+        return ReadOptions(frame_rate=self.frame_rate, image_topic=self.image_topic, camera_key=self.camera_key)
