@@ -19,7 +19,6 @@ from sliplens.report.plates import (
     draw_grid,
     explained_of,
     gone,
-    show_plate,
     shown_frames,
     told_frame,
     write_plates,
@@ -155,12 +154,12 @@ def test_same_plate_makes_the_same_files(tmp_path):
     files = [write_plates([make_plate()], tmp_path / name)[0].read_bytes() for name in "ab"]
 
     assert files[0] == files[1]
-    assert show_plate(make_plate()).picture == show_plate(make_plate()).picture
+    assert make_plate().picture == make_plate().picture
 
 
 def test_figures_of_the_thesis_are_named_as_such():
-    assert show_plate(make_plate("fig-05-deletion")).files.startswith("Fig. 5 of the thesis, for this data;")
-    assert show_plate(make_plate("timing")).files.startswith("Also figures/timing.pdf")
+    assert make_plate("fig-05-deletion").files.startswith("Fig. 5 of the thesis, for this data;")
+    assert make_plate("timing").files.startswith("Also figures/timing.pdf")
 
 
 @pytest.mark.parametrize(("more", "beside"), [((), "Poly-CAM"), (("poly-cam-thesis",), "Poly-CAM as in the thesis")])

@@ -39,7 +39,7 @@ from sliplens.plots.style import (
 )
 from sliplens.report.comparisons import controls, settings
 from sliplens.report.plates import Plate, named_columns, rows_of
-from sliplens.report.workspace import Results
+from sliplens.report.results import Results
 from sliplens.results.faithfulness import DeletionScores, RemovalCurve, RemovalScores
 
 _EACH_FIGURES = {"difference": "fig-17-faithfulness-difference", "raw": "fig-18-faithfulness-raw"}

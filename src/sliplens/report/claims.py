@@ -34,8 +34,8 @@ from sliplens.report.comparisons import (
     share_of_strongest,
     tell_interval,
 )
+from sliplens.report.results import Results
 from sliplens.report.thesis import THESIS_POLY_CAM
-from sliplens.report.workspace import Results
 from sliplens.results.faithfulness import DeletionCurve, RemovalScores
 from sliplens.results.study import MapQuality, Truth
 

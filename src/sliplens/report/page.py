@@ -4,49 +4,21 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from sliplens.errors import InputError
-from sliplens.files import Provenance
 from sliplens.plots.layout import written_whole
 from sliplens.report.comparisons import tell_interval
 from sliplens.report.pictures import plate_strip
-from sliplens.report.plates import FOLDER, Plate, ShownPlate, show_plate, write_plates
-from sliplens.report.results import load_results
-from sliplens.report.sections import Block, Section, build_sections
+from sliplens.report.plates import FOLDER, Plate, write_plates
+from sliplens.report.results import Results, load_results
+from sliplens.report.sections import Section, build_sections
 from sliplens.report.verdict import Statement, count_alarms, judge
-from sliplens.report.workspace import Results
+from sliplens.results.study import Study
 
 PAGE = "report.html"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Page:
-    """All that the template lays out."""
-
-    name: str
-    finished: str
-    waiting_for: tuple[str, ...]
-    """What is still being made; the page loads itself anew until nothing is."""
-    opening: ShownPlate | None
-    """Picture that says it all, above the verdict."""
-    carrying: tuple[Statement, ...]
-    """Statements to rely on."""
-    warning: tuple[Statement, ...]
-    """Statements to be careful with."""
-    alarms: tuple[str, ...]
-    """A line a kind."""
-    sections: tuple[tuple[Section, tuple[Block | ShownPlate, ...]], ...]
-    """Each with its blocks, as the template's macros of their `layout` lay them out."""
-    study: bool
-    runs: dict[str, Provenance]
-    """By the name of the folder."""
-    recipes: tuple[str, ...]
-    versions: tuple[tuple[str, str], ...]
-    machine: tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,18 +29,8 @@ class Written:
     figures: tuple[Path, ...]
 
 
-@runtime_checkable
-class Kept(Protocol):
-    """What is kept in a folder of its own, such as a study."""
-
-    @property
-    def folder(self) -> Path:
-        """Folder with one subfolder a stage."""
-        ...
-
-
 def write_report(
-    workspace: str | Path | Kept, out: str | Path | None = None, *, waiting_for: Sequence[str] = ()
+    workspace: str | Path | Study, out: str | Path | None = None, *, waiting_for: Sequence[str] = ()
 ) -> Written:
     """Write the report of a workspace as one self-contained HTML file, and its figures beside it.
 
@@ -105,7 +67,7 @@ def write_report(
     statements = judge(results, rng=rng)
     sections = build_sections(results, rng=rng)
     opening = None if results.strip is None else plate_strip(results.strip)
-    text = render_page(build_page(results, statements, sections, opening=opening, waiting_for=tuple(waiting_for)))
+    text = _render(results, statements, sections, opening=opening, waiting_for=waiting_for)
     plates = [] if opening is None else [opening]
     plates += [block for section in sections for block in section.blocks if isinstance(block, Plate)]
     # the figures first: a page that is there has all that it names
@@ -115,40 +77,32 @@ def write_report(
     return Written(page=page, figures=figures)
 
 
-def build_page(
+def _render(
     results: Results,
     statements: tuple[Statement, ...],
     sections: tuple[Section, ...],
     *,
-    opening: Plate | None = None,
-    waiting_for: tuple[str, ...] = (),
-) -> Page:
-    """Gather what the page shows of a workspace."""
-    newest = list(results.runs.values())[-1]
-    versions = {tuple(sorted(run.versions.items())) for run in results.runs.values()}
-    mixed = "The stages were run with different versions of the libraries; see the versions of each run.json."
-    return Page(
-        name=results.workspace.resolve().name,
-        finished=newest.finished[:16].replace("T", " at "),
-        waiting_for=waiting_for,
-        opening=None if opening is None else show_plate(opening),
-        carrying=tuple(one for one in statements if one.tone != "caution"),
-        warning=tuple(one for one in statements if one.tone == "caution"),
-        alarms=(*results.notes, *((mixed,) if len(versions) > 1 else ()), *count_alarms(results)),
-        sections=tuple(
-            (section, tuple(show_plate(block) if isinstance(block, Plate) else block for block in section.blocks))
-            for section in sections
-        ),
-        study=bool(results.study),
-        runs=results.runs,
-        recipes=tuple(json.dumps(run.config, indent=2, ensure_ascii=False) for run in results.runs.values()),
-        versions=tuple(newest.versions.items()),
-        machine=tuple((str(name), str(value)) for name, value in vars(newest.machine).items()),
-    )
-
-
-def render_page(page: Page) -> str:
+    opening: Plate | None,
+    waiting_for: Sequence[str],
+) -> str:
     """Lay a page out as HTML; every text is escaped."""
+    runs = list(results.runs.values())
+    versions = {tuple(sorted(run.versions.items())) for run in runs}
+    mixed = "The stages were run with different versions of the libraries; see the versions of each run.json."
     loader = PackageLoader("sliplens.report")
     pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    return pages.get_template("report.html.j2").render(page=page, interval=tell_interval)
+    return pages.get_template("report.html.j2").render(
+        name=results.workspace.resolve().name,
+        finished=runs[-1].finished[:16].replace("T", " at "),
+        waiting_for=waiting_for,
+        opening=opening,
+        carrying=[one for one in statements if one.tone != "caution"],
+        warning=[one for one in statements if one.tone == "caution"],
+        alarms=[*results.notes, *([mixed] if len(versions) > 1 else []), *count_alarms(results)],
+        sections=sections,
+        study=bool(results.study),
+        runs=results.runs,
+        recipes=[json.dumps(run.config, indent=2, ensure_ascii=False) for run in runs],
+        facts={**runs[-1].versions, **vars(runs[-1].machine)},
+        interval=tell_interval,
+    )

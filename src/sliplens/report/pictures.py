@@ -40,7 +40,7 @@ from sliplens.report.plates import (
     shown_frames,
     told_frame,
 )
-from sliplens.report.workspace import Results
+from sliplens.report.results import Results
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionCurve, DeletionScores
 from sliplens.results.strip import Strip

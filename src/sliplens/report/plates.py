@@ -4,6 +4,7 @@ import csv
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from textwrap import fill
 from typing import Any, ClassVar
@@ -17,7 +18,7 @@ from sliplens.plots.contact_sheet import TIMES, brighten, brightening
 from sliplens.plots.layout import Picture, figure_picture, place_axes, place_text, save_page, write_over, written_whole
 from sliplens.plots.saliency import choose_frames, overlay_saliency, plot_colour_bar, stretch_saliency
 from sliplens.plots.style import drawing_style
-from sliplens.report.workspace import Results
+from sliplens.report.results import Results
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionCurve
 
@@ -114,6 +115,8 @@ Numbers = Mapping[str, Sequence[Any] | np.ndarray]
 class Plate:
     """A figure with all that goes with it."""
 
+    layout: ClassVar[str] = "plate"
+
     name: str
     """Name of its files, without suffix."""
     figure: Figure
@@ -124,6 +127,21 @@ class Plate:
     pixels: bool = False
     """Whether it is made of photographs."""
 
+    @cached_property
+    def picture(self) -> Picture:
+        """Figure as the page holds it."""
+        picture = figure_picture(self.figure, alt=self.alt, pixels=self.pixels)
+        # what was laid out stays: doing so again for the PDF takes longer than drawing
+        self.figure.set_layout_engine("none")
+        return picture
+
+    @property
+    def files(self) -> str:
+        """Where its files are found."""
+        found = re.match(r"fig-(\d+)-", self.name)
+        told = f"Fig. {int(found[1])} of the thesis, for this data;" if found else "Also"
+        return f"{told} {FOLDER}/{self.name}.pdf, numbers in {self.name}.csv."
+
 
 def named_columns(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> dict[str, list]:
     """Turn rows into named columns."""
@@ -133,27 +151,6 @@ def named_columns(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> dict[s
 def rows_of(*arrays: np.ndarray) -> list[tuple[Any, ...]]:
     """Turn columns of equal length into rows of Python's own values."""
     return list(zip(*(one.tolist() for one in arrays), strict=True))
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShownPlate:
-    """A plate as the page holds it, and where its files are found."""
-
-    layout: ClassVar[str] = "plate"
-    picture: Picture
-    caption: str
-    files: str
-
-
-def show_plate(plate: Plate) -> ShownPlate:
-    """Hold a plate for the page."""
-    picture = figure_picture(plate.figure, alt=plate.alt, pixels=plate.pixels)
-    # what was laid out stays: doing so again for the PDF takes longer than drawing
-    plate.figure.set_layout_engine("none")
-    found = re.match(r"fig-(\d+)-", plate.name)
-    told = f"Fig. {int(found[1])} of the thesis, for this data;" if found else "Also"
-    files = f"{told} {FOLDER}/{plate.name}.pdf, numbers in {plate.name}.csv."
-    return ShownPlate(picture=picture, caption=plate.caption, files=files)
 
 
 def write_plates(plates: Sequence[Plate], folder: Path) -> tuple[Path, ...]:

@@ -1,5 +1,6 @@
-"""Load the results that a workspace holds, whatever its folders are called."""
+"""Results that a workspace holds, whatever its folders are called."""
 
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,6 @@ from sliplens.codec import load_record, load_result
 from sliplens.errors import InputError
 from sliplens.files import RUN_FILE, Provenance, require_folder
 from sliplens.recordings.dataset import load_dataset
-from sliplens.report.workspace import Results
 from sliplens.results.evaluation import Evaluation
 from sliplens.results.explanation import Explained, load_explained
 from sliplens.results.faithfulness import DeletionScores, Remedies, RemovalScores
@@ -16,6 +16,7 @@ from sliplens.results.strip import Strip
 from sliplens.results.study import Choice, MapQuality, Randomisation, States, Study, Timing, Truth
 from sliplens.results.training import Training
 
+_OF_A_COMMAND: dict[str, type] = {"train": Training, "evaluate": Evaluation, "score": DeletionScores, "strip": Strip}
 _OF_A_STUDY: dict[str, type] = {
     "choice": Choice,
     "states": States,
@@ -26,16 +27,34 @@ _OF_A_STUDY: dict[str, type] = {
     "timing": Timing,
     "truth": Truth,
 }
-RECORDS: dict[str, type] = {
-    "simulate": Simulation,
-    "train": Training,
-    "evaluate": Evaluation,
-    "explain": Explained,
-    "score": DeletionScores,
-    "strip": Strip,
-    **_OF_A_STUDY,
-}
-"""Record of each stage."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Results:
+    """All that a workspace holds; a stage that was not run is None or an empty table."""
+
+    workspace: Path
+    runs: dict[str, Provenance]
+    """By the name of the folder, last finished last."""
+    simulation: Simulation | None = None
+    trainings: dict[str, Training] = field(default_factory=dict)
+    evaluations: dict[str, Evaluation] = field(default_factory=dict)
+    """By input ("raw", "difference")."""
+    explanations: dict[tuple[str, str], Explained] = field(default_factory=dict)
+    scores: dict[tuple[str, str], DeletionScores] = field(default_factory=dict)
+    """By input and source ("simulated", "real")."""
+    strip: Strip | None = None
+    """One trial from stick to slip."""
+    study: Study = field(default_factory=Study)
+    """What a study adds; false where none was run."""
+    notes: tuple[str, ...] = ()
+    """What a reader must know of how the results were chosen."""
+
+    @property
+    def inputs(self) -> set[str]:
+        """Inputs that any stage tells of."""
+        named = {*self.trainings, *self.evaluations, *(name for name, _ in (*self.explanations, *self.scores))}
+        return named | self.study.inputs if self.study or not named else named
 
 
 def load_results(workspace: Path) -> Results:
@@ -67,9 +86,10 @@ def load_results(workspace: Path) -> Results:
             result = describe_simulation(load_dataset(folder))
         elif run.stage == "explain":
             result = load_explained(folder)
-        elif run.stage in RECORDS:
-            command = f"sliplens {'study' if run.stage in _OF_A_STUDY else run.stage}"
-            result = load_result(folder, RECORDS[run.stage], command=command)
+        elif run.stage in _OF_A_COMMAND:
+            result = load_result(folder, _OF_A_COMMAND[run.stage], command=f"sliplens {run.stage}")
+        elif run.stage in _OF_A_STUDY:
+            result = load_result(folder, _OF_A_STUDY[run.stage], command="sliplens study")
         else:
             continue
         name = getattr(result, "input", "")
@@ -85,34 +105,32 @@ def load_results(workspace: Path) -> Results:
         raise InputError(
             f"{workspace} holds no result to report; run `sliplens simulate` and the stages after it into this folder"
         )
+
+    def of(stage: str) -> dict[str, Any]:
+        return {name: value for (own, name, _), value in found.items() if own == stage}
+
     return Results(
         workspace=workspace,
         runs={folder.name: run for folder, run in runs.items()},
-        simulation=found.get(("simulate", "", "")),
-        trainings={key[1]: value for key, value in found.items() if key[0] == "train"},
-        evaluations={key[1]: value for key, value in found.items() if key[0] == "evaluate"},
+        simulation=of("simulate").get(""),
+        trainings=of("train"),
+        evaluations=of("evaluate"),
         explanations={key[1:]: value for key, value in found.items() if key[0] == "explain"},
         scores={key[1:]: value for key, value in found.items() if key[0] == "score"},
-        strip=next((value for key, value in found.items() if key[0] == "strip"), None),
-        study=_gather_study(workspace, found),
+        strip=next(iter(of("strip").values()), None),
+        study=Study(
+            folder=workspace,
+            evaluations=of("evaluate"),
+            choice=of("choice").get(""),
+            states=of("states").get(""),
+            explanations=of("explain"),
+            deletion=of("score"),
+            remedies=of("remedies"),
+            faithfulness=of("faithfulness"),
+            randomisation=of("randomisation"),
+            map_quality=of("map-quality"),
+            timing=of("timing"),
+            truth=of("truth"),
+        ),
         notes=tuple(notes),
     )
-
-
-def _gather_study(workspace: Path, found: dict[tuple[str, str, str], Any]) -> Study:
-    by_input = {
-        field: {name: value for (own, name, _), value in found.items() if own == stage}
-        for stage, field in (
-            ("evaluate", "evaluations"),
-            ("explain", "explanations"),
-            ("score", "deletion"),
-            ("remedies", "remedies"),
-            ("faithfulness", "faithfulness"),
-            ("randomisation", "randomisation"),
-            ("map-quality", "map_quality"),
-            ("timing", "timing"),
-            ("truth", "truth"),
-        )
-    }
-    choice, states = (found.get((stage, "", "")) for stage in ("choice", "states"))
-    return Study(folder=workspace, choice=choice, states=states, **by_input)  # pyright: ignore[reportArgumentType]

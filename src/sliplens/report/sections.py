@@ -1,7 +1,7 @@
 """Sections of the page: one list, from which those are taken whose results are there."""
 
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -10,8 +10,8 @@ from sliplens.plots.style import input_name, inputs_in_order
 from sliplens.report import charts, pictures, state_figures, tables
 from sliplens.report.claims import Claim, judge_claims
 from sliplens.report.plates import Plate, explained_of
+from sliplens.report.results import Results
 from sliplens.report.verdict import AlarmGroup, alarms_of, group_alarms
-from sliplens.report.workspace import Results
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,56 +31,36 @@ Block = tables.Table | Plate | Claim | Notes
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A part of the page: what is missing of it, and what it shows in the order it is read."""
-
-    id: str
-    title: str
-    short_title: str
-    intro: str
-    missing: tuple[str, ...]
-    blocks: tuple[Block, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Outline:
-    """A section as it could be."""
+    """A part of the page: as it could be, and as it is once it is built."""
 
     id: str
     title: str
     short_title: str
     intro: str | Callable[[Results], str]
-    command: str
+    command: str = ""
     """Command that makes its results, in a workspace that is no study."""
-    build: Callable[[Results, np.random.Generator], Iterable[Block | None]]
+    build: Callable[[Results, np.random.Generator], Iterable[Block | None]] = lambda *_: ()
     """Makes its blocks; None for one that is not there. Without any, the section is left out."""
-    needs: Callable[[Results], Collection[str]] | None = None
+    needs: Callable[[Results], Collection[str]] = lambda results: results.inputs
     """Inputs that its results are there for; one that is missing is named."""
+    missing: tuple[str, ...] = ()
+    blocks: tuple[Block, ...] = ()
+    """In the order they are read."""
 
 
 def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Section, ...]:
     """Build the sections whose results are there, in the order they are read; the last says what was not run."""
     sections, absent = [], {}
-    for outline in OUTLINES:
-        blocks = tuple(block for block in outline.build(results, rng) if block is not None)
-        command = f"sliplens {'study' if results.study else outline.command}"
+    for section in SECTIONS:
+        blocks = tuple(block for block in section.build(results, rng) if block is not None)
+        command = f"sliplens {'study' if results.study else section.command}"
         if not blocks:
-            absent.setdefault(command, []).append(outline.short_title)
+            absent.setdefault(command, []).append(section.short_title)
             continue
-        there = results.inputs if outline.needs is None else outline.needs(results)
-        sections.append(
-            Section(
-                id=outline.id,
-                title=outline.title,
-                short_title=outline.short_title,
-                intro=outline.intro if isinstance(outline.intro, str) else outline.intro(results),
-                missing=tuple(
-                    f"{input_name(name)}: not run yet; `{command}` makes it."
-                    for name in _names(results.inputs)
-                    if name not in there
-                ),
-                blocks=blocks,
-            )
-        )
+        without = [name for name in _names(results.inputs) if name not in section.needs(results)]
+        missing = tuple(f"{input_name(name)}: not run yet; `{command}` makes it." for name in without)
+        intro = section.intro if isinstance(section.intro, str) else section.intro(results)
+        sections.append(replace(section, intro=intro, missing=missing, blocks=blocks))
     return (*sections, _recipe(results, absent))
 
 
@@ -104,9 +84,9 @@ def _faithfulness(results: Results, _: np.random.Generator) -> Iterable[Block | 
 
 def _deletion(results: Results, rng: np.random.Generator) -> Iterable[Block | None]:
     by_source = {
-        source: {name: results.scores[name, source] for name in _names(results.scored_inputs(source))}
+        source: {name: results.scores[name, source] for name in _names(scored)}
         for source in ("simulated", "real")
-        if results.scored_inputs(source)
+        if (scored := [name for name, own in results.scores if own == source])
     }
     # beside the sound scores stands D already
     yield from (
@@ -215,8 +195,8 @@ def _names(found: Iterable[str]) -> list[str]:
     return inputs_in_order(found)[::-1]
 
 
-OUTLINES: tuple[Outline, ...] = (
-    Outline(
+SECTIONS: tuple[Section, ...] = (
+    Section(
         id="claims",
         title="The claims of the thesis, tested here",
         short_title="Claims",
@@ -226,7 +206,7 @@ OUTLINES: tuple[Outline, ...] = (
         command="study",
         build=lambda results, rng: judge_claims(results, rng=rng) if results.study else (),
     ),
-    Outline(
+    Section(
         id="accuracy",
         title="How well the safety margin is read",
         short_title="Accuracy",
@@ -236,7 +216,7 @@ OUTLINES: tuple[Outline, ...] = (
         build=_accuracy,
         needs=lambda results: results.evaluations,
     ),
-    Outline(
+    Section(
         id="faithfulness",
         title="How far the explanations can be believed",
         short_title="Faithfulness",
@@ -248,7 +228,7 @@ OUTLINES: tuple[Outline, ...] = (
         build=_faithfulness,
         needs=lambda results: results.study.faithfulness,
     ),
-    Outline(
+    Section(
         id="deletion",
         title="The thesis's score, step by step",
         short_title="Deletion",
@@ -261,7 +241,7 @@ OUTLINES: tuple[Outline, ...] = (
             name for name, _ in results.scores if not results.study.remedies or name in results.study.remedies
         },
     ),
-    Outline(
+    Section(
         id="randomisation",
         title="Does the explanation notice that the network forgot everything?",
         short_title="New weights",
@@ -270,7 +250,7 @@ OUTLINES: tuple[Outline, ...] = (
         build=_randomisation,
         needs=lambda results: results.study.randomisation,
     ),
-    Outline(
+    Section(
         id="maps",
         title="Where the networks look, and what the maps look like",
         short_title="Saliency maps",
@@ -281,7 +261,7 @@ OUTLINES: tuple[Outline, ...] = (
         build=_maps,
         needs=lambda results: {name for name, source in results.explanations if source == results.study.source},
     ),
-    Outline(
+    Section(
         id="real",
         title="Real touch",
         short_title="Real touch",
@@ -290,7 +270,7 @@ OUTLINES: tuple[Outline, ...] = (
         build=_real,
         # real frames may exist as difference images only, so one input is enough
     ),
-    Outline(
+    Section(
         id="timing",
         title="What an explanation costs",
         short_title="Cost",
@@ -299,7 +279,7 @@ OUTLINES: tuple[Outline, ...] = (
         build=_cost,
         needs=lambda results: results.study.timing or {name for name, _ in results.explanations},
     ),
-    Outline(
+    Section(
         id="choice",
         title="Which trials were taken",
         short_title="Trials",
@@ -307,7 +287,7 @@ OUTLINES: tuple[Outline, ...] = (
         command="study",
         build=lambda results, _: () if results.study.choice is None else (tables.table_trials(results.study.choice),),
     ),
-    Outline(
+    Section(
         id="truth",
         title="What the network should have looked at",
         short_title="Truth",

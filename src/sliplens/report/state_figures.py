@@ -34,8 +34,8 @@ from sliplens.report.plates import (
     show_map,
     shown_frames,
 )
+from sliplens.report.results import Results
 from sliplens.report.verdict import rank_methods
-from sliplens.report.workspace import Results
 from sliplens.results.explanation import Explained
 from sliplens.results.study import StateFrame, States, Truth
 

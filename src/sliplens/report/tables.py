@@ -27,8 +27,8 @@ from sliplens.plots.style import (
     source_name,
 )
 from sliplens.report.comparisons import against_control, mean_at, settings, tell_bounds, tell_interval
+from sliplens.report.results import Results
 from sliplens.report.thesis import ACCURACY, DELETION, MARK, NETWORK_PIXELS, SECONDS, thesis_row
-from sliplens.report.workspace import Results
 from sliplens.results.faithfulness import DeletionScores, MethodScore, Remedies, RemovalScore, RemovalScores
 from sliplens.results.study import MAP_MEASURES, REGIONS, Choice, MapQuality, Randomisation, Timing, Truth
 

@@ -34,8 +34,8 @@ from sliplens.report.comparisons import (
     settings,
     tell_interval,
 )
+from sliplens.report.results import Results
 from sliplens.report.thesis import NETWORK_PIXELS
-from sliplens.report.workspace import Results
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionScores, RemovalScores
 from sliplens.results.study import Truth
