@@ -1,8 +1,7 @@
 """Data sets for other programs: LeRobot data sets and MCAP files, complete or absent."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from sliplens.files import output_folder
@@ -45,10 +44,7 @@ def export_lerobot(
     RecordingError
         If a trial is damaged, or sizes of frames or frame rates differ.
     """
-    from sliplens.recordings.formats.lerobot_export import write_lerobot  # noqa: PLC0415 (Pillow and PyAV come with it)
-
-    export = partial(_export, "lerobot", write_lerobot, run_file="meta/sliplens/run.json")  # it reads `meta` by name
-    return export(data, Path(out), trials=trials, overwrite=overwrite, on_progress=on_progress)
+    return _export("lerobot", data, Path(out), trials=trials, overwrite=overwrite, on_progress=on_progress)
 
 
 def export_mcap(
@@ -61,14 +57,7 @@ def export_mcap(
 ) -> Export:
     """Write trials as `TRIAL.mcap`, files of ROS 2 messages, without loss; see `write_mcap`.
 
-    Parameters
-    ----------
-    data
-        Data set, or its folder.
-    out
-        Folder to make.
-    trials
-        Names of trials; all if None.
+    Arguments are those of `export_lerobot`.
 
     Raises
     ------
@@ -77,23 +66,27 @@ def export_mcap(
     RecordingError
         If a trial is damaged, or its times do not fit into stamps.
     """
-    from sliplens.recordings.formats.mcap import write_mcap  # noqa: PLC0415 (not needed where nothing is exported)
-
-    export = partial(_export, "mcap", write_mcap, run_file="run.json")  # tools for MCAP open single files
-    return export(data, Path(out), trials=trials, overwrite=overwrite, on_progress=on_progress)
+    return _export("mcap", data, Path(out), trials=trials, overwrite=overwrite, on_progress=on_progress)
 
 
 def _export(
     name: str,
-    write: Callable[..., None],
     data: Dataset | Path | str,
     out: Path,
     *,
-    run_file: str,
     trials: Sequence[str] | None,
     overwrite: bool,
     on_progress: OnProgress | None,
 ) -> Export:
+    # Pillow, PyAV and ROS come with them
+    if name == "lerobot":
+        from sliplens.recordings.formats.lerobot_export import write_lerobot as write  # noqa: PLC0415
+
+        run_file = "meta/sliplens/run.json"  # it reads `meta` by name
+    else:
+        from sliplens.recordings.formats.mcap import write_mcap as write  # noqa: PLC0415
+
+        run_file = "run.json"  # tools for MCAP open single files
     data = data if isinstance(data, Dataset) else load_dataset(data)
     chosen = data.trials if not trials else tuple(data.find(name) for name in dict.fromkeys(trials))
     config = {"format": name, "data_hash": data.hash, "trials": [info.trial for info in chosen]}

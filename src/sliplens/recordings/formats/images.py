@@ -1,21 +1,22 @@
 """A folder of images as one trial."""
 
+import io
 import re
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from sliplens.errors import ImageError, RecordingError
+from sliplens.errors import ImageError, RecordingError, SliplensError
 from sliplens.images.files import list_images, read_image
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.formats.tables import (
-    TIME_UNITS,
+    UNITS,
     ForceColumns,
     TextTable,
     evenly_spaced,
@@ -30,33 +31,55 @@ from sliplens.recordings.formats.tables import (
     unit_of,
 )
 
+_DAMAGED = (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning)
+
+
+@contextmanager
+def telling_damage(words: str, cure: str, *, kind: type[SliplensError] = RecordingError) -> Iterator[None]:
+    """Tell in these words what Pillow raises of an image inside that is damaged, or expands too far."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise kind(f"{error.filename} does not exist; check the path") from None
+    except _DAMAGED as error:
+        raise kind(f"{words} ({error}); {cure}") from None
+
+
+def open_encoded(data: Any, *, where: str) -> Image.Image:
+    """Header of a PNG or JPEG in memory, whatever it is called: the bytes say what they are."""
+    image = Image.open(io.BytesIO(data), formats=("JPEG", "PNG"))
+    if image.mode not in {"RGB", "L"}:
+        raise RecordingError(f"{where} has pixels of mode {image.mode}; record it as 8-bit RGB or grey")
+    return image
+
+
+def rgb_pixels(image: Image.Image) -> Frame:
+    """Pixels of an RGB or grey image; a grey one gets three equal channels."""
+    pixels = np.array(image)
+    return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
+
 
 def frame_size(path: Path) -> tuple[int, int]:
     """Height and width of an image, in pixels, read from its header."""
-    try:
-        with warnings.catch_warnings(), Image.open(path) as image:
-            # Pillow warns of a size that would fill the memory, and goes on
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            pages = getattr(image, "n_frames", 1)
-            if pages > 1:
-                raise ImageError(f"{path} holds {pages} images; save one image a file")
-            return image.height, image.width
-    except FileNotFoundError:
-        raise ImageError(f"{path} does not exist; check the path") from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise ImageError(f"{path} cannot be read as an image ({error}); copy or export it again") from None
+    with _telling_of(path), warnings.catch_warnings(), Image.open(path) as image:
+        # Pillow warns of a size that would fill the memory, and goes on
+        warnings.simplefilter("error", Image.DecompressionBombWarning)
+        pages = getattr(image, "n_frames", 1)
+        if pages > 1:
+            raise ImageError(f"{path} holds {pages} images; save one image a file")
+        return image.height, image.width
 
 
 def read_frame(path: Path, *, size: tuple[int, int]) -> Frame:
     """Read an image as a frame."""
-    try:
-        with Image.open(path) as image:
-            if image.mode != "L" or image.size != size[::-1]:
-                return read_image(path, size=size)  # says what is wrong, too
-            grey = np.array(image)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise ImageError(f"{path} cannot be read as an image ({error}); copy or export it again") from None
-    return np.repeat(grey[:, :, None], 3, axis=2)
+    with _telling_of(path), Image.open(path) as image:
+        if image.mode != "L" or image.size != size[::-1]:
+            return read_image(path, size=size)  # says what is wrong, too
+        return rgb_pixels(image)
+
+
+def _telling_of(path: Path) -> AbstractContextManager[None]:
+    return telling_damage(f"{path} cannot be read as an image", "copy or export it again", kind=ImageError)
 
 
 def common_size(paths: tuple[Path, ...]) -> tuple[int, int]:
@@ -75,17 +98,10 @@ def common_size(paths: tuple[Path, ...]) -> tuple[int, int]:
 _NAME_COLUMNS = ("file", "filename", "file_name", "image", "image_name", "frame", "path", "name")
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameTimes:
-    """Images in the order they were taken."""
-
-    paths: tuple[Path, ...]
-    time_s: Float[np.ndarray, " frames"]
-    notes: tuple[str, ...]
-
-
-def read_frame_times(table: Path, images: Sequence[Path]) -> FrameTimes:
-    """Find the time of every image in a table with a column of file names and one of times."""
+def read_frame_times(
+    table: Path, images: Sequence[Path]
+) -> tuple[tuple[Path, ...], Float[np.ndarray, " frames"], list[str]]:
+    """Images in the order they were taken, their times from a table with names of files and times, and notes."""
     text = open_table(table)
     name_column, time_column = _name_column(text), guess_time_column(text)
     stamps, listed = _stamps(text, name_column, time_column)
@@ -108,7 +124,7 @@ def read_frame_times(table: Path, images: Sequence[Path]) -> FrameTimes:
     ]
     if listed > len(images):
         notes.append(f"{table.name}: {listed - len(images)} of {listed} rows name no image of the folder.")
-    return FrameTimes(paths=tuple(row[2] for row in found), time_s=time * TIME_UNITS[unit], notes=tuple(notes))
+    return tuple(row[2] for row in found), time * UNITS["time"][unit][0], notes
 
 
 def _name_column(text: TextTable) -> str:
@@ -129,8 +145,7 @@ def _stamps(text: TextTable, name_column: str, time_column: str) -> tuple[dict[s
     for line, fields in text.rows():
         count += 1
         name = fields[name_at].replace("\\", "/").rsplit("/", maxsplit=1)[-1]
-        where = f"{text.path}, line {line}, {time_column!r}"
-        value = to_number(fields[time_at].replace(",", "."), shown=fields[time_at], where=where)
+        value = to_number(fields[time_at], where=f"{text.path}, line {line}, {time_column!r}")
         if name in stamps:
             raise RecordingError(f"{text.path}, line {line} names {name!r} again; give each image one time")
         stamps[name] = value, line
@@ -169,15 +184,13 @@ def read_image_folder(
     paths = tuple(list_images(folder))
     notes = []
     if times is not None:
-        table = read_frame_times(times, paths)
-        paths, time = table.paths, table.time_s
-        notes.extend(table.notes)
+        paths, time, notes = read_frame_times(times, paths)
     elif frame_rate is not None:
         time = evenly_spaced(len(paths), frame_rate=frame_rate)
         notes.append(f"{folder.name}: frames were declared to be taken {frame_rate:g} times a second.")
     else:
         unit = require_unit(str(name_unit), quantity="time")
-        time = _numbers_in_names(paths) * TIME_UNITS[unit]
+        time = _numbers_in_names(paths) * UNITS["time"][unit][0]
         notes.append(f"{folder.name}: the last number in a file's name was declared to be its time in {unit}.")
     lossy = sum(path.suffix.lower() in _LOSSY for path in paths)
     if lossy:
@@ -186,19 +199,15 @@ def read_image_folder(
             "record PNG or TIFF where you can."
         )
     size = common_size(paths)
-    clock = place_on_clock(time, forces=forces, start_s=start_s, source=folder.name, **columns)
-
-    def read_frames() -> Iterator[Frame]:
-        return (read_frame(path, size=size) for path in paths)
-
+    time, samples, more = place_on_clock(time, forces=forces, start_s=start_s, source=folder.name, **columns)
     return Capture(
         trial=trial_name(folder.resolve().name if name is None else name),
         source=str(folder),
-        frame_time_s=clock.time_s,
+        frame_time_s=time,
         frame_size=size,
-        read_frames=read_frames,
-        forces=clock.forces,
-        notes=(*notes, *clock.notes),
+        read_frames=lambda: (read_frame(path, size=size) for path in paths),
+        forces=samples,
+        notes=(*notes, *more),
     )
 
 

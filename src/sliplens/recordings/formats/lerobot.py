@@ -1,6 +1,5 @@
 """LeRobot v3 data sets of a tactile camera and a force sensor."""
 
-import io
 import json
 import re
 from collections.abc import Callable, Iterator
@@ -18,10 +17,10 @@ import pyarrow.parquet as pq
 from av.container import InputContainer
 from av.error import FFmpegError
 from jaxtyping import Bool, Float, Int64
-from PIL import Image
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Capture, Forces, Frame
+from sliplens.recordings.formats.images import open_encoded, rgb_pixels, telling_damage
 from sliplens.recordings.formats.stored import ExportedTrial
 from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.store import DAMAGED_PARQUET, load_forces, one_line
@@ -252,7 +251,6 @@ class EpisodeRows:
 # what FFmpeg would guess from the content may be a play list that leads to other files and hosts
 _CONTAINERS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska", ".webm": "webm"}
 _MOST_PIXELS = 100_000_000  # of a frame: a larger one is a damaged header
-_DAMAGED_IMAGE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -349,15 +347,10 @@ def _row_groups(file: pq.ParquetFile, episode: int) -> list[int]:
 
 
 def decode_image(data: bytes, *, where: str) -> Frame:
-    """Pixels of a PNG or JPEG; a grey one gets three equal channels."""
-    try:
-        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
-            if image.mode not in {"RGB", "L"}:
-                raise RecordingError(f"{where} has pixels of mode {image.mode}; record it as 8-bit RGB or grey")
-            pixels = np.array(image)
-    except _DAMAGED_IMAGE as error:
-        raise RecordingError(f"{where} cannot be read as PNG or JPEG ({error}); copy the data set again") from None
-    return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
+    """Pixels of a PNG or JPEG."""
+    words = f"{where} cannot be read as PNG or JPEG"
+    with telling_damage(words, "copy the data set again"), open_encoded(data, where=where) as image:
+        return rgb_pixels(image)
 
 
 def _decode_from(container: InputContainer, start_s: float) -> Iterator[tuple[float, av.VideoFrame]]:

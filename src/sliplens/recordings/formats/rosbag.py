@@ -1,6 +1,5 @@
 """ROS 2 bags (MCAP or sqlite3) of a tactile camera and a force-torque sensor."""
 
-import io
 import os
 import sys
 from array import array
@@ -21,6 +20,7 @@ from PIL import Image
 from sliplens.errors import RecordingError, SliplensError
 from sliplens.extras import require_packages
 from sliplens.recordings.capture import Capture, Forces, Frame
+from sliplens.recordings.formats.images import open_encoded, rgb_pixels, telling_damage
 from sliplens.recordings.formats.mcap import (
     IMAGE,
     LABELS,
@@ -43,8 +43,6 @@ if TYPE_CHECKING:
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
-_FORMATS = ("JPEG", "PNG")
-_DAMAGED = (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning)
 
 
 def image_size(message: Any, *, where: str) -> tuple[int, int]:
@@ -74,12 +72,9 @@ def image_size(message: Any, *, where: str) -> tuple[int, int]:
 def image_pixels(message: Any, *, where: str) -> Frame:
     """Pixels of an image as RGB; grey is repeated in all three channels."""
     if message.__msgtype__ == COMPRESSED:
-        with _open_compressed(message, where=where) as image:
-            try:
-                pixels = np.array(image)
-            except _DAMAGED as error:
-                raise RecordingError(f"{where} is damaged ({error}); cut the bag before it") from None
-        return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
+        told = telling_damage(f"{where} is damaged", "cut the bag before it")
+        with _open_compressed(message, where=where) as image, told:
+            return rgb_pixels(image)
     height, width = image_size(message, where=where)
     channels = _CHANNELS[message.encoding]
     # rows may be padded: step counts the padding too
@@ -92,17 +87,10 @@ def image_pixels(message: Any, *, where: str) -> Frame:
 
 def _open_compressed(message: Any, *, where: str) -> Image.Image:
     """Image with its header read; Pillow refuses one that would expand beyond its limit (a decompression bomb)."""
-    try:
-        # the bytes say what they are; `format` is free text, and drivers differ in it
-        image = Image.open(io.BytesIO(message.data), formats=_FORMATS)
-    except _DAMAGED as error:
-        raise RecordingError(
-            f"{where}, of format {message.format[:40]!r}, cannot be read as {' or '.join(_FORMATS)} ({error}); "
-            "record it again, or as one of these"
-        ) from None
-    if image.mode not in {"RGB", "L"}:
-        raise RecordingError(f"{where} has pixels of mode {image.mode}; record it as 8-bit RGB or grey")
-    return image
+    # `format` is free text, and drivers differ in it
+    words = f"{where}, of format {message.format[:40]!r}, cannot be read as JPEG or PNG"
+    with telling_damage(words, "record it again, or as one of these"):
+        return open_encoded(message.data, where=where)
 
 
 MOST_BYTES = 256 * 2**20
@@ -395,12 +383,7 @@ class _Scan:
 
 
 def _scan(
-    path: Path,
-    topics: Collection[str],
-    *,
-    images: str,
-    wrenches: str | None,
-    kinds: Mapping[str, str] | None = None,
+    path: Path, topics: Collection[str], *, images: str, wrenches: str | None, kinds: Mapping[str, str] | None = None
 ) -> _Scan:
     """Read stamps, sizes and forces, but no pixel of a frame."""
     found = _Scan(frames=_Stamps(topic=images), wrenches=_Stamps(topic=wrenches or "no topic"))

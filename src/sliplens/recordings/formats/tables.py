@@ -6,7 +6,6 @@ import re
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from math import isfinite
 from pathlib import Path
 from typing import TypedDict, Unpack
@@ -93,71 +92,47 @@ def open_table(path: Path) -> TextTable:
     raise RecordingError(f"{path} is empty; name a table with a header and a row a sample")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Numbers:
-    """Columns of numbers."""
-
-    values: Float[np.ndarray, "rows columns"]
-    lines: tuple[int, ...]
-    """Line of the file, for each row."""
-    decimal_comma: bool
-
-
-def read_numbers(table: TextTable, names: Sequence[str]) -> Numbers:
-    """Read columns of a table as finite numbers."""
+def read_numbers(table: TextTable, names: Sequence[str]) -> tuple[Float[np.ndarray, "rows columns"], array, bool]:
+    """Read columns as finite numbers, with the line of each row, and whether decimals have commas."""
     places = [table.header.index(name) for name in names]
     values, lines = array("d"), array("q")
     commas = points = False
     for line, fields in table.rows():
         lines.append(line)
         for place in places:
-            text = fields[place]
-            points |= "." in text
-            if "," in text:
-                commas = True
-                text = text.replace(",", ".")
-            values.append(
-                to_number(text, shown=fields[place], where=f"{table.path}, line {line}, {_name(table, place)}")
-            )
+            points |= "." in fields[place]
+            commas |= "," in fields[place]
+            values.append(to_number(fields[place], where=f"{table.path}, line {line}, {table.header[place]!r}"))
     if not lines:
         raise RecordingError(f"{table.path} has a header but no row; record the force sensor too")
     if commas and points:
         raise RecordingError(f"{table.path} mixes decimal commas and points; write all numbers in one way")
-    return Numbers(
-        values=np.frombuffer(values, dtype=np.float64).reshape(-1, len(places)),
-        lines=tuple(lines),
-        decimal_comma=commas,
-    )
+    return np.frombuffer(values, dtype=np.float64).reshape(-1, len(places)), lines, commas
 
 
-def to_number(text: str, *, shown: str, where: str) -> float:
-    """Read a finite number."""
+def to_number(text: str, *, where: str) -> float:
+    """Read a finite number, whose decimals may have a comma."""
     if not text:
         raise RecordingError(f"{where} is empty; mend or drop the line")
     try:
-        value = float(text)
+        value = float(text.replace(",", "."))
     except ValueError:
-        raise RecordingError(
-            f"{where} is {shown[:40]!r}, not a number; mend the line, or name another column"
-        ) from None
+        raise RecordingError(f"{where} is {text[:40]!r}, not a number; mend the line, or name another column") from None
     if not isfinite(value):
-        raise RecordingError(f"{where} is {shown!r}, not a finite number; mend or drop the line")
+        raise RecordingError(f"{where} is {text!r}, not a finite number; mend or drop the line")
     return value
 
 
 def require_rising(time: Float[np.ndarray, " rows"], lines: Sequence[int], *, path: Path, column: str) -> None:
     """Check that times rise from row to row."""
-    for row, (before, after) in enumerate(pairwise(time.tolist())):
-        if not after > before:
-            what = "repeats" if after == before else "falls"
-            raise RecordingError(
-                f"{path}, line {lines[row + 1]}: {column!r} {what} ({before:.9g}, then {after:.9g}); "
-                "sort the rows or mend their stamps"
-            )
-
-
-def _name(table: TextTable, place: int) -> str:
-    return repr(table.header[place])
+    wrong = np.flatnonzero(~(np.diff(time) > 0))
+    if len(wrong):
+        before, after = time[wrong[0] : wrong[0] + 2].tolist()
+        what = "repeats" if after == before else "falls"
+        raise RecordingError(
+            f"{path}, line {lines[wrong[0] + 1]}: {column!r} {what} ({before:.9g}, then {after:.9g}); "
+            "sort the rows or mend their stamps"
+        )
 
 
 def _encoding(path: Path) -> str:
@@ -210,74 +185,67 @@ def _is_number(text: str) -> bool:
     return True
 
 
-TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-"""Seconds in a unit of time."""
-FORCE_UNITS = {"N": 1.0, "mN": 1e-3, "kN": 1e3, "gf": 9.80665e-3, "kgf": 9.80665, "lbf": 4.4482216152605}
-"""Newtons in a unit of force."""
-
-_TIME_SPELLINGS = {
-    "s": ("s", "sec", "secs", "second", "seconds"),
-    "ms": ("ms", "msec", "msecs", "millis", "millisecond", "milliseconds"),
-    "us": ("us", "usec", "usecs", "micros", "microsecond", "microseconds", "\u00b5s", "\u03bcs"),  # micro sign, mu
-    "ns": ("ns", "nsec", "nsecs", "nanos", "nanosecond", "nanoseconds"),
+UNITS = {
+    "time": {
+        "s": (1.0, "s sec secs second seconds"),
+        "ms": (1e-3, "ms msec msecs millis millisecond milliseconds"),
+        "us": (1e-6, "us usec usecs micros microsecond microseconds \u00b5s \u03bcs"),  # micro sign, mu
+        "ns": (1e-9, "ns nsec nsecs nanos nanosecond nanoseconds"),
+    },
+    "force": {
+        "N": (1.0, "n newton newtons"),
+        "mN": (1e-3, "mn millinewton millinewtons"),
+        "kN": (1e3, "kn kilonewton kilonewtons"),
+        "gf": (9.80665e-3, "gf g gram grams gramforce"),
+        "kgf": (9.80665, "kgf kg kp kilogram kilograms"),
+        "lbf": (4.4482216152605, "lbf lb lbs"),
+    },
 }
-_FORCE_SPELLINGS = {
-    "N": ("n", "newton", "newtons"),
-    "mN": ("mn", "millinewton", "millinewtons"),
-    "kN": ("kn", "kilonewton", "kilonewtons"),
-    "gf": ("gf", "g", "gram", "grams", "gramforce"),
-    "kgf": ("kgf", "kg", "kp", "kilogram", "kilograms"),
-    "lbf": ("lbf", "lb", "lbs"),
-}
-_SPELLINGS = {"time": _TIME_SPELLINGS, "force": _FORCE_SPELLINGS}
+"""Seconds or newtons in a unit, and how it is spelled."""
 _TIME_WORDS = frozenset({"time", "times", "t", "stamp", "timestamp", "timestamps", "ts", "elapsed", "clock"})
 _AXES = {
-    "x": (("fx",), ("f", "x"), ("force", "x"), ("forcex",)),
-    "y": (("fy",), ("f", "y"), ("force", "y"), ("forcey",)),
-    "z": (("fz",), ("f", "z"), ("force", "z"), ("forcez",)),
-    "normal": (("fn",), ("f", "n"), ("normal",), ("normal", "force"), ("force", "normal"), ("normalforce",)),
+    **{axis: (f"f{axis}", f"f {axis}", f"force {axis}", f"force{axis}") for axis in "xyz"},
+    "normal": ("fn", "f n", "normal", "normal force", "force normal", "normalforce"),
     "tangential": (
-        *(("ft",), ("f", "t"), ("tangential",), ("tangential", "force"), ("force", "tangential"), ("tangentialforce",)),
-        *(("shear",), ("shear", "force"), ("force", "shear")),
+        *("ft", "f t", "tangential", "tangential force", "force tangential", "tangentialforce"),
+        *("shear", "shear force", "force shear"),
     ),
 }
 
 
 def unit_of(name: str, *, quantity: str, path: str) -> str | None:
     """Unit that a column's name gives, in brackets or as its last word; None where it gives none."""
-    spellings = _SPELLINGS[quantity]
     bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]", name)
     if bracket:
-        unit = _spelled(bracket[1].lower(), spellings)
+        unit = _spelled(bracket[1].lower(), quantity)
         if unit is None:
             raise RecordingError(
                 f"{path}: {name!r} is in {bracket[1]!r}, which is no known unit of {quantity} "
-                f"({', '.join(spellings)}); declare the right one with --{quantity}-unit"
+                f"({', '.join(UNITS[quantity])}); declare the right one with --{quantity}-unit"
             )
         return unit
     words = _words(name)
     # "f_n" is a normal force, "fx_n" one along x in newtons
     if quantity == "force" and (len(words) < 2 or _axis(words) is not None):
         return None
-    return _spelled(words[-1], spellings) if words else None
+    return _spelled(words[-1], quantity) if words else None
 
 
 def require_unit(unit: str, *, quantity: str) -> str:
     """Return a declared unit as it is written here."""
-    known = _spelled(unit.lower(), _SPELLINGS[quantity])
+    known = _spelled(unit.lower(), quantity)
     if known is None:
-        raise RecordingError(f"{unit!r} is no unit of {quantity}; use one of {', '.join(_SPELLINGS[quantity])}")
+        raise RecordingError(f"{unit!r} is no unit of {quantity}; use one of {', '.join(UNITS[quantity])}")
     return known
 
 
 def guess_time_column(table: TextTable) -> str:
     """Column whose name says that it holds times."""
-    units = {spelling for names in _TIME_SPELLINGS.values() for spelling in names}
     found = []
     for name in table.header:
         words = _words(re.sub(r"[\[(].*", "", name))
         named = bool(_TIME_WORDS & set(words)) and _axis(words) is None  # "f_t" is a tangential force
-        if named or (len(words) == 1 and words[0] in units):
+        if named or (len(words) == 1 and _spelled(words[0], "time")):
             found.append(name)
     return _only(found, table=table, what="the time", option="--time-column")
 
@@ -304,8 +272,7 @@ def guess_force_columns(table: TextTable) -> tuple[str, ...]:
 def guess_time_unit(time: Float[np.ndarray, " samples"]) -> str:
     """Unit of times from their size: by the date where they count from 1970, else by the usual step.
 
-    A force sensor is read from 2 to 10 000 times a second, a camera likewise: a step of 0.01 is in seconds, one of 1 or
-    10 in milliseconds.
+    A force sensor or camera is read 2 to 10 000 times a second: a step of 0.01 is in seconds, 1 or 10 in milliseconds.
     """
     size = float(np.abs(time[-1]))
     for unit, since_1970 in (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 1e8)):
@@ -319,19 +286,17 @@ def guess_time_unit(time: Float[np.ndarray, " samples"]) -> str:
 
 
 def _words(name: str) -> Sequence[str]:
-    return [word for word in re.split(r"[^0-9a-z\u00b5\u03bc]+", name.lower()) if word]
+    return re.findall(r"[0-9a-z\u00b5\u03bc]+", name.lower())
 
 
 def _axis(words: Sequence[str]) -> str | None:
     """Axis that the last words of a name give: "wrench.force.x" is the force along x."""
-    for axis, spellings in _AXES.items():
-        if any(tuple(words[-len(spelling) :]) == spelling for spelling in spellings):
-            return axis
-    return None
+    ends = {" ".join(words[-count:]) for count in (1, 2)}
+    return next((axis for axis, spellings in _AXES.items() if ends & set(spellings)), None)
 
 
-def _spelled(text: str, spellings: dict[str, tuple[str, ...]]) -> str | None:
-    return next((unit for unit, names in spellings.items() if text in names), None)
+def _spelled(text: str, quantity: str) -> str | None:
+    return next((unit for unit, (_, names) in UNITS[quantity].items() if text in names.split()), None)
 
 
 def _only(found: Sequence[str], *, table: TextTable, what: str, option: str) -> str:
@@ -371,6 +336,15 @@ MOST_FORCE_N = 1e4
 """No fingertip survives more; a larger number is in another unit."""
 
 
+class ForceColumns(TypedDict, total=False):
+    """What `read_force_table` may be told of a table."""
+
+    time_column: str | None
+    force_columns: Sequence[str] | None
+    time_unit: str | None
+    force_unit: str | None
+
+
 @dataclass(frozen=True, kw_only=True)
 class ForceTable:
     """Forces of a table, and how its columns were read."""
@@ -393,28 +367,22 @@ def read_force_table(
     Columns are separated by commas, semicolons or tabs, decimals by points or (where columns are not separated by
     commas) commas; lines that begin with # or % are comments. What is not declared is guessed from the names of the
     columns (`time_s`, `t [ms]`, `stamp`; `fx`, `force_x [mN]`, `wrench.force.x`; `fn` and `ft`), the unit of the time
-    also from its steps.
-
-    Parameters
-    ----------
-    force_columns
-        Names of three columns, forces along x, y and z; or of two, the normal and the tangential force, which become
-        z and x.
+    also from its steps. Two force columns, normal and tangential, become z and x.
     """
     table = open_table(path)
     time_name = guess_time_column(table) if time_column is None else table.require(time_column, option="--time-column")
     names = _force_names(table, force_columns)
-    numbers = read_numbers(table, [time_name, *names])
-    time = numbers.values[:, 0]
-    require_rising(time, numbers.lines, path=path, column=time_name)
+    values, lines, decimal_comma = read_numbers(table, [time_name, *names])
+    time = values[:, 0]
+    require_rising(time, lines, path=path, column=time_name)
     unit, how = _time_unit(table, time_name, time_unit, time)
     scales, units = _force_scales(table, names, force_unit)
-    forces = numbers.values[:, 1:] * scales
+    forces = values[:, 1:] * scales
     large = np.abs(forces).max(axis=1) > MOST_FORCE_N
     if large.any():
         at = int(np.argmax(large))
         raise RecordingError(
-            f"{path}, line {numbers.lines[at]}: {np.abs(forces[at]).max():.4g} N is no force of a fingertip; "
+            f"{path}, line {lines[at]}: {np.abs(forces[at]).max():.4g} N is no force of a fingertip; "
             "declare the right one with --force-unit"
         )
     declared = "declared" if time_column is not None else "by its name"
@@ -422,29 +390,12 @@ def read_force_table(
         f"{path.name}: times are those of column {time_name!r} ({declared}), in {unit} ({how}).",
         f"{path.name}: forces are those of {_listed(names, force_columns is not None)}, in {units}.",
     ]
-    if numbers.decimal_comma:
+    if decimal_comma:
         notes.append(f"{path.name}: commas were read as decimal points.")
     return ForceTable(
-        forces=Forces(time_s=time * TIME_UNITS[unit], force_n=_to_axes(forces), source=str(path)), notes=tuple(notes)
+        forces=Forces(time_s=time * UNITS["time"][unit][0], force_n=_to_axes(forces), source=str(path)),
+        notes=tuple(notes),
     )
-
-
-class ForceColumns(TypedDict, total=False):
-    """What `read_force_table` may be told of a table."""
-
-    time_column: str | None
-    force_columns: Sequence[str] | None
-    time_unit: str | None
-    force_unit: str | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class FrameClock:
-    """Times of frames on the clock of the forces that were recorded into a table beside them."""
-
-    time_s: Float[np.ndarray, " frames"]
-    forces: Forces | None
-    notes: tuple[str, ...]
 
 
 def place_on_clock(
@@ -454,8 +405,8 @@ def place_on_clock(
     start_s: float | None,
     source: str,
     **columns: Unpack[ForceColumns],
-) -> FrameClock:
-    """Read the table of forces beside frames, if there is one, and put the frames on its clock.
+) -> tuple[Float[np.ndarray, " frames"], Forces | None, tuple[str, ...]]:
+    """Times of frames on the clock of the forces in the table beside them, these forces, and notes.
 
     The first frame was taken at `start_s` on the clock of the forces; where that is None, both count from one zero.
     """
@@ -475,7 +426,7 @@ def place_on_clock(
             f"({samples.time_s[0]:.6g} to {samples.time_s[-1]:.6g} s) have no moment in common; "
             "declare with --start-s when the first frame was taken, on the clock of the forces"
         )
-    return FrameClock(time_s=time_s, forces=samples, notes=notes)
+    return time_s, samples, notes
 
 
 def _force_names(table: TextTable, declared: Sequence[str] | None) -> tuple[str, ...]:
@@ -507,7 +458,7 @@ def _time_unit(
     if unit is not None:
         return unit, "by its name"
     unit = guess_time_unit(time)
-    span = (time[-1] - time[0]) * TIME_UNITS[unit]
+    span = (time[-1] - time[0]) * UNITS["time"][unit][0]
     return unit, f"guessed: {len(time)} samples in {span:.4g} s"
 
 
@@ -516,11 +467,11 @@ def _force_scales(
 ) -> tuple[Float[np.ndarray, " columns"], str]:
     if declared is not None:
         unit = require_unit(declared, quantity="force")
-        return np.full(len(names), FORCE_UNITS[unit]), f"{unit} (declared)"
+        return np.full(len(names), UNITS["force"][unit][0]), f"{unit} (declared)"
     named = [unit_of(name, quantity="force", path=str(table.path)) for name in names]
     units = [unit or "N" for unit in named]
     how = "assumed, for the names give no unit" if None in named else "by their names"
-    return np.array([FORCE_UNITS[unit] for unit in units]), f"{', '.join(dict.fromkeys(units))} ({how})"
+    return np.array([UNITS["force"][unit][0] for unit in units]), f"{', '.join(dict.fromkeys(units))} ({how})"
 
 
 def _listed(names: Sequence[str], declared: bool) -> str:

@@ -16,17 +16,8 @@ from sliplens.recordings.formats.tables import evenly_spaced, trial_name
 from sliplens.recordings.trial import labels_of_margins, require_unit_interval
 
 
-@dataclass(frozen=True, kw_only=True)
-class Line:
-    """A line of a list."""
-
-    line: int
-    """Counted from 1, in the file."""
-    text: str
-
-
-def read_lines(path: Path) -> list[Line]:
-    """Read the lines of a list that are neither empty nor comments."""
+def read_lines(path: Path) -> list[tuple[int, str]]:
+    """Lines of a list that are neither empty nor comments, with their numbers in the file from 1."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -37,8 +28,8 @@ def read_lines(path: Path) -> list[Line]:
         text = "\0"
     if "\0" in text:
         raise RecordingError(f"{path} is not a text file; name a list with one entry a line")
-    lines = [Line(line=number, text=line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
-    lines = [line for line in lines if line.text and not line.text.startswith("#")]
+    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
+    lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
     if not lines:
         raise RecordingError(f"{path} is empty; list one entry a line")
     return lines
@@ -136,14 +127,20 @@ def read_thesis(
         )
     files = ListedFiles(folder=frames_list.parent, root=frames_list.parent if image_root is None else image_root)
     rows: dict[Path, list[tuple[Path, float]]] = {}
-    for frame, reference, margin in zip(frames, references, margins.tolist(), strict=True):
-        untouched = files.find(reference.text, where=f"{lists[1]}, line {reference.line}")
-        found = files.find(frame.text, where=f"{frames_list}, line {frame.line}")
+    for (number, frame), (at, reference), margin in zip(frames, references, margins.tolist(), strict=True):
+        untouched = files.find(reference, where=f"{lists[1]}, line {at}")
+        found = files.find(frame, where=f"{frames_list}, line {number}")
         rows.setdefault(untouched, []).append((found, margin))
-    names = _trial_names(stem, len(rows))
+    base, digits = trial_name(stem or "thesis"), len(str(len(rows)))
     return [
-        _trial(name, reference, rows[reference], source=str(frames_list), notes=(*notes, times), frame_rate=rate)
-        for name, reference in zip(names, rows, strict=True)
+        _trial(
+            base if len(rows) == 1 else f"{base}-{number:0{digits}d}",
+            *one,
+            str(frames_list),
+            notes=(*notes, times),
+            frame_rate=rate,
+        )
+        for number, one in enumerate(rows.items(), start=1)
     ]
 
 
@@ -164,17 +161,12 @@ def _frames_list(path: Path) -> Path:
     return path
 
 
-def _trial_names(stem: str, count: int) -> list[str]:
-    base = trial_name(stem or "thesis")
-    return [base] if count == 1 else [f"{base}-{number:0{len(str(count))}d}" for number in range(1, count + 1)]
-
-
 def _trial(
     name: str,
     reference: Path,
     rows: list[tuple[Path, float]],
-    *,
     source: str,
+    *,
     notes: tuple[str, ...],
     frame_rate: float,
 ) -> Capture:
@@ -203,7 +195,7 @@ def _read_margins(path: Path, *, unit: str | None) -> tuple[Float[np.ndarray, " 
     if unit not in {None, "fraction", "percent"}:
         raise RecordingError(f"{unit!r} is no unit of a safety margin; use fraction or percent")
     lines = read_lines(path)
-    rows = [re.split(r"[;,\t]", line.text) for line in lines]
+    rows = [re.split(r"[;,\t]", line) for _, line in lines]
     column = -1
     if not all(map(_is_margin, rows[0])):  # a header
         heads = [head.strip().strip('"').lower() for head in rows[0]]
@@ -212,10 +204,10 @@ def _read_margins(path: Path, *, unit: str | None) -> tuple[Float[np.ndarray, " 
     if not rows:
         raise RecordingError(f"{path} has a header but no margin; give one a line")
     values, percent = [], unit == "percent"
-    for line, row in zip(lines, rows, strict=True):
+    for (number, line), row in zip(lines, rows, strict=True):
         text = row[column].strip().strip('"')
         if not _is_margin(text):
-            raise RecordingError(f"{path}, line {line.line} is {line.text[:40]!r}, not a safety margin; mend the line")
+            raise RecordingError(f"{path}, line {number} is {line[:40]!r}, not a safety margin; mend the line")
         percent |= text.endswith("%")
         values.append(float(text.removesuffix("%") or "nan"))
     margins = np.array(values)

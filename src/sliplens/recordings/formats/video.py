@@ -281,22 +281,19 @@ def read_video(
         raise RecordingError(f"{path} has no presentation stamps; declare its rate with --frame-rate")
     else:
         time = file.time_s
-    clock = place_on_clock(time, forces=forces, start_s=start_s, source=path.name, **columns)
-    notes.extend(clock.notes)
+    time, samples, more = place_on_clock(time, forces=forces, start_s=start_s, source=path.name, **columns)
+    notes.extend(more)
     skipped = _skipped(path, file, skip_frames=skip_frames, skip_stale=skip_stale)
     if skipped:
         notes.append(f"{path.name}: the first {skipped} of {file.frames} frames were left out.")
 
-    def read_frames() -> Iterator[Frame]:
-        return islice(decode_video(file), skipped, None)
-
     return Capture(
         trial=trial_name(path.stem if name is None else name),
         source=str(path),
-        frame_time_s=clock.time_s[skipped:],
+        frame_time_s=time[skipped:],
         frame_size=file.frame_size,
-        read_frames=read_frames,
-        forces=clock.forces,
+        read_frames=lambda: islice(decode_video(file), skipped, None),
+        forces=samples,
         notes=tuple(notes),
     )
 
