@@ -138,7 +138,7 @@ def read_thesis(
             *one,
             str(frames_list),
             notes=(*notes, times),
-            frame_rate=rate,
+            rate=rate,
         )
         for number, one in enumerate(rows.items(), start=1)
     ]
@@ -162,13 +162,7 @@ def _frames_list(path: Path) -> Path:
 
 
 def _trial(
-    name: str,
-    reference: Path,
-    rows: list[tuple[Path, float]],
-    source: str,
-    *,
-    notes: tuple[str, ...],
-    frame_rate: float,
+    name: str, reference: Path, rows: list[tuple[Path, float]], source: str, *, notes: tuple[str, ...], rate: float
 ) -> Capture:
     ordered = sorted(rows, key=lambda row: natural_key(str(row[0])))
     if ordered != rows:
@@ -181,7 +175,7 @@ def _trial(
     return Capture(
         trial=name,
         source=f"{name} of {source}",
-        frame_time_s=evenly_spaced(len(paths), frame_rate=frame_rate),
+        frame_time_s=evenly_spaced(len(paths), frame_rate=rate),
         frame_size=size,
         read_frames=lambda: (read_frame(path, size=size) for path in paths),
         forces=None,
