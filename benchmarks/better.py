@@ -36,7 +36,7 @@ from sliplens.intervals import paired_difference
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
 from sliplens.models.engines import prepare
-from sliplens.recordings import Dataset, Recording
+from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.recordings.trial import SLIPS
 from sliplens.simulation import SimulationRecipe, simulate_dataset
 
@@ -220,7 +220,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     found = {}
     with tempfile.TemporaryDirectory() as scratch:
         try:
-            data = Dataset.open(options.data) if options.data else simulate_dataset(Path(scratch) / "data", RECIPE)
+            data = load_dataset(options.data) if options.data else simulate_dataset(Path(scratch) / "data", RECIPE)
             for run in options.run:
                 trained, cases = load(run), []
                 for case in find_cases(trained, data, options=options):

@@ -31,7 +31,7 @@ from sliplens.explainers.maps import pearson_r, resize, to_masks, top_overlap
 from sliplens.files import machine, versions
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
-from sliplens.recordings import Dataset
+from sliplens.recordings import Dataset, load_dataset
 from sliplens.simulation import SimulationRecipe, simulate_dataset
 from sliplens.study import frames_from_dataset, frames_from_folder
 
@@ -170,7 +170,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if options.data is None:
                 data = simulate_dataset(Path(scratch) / "data", RECIPE)
             else:
-                data = Dataset.open(options.data)
+                data = load_dataset(options.data)
             found, gpu = {}, []
             for run in options.run:
                 trained = load(run)

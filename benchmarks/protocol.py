@@ -14,7 +14,7 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # must be set before torch is imported
 
-from sliplens.recordings import Dataset
+from sliplens.recordings import Dataset, load_dataset
 from sliplens.simulation import PRESETS, simulate_dataset
 from sliplens.training import evaluate, train
 
@@ -57,7 +57,7 @@ def main() -> None:
                 recipe = replace(recipe, frames_per_trial=options.frames_per_trial, frame_totals=None)
             data = simulate_dataset(folder, recipe)
         else:
-            data = Dataset.open(options.data)
+            data = load_dataset(options.data)
         found = {name: train_and_test(data, work, name=name, options=options) for name in INPUTS}
     if options.json:
         asked = {key: value for key, value in vars(options).items() if key not in {"json", "work", "data"}}

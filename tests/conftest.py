@@ -15,7 +15,7 @@ from hypothesis import settings
 
 from sliplens.images import absolute_difference, write_png
 from sliplens.models import Manifest, build_model, save_checkpoint
-from sliplens.recordings import ContactState, Dataset, Recording
+from sliplens.recordings import ContactState, Dataset, Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SimulationRecipe, plan_trials, simulate_trial
@@ -107,7 +107,7 @@ def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
         save_recording(recording, path)
         table.append(trial_info(path, split=split))
     write_dataset_table(folder, table, simulated=True)
-    return Dataset.open(folder)
+    return load_dataset(folder)
 
 
 @pytest.fixture(scope="session")
@@ -121,7 +121,7 @@ def fine_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
         save_recording(recording, path)
         table.append(trial_info(path, split="test"))
     write_dataset_table(folder, table)
-    return Dataset.open(folder)
+    return load_dataset(folder)
 
 
 def save_untrained(folder: Path, *, kind: str = "difference", seed: int = 0, frame_size: int = FRAME_SIZE) -> Path:

@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 from command_line import refused
 
-from sliplens.recordings import Dataset
+from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.dataset import trial_path
 from sliplens.simulation import SimulationRecipe, simulate_dataset
 
@@ -32,7 +32,7 @@ def damaged(tmp_path: Path, small_dataset: Dataset) -> Path:
 def test_a_damaged_page_is_told_by_every_command(
     capsys: pytest.CaptureFixture[str], damaged: Path, difference_run: Path, tmp_path: Path
 ):
-    data = Dataset.open(damaged)
+    data = load_dataset(damaged)
     for split in ("train", "test"):
         damage_page(trial_path(damaged, data.select(split=split)[0].trial), "image")
     trial = data.select(split="test")[0].trial

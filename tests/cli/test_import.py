@@ -10,7 +10,7 @@ from command_line import refused, run
 from own_recording import TARE, write_forces, write_video
 
 from sliplens.images import write_png
-from sliplens.recordings import Dataset, Recording
+from sliplens.recordings import Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import read_header, save_recording, write_trial
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
@@ -44,7 +44,7 @@ def test_labels_of_an_imported_video_are_those_of_the_simulator(
     command = ("import", video, "-o", tmp_path / "data", "--sensor", "mine", "--forces", table)
     assert run(*command) == 0
     assert run("check", tmp_path / "data") == 0
-    data = Dataset.open(tmp_path / "data")
+    data = load_dataset(tmp_path / "data")
     back = data.load(data.trials[0])
     assert (back.trial, back.sensor, data.simulated) == ("cup", "mine", False)
     np.testing.assert_array_equal(back.frames, trial.frames)
@@ -78,7 +78,7 @@ def test_a_folder_of_images_gives_the_labels_of_the_video(tmp_path: Path, trial:
     shared = ("--sensor", "mine", "--forces", table)
     assert run("import", folder, "-o", tmp_path / "a", *shared, "--frame-rate", 30) == 0
     assert run("import", video, "-o", tmp_path / "b", *shared, "--frame-rate", 30) == 0
-    one, other = (Dataset.open(tmp_path / name) for name in "ab")
+    one, other = (load_dataset(tmp_path / name) for name in "ab")
     np.testing.assert_array_equal(one.load(one.trials[0]).safety_margin, other.load(other.trials[0]).safety_margin)
 
 
@@ -91,7 +91,7 @@ def test_lag_and_tare_by_hand_are_taken(tmp_path: Path, table: Path, video: Path
     words = ("--sensor", "mine", "--tare", *TARE, "--no-audit")
     assert run("import", video, "-o", tmp_path / "a", "--forces", table, "--lag-ms", 0, *words) == 0
     assert run("import", video, "-o", tmp_path / "b", "--forces", late, "--lag-ms", 50, *words) == 0
-    one, other = (Dataset.open(tmp_path / name) for name in "ab")
+    one, other = (load_dataset(tmp_path / name) for name in "ab")
     first, second = one.load(one.trials[0]), other.load(other.trials[0])
     # the same samples at the same times, but for the rounding of their stamps to 10 us, of forces that change by some
     # 50 N/s at most
@@ -119,7 +119,7 @@ def test_times_of_images_come_from_a_table_or_from_their_names(
     assert run("import", folder, "-o", tmp_path / "a", *shared, "--times", times) == 0
     assert run("import", folder, "-o", tmp_path / "b", *shared, "--name-unit", "us") == 0
     for name in "ab":
-        data = Dataset.open(tmp_path / name)
+        data = load_dataset(tmp_path / name)
         np.testing.assert_allclose(data.load(data.trials[0]).time_s, trial.time_s, atol=1e-6)
     capsys.readouterr()
     both = ("--times", times, "--name-unit", "us")
@@ -128,7 +128,7 @@ def test_times_of_images_come_from_a_table_or_from_their_names(
 
 def test_friction_by_hand_is_taken(tmp_path: Path, table: Path, video: Path):
     assert run("import", video, "-o", tmp_path / "data", "--sensor", "mine", "--forces", table, "--mu", 1.4) == 0
-    data = Dataset.open(tmp_path / "data")
+    data = load_dataset(tmp_path / "data")
     labelling = read_header(tmp_path / "data" / "trials" / "cup.parquet").labelling
     assert labelling is not None
     assert labelling.basis is not None
@@ -162,7 +162,7 @@ def test_an_interrupted_import_goes_on_where_it_stopped(
     kept = written[0].stat().st_mtime_ns
     assert run(*broken) == 0
     assert (tmp_path / "b" / "trials" / "a.parquet").stat().st_mtime_ns == kept
-    assert Dataset.open(tmp_path / "b").hash == Dataset.open(tmp_path / "w").hash
+    assert load_dataset(tmp_path / "b").hash == load_dataset(tmp_path / "w").hash
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 from command_line import refused, run
 
 from sliplens.images import write_png
-from sliplens.recordings import ContactState, Dataset, Recording
+from sliplens.recordings import ContactState, Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import forces_path, load_forces, load_recording, read_header, save_recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
@@ -45,7 +45,7 @@ def signals(recording: Recording) -> dict[str, np.ndarray]:
 def test_an_imported_data_set_keeps_its_labels_and_what_it_is(tmp_path: Path, trial: Recording, simulated: Path):
     assert run("import", simulated, "-o", tmp_path / "data") == 0
     assert run("check", tmp_path / "data") == 0
-    data = Dataset.open(tmp_path / "data")
+    data = load_dataset(tmp_path / "data")
     back = data.load(data.trials[0])
     for name, values in signals(trial).items():
         np.testing.assert_array_equal(getattr(back, name), values, err_msg=name)
@@ -61,7 +61,7 @@ def test_an_imported_data_set_keeps_its_labels_and_what_it_is(tmp_path: Path, tr
 def test_what_is_said_on_the_command_line_counts_before_what_the_source_tells(tmp_path: Path, simulated: Path):
     words = ("--sensor", "tip", "--day", 7, "--condition", "wet", "--object", "glass", "--test-trials", 1)
     assert run("import", simulated, "-o", tmp_path / "data", "--no-audit", *words) == 0
-    (info,) = Dataset.open(tmp_path / "data").trials
+    (info,) = load_dataset(tmp_path / "data").trials
     assert (info.sensor, info.day, info.condition, info.object, info.split) == ("tip", 7, "wet", "glass", "test")
 
 
@@ -102,7 +102,7 @@ def test_force_samples_are_kept_and_labels_made_anew_from_them_are_the_same(
     assert both.sum() > 150
     expected = 1 - (1 - before.safety_margin) * before.friction_coefficient / 1.6
     np.testing.assert_allclose(after.safety_margin[both], expected[both], atol=1e-9)
-    assert Dataset.open(tmp_path / "data").trials[0].split == "validation"
+    assert load_dataset(tmp_path / "data").trials[0].split == "validation"
     # what the trial came from, what was noted then, and how it was divided stay
     assert (tmp_path / "data" / "splits.json").read_text() == '{"rules": "of somebody"}'
     first, last = (read_header(trial_path(folder, trial.trial)).labelling for folder in (relabelled, tmp_path / "data"))
@@ -120,10 +120,10 @@ def test_labels_that_were_not_found_are_not_overwritten(simulated: Path, capsys:
 def test_pages_alone_are_drawn_of_what_was_imported(
     tmp_path: Path, trial: Recording, simulated: Path, relabelled: Path, capsys: pytest.CaptureFixture[str]
 ):
-    before = Dataset.open(relabelled).hash
+    before = load_dataset(relabelled).hash
     assert run("label", relabelled, "--audit-only", "-o", tmp_path) == 0
     assert (tmp_path / "audit" / f"{trial.trial}.png").is_file()
-    assert Dataset.open(relabelled).hash == before
+    assert load_dataset(relabelled).hash == before
     capsys.readouterr()
     assert "was not imported" in refused(capsys, "label", simulated, "--audit-only")
 
@@ -164,7 +164,7 @@ def thesis_lists(tmp_path: Path, rng: np.random.Generator) -> Path:
 def test_the_lists_of_the_thesis_become_a_data_set(tmp_path: Path, thesis_lists: Path):
     assert run("import", thesis_lists, "-o", tmp_path / "data", "--sensor", "chromatouch", "--frame-rate", 60) == 0
     assert run("check", tmp_path / "data") == 0
-    data = Dataset.open(tmp_path / "data")
+    data = load_dataset(tmp_path / "data")
     back = data.load(data.trials[0])
     np.testing.assert_array_equal(back.safety_margin, np.linspace(1, 0, 10).round(2))
     np.testing.assert_allclose(back.time_s, np.arange(10) / 60)
@@ -192,7 +192,7 @@ def test_real_clips_come_with_what_is_known_of_them_and_no_label(tmp_path: Path,
         pytest.skip(f"the real clips are not at {grasp}")
     assert run("import", grasp, "-o", tmp_path / "data") == 0
     assert run("check", tmp_path / "data") == 0
-    data = Dataset.open(tmp_path / "data")
+    data = load_dataset(tmp_path / "data")
     assert {info.object for info in data.trials} == {"jute_basket"}
     assert {info.sensor for info in data.trials} == {"gelsight-mini"}
     for info in data.trials:

@@ -8,7 +8,7 @@ import pytest
 from command_line import refused, run
 from PIL import Image
 
-from sliplens.recordings import Dataset
+from sliplens.recordings import load_dataset
 from sliplens.simulation import PRESETS, make_recipe
 
 SMALL = ("--dry-trials", "3", "--wet-trials", "1", "--days", "2", "--frames-per-trial", "20")
@@ -17,7 +17,7 @@ SMALL = ("--dry-trials", "3", "--wet-trials", "1", "--days", "2", "--frames-per-
 def test_a_data_set_is_written_whole_and_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     command = ("simulate", tmp_path / "data", *SMALL, "--sensor", "flat-gel", "--release")
     assert run(*command) == 0
-    data = Dataset.open(tmp_path / "data")
+    data = load_dataset(tmp_path / "data")
     assert [trial.split for trial in data.trials] == ["train", "validation", "test", "test"]
     assert {trial.sensor for trial in data.trials} <= {"flat-gel-1", "flat-gel-2"}
     recipe = json.loads((tmp_path / "data" / "run.json").read_text())["config"]["recipe"]

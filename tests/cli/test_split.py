@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from command_line import refused, run
 
-from sliplens.recordings import Dataset
+from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.splits import SPLITS_FILE
 
 RULES = """
@@ -46,7 +46,7 @@ def rules(tmp_path: Path) -> Path:
 
 def test_the_trials_go_where_the_rules_say(folder: Path, rules: Path, capsys: pytest.CaptureFixture[str]):
     assert run("split", folder, "--rules", rules) == 0
-    found = {info.trial: info.split for info in Dataset.open(folder).trials}
+    found = {info.trial: info.split for info in load_dataset(folder).trials}
     # days 1 2 3 4 1 2 3 4: trials 3 and 7 are of day 4
     assert found == {
         "train-dry-0": "train",
@@ -94,11 +94,11 @@ def test_a_dry_run_writes_nothing(folder: Path, rules: Path, capsys: pytest.Capt
 def test_a_preset_splits_and_leaks_are_told(folder: Path, capsys: pytest.CaptureFixture[str]):
     assert run("split", folder, "--preset", "trials") == 0
     # 5.6, 1.2 and 1.2 of eight trials
-    splits = [info.split for info in Dataset.open(folder).trials]
+    splits = [info.split for info in load_dataset(folder).trials]
     assert [splits.count(name) for name in ("train", "validation", "test")] == [6, 1, 1]
     assert "in train and test: the test does not tell of a new day" in capsys.readouterr().out
     assert run("split", folder, "--preset", "thesis") == 0
-    tests = {info.day for info in Dataset.open(folder).select(split="test")}
+    tests = {info.day for info in load_dataset(folder).select(split="test")}
     assert tests == {4}
     assert "note:" not in capsys.readouterr().out
 

@@ -16,7 +16,7 @@ from sliplens.errors import InputError, RecordingError
 from sliplens.images.files import decode_png
 from sliplens.plots import viewer as viewer_process
 from sliplens.plots.viewer import open_viewer, write_rrd
-from sliplens.recordings import ContactState, Dataset, Recording
+from sliplens.recordings import ContactState, Dataset, Recording, load_dataset
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.importing import import_trial
@@ -82,7 +82,7 @@ def stored(folder: Path, *recordings: Recording) -> Dataset:
         save_recording(recording, trial_path(folder, recording.trial))
         table.append(trial_info(trial_path(folder, recording.trial), split="train"))
     write_dataset_table(folder, table)
-    return Dataset.open(folder)
+    return load_dataset(folder)
 
 
 @pytest.fixture(scope="module")
@@ -290,7 +290,7 @@ def test_samples_of_the_force_sensor_stand_on_the_clock_of_the_camera(
         forces_file=forces_path(tmp_path, "cup_1"),
     )
     write_dataset_table(tmp_path, [trial_info(path, split="test")])
-    data = Dataset.open(tmp_path)
+    data = load_dataset(tmp_path)
     write_rrd(data, data.trials[0], tmp_path / "a.rrd")
     labelling, found = read_header(path).labelling, read_rrd(tmp_path / "a.rrd")
     assert labelling is not None

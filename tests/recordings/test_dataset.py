@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from sliplens.errors import InputError, RecordingError
-from sliplens.recordings import Dataset, Recording
+from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.recordings.dataset import write_dataset_table
 from sliplens.recordings.store import (
     ROW_GROUP,
@@ -146,16 +146,16 @@ def test_a_condition_that_is_not_there_is_refused(small_dataset: Dataset):
 
 def test_a_missing_data_set_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match=r"the data set .*nothing does not exist"):
-        Dataset.open(tmp_path / "nothing")
+        load_dataset(tmp_path / "nothing")
 
 
 def test_a_data_set_without_trials_is_refused(tmp_path: Path):
     write_dataset_table(tmp_path, [])
     with pytest.raises(RecordingError, match="lists no trials"):
-        Dataset.open(tmp_path)
+        load_dataset(tmp_path)
 
 
 def test_a_data_set_of_another_schema_is_refused(tmp_path: Path):
     (tmp_path / "dataset.json").write_text(json.dumps({"schema_version": 99}))
     with pytest.raises(RecordingError, match="is not a sliplens data set of schema 2; make it again"):
-        Dataset.open(tmp_path)
+        load_dataset(tmp_path)

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sliplens.errors import InputError
-from sliplens.recordings import Dataset, TrialFacts
+from sliplens.recordings import Dataset, TrialFacts, load_dataset
 from sliplens.recordings.check import check_dataset
 from sliplens.recordings.dataset import DATASET_FILE
 from sliplens.recordings.splits import (
@@ -386,14 +386,14 @@ def test_a_file_of_a_windows_editor_is_read(tmp_path: Path):
 @pytest.fixture
 def data(tmp_path: Path, small_dataset: Dataset) -> Dataset:
     shutil.copytree(small_dataset.folder, tmp_path / "data")
-    return Dataset.open(tmp_path / "data")
+    return load_dataset(tmp_path / "data")
 
 
 def test_nothing_of_a_data_set_changes_but_its_splits(data: Dataset):
     before = json.loads((data.folder / DATASET_FILE).read_text())
     plan = SplitPlan(rules=(SplitRule(day=(2, 3), name="test"), SplitRule(name="train")))
     split_dataset(data, plan)
-    stored = Dataset.open(data.folder)
+    stored = load_dataset(data.folder)
     assert [info.split for info in stored.trials] == ["test" if info.day in {2, 3} else "train" for info in data.trials]
     assert [replace(info, split="") for info in stored.trials] == [replace(info, split="") for info in data.trials]
     after = json.loads((data.folder / DATASET_FILE).read_text())
@@ -423,7 +423,7 @@ def test_the_rules_are_kept_as_their_file_said_them(data: Dataset, tmp_path: Pat
         {"share": {"train": 0.8, "validation": 0.2}, "by": "trial", "seed": 3},
     ]
     assert record["source"] == str(tmp_path / "rules.toml")
-    assert record["splits"] == {info.trial: info.split for info in Dataset.open(data.folder).trials}
+    assert record["splits"] == {info.trial: info.split for info in load_dataset(data.folder).trials}
     assert record["notes"] == list(result.notes)
 
 
@@ -432,4 +432,4 @@ def test_a_dry_run_tells_the_splits_and_writes_nothing(data: Dataset):
     result = split_dataset(data.folder, "thesis", dry_run=True)
     assert {path: path.read_bytes() for path in data.folder.rglob("*") if path.is_file()} == before
     assert result == split_dataset(data, "thesis")
-    assert tuple(info.split for info in Dataset.open(data.folder).trials) == result.splits
+    assert tuple(info.split for info in load_dataset(data.folder).trials) == result.splits

@@ -52,11 +52,6 @@ def test_header_tells_a_trial_without_its_frames(tmp_path: Path, recording: Reco
         assert (header.truth and header.truth.recipe) == recipe
 
 
-def test_masks_are_the_parts_of_the_map(truth: GroundTruth):
-    assert np.all(truth.contact_mask[truth.stick_mask])
-    np.testing.assert_array_equal(truth.contact_map, truth.contact_mask.astype(int) + truth.stick_mask)
-
-
 def test_a_file_that_lost_a_column_of_its_truth_is_refused(tmp_path: Path, recording: Recording, truth: GroundTruth):
     path = tmp_path / "a.parquet"
     save_recording(replace(recording, truth=truth), path)

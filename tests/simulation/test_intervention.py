@@ -9,7 +9,7 @@ import pytest
 from realism.scene import nominal_unit
 from sliplens.errors import InputError
 from sliplens.files import output_folder
-from sliplens.recordings import Dataset, Recording
+from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.simulation import (
     CHROMATOUCH,
     FLAT_GEL,
@@ -41,7 +41,7 @@ RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=24, seed=
 def simulate(folder: Path, recipe: SimulationRecipe) -> Dataset:
     with output_folder(folder, stage="simulate", config={"recipe": recipe, "device": "cpu"}) as out:
         simulate_dataset(out.folder, recipe)
-    return Dataset.open(folder)
+    return load_dataset(folder)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def data(tmp_path_factory) -> Dataset:
 
 @pytest.fixture(scope="module")
 def recordings(data: Dataset) -> list[Recording]:
-    return list(data.load_all(data.trials))
+    return [data.load(info) for info in data.trials]
 
 
 @pytest.fixture(scope="module")

@@ -153,7 +153,7 @@ def test_every_frame_carries_its_truth(recordings):
         assert truth.marker_px.shape == (30, CHROMATOUCH.geometry.markers, 2)
         touched = np.isfinite(recording.safety_margin)
         np.testing.assert_array_equal(truth.contact_radius_m > 0, touched)
-        np.testing.assert_array_equal(truth.contact_mask.any(axis=(1, 2)), touched)
+        np.testing.assert_array_equal(truth.contact_map.any(axis=(1, 2)), touched)
         np.testing.assert_allclose(
             (truth.stick_radius_m[touched] / truth.contact_radius_m[touched]) ** 2,
             recording.stick_ratio[touched],

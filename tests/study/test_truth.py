@@ -16,7 +16,7 @@ from sliplens.faithfulness.true_fill import SHARES
 from sliplens.faithfulness.units import unit_means
 from sliplens.files import output_folder
 from sliplens.models import Manifest, Run
-from sliplens.recordings import Dataset
+from sliplens.recordings import Dataset, load_dataset
 from sliplens.results import Explained, ExplainedFrame
 from sliplens.results.explanation import MethodNotes
 from sliplens.results.study import Truth
@@ -55,7 +55,7 @@ def data(tmp_path_factory) -> Dataset:
     folder = tmp_path_factory.mktemp("simulated") / "data"
     with output_folder(folder, stage="simulate", config={"recipe": RECIPE}) as out:
         simulate_dataset(out.folder, RECIPE)
-    return Dataset.open(folder)
+    return load_dataset(folder)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import numpy as np
 import torch
 
 from sliplens.models.encodings import get_encoding
-from sliplens.recordings import Dataset, Recording
+from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
 from sliplens.training.data import UNTOUCHED, load_frames
@@ -63,7 +63,7 @@ def test_frames_whose_label_cannot_be_trusted_are_left_out(tmp_path: Path, recor
     path = trial_path(tmp_path, "trial")
     save_recording(doubted, path)
     write_dataset_table(tmp_path, [trial_info(path, split="train")])
-    data = Dataset.open(tmp_path)
+    data = load_dataset(tmp_path)
     frames = load_frames(data, data.trials, encoding=get_encoding("difference"), image_size=32)
     # frame 0 has no contact, frames 7 to 11 are not trusted
     assert frames.frame == (1, 2, 3, 4, 5, 6)

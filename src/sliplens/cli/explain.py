@@ -58,9 +58,9 @@ class Explain(Command):
         if self.model is None or self.output is None:
             raise InputError("name the network and the folder to make: sliplens explain RUN DATA -o FOLDER")
         if self.data is not None and self.frames is None:
-            from sliplens.recordings import Dataset
+            from sliplens.recordings import load_dataset
 
-            source = Dataset.open(self.data)
+            source = load_dataset(self.data)
         elif self.frames is not None and self.data is None:
             source = self.frames
         else:

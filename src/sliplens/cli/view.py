@@ -28,14 +28,14 @@ class View(Command):
     def run(self) -> None:
         """Open the viewer, or write its file."""
         from sliplens.plots.viewer import open_viewer, require_rerun, require_rrd_path, write_rrd
-        from sliplens.recordings import Dataset
+        from sliplens.recordings import load_dataset
 
         require_rerun()
         if self.output is not None:
             require_rrd_path(self.output)
             if self.output.exists() and not self.overwrite:
                 raise InputError(f"{self.output} exists; choose another file or pass --overwrite")
-        data = Dataset.open(self.data)
+        data = load_dataset(self.data)
         info = data.trials[0] if self.trial is None else data.find(self.trial)
         with Terminal().stage(f"Reading {info.trial}") as bar:
             if self.output is None:

@@ -1,16 +1,13 @@
 """A data set on disk: one Parquet file a trial, frames without loss beside their labels."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-
-import numpy as np
-import pyarrow.parquet as pq
 
 from sliplens.codec import from_builtins, save_record
 from sliplens.errors import RecordingError
 from sliplens.files import hash_file, hash_json, read_json, require_folder
-from sliplens.recordings.store import SCHEMA_VERSION, forces_path, load_labels, load_recording, read_header, reading
+from sliplens.recordings.store import SCHEMA_VERSION, forces_path, load_recording, read_header
 from sliplens.recordings.trial import Labels, Recording, TrialFacts
 
 DATASET_FILE = "dataset.json"
@@ -49,11 +46,6 @@ class Dataset:
     folder: Path
     trials: tuple[TrialInfo, ...]
     simulated: bool = False
-
-    @classmethod
-    def open(cls, folder: Path) -> "Dataset":
-        """Open a data set, as `load_dataset` does."""
-        return load_dataset(folder)
 
     @property
     def source(self) -> str:
@@ -112,11 +104,7 @@ class Dataset:
 
     def read_labels(self, info: TrialInfo) -> Labels:
         """Labels of one trial, without its frames."""
-        return load_labels(trial_path(self.folder, info.trial)).labels
-
-    def load_all(self, trials: Sequence[TrialInfo], *, truth: bool = True) -> Iterator[Recording]:
-        """Read trials one after another."""
-        return (self.load(info, truth=truth) for info in trials)
+        return load_recording(trial_path(self.folder, info.trial), pixels=False)
 
 
 _NAMED = 10  # trials named in a message before the rest is counted
@@ -152,16 +140,6 @@ def load_dataset(folder: Path | str) -> Dataset:
 def trial_path(folder: Path, trial: str) -> Path:
     """File that holds a trial of a data set."""
     return folder / "trials" / f"{trial}.parquet"
-
-
-def count_labelled(path: Path) -> int:
-    """Number of frames of a trial whose safety margin can be trusted, found without reading its images."""
-    with reading(path):
-        names = [name for name in ("safety_margin", "valid") if name in pq.read_schema(path).names]
-        table = pq.read_table(path, columns=names)
-    columns = {name: table.column(name).to_numpy() for name in names}
-    present = np.isfinite(columns["safety_margin"].astype(np.float64))
-    return int(np.sum(present & columns["valid"] if "valid" in columns else present))
 
 
 def trial_info(path: Path, *, split: str) -> TrialInfo:

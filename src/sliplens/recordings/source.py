@@ -18,7 +18,7 @@ from sliplens.recordings.formats import open_captures, recognise
 from sliplens.recordings.formats.images import frame_size, read_frame
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
 from sliplens.recordings.options import ReadOptions, spoken
-from sliplens.recordings.store import load_recording, read_reference, stream_frames
+from sliplens.recordings.store import load_recording, stream_frames
 
 Frames: TypeAlias = UInt8[np.ndarray, "frames height width 3"]
 """RGB images of the camera, one after another."""
@@ -146,7 +146,7 @@ def _stored(folder: Path, info: TrialInfo) -> TrialFrames:
         frame_size=(info.height, info.width),
         source=str(folder),
         read_frames=partial(stream_frames, path),
-        read_reference=partial(read_reference, path),
+        read_reference=lambda: recording.reference,
         time_s=recording.time_s,
         safety_margin=np.where(recording.labelled, recording.safety_margin, np.nan),
     )

@@ -2,10 +2,11 @@
 
 import os
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,16 @@ from sliplens.errors import RecordingError
 from sliplens.images.files import decode_png, encode_png
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling
-from sliplens.recordings.trial import OPTIONAL_LABELS, SIGNALS, ContactState, GroundTruth, Labels, Recording, TrialFacts
+from sliplens.recordings.trial import (
+    LABEL_SIGNALS,
+    OPTIONAL_LABELS,
+    SIGNALS,
+    ContactState,
+    GroundTruth,
+    Labels,
+    Recording,
+    TrialFacts,
+)
 
 SCHEMA_VERSION = 2
 CODEC = "rows+zstd"
@@ -29,7 +39,6 @@ ROW_GROUP = 64
 """Frames that are written, and can be read, together."""
 DAMAGED_PARQUET = (pa.ArrowException, OSError, ValueError, LookupError)
 """Errors that Arrow raises of a damaged file: names, too, may be no text."""
-_COMMAND = "sliplens import"
 
 
 def one_line(error: Exception) -> str:
@@ -38,16 +47,14 @@ def one_line(error: Exception) -> str:
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
+def reading(path: Path, *, wrong: str = "is not a readable Parquet file") -> Iterator[None]:
     """Tell of a file of a data set that is missing or damaged, whatever is read of it inside."""
     try:
         yield
     except FileNotFoundError:
         raise RecordingError(f"{path} does not exist; make the data set again") from None
     except DAMAGED_PARQUET as error:
-        raise RecordingError(
-            f"{path} is not a readable Parquet file ({one_line(error)}); make the data set again"
-        ) from None
+        raise RecordingError(f"{path} {wrong} ({one_line(error)}); make the data set again") from None
 
 
 def encode_pixels(pixels: UInt8[np.ndarray, "height width *channels"]) -> bytes:
@@ -65,14 +72,8 @@ def encode_frames(frames: Iterable[UInt8[np.ndarray, "height width *channels"]])
     """
     workers = os.cpu_count() or 1
     with ThreadPoolExecutor(workers) as pool:  # Zstandard lets go of the interpreter's lock
-        chunk: list[bytes] = []
-        for image in _in_turn(pool, frames, ahead=2 * workers):
-            chunk.append(image)
-            if len(chunk) == ROW_GROUP:
-                yield chunk
-                chunk = []
-        if chunk:
-            yield chunk
+        images = _in_turn(pool, frames, ahead=2 * workers)
+        yield from iter(lambda: list(islice(images, ROW_GROUP)), [])
 
 
 def _in_turn(
@@ -127,34 +128,34 @@ _HEADER = b"sliplens"
 
 def read_header(path: Path) -> TrialHeader:
     """Read what a trial is and how its labels were made, without its frames."""
+    file, header = _open(path)
+    file.close()
+    return header
+
+
+def _open(path: Path) -> tuple[pq.ParquetFile, TrialHeader]:
     with reading(path):
-        file = pq.read_metadata(path)
-    return replace(_parse_header(file.metadata, path), frames=file.num_rows)
-
-
-def _parse_header(metadata: dict[bytes, bytes] | None, path: Path) -> TrialHeader:
-    metadata = metadata or {}
+        file = pq.ParquetFile(path, memory_map=True)
+    metadata: dict[bytes, bytes] = file.schema_arrow.metadata or {}
     missing = [key.decode() for key in (_HEADER, b"reference") if key not in metadata]
     if missing:
         raise RecordingError(f"{path} lacks {', '.join(missing)} in its metadata; make the data set again")
+    missing = {"image", "contact_state", *SIGNALS} - set(file.schema_arrow.names)
+    if missing:
+        raise RecordingError(f"{path} lacks {', '.join(sorted(missing))}; make the data set again")
+    codec = metadata.get(b"codec", b"png").decode()
+    if codec != CODEC:
+        raise RecordingError(f"{path} keeps its images as {codec}, {CODEC} is needed; make the data set again")
     try:
         values = msgspec.json.decode(metadata[_HEADER])
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise RecordingError(f"the header of {path} is no JSON ({error}); make the data set again") from None
-    return from_builtins(values, TrialHeader, where=f"the header of {path}", command=_COMMAND)
-
-
-def read_reference(path: Path) -> Frame:
-    """Read the reference frame of a trial."""
-    with reading(path):
-        metadata = pq.read_metadata(path).metadata
-    if not metadata or b"reference" not in metadata:
-        raise RecordingError(f"{path} lacks reference in its metadata; make the data set again")
-    return decode_png(metadata[b"reference"], where=f"the reference frame of {path}")
+    header = from_builtins(values, TrialHeader, where=f"the header of {path}", command="sliplens import")
+    return file, replace(header, frames=file.metadata.num_rows)
 
 
 _TRUTH_SIGNALS = ("static_friction", "contact_radius_m", "stick_radius_m")
-_TRUTH_COLUMNS = frozenset({*_TRUTH_SIGNALS, "marker_px", "contact_map"})
+_TRUTH_COLUMNS = {*_TRUTH_SIGNALS, "marker_px", "contact_map"}
 
 
 def save_recording(recording: Recording, path: Path) -> None:
@@ -180,19 +181,10 @@ def write_trial(
     reference: Frame,
     truth: GroundTruth | None = None,
 ) -> None:
-    """Write the Parquet file of a trial, chunk by chunk; it appears when complete.
-
-    Parameters
-    ----------
-    images
-        Encoded frames in chunks, a row group each; see `encode_frames`.
-    """
-    columns: dict[str, Any] = {"time_s": time_s, "contact_state": [str(state) for state in labels.contact_state]}
-    columns |= {name: getattr(labels, name) for name in SIGNALS[1:]}
-    for name in OPTIONAL_LABELS:
-        values = getattr(labels, name)
-        if values is not None:
-            columns[name] = [str(reason) for reason in values] if name == "reason" else values
+    """Write the Parquet file of a trial, its encoded images a row group at a time; it appears when complete."""
+    columns: dict[str, Any] = {"time_s": time_s, "contact_state": labels.contact_state}
+    columns |= {name: getattr(labels, name) for name in (*LABEL_SIGNALS, *OPTIONAL_LABELS)}
+    columns = {name: values for name, values in columns.items() if values is not None}
     kept = None
     if truth is not None:
         rest = tuple((float(x), float(y)) for x, y in truth.marker_rest_px)
@@ -239,121 +231,66 @@ def _in_place(images: list[bytes]) -> pa.ChunkedArray:
 def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Recording:
     """Read a trial written by `save_recording`.
 
-    Parameters
-    ----------
-    pixels
-        Read the images too. Without them, and the truth, a trial of any length takes little memory: the reference
-        stands for every frame, and `read_frames` reads those that are needed.
+    Without pixels, and then without the truth, a trial of any length takes little memory: the reference stands for
+    every frame, and `read_frames` reads those that are needed.
     """
-    without = (set() if pixels else {"image"}) | (set() if truth and pixels else _TRUTH_COLUMNS)
-    header, table = _read_columns(path, without=without)
+    truth = truth and pixels
+    file, header = _open(path)
+    without = (set() if pixels else {"image"}) | (set() if truth else _TRUTH_COLUMNS)
+    with reading(path), file:
+        table = file.read(columns=[name for name in file.schema_arrow.names if name not in without])
     reference = decode_png(table.schema.metadata[b"reference"], where=f"the reference frame of {path}")
     if table.num_rows == 0:
         raise RecordingError(f"trial {header.trial} has no frames; leave it out or record it again")
     size = reference.shape
+    labels = {name: table.column(name).to_numpy() for name in OPTIONAL_LABELS if name in table.column_names}
+    if "reason" in labels:
+        labels["reason"] = tuple(str(reason) for reason in labels["reason"])
     return Recording(
         **_facts(header),
-        **_label_values(table, header),
+        **{name: table.column(name).to_numpy().astype(np.float64) for name in SIGNALS},
+        **labels,
+        contact_state=tuple(ContactState(state) for state in table.column("contact_state").to_pylist()),
+        labelling=header.labelling,
         reference=reference,
         frames=_decode(table.column("image"), size=size, where=f"of {path}")
         if pixels
         else np.broadcast_to(reference, (table.num_rows, *size)),
-        time_s=table.column("time_s").to_numpy().astype(np.float64),
-        truth=_read_truth(table, header.truth, size[:2], path) if truth and pixels and header.truth else None,
+        truth=_read_truth(table, header.truth, size[:2], path) if truth and header.truth else None,
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class StoredLabels:
-    """Times and labels of a stored trial."""
-
-    time_s: Float[np.ndarray, " frames"]
-    labels: Labels
-
-
-def load_labels(path: Path) -> StoredLabels:
-    """Read the times and labels of a trial, without any image."""
-    header, table = _read_columns(path, without={"image"} | _TRUTH_COLUMNS)
-    time_s = table.column("time_s").to_numpy().astype(np.float64)
-    return StoredLabels(time_s=time_s, labels=Labels(**_label_values(table, header)))
 
 
 def _facts(trial: TrialFacts) -> dict[str, Any]:
     return {field.name: getattr(trial, field.name) for field in fields(TrialFacts)}
 
 
-def _read_columns(path: Path, *, without: set[str] | frozenset[str]) -> tuple[TrialHeader, pa.Table]:
-    with reading(path):
-        stored = pq.read_schema(path)
-        table = pq.read_table(path, columns=[name for name in stored.names if name not in without])
-    header = _parse_header(stored.metadata, path)
-    missing = {"image", "contact_state", *SIGNALS} - set(stored.names)
-    if missing:
-        raise RecordingError(f"{path} lacks {', '.join(sorted(missing))}; make the data set again")
-    _require_codec(stored, path)
-    return replace(header, frames=table.num_rows), table
-
-
-def _label_values(table: pa.Table, header: TrialHeader) -> dict[str, Any]:
-    columns = {name: table.column(name).to_numpy() for name in OPTIONAL_LABELS if name in table.column_names}
-    if "reason" in columns:
-        columns["reason"] = tuple(str(reason) for reason in columns["reason"])
-    return {
-        **{name: table.column(name).to_numpy().astype(np.float64) for name in SIGNALS[1:]},
-        "contact_state": tuple(ContactState(state) for state in table.column("contact_state").to_pylist()),
-        **columns,
-        "labelling": header.labelling,
-    }
-
-
-def stream_frames(path: Path) -> Iterator[Frame]:
-    """Frames of a stored trial one at a time, a row group of them in memory."""
-    header, file, first = read_header(path), _open_images(path), 0
+def stream_frames(path: Path, places: Collection[int] | None = None) -> Iterator[Frame]:
+    """Frames of a stored trial one at a time, those of some places or all, a row group of them in memory."""
+    file, header = _open(path)
+    first = 0
     with file:
         for group in range(file.num_row_groups):
-            images = _read_images(file, group, path)
-            for at, image in enumerate(images):
-                where = f"frame {first + at} of {path}"
-                yield decode_pixels(image.as_buffer(), size=(header.height, header.width, 3), where=where)
-            first += len(images)
+            rows = range(first, first + file.metadata.row_group(group).num_rows)
+            inside = [place for place in rows if places is None or place in places]
+            if inside:
+                with reading(path):
+                    images = file.read_row_group(group, columns=["image"]).column("image")
+                for place in inside:
+                    where, size = f"frame {place} of {path}", (header.height, header.width, 3)
+                    yield decode_pixels(images[place - first].as_buffer(), size=size, where=where)
+            first = rows.stop
 
 
 def read_frames(path: Path, places: Sequence[int]) -> UInt8[np.ndarray, "frames height width 3"]:
     """Some frames of a stored trial, in the order asked for, a row group in memory at a time."""
-    header, first = read_header(path), 0
+    header, wanted = read_header(path), set(places)
     strange = [place for place in places if not 0 <= place < header.frames]
     if strange:
         raise RecordingError(f"{path} has no frame {strange[0]}; name one from 0 to {header.frames - 1}")
     found = np.empty((len(places), header.height, header.width, 3), dtype=np.uint8)
-    with _open_images(path) as file:
-        for group in range(file.num_row_groups):
-            end = first + file.metadata.row_group(group).num_rows
-            inside = [(at, place) for at, place in enumerate(places) if first <= place < end]
-            images = _read_images(file, group, path) if inside else None
-            for at, place in inside:
-                assert images is not None
-                where = f"frame {place} of {path}"
-                found[at] = decode_pixels(images[place - first].as_buffer(), size=found.shape[1:], where=where)
-            first = end
+    for place, frame in zip(sorted(wanted), stream_frames(path, wanted), strict=True):
+        found[np.equal(places, place)] = frame
     return found
-
-
-def _open_images(path: Path) -> pq.ParquetFile:
-    with reading(path):
-        file = pq.ParquetFile(path, memory_map=True)
-    _require_codec(file.schema_arrow, path)
-    return file
-
-
-def _read_images(file: pq.ParquetFile, group: int, path: Path) -> pa.ChunkedArray:
-    with reading(path):
-        return file.read_row_group(group, columns=["image"]).column("image")
-
-
-def _require_codec(schema: pa.Schema, path: Path) -> None:
-    codec = (schema.metadata or {}).get(b"codec", b"png").decode()
-    if codec != CODEC:
-        raise RecordingError(f"{path} keeps its images as {codec}, {CODEC} is needed; make the data set again")
 
 
 def _read_truth(table: pa.Table, header: TruthHeader, size: tuple[int, ...], path: Path) -> GroundTruth:
@@ -394,7 +331,7 @@ def forces_path(folder: Path, trial: str) -> Path:
 
 def save_forces(forces: Forces, path: Path) -> None:
     """Write samples as one Parquet file, a row a sample; whole or not at all."""
-    columns = {"time_s": forces.time_s, **{name: forces.force_n[:, at] for at, name in enumerate(_AXES)}}
+    columns = {"time_s": forces.time_s, **dict(zip(_AXES, forces.force_n.T, strict=True))}
     table = pa.table(columns).replace_schema_metadata({"source": forces.source})
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
@@ -404,14 +341,9 @@ def save_forces(forces: Forces, path: Path) -> None:
 
 def load_forces(path: Path) -> Forces:
     """Read samples written by `save_forces`."""
-    try:
+    with reading(path, wrong="does not hold samples of forces"):
         table = pq.read_table(path)
+        samples = table.select(["time_s", *_AXES]).cast(pa.schema({name: pa.float64() for name in ("time_s", *_AXES)}))
         source = (table.schema.metadata or {}).get(b"source", b"the force sensor").decode()
-        values = [table.column(name).to_numpy().astype(np.float64) for name in ("time_s", *_AXES)]
-    except FileNotFoundError:
-        raise RecordingError(f"{path} does not exist; make the data set again") from None
-    except (*DAMAGED_PARQUET, TypeError) as error:  # the latter of values that are missing
-        raise RecordingError(
-            f"{path} does not hold samples of forces ({one_line(error)}); make the data set again"
-        ) from None
-    return Forces(time_s=values[0], force_n=np.stack(values[1:], axis=-1), source=source)
+    time_s, *force_n = (column.to_numpy() for column in samples.columns)
+    return Forces(time_s=time_s, force_n=np.stack(force_n, axis=-1), source=source)

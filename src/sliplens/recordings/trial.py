@@ -184,16 +184,6 @@ class GroundTruth:
                 f"frame {at} sticks beyond its contact; the stick radius is at most the contact radius"
             )
 
-    @property
-    def contact_mask(self) -> Bool[np.ndarray, "frames height width"]:
-        """Pixels that see the contact."""
-        return self.contact_map != OUTSIDE
-
-    @property
-    def stick_mask(self) -> Bool[np.ndarray, "frames height width"]:
-        """Pixels that see skin stick to the object."""
-        return self.contact_map == STICKS
-
 
 @dataclass(frozen=True, kw_only=True)
 class Recording(TrialFacts, Labels):

@@ -19,7 +19,7 @@ from sliplens.files import hash_json, output_folder
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
 from sliplens.progress import OnProgress, note, stage, wrote
-from sliplens.recordings import Dataset
+from sliplens.recordings import Dataset, load_dataset
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionScores, Remedies, RemovalScores
 from sliplens.results.study import (
@@ -144,7 +144,7 @@ def run_study(
     scratch = None if out is not None else tempfile.TemporaryDirectory(prefix="sliplens-study-")
     stages = _Stages(
         folder=Path(out if scratch is None else scratch.name),  # pyright: ignore[reportArgumentType] (one is given)
-        data=data if isinstance(data, Dataset) else Dataset.open(Path(data)),
+        data=data if isinstance(data, Dataset) else load_dataset(data),
         networks=networks,
         explainers=explainers,
         tests=frozenset(tests),

@@ -22,7 +22,6 @@ from sliplens.errors import InputError, RecordingError
 from sliplens.models.encodings import Encoding
 from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset, TrialInfo
-from sliplens.recordings.dataset import count_labelled, trial_path
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,13 +156,14 @@ def load_frames(
     if len(sizes) > 1:
         raise RecordingError(f"{data.folder} mixes frames of {sorted(sizes)} pixels; use one sensor at a time")
     copies_of = partial(_untouched_copies, share=untouched_share)
-    counts = [count_labelled(trial_path(data.folder, info.trial)) for info in trials]
+    counts = [int(data.read_labels(info).labelled.sum()) for info in trials]
     if not sum(counts):
         raise RecordingError(f"{data.folder}: no frame of the {len(trials)} trials has a label; label them first")
     total = sum(count + copies_of(count) for count in counts)
     images = _allocate((total, 3, image_size, image_size), scratch)
     labels, times, rows = [], [], []
-    for done, recording in enumerate(data.load_all(trials, truth=False), start=1):
+    for done, info in enumerate(trials, start=1):
+        recording = data.load(info, truth=False)
         labelled = np.flatnonzero(recording.labelled)
         compared = encoding.compare(recording.frames[labelled], recording.reference)
         images[len(rows) : len(rows) + len(labelled)] = encoding.resize(compared, image_size=image_size)

@@ -13,7 +13,7 @@ import pytest
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.images.files import decode_png
-from sliplens.recordings import ContactState, Dataset, Recording
+from sliplens.recordings import ContactState, Dataset, Recording, load_dataset
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.formats.lerobot import read_lerobot
@@ -123,7 +123,7 @@ def data(tmp_path: Path, rng: np.random.Generator) -> Dataset:
     splits = {"pressed": "train", "wet": "test", "found": "train"}
     table = [trial_info(trial_path(folder, name), split=split) for name, split in splits.items()]
     write_dataset_table(folder, table)
-    return Dataset.open(folder)
+    return load_dataset(folder)
 
 
 @pytest.fixture
@@ -349,7 +349,7 @@ def test_memory_does_not_grow_with_the_length_of_a_trial(tmp_path, rng):
         save_recording(make_trial("a", rng, count=count), trial_path(folder, "a"))
         write_dataset_table(folder, [trial_info(trial_path(folder, "a"), split="train")])
         out.mkdir()
-        data = Dataset.open(folder)
+        data = load_dataset(folder)
         tracemalloc.start()
         write_lerobot(data, out)
         peaks.append(tracemalloc.get_traced_memory()[1])
@@ -365,7 +365,7 @@ def test_the_rate_is_the_median_and_whole_where_it_nearly_is(tmp_path, rng, rate
     save_recording(make_trial("a", rng, count=9, time_s=time), trial_path(tmp_path / "data", "a"))
     write_dataset_table(tmp_path / "data", [trial_info(trial_path(tmp_path / "data", "a"), split="train")])
     (tmp_path / "out").mkdir()
-    write_lerobot(Dataset.open(tmp_path / "data"), tmp_path / "out")
+    write_lerobot(load_dataset(tmp_path / "data"), tmp_path / "out")
     # the median of steps is the reciprocal of the rate up to rounding
     assert read_info(tmp_path / "out")["fps"] == pytest.approx(fps, rel=1e-12)
     assert isinstance(read_info(tmp_path / "out")["fps"], type(fps))
@@ -376,7 +376,7 @@ def test_one_frame_alone_has_a_rate_too(tmp_path, rng):
     save_recording(make_trial("a", rng, count=1), trial_path(tmp_path / "data", "a"))
     write_dataset_table(tmp_path / "data", [trial_info(trial_path(tmp_path / "data", "a"), split="train")])
     (tmp_path / "out").mkdir()
-    write_lerobot(Dataset.open(tmp_path / "data"), tmp_path / "out")
+    write_lerobot(load_dataset(tmp_path / "data"), tmp_path / "out")
     assert read_info(tmp_path / "out")["fps"] == 30
     assert len(list(read_lerobot(tmp_path / "out")[0].read_frames())) == 1
 
@@ -400,7 +400,7 @@ def test_trials_that_do_not_go_together_are_refused(tmp_path, rng, changes, mess
     write_dataset_table(folder, table)
     (tmp_path / "out").mkdir()
     with pytest.raises(RecordingError, match=message):
-        write_lerobot(Dataset.open(folder), tmp_path / "out")
+        write_lerobot(load_dataset(folder), tmp_path / "out")
 
 
 def test_a_folder_that_cannot_take_it_is_refused(data, exported, tmp_path):

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from sliplens.errors import RecordingError
-from sliplens.recordings import ContactState, Dataset, Recording
+from sliplens.recordings import ContactState, Recording, load_dataset
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.formats.lerobot import read_lerobot
@@ -55,7 +55,7 @@ def exported(tmp_path: Path, rng: np.random.Generator) -> Path:
     write_dataset_table(source, table)
     folder = tmp_path / "exported"
     folder.mkdir()
-    write_lerobot(Dataset.open(source), folder)
+    write_lerobot(load_dataset(source), folder)
     return folder
 
 

@@ -14,7 +14,7 @@ from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_path
 from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.labelling import Labelling
-from sliplens.recordings.store import forces_path, load_forces, load_labels, read_reference, stream_frames
+from sliplens.recordings.store import forces_path, load_forces, load_recording, stream_frames
 from sliplens.recordings.trial import ContactState, Labels, TrialFacts, require_unit_interval
 
 STATES = {str(state): state for state in ContactState}
@@ -34,7 +34,7 @@ def read_stored(folder: Path) -> list[Capture]:
 def read_stored_trial(data: Dataset, info: TrialInfo) -> Capture:
     """Read one trial of a data set as `read_stored` does."""
     path = trial_path(data.folder, info.trial)
-    stored = load_labels(path)
+    stored = load_recording(path, pixels=False)
     return Capture(
         **{field.name: getattr(info, field.name) for field in fields(TrialFacts)},
         source=f"{info.trial} of {data.folder}",
@@ -43,9 +43,9 @@ def read_stored_trial(data: Dataset, info: TrialInfo) -> Capture:
         read_frames=partial(stream_frames, path),
         forces=load_forces(forces_path(data.folder, info.trial))
         if info.forces_sha256
-        else _forces_of_frames(stored.time_s, stored.labels, info.trial),
-        labels=stored.labels,
-        reference=read_reference(path),
+        else _forces_of_frames(stored.time_s, stored, info.trial),
+        labels=stored,
+        reference=stored.reference,
         split=info.split,
         simulated=data.simulated,
     )

@@ -3,7 +3,7 @@
 from sliplens.recordings.labelling import ForceAxes, Found, FrictionEstimate, Lag
 from sliplens.recordings.labels.axes import ContactForces, apply_axes, infer_axes
 from sliplens.recordings.labels.friction import ImageMotion, estimate_friction, given_friction
-from sliplens.recordings.labels.lag import estimate_lag, given_lag, image_motion, measure_motion
+from sliplens.recordings.labels.lag import estimate_lag, given_lag, measure_motion
 from sliplens.recordings.labels.margin import FoundLabels, Reason, contact_threshold, label_frames, label_trial
 from sliplens.recordings.labels.reference import choose_reference
 from sliplens.recordings.options import LabelSettings
@@ -25,7 +25,6 @@ __all__ = [
     "estimate_lag",
     "given_friction",
     "given_lag",
-    "image_motion",
     "infer_axes",
     "label_frames",
     "label_trial",

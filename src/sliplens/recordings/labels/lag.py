@@ -30,13 +30,8 @@ def soften(frame: Frame) -> Float32[np.ndarray, "rows columns 3"]:
     return (blocks / np.float32(side * side)).astype(np.float32)
 
 
-def image_motion(previous: Frame, frame: Frame) -> float:
-    """Mean absolute difference of two softened frames, in grey levels."""
-    return float(np.mean(np.abs(soften(frame) - soften(previous))))
-
-
 def measure_motion(frames: Iterable[Frame]) -> Float[np.ndarray, " frames"]:
-    """How much each frame differs from the one before it (`image_motion`); 0 for the first."""
+    """Mean absolute difference of each softened frame from the one before it, in grey levels; 0 for the first."""
     motion: list[float] = []
     previous = None
     for frame in frames:
