@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
@@ -15,13 +15,7 @@ Contrast: TypeAlias = Literal["dark", "light", "colour"]
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerKind:
-    """Difference between the markers of a sensor and what they are printed on.
-
-    Raises
-    ------
-    InputError
-        If the radii are not a positive low and a larger high, or a channel's weight is negative.
-    """
+    """Difference between the markers of a sensor and what they are printed on."""
 
     name: str
     contrasts: tuple[Contrast, ...]
@@ -79,36 +73,27 @@ _BRIGHT, _DARK, _EXPOSED = 250, 5, 0.5
 _GREY = np.array([1, 1, 1], dtype=np.float32) / 3
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Spots:
+class _Spots(NamedTuple):
     """Round spots that stand out in one way."""
 
-    labels: Int[np.ndarray, "height width"]
-    """Number of the component that each pixel belongs to."""
-    chosen: Int[np.ndarray, " spots"]
-    """Components that are round."""
+    labels: Int[np.ndarray, "height width"]  # number of the component that each pixel belongs to
+    chosen: Int[np.ndarray, " spots"]  # components that are round
     radius_px: float
-    score: float
-    """Agreement with markers: many, alike, and little else."""
+    score: float  # agreement with markers: many, alike, and little else
 
 
 def find_appearance(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind) -> Appearance:
-    """Find the colour, size and contrast of a frame's markers.
-
-    Spots are what passes Otsu's threshold over the local background; those that are round and of one size tell the
-    colour in which markers differ from what surrounds them. Its direction is the weight of the channels, unless the
-    kind names them.
-    """
+    """Find the colour, size and contrast of a frame's markers: round spots of one size over Otsu's threshold."""
     _require_exposed(frame)
-    tries: list[tuple[Contrast, _Spots]] = [
-        (contrast, spots) for contrast in kind.contrasts if (spots := _find_spots(frame, kind, contrast))
-    ]
+    tries: dict[Contrast, _Spots] = {
+        contrast: spots for contrast in kind.contrasts if (spots := _find_spots(frame, kind, contrast))
+    }
     if not tries:
         raise ImageError(
             f"fewer than {FEWEST} markers of kind {kind.name} were found in a frame of {frame.shape[0]} x "
             f"{frame.shape[1]} pixels; name another kind, or use a frame in which the markers are seen"
         )
-    contrast, spots = max(tries, key=lambda one: one[1].score)
+    contrast, spots = max(tries.items(), key=lambda one: one[1].score)
     weights = _weights(frame, spots, kind, contrast)
     signal = frame.astype(np.float32) @ weights
     inside = np.isin(spots.labels, spots.chosen)
@@ -118,14 +103,11 @@ def find_appearance(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind
 
 
 def _require_exposed(frame: UInt8[np.ndarray, "height width 3"]) -> None:
-    for what, share in (
-        ("saturated", np.mean(frame.min(axis=-1) >= _BRIGHT)),
-        ("black", np.mean(frame.max(axis=-1) <= _DARK)),
-    ):
-        if share > _EXPOSED:
+    for what, pixels in (("saturated", frame.min(axis=-1) >= _BRIGHT), ("black", frame.max(axis=-1) <= _DARK)):
+        if np.mean(pixels) > _EXPOSED:
             raise ImageError(
-                f"{100 * share:.0f} % of the frame is {what}, so that no marker can be told; mend the exposure or name "
-                "another frame"
+                f"{100 * np.mean(pixels):.0f} % of the frame is {what}, so that no marker can be told; mend the "
+                "exposure or name another frame"
             )
 
 
@@ -209,31 +191,30 @@ _SLOPE_SHARE = 0.5  # of the contrast that the background may change by across a
 
 @dataclass(frozen=True, kw_only=True)
 class Shapes:
-    """Measurements on spots."""
+    """Measurements on spots; pixel coordinates are (x, y), pixel centres at whole numbers."""
 
     centre_px: Float[np.ndarray, "spots 2"]
     radius_px: Float[np.ndarray, " spots"]
+    """Radius of the disc of the same area."""
     contrast: Float[np.ndarray, " spots"]
+    """Contrast with the background around it, in weighted grey levels."""
     roundness: Float[np.ndarray, " spots"]
     """Shorter over longer axis, 1 for a disc."""
     noise: Float[np.ndarray, " spots"]
-    """Standard deviation of the background around it."""
+    """Standard deviation of the background around it, in weighted grey levels."""
+
+    def __len__(self) -> int:
+        return len(self.centre_px)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Window:
+class _Window(NamedTuple):
     """Common part of windows of one size; pixels in one row."""
 
     half: int
-    x: Float32[np.ndarray, " pixels"]
-    y: Float32[np.ndarray, " pixels"]
     ring: Bool[np.ndarray, " pixels"]
-    means: Float32[np.ndarray, "pixels 4"]
-    """Averages over the ring (level, slope along x, slope along y) and over the core."""
-    plane: Float32[np.ndarray, "3 pixels"]
-    """1, x and y."""
-    moments: Float32[np.ndarray, "pixels 6"]
-    """1, x, y, x^2, y^2 and xy."""
+    means: Float32[np.ndarray, "pixels 4"]  # over the ring (level, slope along x, slope along y) and over the core
+    plane: Float32[np.ndarray, "3 pixels"]  # 1, x and y
+    moments: Float32[np.ndarray, "pixels 6"]  # 1, x, y, x^2, y^2 and xy
 
 
 @lru_cache(maxsize=32)
@@ -244,34 +225,26 @@ def _window(radius_px: float) -> _Window:
     ring, core = (distance > _INNER * radius_px) & (distance < _OUTER * radius_px), distance <= _CORE * radius_px
     means = [ring / ring.sum(), ring * x / (x[ring] @ x[ring]), ring * y / (y[ring] @ y[ring]), core / core.sum()]
     one = np.ones_like(x)
-    return _Window(
-        half=half,
-        x=x,
-        y=y,
-        ring=ring,
-        means=np.stack(means, axis=1).astype(np.float32),
-        plane=np.stack([one, x, y]),
-        moments=np.stack([one, x, y, x * x, y * y, x * y], axis=1),
-    )
+    moments = np.stack([one, x, y, x * x, y * y, x * y], axis=1)
+    return _Window(half, ring, np.stack(means, axis=1).astype(np.float32), np.stack([one, x, y]), moments)
 
 
 def measure_spots(
     signal: Float32[np.ndarray, "height width"], near_px: Float[np.ndarray, "spots 2"], *, radius_px: float
 ) -> Shapes:
-    """Measure the spots near some places: centroid and area of what passes half of the contrast.
+    """Measure the spots near some places, given to a third of a radius, in a signal that is high on markers.
 
     The background is a plane, fitted in a ring around each spot. A pixel counts as marker from a quarter (not at all)
     to three quarters (wholly) of the contrast: so speckle inside a marker does not move its centre, while its edge
     still does by fractions of a pixel.
-
-    `signal`: high on markers; `near_px`: x, y of each spot, to about a third of a radius.
     """
     window = _window(round(max(radius_px, 1.5), 1))
     height, width = signal.shape
-    pad = window.half + 1
-    padded = np.pad(signal, pad, mode="edge")
     whole = np.clip(np.round(near_px), 0, (width - 1, height - 1)).astype(np.int64)
-    patches = _cut(padded, whole, window, pad)
+    steps = np.arange(2 * window.half + 1)
+    rows, columns = whole[:, 1, None] + steps, whole[:, 0, None] + steps
+    padded = np.pad(signal, window.half, mode="edge")
+    patches = padded[rows[:, :, None], columns[:, None, :]].reshape(len(whole), steps.size**2)
     level, slope_x, slope_y, core = (patches @ window.means).T
     contrast = core - level
     limit = _SLOPE_SHARE * np.abs(contrast) / radius_px
@@ -284,7 +257,7 @@ def measure_spots(
     offset = np.zeros((len(whole), 2), dtype=np.float32)
     moments = np.ones((len(whole), 6), dtype=np.float32)
     for _ in range(_ROUNDS):
-        x, y = window.x - offset[:, :1], window.y - offset[:, 1:]
+        x, y = window.plane[1] - offset[:, :1], window.plane[2] - offset[:, 1:]
         near = np.sqrt(x * x + y * y)
         part = share * np.clip(np.subtract(_REACH * radius_px + 0.5, near, out=near), 0, 1, out=near)
         moments = part @ window.moments
@@ -302,14 +275,6 @@ def measure_spots(
     )
 
 
-def _cut(
-    padded: Float32[np.ndarray, "rows columns"], whole: Int[np.ndarray, "spots 2"], window: _Window, pad: int
-) -> Float32[np.ndarray, "spots pixels"]:
-    steps = np.arange(-window.half, window.half + 1) + pad
-    rows, columns = whole[:, 1, None] + steps, whole[:, 0, None] + steps
-    return padded[rows[:, :, None], columns[:, None, :]].reshape(len(whole), (2 * window.half + 1) ** 2)
-
-
 _SMALL_RADIUS = 3.0  # pixels: spots are looked for in frames reduced so far, and measured in the frame itself
 _LEAST_RESPONSE = 0.15  # of the markers' own
 _LEAST_CONTRAST = 0.3  # of the markers' own
@@ -319,23 +284,18 @@ _LEAST_ROUNDNESS = 0.4
 
 
 @dataclass(frozen=True, kw_only=True)
-class Markers:
+class Markers(Shapes):
     """Markers of one frame; pixel coordinates are (x, y), pixel centres at whole numbers."""
 
-    centre_px: Float[np.ndarray, "markers 2"]
-    radius_px: Float[np.ndarray, " markers"]
-    """Radius of the disc of the same area."""
-    contrast: Float[np.ndarray, " markers"]
-    """Contrast with the background around it, in weighted grey levels."""
-    roundness: Float[np.ndarray, " markers"]
-    """Shorter over longer axis, 1 for a disc."""
-    whole: Bool[np.ndarray, " markers"]
+    whole: Bool[np.ndarray, " spots"]
     """False where the edge of the frame cuts a marker, so that its centre is not seen."""
     appearance: Appearance
     """Look that they have in common."""
 
-    def __len__(self) -> int:
-        return len(self.centre_px)
+    def only(self, chosen: Bool[np.ndarray, " spots"]) -> "Markers":
+        """Some of them."""
+        arrays = {name: values for name, values in vars(self).items() if name != "appearance"}
+        return replace(self, **{name: values[chosen] for name, values in arrays.items()})
 
 
 def detect_markers(
@@ -356,8 +316,6 @@ def detect_markers(
 
     Raises
     ------
-    InputError
-        If the kind is not known, or OpenCV is missing.
     ImageError
         If no appearance is given and the frame is over- or underexposed, or shows fewer than 4 markers.
     """
@@ -384,18 +342,11 @@ def _detect(frame: UInt8[np.ndarray, "height width 3"], appearance: Appearance) 
     shapes = measure_spots(signal, near, radius_px=appearance.radius_px)
     keep = _sound(shapes, near, appearance)
     keep[keep] = _first_of_each(shapes.centre_px[keep], reach_px=appearance.radius_px)
-    centre, radius = shapes.centre_px[keep], shapes.radius_px[keep]
     height, width = signal.shape
     # a pixel beyond the disc: its blurred edge counts too
-    whole = (centre >= radius[:, None] + 1) & (centre <= np.array([width - 2, height - 2]) - radius[:, None])
-    return Markers(
-        centre_px=centre,
-        radius_px=radius,
-        contrast=shapes.contrast[keep],
-        roundness=shapes.roundness[keep],
-        whole=np.all(whole, axis=1),
-        appearance=appearance,
-    )
+    centre, radius = shapes.centre_px, shapes.radius_px[:, None]
+    whole = np.all((centre >= radius + 1) & (centre <= np.array([width - 2, height - 2]) - radius), axis=1)
+    return Markers(**vars(shapes), whole=whole, appearance=appearance).only(keep)
 
 
 def _find_places(signal: Float32[np.ndarray, "height width"], appearance: Appearance) -> Float[np.ndarray, "places 2"]:

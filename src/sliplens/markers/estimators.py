@@ -1,10 +1,9 @@
 """Estimators of the safety margin from the marker field: one interface, one row a paper."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import final
+from typing import TypeAlias, final
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -18,15 +17,12 @@ _PULL_PX = 0.2  # of the inner markers' mean motion: several times its noise
 _INNER_SHARE = 1 / 3  # of the markers: what surely touches
 
 
+__all__ = ["ESTIMATORS", "FieldTrial", "MarginEstimator", "affine_parts", "field_trial", "find_hold", "get_estimator"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class FieldTrial:
-    """Displacements of one trial; pixel coordinates are (x, y).
-
-    Raises
-    ------
-    InputError
-        If there are fewer than 6 markers, sizes disagree, or the frame of the hold is not one of the trial.
-    """
+    """Displacements of one trial, of at least 6 markers; pixel coordinates are (x, y)."""
 
     rest_px: Float[np.ndarray, "_ 2"]
     displacement_px: Float[np.ndarray, "_ _ 2"]
@@ -74,8 +70,16 @@ class FieldTrial:
 def _ring(
     rest_px: Float[np.ndarray, "markers 2"], pressed_px: Float[np.ndarray, "markers 2"], low: float, high: float
 ) -> Bool[np.ndarray, " markers"]:
-    """Markers between two shares of all, ranked by their distance from where pressing moved nothing."""
-    distance = np.linalg.norm(rest_px - pressed_centre(rest_px, pressed_px), axis=1)
+    """Markers between two shares of all, ranked by their distance from where pressing moved nothing.
+
+    That is told by the affine fit; the middle of the markers stands for it where the fit says nothing.
+    """
+    centre = rest_px.mean(axis=0)
+    mean_x, mean_y, divergence, *_ = affine_parts(rest_px, pressed_px[None])[0]
+    if np.isfinite(divergence) and abs(divergence) >= 1e-3:
+        reach = np.abs(rest_px - centre).max() / 2
+        centre = centre - np.clip(2 * np.array([mean_x, mean_y]) / divergence, -reach, reach)
+    distance = np.linalg.norm(rest_px - centre, axis=1)
     rank = np.argsort(np.argsort(distance, kind="stable"), kind="stable") / len(distance)
     return (rank >= low) & (rank < high)
 
@@ -114,18 +118,6 @@ def affine_parts(
     return np.where(known.sum(axis=1)[:, None] >= 3, parts, np.nan)
 
 
-def pressed_centre(
-    rest_px: Float[np.ndarray, "markers 2"], displacement_px: Float[np.ndarray, "markers 2"]
-) -> Float[np.ndarray, "2"]:
-    """Point that pressing left where it was, by the affine fit; the middle of the markers where it says nothing."""
-    middle = rest_px.mean(axis=0)
-    mean_x, mean_y, divergence, *_ = affine_parts(rest_px, displacement_px[None])[0]
-    if not np.isfinite(divergence) or abs(divergence) < 1e-3:
-        return middle
-    reach = np.abs(rest_px - middle).max() / 2
-    return middle - np.clip(2 * np.array([mean_x, mean_y]) / divergence, -reach, reach)
-
-
 def find_hold(rest_px: Float[np.ndarray, "markers 2"], displacement_px: Float[np.ndarray, "frames markers 2"]) -> int:
     """Find the last frame before the pull: pressed, and the inner markers not yet moved by 0.2 px on average.
 
@@ -144,18 +136,11 @@ def find_hold(rest_px: Float[np.ndarray, "markers 2"], displacement_px: Float[np
 
 
 def field_trial(tracks: Tracks, *, hold: int | None = None) -> FieldTrial:
-    """Displacements of a tracked trial, its hold found by `find_hold` if it is not given.
-
-    Raises
-    ------
-    InputError
-        If fewer than 6 markers of the reference frame were tracked, or the frame is not one of the trial.
-    """
+    """Displacements of a tracked trial, its hold found by `find_hold` if it is not given."""
     kept = tracks.from_reference
     rest, displacement = tracks.rest_px[kept], tracks.displacement_px[:, kept]
-    return FieldTrial(
-        rest_px=rest, displacement_px=displacement, hold=find_hold(rest, displacement) if hold is None else hold
-    )
+    hold = find_hold(rest, displacement) if hold is None else hold
+    return FieldTrial(rest_px=rest, displacement_px=displacement, hold=hold)
 
 
 _BINS, _BIN_PX = 48, 0.25
@@ -164,12 +149,12 @@ _STILL_PX = 0.05
 
 
 def mean_shear(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
-    """Mean motion of all markers since the hold, in pixels: the trivial reading of a pull."""
+    """Mean motion of all markers since the hold, in pixels."""
     return np.linalg.norm(_mean(trial.increment_px), axis=-1)[:, None]
 
 
 def shear_over_divergence(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
-    """Mean motion over divergence, in pixels: a pull for a press, as a ratio of forces is."""
+    """Mean motion over divergence, in pixels."""
     return mean_shear(trial) / _pressed(trial)[:, None]
 
 
@@ -181,14 +166,9 @@ def _pressed(trial: FieldTrial) -> Float[np.ndarray, " frames"]:
 def rigid_residual(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
     """Largest, and root mean square, distance of the contact's markers from a rigid motion t + w x r, in pixels.
 
-    Where the contact sticks, it moves as the object does; where it slips, it is left behind. The paper calls it slip
-    when the largest distance passes a threshold; here the margin is fitted to it, and to the root mean square, which
-    one bad marker moves less.
-
-    References
-    ----------
     Dong, Ma, Donlon and Rodriguez, *Maintaining Grasps within Slipping Bounds by Monitoring Incipient Slip*, ICRA 2019.
     """
+    # the paper looks at the largest alone; one bad marker moves the root mean square less
     distance = _from_rigid(trial, trial.inner | trial.outer)
     known = np.isfinite(distance).any(axis=1)
     largest, rms = np.full(len(trial), np.nan), np.full(len(trial), np.nan)
@@ -198,12 +178,9 @@ def rigid_residual(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
 
 
 def stick_area(trial: FieldTrial, *, tolerance_px: float) -> Float[np.ndarray, "frames 1"]:
-    """Share of the contact's markers that move with the rigid motion of its middle, within a tolerance in pixels.
+    """Share of the contact's markers that move with the rigid motion of its middle.
 
-    References
-    ----------
-    Sui et al., *Incipient Slip Detection Method for Soft Objects with Vision-Based Tactile Sensor*, Measurement 2022:
-    the ratio of the areas of stick and contact tells how near slip is.
+    Sui et al., *Incipient Slip Detection Method for Soft Objects with Vision-Based Tactile Sensor*, Measurement 2022.
     """
     distance = _from_rigid(trial, trial.inner)
     contact = trial.inner | trial.outer
@@ -216,17 +193,12 @@ def stick_area(trial: FieldTrial, *, tolerance_px: float) -> Float[np.ndarray, "
 def displacement_entropy(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
     """Entropy H = -sum p ln p of the histogram of motions since the hold, and its change to the next frame.
 
-    Bins of a quarter pixel, the last one open: a width taken from the trial's own largest motion would tell of frames
-    that are still to come.
-
-    References
-    ----------
     Yuan, Li, Srinivasan and Adelson, *Measurement of Shear and Slip with a GelSight Tactile Sensor*, ICRA 2015; for the
     rate Hu et al., *Learning to Detect Slip through Tactile Estimation of the Contact Force Field and its Entropy*,
     arXiv:2303.00935.
     """
-    length = np.linalg.norm(trial.increment_px, axis=-1)
-    bins = np.minimum(length / _BIN_PX, _BINS - 1)
+    # the last one open: a width taken from the trial's own largest motion would tell of frames that are still to come
+    bins = np.minimum(np.linalg.norm(trial.increment_px, axis=-1) / _BIN_PX, _BINS - 1)
     entropy = np.full(len(trial), np.nan)
     for frame, row in enumerate(bins):
         known = row[np.isfinite(row)].astype(int)
@@ -239,10 +211,6 @@ def displacement_entropy(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
 def edge_over_centre(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
     """Motion of the contact's edge over that of its middle since the hold, and the motion of the middle in pixels.
 
-    Slip begins at the edge: it falls behind the middle.
-
-    References
-    ----------
     Khamis, Albero, Salerno, Idil, Loizou and Redmond, *PapillArray: An incipient slip sensor for dexterous robotic or
     prosthetic manipulation*, Sensors and Actuators A 2018.
     """
@@ -255,15 +223,7 @@ def edge_over_centre(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
 
 
 def helmholtz_hodge(trial: FieldTrial) -> Float[np.ndarray, "frames 8"]:
-    """Parts of the field since T_0 and since the hold: divergence, curl, shift and deviators, by least squares.
-
-    Divergence and curl since T_0; length of the mean motion since the hold, and divergence, curl and deviator of that
-    motion, all, and its mean over the inner markers alone.
-
-    References
-    ----------
-    Zhang, Kan, Yang, Tse and Wang, 2019 (see `affine_parts`).
-    """
+    """Divergence and curl since T_0; all parts of the motion since the hold, that of the middle, and their ratio."""
     whole, since = (affine_parts(trial.rest_px, field) for field in (trial.displacement_px, trial.increment_px))
     inner = np.linalg.norm(_mean(trial.increment_px[:, trial.inner]), axis=-1)
     scale = float(np.linalg.norm(trial.rest_px - trial.rest_px.mean(axis=0), axis=1).max())
@@ -304,117 +264,86 @@ _RIDGE = 1e-3
 _HERTZ = 1.5  # exponent of the sphere, physics of Cattaneo and Mindlin
 _TOLERANCES_PX = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0, 1.5)
 
-Margins = Float[np.ndarray, " frames"]
+Margins: TypeAlias = Float[np.ndarray, " frames"]
+Trials: TypeAlias = Sequence[FieldTrial]
+Reader: TypeAlias = Callable[[FieldTrial], Margins]
+"""Reads the margin of each frame; not finite where the field tells nothing."""
 
 
-class MarginEstimator(ABC):
+@final
+class MarginEstimator:
     """Reads the safety margin of every frame of a trial, after it was fitted on others."""
 
-    def fit(self, trials: Sequence[FieldTrial], margins: Sequence[Float[np.ndarray, " _"]]) -> "MarginEstimator":
+    def __init__(self, learn: Callable[[Trials, Margins], Reader]) -> None:
+        self._learn = learn
+        self._fitted: tuple[Reader, float] | None = None
+
+    def fit(self, trials: Trials, margins: Sequence[Float[np.ndarray, " _"]]) -> "MarginEstimator":
         """Fit on training trials; gives itself.
 
-        Parameters
-        ----------
-        margins
-            Safety margin of each frame of each trial, in [0, 1]; NaN where there is no label.
-
-        Raises
-        ------
-        InputError
-            If no frame is labelled, or a trial has another number of frames than margins.
+        `margins`: safety margin of each frame of each trial, in [0, 1]; NaN where there is no label.
         """
         if len(trials) != len(margins) or any(len(one) != len(own) for one, own in zip(trials, margins, strict=False)):
             raise InputError("trials and margins do not match; give a margin for every frame of every trial")
         labels = np.concatenate([*margins, np.zeros(0)])
         if not np.isfinite(labels).any():
             raise InputError("no frame of the training trials has a label; give trials with safety margins")
-        self._mean = float(np.nanmean(labels))
-        self._fit(trials, labels)
+        self._fitted = self._learn(trials, labels), float(np.nanmean(labels))
         return self
 
     def estimate(self, trial: FieldTrial) -> Margins:
-        """Safety margin of each frame, in [0, 1]; the training mean where the field tells nothing.
-
-        Raises
-        ------
-        InputError
-            If the estimator was not fitted.
-        """
-        if not hasattr(self, "_mean"):
+        """Safety margin of each frame, in [0, 1]; the training mean where the field tells nothing."""
+        if self._fitted is None:
             raise InputError("the estimator was not fitted; call fit with training trials first")
-        value = self._estimate(trial)
-        return np.clip(np.where(np.isfinite(value), value, self._mean), 0, 1)
-
-    @abstractmethod
-    def _fit(self, trials: Sequence[FieldTrial], labels: Float[np.ndarray, " all_frames"]) -> None: ...
-
-    @abstractmethod
-    def _estimate(self, trial: FieldTrial) -> Margins: ...
+        read, mean = self._fitted
+        return _bounded(read(trial), mean)
 
 
-@final
-class Constant(MarginEstimator):
+def _bounded(margin: Margins, mean: float) -> Margins:
+    return np.clip(np.where(np.isfinite(margin), margin, mean), 0, 1)
+
+
+def _usable(labels: Margins, features: Float[np.ndarray, "frames features"]) -> Bool[np.ndarray, " frames"]:
+    """Labelled frames whose field tells something."""
+    usable = np.isfinite(labels) & np.all(np.isfinite(features), axis=1)
+    if not usable.any():
+        raise InputError("no labelled frame of the training trials has a field; follow more markers")
+    return usable
+
+
+def _learn_mean(_: Trials, labels: Margins) -> Reader:
     """The mean margin of the training frames: what a reader without any touch would say."""
-
-    def _fit(self, trials: Sequence[FieldTrial], labels: Float[np.ndarray, " all_frames"]) -> None:
-        """Nothing but the mean is needed."""
-
-    def _estimate(self, trial: FieldTrial) -> Margins:
-        return np.full(len(trial), self._mean)
+    return lambda trial: np.full(len(trial), np.nanmean(labels))
 
 
-@final
-class FeatureRegression(MarginEstimator):
+def _learn_features(features: Callable[[FieldTrial], np.ndarray], trials: Trials, labels: Margins) -> Reader:
     """Ridge regression of the margin on a few numbers of the field, their squares and products."""
+    values, mean = np.concatenate([features(trial) for trial in trials]), np.nanmean(labels)
+    usable = _usable(labels, values)
+    middle, scale = values[usable].mean(axis=0), values[usable].std(axis=0) + 1e-9
+    rows, columns = np.triu_indices(values.shape[1])
 
-    def __init__(self, features: Callable[[FieldTrial], np.ndarray]) -> None:
-        self._features = features
-
-    def _fit(self, trials: Sequence[FieldTrial], labels: Float[np.ndarray, " all_frames"]) -> None:
-        values = np.concatenate([self._features(trial) for trial in trials])
-        usable = np.isfinite(labels) & np.all(np.isfinite(values), axis=1)
-        if not usable.any():
-            raise InputError("no labelled frame of the training trials has a field; follow more markers")
-        self._middle, self._scale = values[usable].mean(axis=0), values[usable].std(axis=0) + 1e-9
-        terms = self._terms(values[usable])
-        normal = terms.T @ terms / len(terms) + _RIDGE * np.eye(terms.shape[1])
-        self._weights = np.linalg.solve(normal, terms.T @ (labels[usable] - self._mean) / len(terms))
-
-    def _estimate(self, trial: FieldTrial) -> Margins:
-        return self._mean + self._terms(self._features(trial)) @ self._weights
-
-    def _terms(self, values: np.ndarray) -> np.ndarray:
+    def terms(values: np.ndarray) -> np.ndarray:
         # what lies far outside the training frames is taken for their border
-        unit = np.clip((values - self._middle) / self._scale, -5, 5)
-        rows, columns = np.triu_indices(unit.shape[1])
+        unit = np.clip((values - middle) / scale, -5, 5)
         return np.concatenate([np.ones((len(unit), 1)), unit, unit[:, rows] * unit[:, columns]], axis=1)
 
-
-@final
-class StickArea(MarginEstimator):
-    """Sui's share of markers that stick, its tolerance chosen on the training trials.
-
-    References
-    ----------
-    See `stick_area`; the margin is a quadratic in the share, for the relation depends on the contact's shape: for a
-    sphere the area ratio is Gamma^(2/3).
-    """
-
-    def _fit(self, trials: Sequence[FieldTrial], labels: Float[np.ndarray, " all_frames"]) -> None:
-        tries = []
-        margins = np.split(labels, np.cumsum([len(trial) for trial in trials])[:-1])
-        for tolerance in _TOLERANCES_PX:
-            one = FeatureRegression(partial(stick_area, tolerance_px=tolerance)).fit(trials, margins)
-            answer = np.concatenate([one.estimate(trial) for trial in trials])
-            tries.append((float(np.nanmean((answer - labels) ** 2)), one))
-        self._best = min(tries, key=lambda pair: pair[0])[1]
-
-    def _estimate(self, trial: FieldTrial) -> Margins:
-        return self._best.estimate(trial)
+    known = terms(values[usable])
+    normal = known.T @ known / len(known) + _RIDGE * np.eye(known.shape[1])
+    weights = np.linalg.solve(normal, known.T @ (labels[usable] - mean) / len(known))
+    return lambda trial: mean + terms(features(trial)) @ weights
 
 
-@final
-class Eccentricity(MarginEstimator):
+def _learn_stick_area(trials: Trials, labels: Margins) -> Reader:
+    """A quadratic in Sui's share of markers that stick, its tolerance chosen on the training trials."""
+    # the relation depends on the contact's shape: for a sphere the area ratio is Gamma^(2/3)
+    mean = float(np.nanmean(labels))
+    readers = [_learn_features(partial(stick_area, tolerance_px=one), trials, labels) for one in _TOLERANCES_PX]
+    answers = [_bounded(np.concatenate([read(trial) for trial in trials]), mean) for read in readers]
+    return readers[int(np.argmin([np.nanmean((answer - labels) ** 2) for answer in answers]))]
+
+
+def _learn_eccentricity(trials: Trials, labels: Margins) -> Reader:
     """Ikeda's eccentricity e = delta_t / a: how far the contact's middle has moved, for how far it is pressed.
 
     Gamma = (1 - delta_t / delta_full)^1.5 for a sphere, with delta_full = mu (2 - nu) delta / (2 (1 - nu)): full slip
@@ -423,79 +352,41 @@ class Eccentricity(MarginEstimator):
     inner markers since the hold, delta is taken in proportion to the divergence since T_0, and the factor between them,
     which holds the friction, is fitted on the training trials.
 
-    References
-    ----------
     Ikeda, Kurita, Ueda, Matsumoto and Ogasawara, *Grip Force Control for an Elastic Finger using Vision-based Incipient
     Slip Feedback*, IROS 2004; Obinata et al., *Vision Based Tactile Sensor Using Transparent Elastic Fingertip for
     Dexterous Handling*, 2007. Johnson, *Contact Mechanics* (1985), section 7.2.
     """
-
-    def _fit(self, trials: Sequence[FieldTrial], labels: Float[np.ndarray, " all_frames"]) -> None:
-        ratio = np.concatenate([self._ratio(trial) for trial in trials])
-        usable = np.isfinite(labels) & np.isfinite(ratio)
-        if not usable.any():
-            raise InputError("no labelled frame of the training trials has a field; follow more markers")
-        tries = np.geomspace(1e-2, 1e2, 400) * max(float(np.median(ratio[usable])), 1e-3)
-        errors = [np.mean((self._margin(ratio[usable], full) - labels[usable]) ** 2) for full in tries]
-        self._full = float(tries[int(np.argmin(errors))])
-
-    def _estimate(self, trial: FieldTrial) -> Margins:
-        return self._margin(self._ratio(trial), self._full)
-
-    @staticmethod
-    def _ratio(trial: FieldTrial) -> Margins:
-        return np.linalg.norm(_mean(trial.increment_px[:, trial.inner]), axis=1) / _pressed(trial)
-
-    @staticmethod
-    def _margin(ratio: np.ndarray, full: float) -> np.ndarray:
-        return np.clip(1 - ratio / full, 0, 1) ** _HERTZ
+    ratio = np.concatenate([_eccentricity(trial) for trial in trials])
+    usable = _usable(labels, ratio[:, None])
+    tries = np.geomspace(1e-2, 1e2, 400) * max(float(np.median(ratio[usable])), 1e-3)
+    errors = [np.mean((_hertz(ratio[usable], full) - labels[usable]) ** 2) for full in tries]
+    return lambda trial: _hertz(_eccentricity(trial), tries[int(np.argmin(errors))])
 
 
-ESTIMATORS: dict[str, Callable[[], MarginEstimator]] = {
-    "constant": Constant,
-    "mean-shear": partial(FeatureRegression, mean_shear),
-    "shear-over-divergence": partial(FeatureRegression, shear_over_divergence),
-    "ikeda-eccentricity": Eccentricity,
-    "sui-stick-area": StickArea,
-    "dong-rigid-residual": partial(FeatureRegression, rigid_residual),
-    "yuan-entropy": partial(FeatureRegression, displacement_entropy),
-    "khamis-edge-centre": partial(FeatureRegression, edge_over_centre),
-    "helmholtz-hodge": partial(FeatureRegression, helmholtz_hodge),
+def _eccentricity(trial: FieldTrial) -> Margins:
+    return np.linalg.norm(_mean(trial.increment_px[:, trial.inner]), axis=1) / _pressed(trial)
+
+
+def _hertz(ratio: Margins, full: float) -> Margins:
+    return np.clip(1 - ratio / full, 0, 1) ** _HERTZ
+
+
+ESTIMATORS: dict[str, Callable[[Trials, Margins], Reader]] = {
+    "constant": _learn_mean,
+    "mean-shear": partial(_learn_features, mean_shear),
+    "shear-over-divergence": partial(_learn_features, shear_over_divergence),
+    "ikeda-eccentricity": _learn_eccentricity,
+    "sui-stick-area": _learn_stick_area,
+    "dong-rigid-residual": partial(_learn_features, rigid_residual),
+    "yuan-entropy": partial(_learn_features, displacement_entropy),
+    "khamis-edge-centre": partial(_learn_features, edge_over_centre),
+    "helmholtz-hodge": partial(_learn_features, helmholtz_hodge),
 }
-"""Estimators by name, unfitted: the first three are trivial, the others named for their papers."""
+"""What each estimator learns from trials and their margins: the first three trivial, the others named for papers."""
 
 
 def get_estimator(name: str) -> MarginEstimator:
-    """Unfitted estimator of a name.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
+    """Unfitted estimator of a name, a row of `ESTIMATORS`."""
     if name not in ESTIMATORS:
         raise InputError(f"estimator {name!r} is not known; choose {', '.join(ESTIMATORS)}")
-    return ESTIMATORS[name]()
-
-
-__all__ = [
-    "ESTIMATORS",
-    "Constant",
-    "Eccentricity",
-    "FeatureRegression",
-    "FieldTrial",
-    "MarginEstimator",
-    "StickArea",
-    "affine_parts",
-    "displacement_entropy",
-    "edge_over_centre",
-    "field_trial",
-    "find_hold",
-    "get_estimator",
-    "helmholtz_hodge",
-    "mean_shear",
-    "pressed_centre",
-    "rigid_residual",
-    "shear_over_divergence",
-    "stick_area",
-]
+    return MarginEstimator(ESTIMATORS[name])

@@ -1,9 +1,16 @@
 """From one frame to the next: a step where the pattern moved little, a search where it may have jumped."""
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+Places: TypeAlias = Float[np.ndarray, "markers 2"]
+Spots: TypeAlias = Float[np.ndarray, "spots 2"]
+Chosen: TypeAlias = Bool[np.ndarray, " markers"]
 
 _NEIGHBOURS = 8
 _FEWEST = 3
@@ -21,7 +28,7 @@ class Neighbours:
     """Distance of the nearest one."""
 
 
-def find_neighbours(place_px: Float[np.ndarray, "markers 2"]) -> Neighbours:
+def find_neighbours(place_px: Places) -> Neighbours:
     """Find the nearest eight markers of each, or all others where there are fewer."""
     distance = np.linalg.norm(place_px[:, None] - place_px[None], axis=-1)
     np.fill_diagonal(distance, np.inf)
@@ -32,15 +39,10 @@ def find_neighbours(place_px: Float[np.ndarray, "markers 2"]) -> Neighbours:
     return Neighbours(index=index, offset=offset, pitch_px=pitch)
 
 
-def predict_from_neighbours(
-    neighbours: Neighbours, displacement_px: Float[np.ndarray, "markers 2"], known: Bool[np.ndarray, " markers"]
-) -> Float[np.ndarray, "markers 2"]:
-    """Displacement of each marker as its neighbours alone tell it, in pixels.
+def predict_from_neighbours(neighbours: Neighbours, displacement_px: Places, known: Chosen) -> Places:
+    """Displacement of each marker as its neighbours alone tell it, in pixels; NaN where fewer than three are known.
 
-    A plane through the known neighbours' displacements, the near ones weighing most, its slopes held down a little; NaN
-    where fewer than three neighbours are known.
-
-    `displacement_px`: x, y of each marker; what is not known may be NaN.
+    A plane through the known neighbours' displacements, the near ones weighing most, its slopes held down a little.
     """
     usable = known[neighbours.index]
     values = np.where(usable[..., None], displacement_px[neighbours.index], 0.0)
@@ -70,45 +72,35 @@ class Pairing:
     support: float
     """Share of the markers expected in view that have a spot."""
     spread_px: float
-    """Unlikeness of the steps where they are most alike: a touch bends some skin, a wrong match spoils all. The
-    lower quartile of the steps' distances from what their neighbours' steps say, or the lower fifth of those from the
-    commonest step, whichever is less."""
-    step_px: Float[np.ndarray, "markers 2"]
+    """Unlikeness of the steps where they are most alike: a touch bends some skin, a wrong match spoils all."""
+    step_px: Places
     """Step of each from where it was; NaN without a spot."""
 
     @property
-    def paired(self) -> Bool[np.ndarray, " markers"]:
+    def paired(self) -> Chosen:
         """Markers with a spot."""
         return self.spot >= 0
 
 
 def pair(
-    predicted_px: Float[np.ndarray, "markers 2"],
-    found_px: Float[np.ndarray, "spots 2"],
-    *,
-    from_px: Float[np.ndarray, "markers 2"],
-    neighbours: Neighbours,
-    expected: Bool[np.ndarray, " markers"],
+    predicted_px: Places, found_px: Spots, from_px: Places, *, neighbours: Neighbours, size: tuple[int, int]
 ) -> Pairing:
-    """Pair markers and spots that are nearest to each other, and that lead back to where they came from.
+    """Pair markers and spots that are nearest to each other, and that lead back to where the markers were before.
 
     Forward: a marker's spot is the nearest to its predicted place, and the marker the nearest to the spot, less than
     0.45 of the pitch away. Backward: the spot, moved back by the step that the marker's neighbours made, must lie less
     than 0.45 of the pitch from this marker's own place.
-
-    `predicted_px`: where each marker is expected; NaN if nowhere; `from_px`: where each marker was before; NaN where it
-    was not seen.
     """
     spot = _mutual(predicted_px, found_px, reach_px=GATE * neighbours.pitch_px)
     step = np.full(predicted_px.shape, np.nan)
     step[spot >= 0] = found_px[spot[spot >= 0]] - from_px[spot >= 0]
-    known = np.all(np.isfinite(step), axis=1)
-    told = predict_from_neighbours(neighbours, step, known)
+    told = predict_from_neighbours(neighbours, step, np.all(np.isfinite(step), axis=1))
     error = np.linalg.norm(step - told, axis=1)
     astray = error > GATE * neighbours.pitch_px
     spot, step = np.where(astray, -1, spot), np.where(astray[:, None], np.nan, step)
     error = error[np.isfinite(error) & ~astray]
     bent = float(np.quantile(error, 0.25)) if len(error) else np.inf
+    expected = np.all((predicted_px >= 0) & (predicted_px <= np.array([size[1] - 1, size[0] - 1])), axis=1)
     seen = expected & (spot >= 0)
     return Pairing(
         spot=spot,
@@ -128,10 +120,7 @@ def _from_commonest(steps: Float[np.ndarray, "steps 2"]) -> float:
 
 
 def _mutual(
-    predicted_px: Float[np.ndarray, "markers 2"],
-    found_px: Float[np.ndarray, "spots 2"],
-    *,
-    reach_px: Float[np.ndarray, " markers"],
+    predicted_px: Places, found_px: Spots, *, reach_px: Float[np.ndarray, " markers"]
 ) -> Int[np.ndarray, " markers"]:
     if not len(found_px):
         return np.full(len(predicted_px), -1)
@@ -143,20 +132,14 @@ def _mutual(
     return np.where(good, nearest, -1)
 
 
-def likely_shifts(
-    places_px: Float[np.ndarray, "markers 2"], found_px: Float[np.ndarray, "spots 2"], *, pitch_px: float
-) -> Float[np.ndarray, "shifts 2"]:
-    """Shifts that bring many markers onto spots at once, most votes first.
-
-    Every pair of marker and spot votes for its difference; votes within a third of the pitch count together.
-    """
+def likely_shifts(places_px: Places, found_px: Spots, *, pitch_px: float) -> Float[np.ndarray, "shifts 2"]:
+    """Shifts that bring many markers onto spots at once, most votes first: every pair votes for its difference."""
     ways = (found_px[None] - places_px[:, None]).reshape(-1, 2)
     # longer ones leave hardly any marker in view
     ways = ways[np.abs(ways).max(axis=1) < _FURTHEST * pitch_px]
     if not len(ways):
         return np.zeros((0, 2))
-    cell = pitch_px / 3
-    keys = np.round(ways / cell).astype(np.int64)
+    keys = np.round(ways / (pitch_px / 3)).astype(np.int64)
     cells, inverse, votes = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
     # a peak may lie on the border of cells: neighbours lend their votes
     near = np.eye(len(cells), dtype=bool)
@@ -200,46 +183,38 @@ class Usual:
 
 
 def link(
-    origins: list[Float[np.ndarray, "markers 2"]],
-    found_px: Float[np.ndarray, "spots 2"],
-    *,
-    neighbours: Neighbours,
-    frame_size: tuple[int, int],
-    usual: Usual,
-    lost: bool,
+    origins: list[Places], found_px: Spots, *, neighbours: Neighbours, size: tuple[int, int], usual: Usual, lost: bool
 ) -> Pairing | None:
-    """Tell which marker is which; None where it cannot be told.
+    """Tell which marker is which, from places where they may have been, the likeliest first; None if it cannot be told.
 
     A small and smooth step is taken as it is. Otherwise all shifts that bring many markers onto spots are tried: on a
     regular grid a step of 0.6 pitches looks like one of 0.4 the other way. The right one keeps the small irregularities
     of the print, so that neighbours move alike. A step of less than a quarter pitch is believed unless another does
-    clearly better; of larger ones, and after a jump, the best is believed only where no other does nearly as well.
-
-    `origins`: places from which the markers may have come, the likeliest first; no NaN; `lost`: whether nothing was
-    said of the frame before: then no step counts as small.
+    clearly better; of larger ones, and where the pattern was lost in the frame before, the best is believed only where
+    no other does nearly as well.
     """
-    step = _pair(origins[0], np.zeros(2), found_px, neighbours=neighbours, frame_size=frame_size)
-    if not lost and _is_calm(step, neighbours, usual):
-        return step
+    step = _pair(origins[0], np.zeros(2), found_px, neighbours=neighbours, size=size)
+    moved = np.linalg.norm(step.step_px, axis=1) / neighbours.pitch_px
+    way = np.inf if lost or not step.paired.any() else float(np.nanmedian(moved))
     pitch = float(np.median(neighbours.pitch_px))
+    # the first step has nothing to be compared with
+    spread = usual.spread_px if np.isfinite(usual.spread_px) else 0.02 * pitch
+    smooth = step.spread_px <= max(_CALM_SPREAD * spread, _LEAST_SPREAD_PX)
+    if way <= _CALM_STEP and smooth and step.support >= _CALM_SUPPORT * usual.support:
+        return step
     rivals: list[Pairing] = []
     for origin in origins:
         for shift in (np.zeros(2), *likely_shifts(origin, found_px, pitch_px=pitch)):
-            pairing = _pair(origin, shift, found_px, neighbours=neighbours, frame_size=frame_size)
+            pairing = _pair(origin, shift, found_px, neighbours=neighbours, size=size)
             if pairing.support >= _LEAST_SUPPORT and pairing.paired.sum() >= _LEAST_SHARE * len(origin):
                 rivals.append(pairing)
-    if not lost and _is_small(step, neighbours) and not any(_beats(other, step) for other in rivals):
+    small = way < _SMALL_STEP and step.support >= _SMALL_SUPPORT
+    if small and not any(_beats(other, step) for other in rivals):
         return step
     if not rivals:
         return None
     best = max(rivals, key=lambda one: one.paired.sum() * one.support / (one.spread_px + 0.1))
     return None if any(_rules_out(other, best) for other in rivals) else best
-
-
-def _is_small(step: Pairing, neighbours: Neighbours) -> bool:
-    """Whether a pattern moved so little, most of it seen, that it is believed unless something speaks against it."""
-    moved = np.linalg.norm(step.step_px, axis=1) / neighbours.pitch_px
-    return bool(step.paired.any()) and step.support >= _SMALL_SUPPORT and float(np.nanmedian(moved)) < _SMALL_STEP
 
 
 def _beats(other: Pairing, small: Pairing) -> bool:
@@ -261,37 +236,20 @@ def _rules_out(other: Pairing, best: Pairing) -> bool:
     return bool(different and strong and other.spread_px < _RIVAL_SPREAD * best.spread_px + 0.02)
 
 
-def _is_calm(step: Pairing, neighbours: Neighbours, usual: Usual) -> bool:
-    moved = np.linalg.norm(step.step_px, axis=1) / neighbours.pitch_px
-    if not step.paired.any() or np.nanmedian(moved) > _CALM_STEP:
-        return False
-    # the first step has nothing to be compared with
-    spread = usual.spread_px if np.isfinite(usual.spread_px) else 0.02 * float(np.median(neighbours.pitch_px))
-    return step.spread_px <= max(_CALM_SPREAD * spread, _LEAST_SPREAD_PX) and (
-        step.support >= _CALM_SUPPORT * usual.support
-    )
-
-
 def _pair(
-    origin_px: Float[np.ndarray, "markers 2"],
+    origin_px: Places,
     shift_px: Float[np.ndarray, "2"],
-    found_px: Float[np.ndarray, "spots 2"],
+    found_px: Spots,
     *,
     neighbours: Neighbours,
-    frame_size: tuple[int, int],
+    size: tuple[int, int],
 ) -> Pairing:
     """Pair after a shift of all, then once more after the steps that neighbours made."""
     predicted = origin_px + shift_px
-    pairing = pair(
-        predicted, found_px, from_px=origin_px, neighbours=neighbours, expected=_in_view(predicted, frame_size)
-    )
+    pairing = pair(predicted, found_px, origin_px, neighbours=neighbours, size=size)
     told = predict_from_neighbours(neighbours, pairing.step_px, pairing.paired)
     refined = np.where(np.isfinite(told), origin_px + told, predicted)
-    return pair(refined, found_px, from_px=origin_px, neighbours=neighbours, expected=_in_view(refined, frame_size))
-
-
-def _in_view(place_px: Float[np.ndarray, "markers 2"], size: tuple[int, int]) -> Bool[np.ndarray, " markers"]:
-    return np.all((place_px >= 0) & (place_px <= np.array([size[1] - 1, size[0] - 1])), axis=1)
+    return pair(refined, found_px, origin_px, neighbours=neighbours, size=size)
 
 
 _STRAY_PITCHES, _STRAY_SPREADS = 0.3, 6.0
@@ -301,31 +259,23 @@ _ALIKE = 0.5  # pitches, of displacement between two that stand together
 _STRAIN = 0.55  # pixels of relative displacement per pixel of distance: more is no skin, but a wrong match
 
 
-def drop_strays(
-    neighbours: Neighbours, shift_px: Float[np.ndarray, "markers 2"], sound: Bool[np.ndarray, " markers"]
-) -> tuple[Bool[np.ndarray, " markers"], Float[np.ndarray, "markers 2"]]:
+def drop_strays(neighbours: Neighbours, shift_px: Places, sound: Chosen) -> tuple[Chosen, Places]:
     """Drop markers that stray from their neighbours, worst first: one stray makes all round it look astray.
 
     Gives which may still be believed, and what the neighbours that remain say of each displacement.
     """
-    sound = sound.copy()
-    told = predict_from_neighbours(neighbours, shift_px, sound)
     while True:
+        told = predict_from_neighbours(neighbours, shift_px, sound)
         error = np.where(sound, np.linalg.norm(shift_px - told, axis=1), np.nan)
-        if not np.isfinite(error).any():
-            return sound, told
-        limit = np.maximum(_STRAY_PITCHES * neighbours.pitch_px, _STRAY_SPREADS * np.nanmedian(error))
-        excess = np.nan_to_num(error / limit)
+        usual = np.nanmedian(error) if np.isfinite(error).any() else np.inf
+        excess = np.nan_to_num(error / np.maximum(_STRAY_PITCHES * neighbours.pitch_px, _STRAY_SPREADS * usual))
         if excess.max() <= 1:
             return sound, told
         # several at a time where they are no neighbours of each other
-        sound &= ~((excess > 1) & (excess >= excess[neighbours.index].max(axis=1)))
-        told = predict_from_neighbours(neighbours, shift_px, sound)
+        sound = sound & ~((excess > 1) & (excess >= excess[neighbours.index].max(axis=1)))
 
 
-def drop_contradicting(
-    neighbours: Neighbours, shift_px: Float[np.ndarray, "markers 2"], sound: Bool[np.ndarray, " markers"]
-) -> Bool[np.ndarray, " markers"]:
+def drop_contradicting(neighbours: Neighbours, shift_px: Places, sound: Chosen) -> Chosen:
     """Drop groups that agree among themselves but contradict the largest group.
 
     A part of a grid that moved by most of a pitch is matched wrongly as a whole: no marker in it strays from the next.
@@ -334,21 +284,13 @@ def drop_contradicting(
     both = sound[:, None] & sound[neighbours.index]
     apart = np.linalg.norm(neighbours.offset, axis=-1)
     relative = np.linalg.norm(shift_px[neighbours.index] - shift_px[:, None], axis=-1) / neighbours.pitch_px[:, None]
-    torn = both & (relative > _STRAIN * apart)
-    against = torn & (apart < _NEAR)
+    against = both & (relative > _STRAIN * apart) & (apart < _NEAR)
     if not against.any():
         return sound
     joined = both & (relative < _ALIKE) & (apart < _ADJACENT)
-    label = np.arange(len(sound))
-    while True:
-        # each takes the lowest label of its group, until none changes; bonds hold both ways
-        lowest = label.copy()
-        ends = np.where(joined, label[neighbours.index], len(label)).min(axis=1)
-        np.minimum(lowest, ends, out=lowest)
-        np.minimum.at(lowest, neighbours.index[joined], np.broadcast_to(lowest[:, None], joined.shape)[joined])
-        if np.array_equal(lowest, label):
-            break
-        label = lowest
+    ends = np.nonzero(joined)[0], neighbours.index[joined]
+    # bonds hold both ways
+    _, label = connected_components(coo_array((joined[joined], ends), shape=(len(sound),) * 2), directed=False)
     main = label == np.bincount(label[sound]).argmax()
     rows, columns = np.nonzero(against)
     others = neighbours.index[rows, columns]
@@ -360,18 +302,16 @@ def drop_contradicting(
 def match_left_over(
     neighbours: Neighbours,
     spot: Int[np.ndarray, " markers"],
-    sound: Bool[np.ndarray, " markers"],
-    told_px: Float[np.ndarray, "markers 2"],
+    sound: Chosen,
+    told_px: Places,
     *,
-    rest_px: Float[np.ndarray, "markers 2"],
-    found_px: Float[np.ndarray, "spots 2"],
+    rest_px: Places,
+    found_px: Spots,
 ) -> Int[np.ndarray, " markers"]:
     """Match markers that are not sound with spots that no sound one has, from known ground outwards.
 
     Where the skin moves more than half a pitch in one step, the nearest spot is the next marker's. Neighbours still
     move alike: from those that are sound each marker's place is told, and once it is found it tells of the next.
-
-    `spot`: which spot each marker has; -1 for none; `told_px`: displacement of each as its sound neighbours tell it.
     """
     believed, spot = sound.copy(), np.where(sound, spot, -1)
     shift = np.full_like(rest_px, np.nan)
@@ -383,11 +323,10 @@ def match_left_over(
             break
         places, reach_px = rest_px[open_ones] + told_px[open_ones], GATE * neighbours.pitch_px[open_ones]
         nearest = _mutual(places, found_px[free], reach_px=reach_px)
-        good = nearest >= 0
-        if not good.any():
+        taken = open_ones[nearest >= 0]
+        if not len(taken):
             break
-        taken = open_ones[good]
-        spot[taken], believed[taken] = free[nearest[good]], True
+        spot[taken], believed[taken] = free[nearest[nearest >= 0]], True
         shift[taken] = found_px[spot[taken]] - rest_px[taken]
         told_px = predict_from_neighbours(neighbours, shift, believed)
     return spot

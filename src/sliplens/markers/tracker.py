@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, Int, UInt8
 from sliplens.errors import ImageError, RecordingError
 from sliplens.markers.detect import MarkerKind, Markers, detect_markers
 from sliplens.markers.linking import (
-    Pairing,
     Usual,
     drop_contradicting,
     drop_strays,
@@ -37,10 +36,9 @@ class Newcomers:
         return len(self._known)
 
     def update(self, spare: Markers, expected_px: Float[np.ndarray, "markers 2"]) -> TrackedFrame:
-        """Follow the new markers, in the order they came, and admit more.
+        """Follow the new markers, in the order they came, and admit more of the spots that no other marker took.
 
-        `spare`: spots of the frame that no marker of the reference took; `expected_px`: where the markers of the
-        reference are, or should be: a spot near one may be its remains.
+        A spot near where a marker of the reference is, or should be, may be its remains.
         """
         place, radius = np.full(self._known.shape, np.nan), np.full(len(self._known), np.nan)
         free = np.ones(len(spare), dtype=bool)
@@ -49,25 +47,22 @@ class Newcomers:
             if len(distance) and distance.min() < _REACH * self._pitch:
                 at = int(distance.argmin())
                 place[index], radius[index], free[at] = spare.centre_px[at], spare.radius_px[at], False
-        seen = np.all(np.isfinite(place), axis=1)
-        self._known = np.where(seen[:, None], place, self._known)
+        self._known = np.where(np.isfinite(place), place, self._known)
         waiting = []
         for at in np.flatnonzero(free):
             spot = spare.centre_px[at]
             others = np.concatenate([expected_px, self._known])
             if np.linalg.norm(others - spot, axis=1).min() < _CLEAR * self._pitch:
                 continue
-            age = max(
-                (age for old, age in self._waiting if np.linalg.norm(old - spot) < _REACH * self._pitch), default=0
-            )
-            if age + 1 < _STEADY_FRAMES:
-                waiting.append((spot, age + 1))
+            ages = [age for old, age in self._waiting if np.linalg.norm(old - spot) < _REACH * self._pitch]
+            age = 1 + max(ages, default=0)
+            if age < _STEADY_FRAMES:
+                waiting.append((spot, age))
                 continue
             self._known = np.concatenate([self._known, spot[None]])
             place, radius = np.concatenate([place, spot[None]]), np.append(radius, spare.radius_px[at])
         self._waiting = waiting
-        seen = np.all(np.isfinite(place), axis=1)
-        status = np.where(seen, MarkerStatus.NEW, MarkerStatus.MISSING).astype(np.uint8)
+        status = np.where(np.isfinite(place[:, 0]), MarkerStatus.NEW, MarkerStatus.MISSING).astype(np.uint8)
         deviation = np.full(len(status), np.nan)
         return TrackedFrame(position_px=place, radius_px=radius, deviation_px=deviation, status=status)
 
@@ -79,26 +74,11 @@ _ROUNDNESS_LEFT, _ROUND = 0.75, 0.7
 
 
 class Tracker:
-    """Follows the markers of one sensor, frame by frame; identity is that of the reference frame.
-
-    Parameters
-    ----------
-    reference
-        The sensor untouched, T_0: RGB.
-    kind
-        Row of `KINDS`, or a kind of one's own.
-
-    Raises
-    ------
-    InputError
-        If the kind is not known, or OpenCV is missing.
-    ImageError
-        If the reference is over- or underexposed, or shows fewer than 4 whole markers.
-    """
+    """Follows the markers of one sensor, frame by frame, as `track_markers` does those of a whole trial."""
 
     def __init__(self, reference: UInt8[np.ndarray, "height width 3"], kind: str | MarkerKind = "auto") -> None:
         found = detect_markers(reference, kind)
-        self.rest = _only(found, found.whole)
+        self.rest = found.only(found.whole)
         if len(self.rest) < _FEWEST:
             raise ImageError(
                 f"the reference shows {len(self.rest)} whole markers, at least {_FEWEST} are needed; name another kind"
@@ -110,13 +90,7 @@ class Tracker:
         self._newcomers = Newcomers(pitch_px=float(np.median(self._neighbours.pitch_px)))
 
     def update(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> TrackedFrame:
-        """Follow the markers into the next frame T_n.
-
-        Raises
-        ------
-        ImageError
-            If the frame has another size than the reference.
-        """
+        """Follow the markers into the next frame T_n, of the reference's size."""
         if frame.shape[:2] != self._size:
             raise ImageError(
                 f"frame of {frame.shape[0]} x {frame.shape[1]} pixels against a reference of {self._size[0]} x "
@@ -128,27 +102,20 @@ class Tracker:
             [rest + self._shift, rest] if self._lost else [rest + self._shift],
             found.centre_px,
             neighbours=self._neighbours,
-            frame_size=self._size,
+            size=self._size,
             usual=self._usual,
             lost=self._lost,
         )
         self._lost = pairing is None
         if pairing is None:
-            return self._nothing()
+            count = len(rest) + self._newcomers.forget()
+            place, status = np.full((count, 2), np.nan), np.full(count, MarkerStatus.LOST, dtype=np.uint8)
+            return TrackedFrame(position_px=place, radius_px=place[:, 0], deviation_px=place[:, 0], status=status)
         self._usual = self._usual.after(pairing)
-        return self._judge(found, pairing)
+        return self._judge(found, pairing.spot)
 
-    def _nothing(self) -> TrackedFrame:
-        count = len(self.rest) + self._newcomers.forget()
-        return TrackedFrame(
-            position_px=np.full((count, 2), np.nan),
-            radius_px=np.full(count, np.nan),
-            deviation_px=np.full(count, np.nan),
-            status=np.full(count, MarkerStatus.LOST, dtype=np.uint8),
-        )
-
-    def _judge(self, found: Markers, pairing: Pairing) -> TrackedFrame:
-        rest, spot = self.rest.centre_px, pairing.spot
+    def _judge(self, found: Markers, spot: Int[np.ndarray, " markers"]) -> TrackedFrame:
+        rest = self.rest.centre_px
         shift, changed, cut, sound, told = self._believe(found, spot)
         if not sound.all():
             spot = match_left_over(
@@ -166,9 +133,7 @@ class Tracker:
         hidden = ~np.isin(status, (MarkerStatus.FOLLOWED, MarkerStatus.BROKEN))
         place[hidden] = np.nan
         spare = found.whole & ~np.isin(np.arange(len(found)), spot)
-        new = self._newcomers.update(
-            _only(found, spare), np.where(np.isfinite(place), place, self.rest.centre_px + self._shift)
-        )
+        new = self._newcomers.update(found.only(spare), np.where(np.isfinite(place), place, rest + self._shift))
         return TrackedFrame(
             position_px=np.concatenate([place, new.position_px]),
             radius_px=np.concatenate([np.where(hidden, np.nan, _taken(found.radius_px, spot)), new.radius_px]),
@@ -206,32 +171,18 @@ def track_markers(
     lead to where its own marker was). After a jump the pattern is found anew by its shape as a whole; where a regular
     grid fits in two ways, all markers are LOST until it can be told again.
 
-    Parameters
-    ----------
-    frames
-        T_1 to T_n: RGB, of the reference's size.
-    kind
-        Row of `KINDS`, or a kind of one's own.
+    `frames` are T_1 to T_n, RGB, of the reference's size; `kind` is a row of `KINDS`, or a kind of one's own.
 
     Raises
     ------
-    InputError
-        If the kind is not known, or OpenCV is missing.
     ImageError
         If the reference is over- or underexposed or shows fewer than 4 whole markers, or a frame has another size.
-    RecordingError
-        If there is no frame.
     """
     tracker = Tracker(reference, kind)
     tracked = [tracker.update(frame) for frame in frames]
     if not tracked:
         raise RecordingError("there is no frame to follow markers into; give one or more beside the reference")
     return stack_tracks(tracked, rest_px=tracker.rest.centre_px, rest_radius_px=tracker.rest.radius_px)
-
-
-def _only(markers: Markers, chosen: Bool[np.ndarray, " markers"]) -> Markers:
-    names = ("centre_px", "radius_px", "contrast", "roundness", "whole")
-    return Markers(**{name: getattr(markers, name)[chosen] for name in names}, appearance=markers.appearance)
 
 
 def _taken(values: np.ndarray, spot: Int[np.ndarray, " markers"]) -> np.ndarray:
