@@ -28,9 +28,8 @@ from sliplens.explainers.channels import combine
 from sliplens.explainers.frozen_model import frozen
 from sliplens.explainers.occlusion import marker_regions, markers_in_recording
 from sliplens.faithfulness.fills import get_fill
-from sliplens.faithfulness.localisation import relevance_mass, relevance_rank
-from sliplens.faithfulness.removal import score_maps
-from sliplens.faithfulness.units import Units, pixel_units, tile_units
+from sliplens.faithfulness.map_quality import relevance_mass, relevance_rank
+from sliplens.faithfulness.removal import Units, score_maps, tile_units
 from sliplens.files import machine, versions
 from sliplens.intervals import paired_difference
 from sliplens.models import Run
@@ -43,7 +42,7 @@ from sliplens.simulation import SimulationRecipe, simulate_dataset
 NETWORKS = ("chromatouch-difference", "chromatouch-raw")
 RECIPE = SimulationRecipe(dry_trials=24, wet_trials=0, days=12, frames_per_trial=40, seed=11)
 FILLS = ("reference", "grey", "blur", "noisy-linear")
-UNITS = {"pixel": pixel_units, "tile": lambda shape: tile_units(shape, size=16)}
+UNITS = {"pixel": lambda shape: tile_units(shape, size=1), "tile": lambda shape: tile_units(shape, size=16)}
 LEVELS = (0.7, 0.4, 0.2, 0.0)
 OURS = "regression"
 FULL_BUDGET_PASSES = 10_000  # more than any frame takes: one engine for maps and removals

@@ -6,8 +6,14 @@ import torch
 
 from sliplens.errors import InputError
 from sliplens.faithfulness import get_fill
-from sliplens.faithfulness.removal import AREAS, removal_curves, score_maps
-from sliplens.faithfulness.units import pixel_units, random_unit_order, tile_units, unit_order
+from sliplens.faithfulness.removal import (
+    AREAS,
+    random_unit_order,
+    removal_curves,
+    score_maps,
+    tile_units,
+    unit_order,
+)
 
 SIZE = 20
 IMAGES = 3
@@ -35,7 +41,7 @@ def contributions(images: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
 
 def test_the_curve_of_a_linear_network_is_the_sum_of_what_went(images: torch.Tensor, weights: torch.Tensor):
     values = contributions(images, weights)
-    units = pixel_units((SIZE, SIZE))
+    units = tile_units((SIZE, SIZE), size=1)
     orders = np.stack([[unit_order(one, units, least_first=least) for one in values] for least in (False, True)])
     curves = removal_curves(linear(weights), images, orders, fill=get_fill("black"), areas=EVERY, batch_size=37)
     for index, one in enumerate(values):
@@ -46,7 +52,7 @@ def test_the_curve_of_a_linear_network_is_the_sum_of_what_went(images: torch.Ten
 
 def test_what_contributes_is_the_best_map_there_is(images: torch.Tensor, weights: torch.Tensor, rng):
     values = contributions(images, weights)
-    units = [pixel_units((SIZE, SIZE))] * IMAGES
+    units = [tile_units((SIZE, SIZE), size=1)] * IMAGES
     maps = {"truth": values, "noisy": values + rng.normal(0, values.std(), values.shape), "opposite": -values}
     scores = score_maps(linear(weights), images, maps, units, fill=get_fill("black"), rng=rng, areas=EVERY)
     truth, noisy, opposite = (scores[name] for name in maps)
@@ -69,7 +75,7 @@ def test_along_the_target_a_signed_map_is_scored_as_what_it_is(images: torch.Ten
     values = contributions(images, mixed)
     towards = np.sign(values.sum(axis=(1, 2)))
     assert np.all(towards == -1)
-    units = [pixel_units((SIZE, SIZE))] * IMAGES
+    units = [tile_units((SIZE, SIZE), size=1)] * IMAGES
     shuffled = values.reshape(IMAGES, -1).copy()
     half = rng.permutation(SIZE**2)[: SIZE**2 // 2]
     shuffled[:, half] = shuffled[:, rng.permutation(half)]
@@ -100,7 +106,7 @@ def test_at_equal_areas_the_curves_can_be_read(images: torch.Tensor, weights: to
 
 
 def test_the_batch_size_changes_nothing(images: torch.Tensor, weights: torch.Tensor, rng):
-    orders = np.stack([[random_unit_order(pixel_units((SIZE, SIZE)), rng=rng)] * IMAGES for _ in range(3)])
+    orders = np.stack([[random_unit_order(tile_units((SIZE, SIZE), size=1), rng=rng)] * IMAGES for _ in range(3)])
     found = [
         removal_curves(
             lambda batch: linear(weights)(batch).sin(), images, orders, fill=get_fill(fill), batch_size=size, seed=4
@@ -116,7 +122,7 @@ def test_the_batch_size_changes_nothing(images: torch.Tensor, weights: torch.Ten
 
 
 def test_a_network_that_answers_always_alike_moves_by_nothing(images: torch.Tensor, rng):
-    orders = np.stack([[random_unit_order(pixel_units((SIZE, SIZE)), rng=rng)] * IMAGES])
+    orders = np.stack([[random_unit_order(tile_units((SIZE, SIZE), size=1), rng=rng)] * IMAGES])
     curves = removal_curves(lambda batch: torch.full((len(batch),), 0.3), images, orders, fill=get_fill("grey"))
     assert np.all(curves.mean_changes == 0)
 

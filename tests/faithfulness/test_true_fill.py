@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.faithfulness.true_fill import SHARES, score_maps_by_marker
+from sliplens.faithfulness.removal import SHARES, score_maps_by_marker
 
 IMAGES, MARKERS = 3, 40
 

@@ -5,9 +5,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from sliplens.errors import InputError, SaliencyError
-from sliplens.faithfulness.units import (
+from sliplens.faithfulness.removal import (
     marker_units,
-    pixel_units,
     random_unit_order,
     tile_units,
     unit_means,
@@ -50,7 +49,7 @@ def test_units_go_whole_and_in_the_order_of_their_means(values: np.ndarray, size
 
 @given(MAPS)
 def test_single_pixels_go_by_their_value(values: np.ndarray):
-    order = unit_order(values, pixel_units(values.shape))
+    order = unit_order(values, tile_units(values.shape, size=1))
     np.testing.assert_array_equal(values.ravel()[order], np.sort(values.ravel())[::-1])
 
 
@@ -66,6 +65,6 @@ def test_a_random_order_takes_units_whole_and_any_of_them_first(rng: np.random.G
 
 def test_a_map_that_does_not_fit_is_refused():
     with pytest.raises(SaliencyError, match=r"the map to rank by has shape \(4, 4\) but its image is 6 x 6"):
-        unit_order(np.zeros((4, 4)), pixel_units((6, 6)))
+        unit_order(np.zeros((4, 4)), tile_units((6, 6), size=1))
     with pytest.raises(SaliencyError, match="NaN or infinity in 36 of 36 pixels"):
-        unit_order(np.full((6, 6), np.nan), pixel_units((6, 6)))
+        unit_order(np.full((6, 6), np.nan), tile_units((6, 6), size=1))

@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from sliplens.codec import load_result, save_result
 from sliplens.errors import CheckpointError, InputError
 from sliplens.faithfulness.controls import CONTROLS
-from sliplens.faithfulness.true_fill import SHARES
-from sliplens.faithfulness.units import unit_means
+from sliplens.faithfulness.removal import SHARES, unit_means
 from sliplens.files import output_folder
 from sliplens.models import Manifest, Run
 from sliplens.recordings import Dataset, load_dataset

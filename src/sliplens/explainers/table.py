@@ -89,9 +89,8 @@ def explain(
     """
     trained = open_run(run)
     explainer = get_explainer(method, **options) if isinstance(method, str) else method
-    images, empty = network_images(trained, frames, reference)
-    inputs = trained.encoding.normalise(images).to(trained.device)
-    return explainer(trained.model, inputs, reference=empty.to(trained.device), on_progress=on_progress)
+    inputs, empty = network_inputs(trained, frames, reference)
+    return explainer(trained.model, inputs, reference=empty, on_progress=on_progress)
 
 
 def open_run(run: Run | Path | str, *, device: str = "cpu") -> Run:
@@ -147,3 +146,11 @@ def network_images(
             "line with --reference IMAGE"
         )
     return encoding.resize(frames, image_size=image_size), torch.zeros(3, image_size, image_size)
+
+
+def network_inputs(
+    trained: Run, frames: UInt8[np.ndarray, "batch _ _ 3"], reference: UInt8[np.ndarray, "_ _ 3"] | None
+) -> tuple[Float[Tensor, "batch 3 size size"], Float[Tensor, "3 size size"]]:
+    """Inputs of a network and that of the untouched sensor, in [0, 1] on its device."""
+    images, empty = network_images(trained, frames, reference)
+    return trained.encoding.normalise(images).to(trained.device), empty.to(trained.device)

@@ -1,18 +1,26 @@
-"""Controls: maps that know nothing of the network, which an explanation has to beat."""
+"""Controls: maps that know nothing of the network, and networks that know nothing, since their weights are new."""
 
-from collections.abc import Callable
+import copy
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
-Maps = Float[Tensor, "images height width"]
+from sliplens.faithfulness.map_quality import stability
+
+Images = Float[Tensor, "images 3 height width"]
+ControlMaps = Float[Tensor, "images height width"]
+Maps = Float[np.ndarray, "images height width"]
+_BATCH_NORMS = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm)
 _CENTRE_SD = 0.25
 """Standard deviation of the centred Gaussian, in widths of the image."""
 
 
-def edges(images: Float[Tensor, "images 3 height width"]) -> Maps:
+def edges(images: Images) -> ControlMaps:
     """Strength of the edges: length of Sobel's gradient, mean over the channels."""
     across = torch.tensor([[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]]) / 8
     kernels = torch.stack([across, across.T]).to(images)[:, None].repeat(3, 1, 1, 1)
@@ -21,12 +29,12 @@ def edges(images: Float[Tensor, "images 3 height width"]) -> Maps:
     return slopes.square().sum(dim=2).sqrt().mean(dim=1)
 
 
-def brightness(images: Float[Tensor, "images 3 height width"]) -> Maps:
+def brightness(images: Images) -> ControlMaps:
     """The input itself, mean over the channels: of a difference image, how much changed."""
     return images.abs().mean(dim=1)
 
 
-def centre(images: Float[Tensor, "images 3 height width"]) -> Maps:
+def centre(images: Images) -> ControlMaps:
     """A Gaussian about the middle: a camera looks at what matters."""
     height, width = images.shape[-2:]
     down, across = (torch.linspace(-0.5, 0.5, side, device=images.device) for side in (height, width))
@@ -34,14 +42,124 @@ def centre(images: Float[Tensor, "images 3 height width"]) -> Maps:
     return bump.to(images.dtype).expand(len(images), height, width)
 
 
-CONTROLS: dict[str, Callable[[Float[Tensor, "images 3 height width"]], Maps]] = {
-    "edges": edges,
-    "input": brightness,
-    "centre": centre,
-}
+CONTROLS: dict[str, Callable[[Images], ControlMaps]] = {"edges": edges, "input": brightness, "centre": centre}
 """Beside these the random orders, and the explainer itself on a network whose weights were drawn anew.
 
 References
 ----------
 Clark et al., *XAI-TRIS* (2024), edge filters; Adebayo et al., *Sanity Checks for Saliency Maps* (2018).
 """
+
+
+def cascade(model: nn.Module, *, seed: int, stages: int, images: Images) -> Iterator[tuple[int, nn.Module]]:
+    """Draw the weights of a copy of a network anew, layer by layer from the output to the input.
+
+    Gives, at so many stages, evenly spread, how many layers have new weights, and the network; the next stage changes
+    it. Normalisation gets the statistics of the images, two at least: with those of an untrained network new weights
+    shrink what passes through them layer by layer, until it gives one answer to every image.
+
+    References
+    ----------
+    Adebayo et al., *Sanity Checks for Saliency Maps* (2018): cascading randomisation.
+    """
+    changed = copy.deepcopy(model).eval()
+    weighted = [
+        module
+        for module in changed.modules()
+        if hasattr(module, "reset_parameters") and next(module.parameters(recurse=False), None) is not None
+    ][::-1]
+    shown = {round((stage + 1) * len(weighted) / stages) for stage in range(stages)}
+    for count, module in enumerate(weighted, start=1):
+        with torch.random.fork_rng(devices=[]):
+            # by its place, so that a layer gets the same weights whatever came before it
+            torch.manual_seed(seed + count - 1)
+            module.reset_parameters()  # pyright: ignore[reportCallIssue]
+        if count in shown:
+            _settle(changed, weighted[:count], images)
+            yield count, changed
+
+
+@torch.no_grad()
+def _settle(model: nn.Module, changed: list[nn.Module], images: Tensor) -> None:
+    """Give batch normalisation with new weights the statistics of some images."""
+    norms = [layer for layer in changed if isinstance(layer, _BATCH_NORMS)]
+    momenta = [norm.momentum for norm in norms]
+    for norm in norms:
+        norm.reset_running_stats()
+        norm.momentum = None  # the statistics of this pass alone
+        norm.train()
+    model(images)
+    for norm, momentum in zip(norms, momenta, strict=True):
+        norm.momentum = momentum
+        norm.eval()
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomisationScores:
+    """What becomes of the maps of one method as a network loses what it has learned."""
+
+    layers: tuple[int, ...]
+    """Layers with new weights, by stage."""
+    similarity: Float[np.ndarray, "stages images"]
+    """Pearson's correlation with the maps of the trained network; an explanation that does not fall towards 0 does not
+    look at the network."""
+    complexity_rise: Float[np.ndarray, " images"]
+    """Rise of the entropy of the map's histogram from the trained to the wholly random network, over that of the
+    trained one. A faithful map gets more complex."""
+
+
+def randomisation_scores(
+    explain: Callable[[nn.Module, Tensor], Maps],
+    model: nn.Module,
+    images: Images,
+    *,
+    before: Maps,
+    seed: int,
+    stages: int = 5,
+) -> RandomisationScores:
+    """Explain a network whose weights are drawn anew from the output on, and compare with the maps of the trained one.
+
+    References
+    ----------
+    Adebayo et al. (2018); Hedstroem et al., *Sanity Checks Revisited* (2024): eMPRT, the rise of complexity, and its
+    histogram entropy.
+    """
+    similarity, layers, after = [], [], before
+    for count, network in cascade(model, seed=seed, stages=stages, images=images):
+        after = explain(network, images)
+        similarity.append(stability(before, after))
+        layers.append(count)
+    first, last = (np.array([histogram_entropy(values) for values in maps]) for maps in (before, after))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rise = (last - first) / first
+    return RandomisationScores(layers=tuple(layers), similarity=np.stack(similarity), complexity_rise=rise)
+
+
+def histogram_entropy(values: Float[np.ndarray, "height width"]) -> float:
+    """Entropy, in nats, of a map's values in 100 bins of its range: 0 for a constant map, at most log 100."""
+    counts = np.histogram(values, bins=100)[0]
+    share = counts[counts > 0] / values.size
+    return float(-(share * np.log(share)).sum()) if np.ptp(values) > 0 else 0.0
+
+
+def smooth_maps(
+    explain: Callable[[nn.Module, Tensor], Maps],
+    model: nn.Module,
+    images: Images,
+    *,
+    noise_sd: float = 0.02,
+    samples: int = 16,
+    seed: int = 0,
+) -> Maps:
+    """Mean of the maps of several noisy copies of each image: so that randomisation compares signal with signal.
+
+    References
+    ----------
+    Hedstroem et al. (2024): sMPRT.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    total = np.zeros((len(images), *images.shape[-2:]))
+    for _ in range(samples):
+        noise = noise_sd * torch.randn(images.shape, generator=generator).to(images)
+        total += explain(model, (images + noise).clamp(0, 1))
+    return total / samples

@@ -70,10 +70,7 @@ def deletion_score(
 
 
 def deletion_order(saliency: Float[np.ndarray, "height width"]) -> Int[np.ndarray, " pixels"]:
-    """Flat pixel indices from most to least salient.
-
-    Ties go to the later pixel first: the order of an ascending stable sort read backwards, which is what the recorded
-    masks of the thesis show.
+    """Flat pixel indices from most to least salient; of ties the later pixel first, as in the thesis's masks.
 
     Examples
     --------

@@ -26,12 +26,10 @@ def noisy_linear(
     noise: Float[Tensor, "batch 3 height width"] | None = None,
     tolerance: float = _TOLERANCE,
 ) -> Float[Tensor, "batch 3 height width"]:
-    """Fill removed pixels so that each is the weighted mean of its eight neighbours, then add noise to them.
+    """Fill removed pixels so that each is the weighted mean of its eight neighbours, then add (standard normal) noise.
 
-    The equations of all removed pixels are solved together, by conjugate gradients: they are those of a symmetric,
-    positive definite matrix, until no filled pixel is farther than the tolerance from the mean of its neighbours. An
-    image of which nothing is left becomes its own mean. Noise is given as standard normal numbers and scaled to ROAD's
-    0.01.
+    All equations are solved together by conjugate gradients, until no filled pixel is farther than the tolerance from
+    the mean of its neighbours. An image of which nothing is left becomes its own mean.
 
     References
     ----------
@@ -52,9 +50,8 @@ def noisy_linear(
     """
     # channels last: the small convolution of every step is six times as fast on a CPU; a mask for each colour, since
     # there a product with one for all of them takes six times as long
-    each, mask = (
-        values.contiguous(memory_format=torch.channels_last) for values in (images, gone[:, None].expand(images.shape))
-    )
+    both = images, gone[:, None].expand(images.shape)
+    each, mask = (values.contiguous(memory_format=torch.channels_last) for values in both)
     filled = _solve(each, mask, tolerance=tolerance)
     if noise is not None:
         filled.addcmul_(noise, mask, value=NOISE_SD)
@@ -64,10 +61,9 @@ def noisy_linear(
 def _solve(
     images: Float[Tensor, "batch 3 height width"], gone: Bool[Tensor, "batch 3 height width"], *, tolerance: float
 ) -> Float[Tensor, "batch 3 height width"]:
-    """Images whose removed pixels are the weighted means of their neighbours; see `noisy_linear`.
+    """Images whose removed pixels are the weighted means of their neighbours, from the solution at half the size on.
 
-    The solution at half the size is where it begins: alone, conjugate gradients carry what they know by one pixel a
-    step, which takes ten times as long where holes are large.
+    Alone, conjugate gradients carry what they know by one pixel a step: ten times as long where holes are large.
     """
     kernel = _KERNEL.to(images).expand(3, 1, 3, 3)
     hole = gone.to(images.dtype)

@@ -1,4 +1,4 @@
-"""Removal curves: how far the answer moves as the most, the least, and random parts of an image are removed."""
+"""Removal: how far the answer moves as the most, the least, and random parts of an image are removed."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -7,62 +7,97 @@ from typing import TypeAlias
 import numpy as np
 import pyarrow as pa
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
+from sliplens.arrays import require_saliency
 from sliplens.errors import InputError
+from sliplens.explainers.occlusion import marker_regions, tile_regions
 from sliplens.faithfulness.fills import Fill, Painter
-from sliplens.faithfulness.units import Units, random_unit_order, unit_order
 from sliplens.intervals import Difference, paired_difference
 from sliplens.models.engines import Engine
-from sliplens.progress import OnProgress
+from sliplens.progress import OnProgress, counted
 
+Units = Int[np.ndarray, "height width"]
+"""Number of what is removed at once, a pixel, a tile or a marker, that each pixel belongs to, from 0."""
 Predict: TypeAlias = Callable[[Tensor], Tensor] | Engine
 """From inputs (batch, 3, height, width) to answers (batch,), in margin units; or an engine made ready for many passes,
 which keeps all cores busy (`sliplens.models.engines.prepare`)."""
+Redraw: TypeAlias = Callable[[int, Bool[np.ndarray, "variants markers"]], Float[Tensor, "variants 3 height width"]]
+"""From the number of an image, and the markers that are put back in each variant, to the network's inputs.
 
-
-def answer_whole(predict: Predict, images: Tensor, *, batch_size: int) -> Float64[np.ndarray, " images"]:
-    """Answers on whole images."""
-    return _collect(predict, images.split(_size(predict, batch_size)), lambda _: None)
-
-
-def _paint(
-    paint: Painter, orders: np.ndarray, jobs: Sequence[tuple[int, int, int]], *, images: Tensor, batch_size: int
-) -> Iterator[Tensor]:
-    """Images of which parts are gone, a batch in memory at a time; jobs are image, order and pixels removed."""
-    ranked, rank = None, torch.empty(0)
-    for start in range(0, len(jobs), batch_size):
-        batch = jobs[start : start + batch_size]
-        gone = torch.empty((len(batch), *images.shape[-2:]), dtype=torch.bool)
-        for row, (image, order, pixels) in enumerate(batch):
-            if ranked != (image, order):  # jobs that share one stand together, so that it is ranked once
-                ranked, rank = (image, order), torch.empty(orders.shape[-1], dtype=torch.int32)
-                rank[torch.from_numpy(orders[order, image])] = torch.arange(len(rank), dtype=torch.int32)
-                rank = rank.view(gone.shape[1:])
-            gone[row] = rank < pixels
-        rows = torch.tensor([image for image, _, _ in batch], device=images.device)
-        yield paint(rows, gone.to(images.device))
-
-
-def _size(predict: Predict, batch_size: int) -> int:
-    return predict.batch_size if isinstance(predict, Engine) else batch_size
-
-
-def _collect(
-    predict: Predict, batches: Iterable[Tensor], on_batch: Callable[[Tensor], None]
-) -> Float64[np.ndarray, " images"]:
-    answers = []
-    with torch.no_grad():
-        for one in predict.run(batches) if isinstance(predict, Engine) else map(predict, batches):
-            answers.append(one.double().cpu().numpy())
-            on_batch(one)
-    return np.concatenate(answers) if answers else np.empty(0)
-
-
+It is the true fill: any other puts pixels where no marker ever was, and a network may answer to that; here every image
+is one that the sensor could have seen, and what is taken away is the marker's motion and nothing else.
+"""
 AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """Shares of the image that are removed; dense where maps differ most."""
+SHARES = (0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+"""Shares of the markers that are put back: each is drawn anew, and of 42 markers one is 2 %."""
 RANDOM_ORDERS = 20
+
+
+def tile_units(shape: tuple[int, int], *, size: int) -> Units:
+    """Square tiles, of 1 for single pixels; those at the right and lower border may be smaller.
+
+    Examples
+    --------
+    >>> from sliplens.faithfulness.removal import tile_units
+    >>> tile_units((2, 4), size=2)
+    array([[0, 0, 1, 1],
+           [0, 0, 1, 1]])
+    """
+    if size < 1:
+        raise InputError(f"tiles of {size} pixels are impossible; choose 1 or more")
+    return tile_regions(shape, tile_px=size).numpy()
+
+
+def marker_units(shape: tuple[int, int], centres_px: Float[np.ndarray, "markers 2"], *, reach_px: float) -> Units:
+    """Each pixel goes to the nearest marker; those farther from all than `reach_px` are one unit, the last."""
+    if not len(centres_px):
+        raise InputError("there is no marker to remove; choose pixels or tiles")
+    return marker_regions(shape, torch.from_numpy(centres_px), radius_px=reach_px).numpy()
+
+
+def unit_means(values: Float[np.ndarray, "height width"], units: Units) -> Float[np.ndarray, " units"]:
+    """Mean of a map over each unit; NaN for one that no pixel belongs to."""
+    count = np.bincount(units.ravel())
+    with np.errstate(invalid="ignore"):
+        return np.bincount(units.ravel(), weights=values.ravel()) / count
+
+
+def unit_order(
+    influence: Float[np.ndarray, "_ _"], units: Units, *, least_first: bool = False
+) -> Int[np.ndarray, " pixels"]:
+    """Flat pixel indices, unit by unit, by the mean of the map over each, from the most influential or the least on.
+
+    Examples
+    --------
+    The right tile is brighter on average: its pixels go first.
+
+    >>> import numpy as np
+    >>> from sliplens.faithfulness.removal import tile_units, unit_order
+    >>> influence = np.array([[0.9, 0.0, 0.5, 0.6], [0.0, 0.0, 0.5, 0.6]])
+    >>> unit_order(influence, tile_units((2, 4), size=2))
+    array([2, 3, 6, 7, 0, 1, 4, 5])
+    """
+    require_saliency(influence, units.shape, where="the map to rank by")
+    means = unit_means(influence, units)[units.ravel()]
+    # units in order, the pixels of each in reading order: lexsort is stable, its last key counts first
+    return np.lexsort((units.ravel(), means if least_first else -means))
+
+
+def random_unit_order(units: Units, *, rng: np.random.Generator) -> Int[np.ndarray, " pixels"]:
+    """Flat pixel indices, unit by unit, in random order: the control that every map has to beat."""
+    rank = rng.permutation(int(units.max()) + 1)
+    return np.argsort(rank[units.ravel()], kind="stable")
+
+
+def influence_orders(influence: Float[np.ndarray, "images markers"]) -> Int[np.ndarray, "2 images markers"]:
+    """Orders of the markers from the most influential on, and from the least.
+
+    Ties fall alike in both: a map that tells nothing has one order, and gains nothing.
+    """
+    return np.stack([np.argsort(sign * influence, axis=-1, kind="stable") for sign in (-1, 1)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,6 +225,47 @@ class Faithfulness:
         return self.curves[:, :, step[0]]
 
 
+def _made_ready(predict: Predict, batch_size: int) -> Engine:
+    if isinstance(predict, Engine):
+        return predict
+    return Engine(name="eager", batch_size=batch_size, answers=lambda batches: ((predict(batch),) for batch in batches))
+
+
+def _answer(
+    engine: Engine, batches: Iterable[Tensor], on_batch: Callable[[Tensor], None] = lambda _: None
+) -> Float64[np.ndarray, " images"]:
+    answers = []
+    with torch.no_grad():
+        for margins in engine.run(batches):
+            answers.append(margins.double().cpu().numpy())
+            on_batch(margins)
+    return np.concatenate(answers) if answers else np.empty(0)
+
+
+def answer_whole(predict: Predict, images: Tensor, *, batch_size: int = 64) -> Float64[np.ndarray, " images"]:
+    """Answers on whole images."""
+    engine = _made_ready(predict, batch_size)
+    return _answer(engine, images.split(engine.batch_size))
+
+
+def _paint(
+    paint: Painter, orders: np.ndarray, jobs: Sequence[tuple[int, int, int]], *, images: Tensor, batch_size: int
+) -> Iterator[Tensor]:
+    """Images of which parts are gone, a batch in memory at a time; jobs are image, order and pixels removed."""
+    ranked, rank = None, torch.empty(0)
+    for start in range(0, len(jobs), batch_size):
+        batch = jobs[start : start + batch_size]
+        gone = torch.empty((len(batch), *images.shape[-2:]), dtype=torch.bool)
+        for row, (image, order, pixels) in enumerate(batch):
+            if ranked != (image, order):  # jobs that share one stand together, so that it is ranked once
+                ranked, rank = (image, order), torch.empty(orders.shape[-1], dtype=torch.int32)
+                rank[torch.from_numpy(orders[order, image])] = torch.arange(len(rank), dtype=torch.int32)
+                rank = rank.view(gone.shape[1:])
+            gone[row] = rank < pixels
+        rows = torch.tensor([image for image, _, _ in batch], device=images.device)
+        yield paint(rows, gone.to(images.device))
+
+
 def removal_curves(
     predict: Predict,
     images: Float[Tensor, "images 3 height width"],
@@ -231,7 +307,7 @@ def removal_curves(
         jobs += [(image, order, step) for order in range(len(orders)) for step in range(1, last)]
         # what is left of the image when all is gone depends on no order: answered once
         jobs.append((image, 0, last))
-    done = 0
+    done, engine = 0, _made_ready(predict, batch_size)
 
     def count(batch: Tensor) -> None:
         nonlocal done
@@ -244,12 +320,12 @@ def removal_curves(
         orders,
         [(image, order, removed[step]) for image, order, step in jobs],
         images=images,
-        batch_size=_size(predict, batch_size),
+        batch_size=engine.batch_size,
     )
     answers = np.empty((len(orders), len(images), len(shares)))
     image_of, order_of, step_of = np.transpose(jobs)
-    answers[order_of, image_of, step_of] = _collect(predict, batches, count)
-    answers[:, :, 0] = answer_whole(predict, images, batch_size=batch_size)
+    answers[order_of, image_of, step_of] = _answer(engine, batches, count)
+    answers[:, :, 0] = answer_whole(engine, images)
     answers[:, :, -1] = answers[0, :, -1]
     return RemovalCurves(areas=shares, answers=answers)
 
@@ -257,7 +333,7 @@ def removal_curves(
 def score_maps(
     predict: Predict,
     images: Float[Tensor, "images 3 height width"],
-    influence: dict[str, Float[np.ndarray, "images height width"]],
+    influence: Mapping[str, Float[np.ndarray, "images height width"]],
     units: Sequence[Units],
     *,
     fill: Fill,
@@ -267,18 +343,14 @@ def score_maps(
     random_orders: int = RANDOM_ORDERS,
     areas: Sequence[float] = AREAS,
     seed: int = 0,
-    batch_size: int = 64,
     on_progress: OnProgress | None = None,
 ) -> dict[str, Faithfulness]:
     """Score the maps of several methods on the same images, against the same random orders.
 
-    Maps are larger where a method says that a part of the units (`pixel_units`, `tile_units`, `marker_units`) matters
-    more. Of signed relevance give the part that works towards the target, `relevance * sign(target)`, and `towards`,
-    the sign of f(x) - f(untouched sensor) of each image: changes count along it; by their size if None.
-
-    Where maps are signed, what speaks against the target is the least influential, and removing it moves the answer the
-    other way, as far as removing what speaks for it. By size the two are told apart by nothing: a map of what each
-    marker really does then ranks below the same map half shuffled, which it does not along the target (docs/study.md).
+    Of signed relevance give the part that works towards the target, and `towards`, the sign of f(x) - f(untouched
+    sensor) of each image: changes count along it, by their size if None. By size removing what speaks against the
+    target counts like removing what speaks for it, and a map of what each marker really does ranks below the same map
+    half shuffled (docs/study.md).
 
     References
     ----------
@@ -299,7 +371,56 @@ def score_maps(
         references=references,
         areas=areas,
         seed=seed,
-        batch_size=batch_size,
         on_progress=on_progress,
     )
+    return Faithfulness.of_orders(curves, influence, towards=towards)
+
+
+def marker_curves(
+    predict: Predict,
+    redraw: Redraw,
+    orders: Int[np.ndarray, "orders images markers"],
+    *,
+    batch_size: int = 64,
+    on_progress: OnProgress | None = None,
+) -> RemovalCurves:
+    """Answers of a network while `SHARES` of the markers are put back, in several orders of their places each.
+
+    What several orders ask for is drawn once, `batch_size` images at a time, which bounds the memory.
+    """
+    areas, (_, images, markers) = np.asarray(SHARES), orders.shape
+    counts = np.round(areas * markers).astype(np.int64)
+    answers = np.empty((len(orders), images, len(areas)))
+    for image in counted(range(images), on_progress):
+        rank = np.argsort(orders[:, image], axis=-1)
+        back = rank[:, None] < counts[:, None]
+        distinct, asked = np.unique(back.reshape(-1, markers), axis=0, return_inverse=True)
+        answered = [
+            answer_whole(predict, redraw(image, distinct[start : start + batch_size]))
+            for start in range(0, len(distinct), batch_size)
+        ]
+        answers[:, image] = np.concatenate(answered)[asked].reshape(back.shape[:2])
+    return RemovalCurves(areas=areas, answers=answers)
+
+
+def score_maps_by_marker(
+    predict: Predict,
+    redraw: Redraw,
+    influence: Mapping[str, Float[np.ndarray, "images markers"]],
+    *,
+    rng: np.random.Generator,
+    towards: Float[np.ndarray, " images"] | None = None,
+    random_orders: int = RANDOM_ORDERS,
+    batch_size: int = 64,
+    on_progress: OnProgress | None = None,
+) -> dict[str, Faithfulness]:
+    """Score how much each marker matters to several methods (`unit_means`) by putting them back; see `score_maps`."""
+    for name, values in influence.items():
+        if not np.isfinite(values).all():
+            raise InputError(f"{name} gives some marker no finite influence; leave out markers that no pixel shows")
+    orders = [influence_orders(values) for values in influence.values()]
+    images, markers = orders[0].shape[1:]
+    by_chance = [[rng.permutation(markers) for _ in range(images)] for _ in range(random_orders)]
+    asked = np.concatenate([*orders, np.array(by_chance)])
+    curves = marker_curves(predict, redraw, asked, batch_size=batch_size, on_progress=on_progress)
     return Faithfulness.of_orders(curves, influence, towards=towards)

@@ -12,7 +12,7 @@ from torch import Tensor
 from sliplens.arrays import require_saliency
 from sliplens.errors import SaliencyError
 from sliplens.explainers import Explanation
-from sliplens.explainers.table import network_images, open_run
+from sliplens.explainers.table import network_inputs, open_run
 from sliplens.faithfulness.alarms import controls_win, fill_decides, flat_maps, saturated
 from sliplens.faithfulness.controls import CONTROLS
 from sliplens.faithfulness.deletion import (
@@ -23,8 +23,7 @@ from sliplens.faithfulness.deletion import (
     saliency_orders,
 )
 from sliplens.faithfulness.fills import get_fill
-from sliplens.faithfulness.removal import AREAS, RANDOM_ORDERS, Faithfulness, score_maps
-from sliplens.faithfulness.units import pixel_units, tile_units
+from sliplens.faithfulness.removal import AREAS, RANDOM_ORDERS, Faithfulness, score_maps, tile_units
 from sliplens.models import Run
 from sliplens.models.engines import Engine, prepare
 from sliplens.progress import OnProgress
@@ -82,16 +81,15 @@ def score(
     SaliencyError
         If there is not a map a frame, or one has another size than the network's input, or holds NaN.
     """
-    fill_of_name = get_fill(fill)
-    trained = open_run(run)
-    inputs, empty = _inputs(trained, frames, reference)
+    fill_of_name, trained = get_fill(fill), open_run(run)
+    inputs, empty = network_inputs(trained, frames, reference)
     method = maps.method if isinstance(maps, Explanation) else "maps"
     influence = {method: _influence(maps, inputs)}
     influence |= {name: control(inputs).double().cpu().numpy() for name, control in CONTROLS.items()}
     whole, untouched = (trained.predict(images).double().numpy() for images in (inputs, empty[None]))
     towards = np.sign(whole - untouched)
     shape = (inputs.shape[-2], inputs.shape[-1])
-    units = pixel_units(shape) if unit == "pixel" else tile_units(shape, size=max(1, shape[0] // _TILES_ACROSS))
+    units = tile_units(shape, size=1 if unit == "pixel" else max(1, shape[0] // _TILES_ACROSS))
     orders = 2 * len(influence) + random_orders
     scores = score_maps(
         prepare_passes(trained, inputs, len(inputs) * orders * (len(AREAS) - 2)),
@@ -151,9 +149,8 @@ def score_by_deletion(
     ----------
     Polak, section 4 and eq. 2.
     """
-    fill_of_name = get_fill(fill)
-    trained = open_run(run)
-    inputs, empty = _inputs(trained, frames, reference)
+    fill_of_name, trained = get_fill(fill), open_run(run)
+    inputs, empty = network_inputs(trained, frames, reference)
     shape = (inputs.shape[-2], inputs.shape[-1])
     salient = np.maximum(_influence(maps, inputs), 0)
     rng = np.random.default_rng(seed)
@@ -179,13 +176,6 @@ def prepare_passes(trained: Run, inputs: Float[Tensor, "images 3 size size"], pa
     """Make an engine ready for so many passes of a network, checked on a few of its inputs, on the network's device."""
     some = inputs[:_CHECKED_IMAGES].to(trained.device)
     return prepare(trained.model, some, trained.predict(some).to(trained.device), passes=passes)
-
-
-def _inputs(
-    trained: Run, frames: Frames, reference: UInt8[np.ndarray, "_ _ 3"] | None
-) -> tuple[Float[Tensor, "images 3 size size"], Float[Tensor, "3 size size"]]:
-    images, empty = network_images(trained, frames, reference)
-    return trained.encoding.normalise(images).to(trained.device), empty.to(trained.device)
 
 
 def _influence(maps: Maps, inputs: Tensor) -> Float64[np.ndarray, "images height width"]:

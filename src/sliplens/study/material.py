@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sliplens.explainers import EXPLAINERS, Explainer, Likeness, PolyCam
+from sliplens.faithfulness.removal import Units, marker_units, tile_units
 from sliplens.faithfulness.scoring import prepare_passes
-from sliplens.faithfulness.units import Units, marker_units, pixel_units, tile_units
 from sliplens.models import Run
 from sliplens.models.engines import Engine
 from sliplens.recordings import Dataset
@@ -102,7 +102,7 @@ class Material:
         shape = (self.inputs.shape[-2], self.inputs.shape[-1])
         count = len(self.inputs)
         tile = max(1, round(_TILE_PX * shape[0] / 224))
-        found = {"pixel": [pixel_units(shape)] * count, "tile": [tile_units(shape, size=tile)] * count}
+        found = {"pixel": [tile_units(shape, size=1)] * count, "tile": [tile_units(shape, size=tile)] * count}
         if all(frame.id in self.markers for frame in self.explained.frames):
             found["marker"] = [
                 marker_units(shape, centres, reach_px=reach)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sliplens.explainers import Explainer, Explanation, IntegratedGradients, PolyCam
-from sliplens.faithfulness.randomisation import cascade, histogram_entropy, randomisation_scores, smooth_maps
+from sliplens.faithfulness.controls import cascade, histogram_entropy, randomisation_scores, smooth_maps
 from sliplens.progress import OnProgress, counted
 from sliplens.results.study import Randomisation, RandomisedMethod, UntrainedMaps
 from sliplens.study.explaining import mean_of_known
@@ -35,7 +35,7 @@ def randomise_weights(
 
     References
     ----------
-    See `sliplens.faithfulness.randomisation`.
+    See `sliplens.faithfulness.controls`.
     """
     inputs, references = material.inputs[:frames], material.references[:frames]
     methods, alarms = {}, []
@@ -119,5 +119,5 @@ def _influence(explanation: Explanation) -> Maps:
 
 
 def _untrained(model: nn.Module, images: Tensor, *, seed: int) -> nn.Module:
-    *_, last = cascade(model, seed=seed, stages=1, images=images)
-    return last.model
+    ((_, untrained),) = cascade(model, seed=seed, stages=1, images=images)
+    return untrained

@@ -8,8 +8,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.faithfulness.true_fill import Redraw
-from sliplens.faithfulness.units import Units
+from sliplens.faithfulness.removal import Redraw, Units
 from sliplens.models import Run
 from sliplens.recordings import Dataset
 from sliplens.recordings.trial import SLIPS

@@ -11,17 +11,21 @@ from scipy.stats import spearmanr
 
 from sliplens.codec import keep_part
 from sliplens.faithfulness import get_fill
-from sliplens.faithfulness.localisation import relevance_mass, relevance_rank
+from sliplens.faithfulness.map_quality import relevance_mass, relevance_rank
 from sliplens.faithfulness.removal import (
     RANDOM_ORDERS,
+    SHARES,
     Faithfulness,
     RemovalCurves,
     answer_whole,
+    influence_orders,
+    marker_curves,
     removal_curves,
+    score_maps_by_marker,
+    unit_means,
+    unit_order,
 )
 from sliplens.faithfulness.scoring import prepare_passes
-from sliplens.faithfulness.true_fill import SHARES, influence_orders, marker_curves, score_maps_by_marker
-from sliplens.faithfulness.units import unit_means, unit_order
 from sliplens.intervals import Difference, paired_difference
 from sliplens.models import Run
 from sliplens.progress import OnProgress, counted
