@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL
-from sliplens.simulation.rendering import add_slices, scatter
+from sliplens.simulation.filming import place
 from sliplens.simulation.sensor import mix_noise, pick_noise
 
 FRAMES, SIZE = 400, 64
@@ -21,9 +21,10 @@ def patches():
 
 def test_a_processor_and_a_gpu_add_patches_to_the_same_places(patches):
     patch, corner, frame = patches
-    slow, fast, naive = (torch.zeros((3, 4, 20, 20)) for _ in range(3))
-    scatter(slow, patch, corner=corner, frame=frame)
-    add_slices(fast, patch, corner=corner, frame=frame)
+    naive = torch.zeros((3, 4, 20, 20))
+    slow, fast = (
+        place(patch, corner=corner, frame=frame, frames=4, size_px=20, at_once=at_once) for at_once in (True, False)
+    )
     for item, (column, row) in enumerate(corner.tolist()):
         for y in range(5):
             for x in range(5):

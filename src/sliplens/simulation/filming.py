@@ -1,11 +1,11 @@
-"""A loaded fingertip filmed: the reference frame and the frames of a trial."""
+"""A loaded fingertip filmed: its light, the reference frame and the frames of a trial, on any device."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
 
 from sliplens.mechanics import normal_slope
@@ -13,11 +13,18 @@ from sliplens.simulation.geometry import pixel_grid
 from sliplens.simulation.loading import Loading
 from sliplens.simulation.motion import Motion, move_markers
 from sliplens.simulation.nuisances import Day, Grasp, Unit
-from sliplens.simulation.rendering import Scene, View, brightness, draw_texture, empty_view, haze, relief, render
-from sliplens.simulation.sensor import DrawnMarkers, Noise, NoisePicks, Sensor, draw_look, pick_noise
+from sliplens.simulation.sensor import DrawnMarkers, Noise, NoisePicks, Sensor, draw_look, mix_noise, pick_noise
 
 _BATCHES = {"cpu": 4, "cuda": 512}
 """Frames drawn at once: few enough for a processor's caches, many enough for a GPU."""
+_PATCH = 32
+"""Side of the square in which a marker is drawn, in pixels; the widest marker's edge has faded by then."""
+_WHITE = 258.0
+"""Glare ends a little above white: the markers in it are seen, the noise is not."""
+_GRAIN_PX = 2.2
+"""Size of the pressed skin's grain."""
+_GLOW_RADIUS = 0.935
+"""Where the glow of the contact fades, over the radius of a nominal contact."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,64 +43,81 @@ class Film:
     blur_px: Float[np.ndarray, " frames_and_reference"]
     """Blur of the untouched sensor, then of each frame, as in the picks."""
     noise_picks: NoisePicks
-    view: View
     rays: Float[np.ndarray, "height width 2"]
+    texture: Float32[np.ndarray, "3 markers side side"]
+    """Grain of the print, of unit strength."""
+    light: Float32[np.ndarray, "3 height width"]
+    """Brightness over the sensor's."""
+    empty: Float32[np.ndarray, "3 height width"]
+    """The untouched sensor without its markers, in grey levels."""
+    haze: Float32[np.ndarray, "3 height width"]
+    """Grey levels that full contact adds."""
+    relief: Float32[np.ndarray, "3 height width"] | None
+    """Relative change of brightness where the skin slopes by 1; None where slopes do not show."""
 
     def __len__(self) -> int:
         return len(self.marker_px)
 
+    def untouched(self) -> "Film":
+        """Film of one frame, the reference."""
+        markers, first = len(self.marker_rest_px), np.zeros(2, dtype=int)
+        nothing = dict.fromkeys(("touch", "indentation_m", "contact_radius_m", "stick_radius_m"), np.zeros(1))
+        motion = replace(
+            self.motion,
+            centres_px=self.motion.rest_px[None],
+            scale=np.ones((1, markers)),
+            pressure=np.zeros((1, markers)),
+            **nothing,
+        )
+        picks, blur_px = self.noise_picks.at(first), self.blur_px[first]
+        return replace(self, motion=motion, marker_px=self.marker_rest_px[None], blur_px=blur_px, noise_picks=picks)
+
     def draw_reference(self, *, device: str | torch.device = "cpu") -> UInt8[Tensor, "height width 3"]:
         """Draw the untouched sensor."""
-        slope = None if self.view.relief is None else np.zeros((1, *self.rays.shape[:2]), dtype=np.float32)
-        return self._draw(
-            self.marker_rest_px[None],
-            self.look_at_rest(),
-            touch=np.zeros(1),
-            slope=slope,
-            taken=slice(0, 1),
-            device=device,
-        )[0]
+        return self.untouched().draw(slice(0, 1), device=device)[0]
 
     def draw(self, frames: slice, *, device: str | torch.device = "cpu") -> UInt8[Tensor, "frames height width 3"]:
-        """Draw some of the frames."""
-        slope = None
-        if self.view.relief is not None:
-            slope = np.asarray(
-                normal_slope(
-                    np.sqrt(self._face_distance_squared(frames)),
-                    contact_radius_m=self.motion.contact_radius_m[frames, None, None],
-                    sphere_radius_m=self.sensor.geometry.sphere_radius_m,
-                ),
-                dtype=np.float32,
-            )
-        return self._draw(
-            self.marker_px[frames],
-            self.look(frames),
-            touch=self.motion.touch[frames],
-            slope=slope,
-            taken=slice(frames.start + 1, frames.stop + 1),
-            device=device,
-        )
+        """Draw some of the frames; nothing in one depends on which are drawn together.
 
-    def look_at_rest(self) -> DrawnMarkers:
-        """Look of the untouched sensor's markers."""
-        ones = np.ones((1, len(self.marker_rest_px)))
-        return self._look(ones, 0 * ones, np.zeros(1), slice(0, 1))
+        Each marker is drawn in a patch of its own and added to the frame, so that a frame costs little more than its
+        noise. Devices agree within one grey level: they round sums of four terms in another order.
+        """
+        # one plane a channel: a channel's constant then meets whole rows of pixels, which vectorises
+        sensor, motion, noise, shade = self.sensor, self.motion, self.noise, self._shade(frames, device=device)
+        contrast = _tensor(self.light, device)[:, None] * _channels(sensor.look.contrast, device)
+        planes = torch.addcmul(_tensor(self.empty, device)[:, None], shade, contrast, value=-1)
+        if self.relief is not None:
+            slope = normal_slope(
+                np.sqrt(self._face_distance_squared(frames)),
+                contact_radius_m=motion.contact_radius_m[frames, None, None],
+                sphere_radius_m=sensor.geometry.sphere_radius_m,
+            )
+            planes *= 1 + _tensor(np.asarray(slope), device) * _tensor(self.relief, device)[:, None]
+        planes.addcmul_(_tensor(motion.touch[frames], device)[:, None, None], _tensor(self.haze, device)[:, None])
+        if noise is not None:
+            background = _channels(noise.background, device)
+            excess, share = _channels(noise.marker, device) - background, shade.clamp_(0, 1)
+            strength = torch.addcmul((1 + noise.edge) * excess, share, noise.edge * excess, value=-1)
+            strength.mul_(share).add_(background)
+            picks = self.noise_picks.at(_after_reference(frames))
+            mixed = mix_noise(picks, noise=noise, image_size_px=sensor.image_size_px, device=device)
+            planes.addcmul_(strength, mixed)
+        planes.add_(0.5).clamp_(0, 255)
+        pixels = torch.empty((*planes.shape[1:], 3), dtype=torch.uint8, device=device)
+        for channel, plane in enumerate(planes):  # converts and interleaves in one go
+            pixels[..., channel].copy_(plane)
+        return pixels
 
     def look(self, frames: slice) -> DrawnMarkers:
         """Look of the markers in some of the frames."""
-        motion, taken = self.motion, slice(frames.start + 1, frames.stop + 1)
-        return self._look(motion.scale[frames], motion.pressure[frames], motion.touch[frames], taken)
-
-    def _look(self, scale: np.ndarray, pressure: np.ndarray, touch: np.ndarray, taken: slice) -> DrawnMarkers:
         return draw_look(
             self.sensor.look,
             geometry=self.sensor.geometry,
             unit=self.unit,
-            scale=scale,
-            pressure=pressure,
-            touch=touch,
-            blur_px=self.blur_px[taken],
+            scale=self.motion.scale[frames],
+            pressure=self.motion.pressure[frames],
+            touch=self.motion.touch[frames],
+            blur_px=self.blur_px[_after_reference(frames)],
         )
 
     def contact_map(self, frames: slice) -> UInt8[np.ndarray, "frames height width"]:
@@ -111,39 +135,36 @@ class Film:
             self.rays, contact_centre_m=self.motion.contact_centre_m, indentation_m=self.motion.indentation_m[frames]
         )
 
-    def _draw(
-        self,
-        centres_px: Float[np.ndarray, "frames markers 2"],
-        markers: DrawnMarkers,
-        *,
-        touch: Float[np.ndarray, " frames"],
-        slope: Float32[np.ndarray, "frames height width"] | None,
-        taken: slice,
-        device: str | torch.device,
-    ) -> UInt8[Tensor, "frames height width 3"]:
-        picks = self.noise_picks.at(taken)
-        scene = Scene(view=self.view, centres_px=centres_px, markers=markers, touch=touch, slope=slope, noise=picks)
-        return render(scene, sensor=self.sensor, noise=self.noise, device=device)
+    def _shade(self, frames: slice, *, device: str | torch.device) -> Float[Tensor, "3 frames height width"]:
+        """Share of the markers' contrast in each pixel: 0 in the background, about 1 in a marker."""
+        centres_px, noise, size_px = self.marker_px[frames], self.noise, self.sensor.image_size_px
+        # markers that no pixel of the frame can see are left out; the padding takes the rest of those that stick out
+        seen = np.all((centres_px > -_PATCH / 2) & (centres_px < size_px - 1 + _PATCH / 2), axis=-1)
+        frame_index, marker_index = np.nonzero(seen)
+        centres, drawn = _tensor(centres_px[seen], device), self.look(frames)
+        radius, edge, contrast = (
+            _tensor(values[seen], device).T[:, :, None, None].contiguous()
+            for values in (drawn.radius_px, drawn.edge_px, drawn.contrast)
+        )
+        corner = torch.floor(centres).to(torch.int64) - _PATCH // 2 + 1
+
+        steps = torch.arange(_PATCH, device=device)
+        dx, dy = (corner[:, axis, None] + steps - centres[:, axis, None] for axis in (0, 1))
+        distance = torch.sqrt(dy.square()[:, :, None] + dx.square()[:, None, :])
+        if noise is None:
+            patch = (radius - distance).div_(edge).sigmoid_()
+        else:
+            texture = _tensor(self.texture, device)[:, torch.as_tensor(marker_index, device=device)]
+            patch = texture * _channels(noise.ragged_px, device)
+            patch.add_(radius).sub_(distance).div_(edge).sigmoid_()
+            patch.mul_(texture.mul_(_channels(noise.grain, device)).add_(1))
+        patch.mul_(contrast)
+        at_once = patch.device.type != "cpu"
+        return place(patch, corner=corner, frame=frame_index, frames=len(centres_px), size_px=size_px, at_once=at_once)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Seat:
-    """Seat of the camera on its day: turned about the image of the skin's middle, and shifted."""
-
-    day: Day
-    middle: Float[np.ndarray, "2"]
-
-    def see(self, points_px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Pixels of this camera for pixels of one that sits as drawn."""
-        return (points_px - self.middle) @ self._turn() + self.middle + np.asarray(self.day.camera_shift_px)
-
-    def unsee(self, points_px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Pixels of a camera that sits as drawn for pixels of this one: the inverse of `see`."""
-        return (points_px - self.middle - np.asarray(self.day.camera_shift_px)) @ self._turn().T + self.middle
-
-    def _turn(self) -> Float[np.ndarray, "2 2"]:
-        cos, sin = np.cos(self.day.camera_rotation_rad), np.sin(self.day.camera_rotation_rad)
-        return np.array([[cos, sin], [-sin, cos]])
+def _after_reference(frames: slice) -> slice:
+    return slice(frames.start + 1, frames.stop + 1)
 
 
 def batches(frames: int, *, device: str | torch.device) -> Iterator[slice]:
@@ -176,18 +197,17 @@ def prepare_film(
         marker_depth=unit.marker_depth,
     )
     geometry, frames = sensor.geometry, len(loading.time_s)
-    seat = _Seat(day=day, middle=np.asarray(geometry.centre_px))
-    contact_px = seat.see(geometry.project(geometry.skin_point(motion.contact_centre_m)))
+    # the camera of the day sits turned about the image of the skin's middle, and shifted
+    cos, sin = np.cos(day.camera_rotation_rad), np.sin(day.camera_rotation_rad)
+    turn, middle, shift = np.array([[cos, sin], [-sin, cos]]), np.asarray(geometry.centre_px), day.camera_shift_px
+
+    def see(points_px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Pixels of this camera for pixels of one that sits as drawn."""
+        return (points_px - middle) @ turn + middle + np.asarray(shift)
+
+    contact_px = see(geometry.project(geometry.skin_point(motion.contact_centre_m)))
     edge, apex = (geometry.project(geometry.skin_point(np.array([x, 0.0]))) for x in (motion.nominal_radius_m, 0.0))
-    light = brightness(sensor, day=day)
-    grain = np.random.default_rng((unit.texture_seed, 1))
-    view = View(
-        texture=draw_texture(geometry.markers, rng=np.random.default_rng(unit.texture_seed)),
-        light=light,
-        empty=empty_view(sensor, day=day, light=light),
-        haze=haze(sensor, grasp=grasp, contact_px=contact_px, radius_px=float(edge[0] - apex[0]), rng=grain),
-        relief=relief(sensor, contact_px=contact_px),
-    )
+    light, grain = brightness(sensor, day=day), np.random.default_rng((unit.texture_seed, 1))
     return Film(
         sensor=sensor,
         grasp=grasp,
@@ -195,11 +215,134 @@ def prepare_film(
         unit=unit,
         motion=motion,
         noise=noise,
-        marker_rest_px=seat.see(motion.rest_px + unit.marker_jitter_px),
-        marker_px=seat.see(motion.centres_px + unit.marker_jitter_px),
+        marker_rest_px=see(motion.rest_px + unit.marker_jitter_px),
+        marker_px=see(motion.centres_px + unit.marker_jitter_px),
         # drawn before the noise, so that a clean film differs in its noise alone
         blur_px=grasp.blur_px * rng.uniform(0.8, 1.2, frames + 1),
         noise_picks=pick_noise(frames + 1, rng=rng),
-        view=view,
-        rays=geometry.rays(seat.unsee(pixel_grid(sensor.image_size_px))),
+        rays=geometry.rays((pixel_grid(sensor.image_size_px) - middle - np.asarray(shift)) @ turn.T + middle),
+        texture=draw_texture(geometry.markers, rng=np.random.default_rng(unit.texture_seed)),
+        light=light,
+        empty=empty_view(sensor, day=day, light=light),
+        haze=haze(sensor, grasp=grasp, contact_px=contact_px, radius_px=float(edge[0] - apex[0]), rng=grain),
+        relief=relief(sensor, contact_px=contact_px),
     )
+
+
+def brightness(sensor: Sensor, *, day: Day) -> Float32[np.ndarray, "3 height width"]:
+    """Brightness of the untouched skin over the sensor's background.
+
+    Gain, white balance, vignette, lamps, and a linear fall of brightness across the image.
+    """
+    x, y = np.moveaxis(pixel_grid(sensor.image_size_px) / (sensor.image_size_px - 1) - 0.5, -1, 0)
+    cos, sin = np.cos(day.gradient_direction_rad), np.sin(day.gradient_direction_rad)
+    # the brightest corner keeps its level
+    fall = 1 - day.gradient * (0.5 - (x * cos + y * sin) / (abs(cos) + abs(sin)))
+    corner = 1 - sensor.vignette * 2 * (x**2 + y**2)
+    even = day.gain * (fall * corner)[..., None] * np.asarray(day.white_balance)
+    for lamp in sensor.lights:
+        towards = 2 * (x * np.cos(np.radians(lamp.direction_deg)) + y * np.sin(np.radians(lamp.direction_deg)))
+        even = even * (1 + lamp.fall * towards[..., None] * np.asarray(lamp.share))
+    return _planes(even)
+
+
+def empty_view(
+    sensor: Sensor, *, day: Day, light: Float32[np.ndarray, "3 height width"]
+) -> Float32[np.ndarray, "3 height width"]:
+    """Untouched sensor without its markers, the lamps' glare included, in grey levels."""
+    skin = np.asarray(sensor.background, dtype=np.float32)[:, None, None] * light
+    glare = sensor.glare
+    if glare is None:
+        return skin
+    bearings = np.radians(glare.bearing_deg) + 2 * np.pi * np.arange(glare.lamps) / glare.lamps
+    lamps = np.asarray(glare.centre_px) + glare.radius_px * np.stack([np.cos(bearings), np.sin(bearings)], axis=-1)
+    away = ((pixel_grid(sensor.image_size_px)[:, :, None] - lamps) ** 2).sum(axis=-1)
+    spots = np.exp(-away / (2 * glare.width_px**2)).sum(axis=-1)
+    return np.minimum(skin + _planes(day.glare * spots[..., None] * np.asarray(glare.colour)), np.float32(_WHITE))
+
+
+def relief(sensor: Sensor, *, contact_px: Float[np.ndarray, "2"]) -> Float32[np.ndarray, "3 height width"] | None:
+    """Relative change of brightness where the skin slopes by 1 away from a contact; None for a sensor without lamps.
+
+    The dent is a hill to the camera inside: its flank towards a lamp brightens.
+    """
+    if not sensor.lights:
+        return None
+    away = pixel_grid(sensor.image_size_px) - contact_px
+    bearing = np.arctan2(away[..., 1], away[..., 0])
+    lamps = [
+        lamp.relief * np.cos(bearing - np.radians(lamp.direction_deg))[..., None] * np.asarray(lamp.share)
+        for lamp in sensor.lights
+    ]
+    return _planes(np.sum(lamps, axis=0))
+
+
+def haze(
+    sensor: Sensor, *, grasp: Grasp, contact_px: Float[np.ndarray, "2"], radius_px: float, rng: np.random.Generator
+) -> Float32[np.ndarray, "3 height width"]:
+    """Grey levels that full contact adds: a veil, a glow where the object reflects the light, the grain of the skin.
+
+    `contact_px`, `radius_px`: where the camera sees the contact's centre, and how large its radius in a nominal grasp.
+    """
+    if not sensor.sees_contact:
+        return np.zeros((3, sensor.image_size_px, sensor.image_size_px), dtype=np.float32)
+    square = ((pixel_grid(sensor.image_size_px) - contact_px) ** 2).sum(axis=-1)
+    disc = np.exp(-((square / (_GLOW_RADIUS * radius_px) ** 2) ** 2))
+    grain = grasp.skin_grain * _smooth_noise(sensor.image_size_px, rng=rng)
+    return _planes(np.asarray(grasp.veil) + disc[..., None] * np.asarray(grasp.glow) + grain[..., None])
+
+
+def _smooth_noise(size: int, *, rng: np.random.Generator) -> Float[np.ndarray, "size size"]:
+    """Noise of unit variance that keeps its sign over a few pixels."""
+    steps = np.arange(-8, 9)
+    kernel = np.exp(-(steps**2) / (2 * _GRAIN_PX**2))
+    kernel /= np.linalg.norm(kernel)
+    windows = np.lib.stride_tricks.sliding_window_view
+    rows = windows(rng.standard_normal((size + 16, size + 16)), len(kernel), axis=1) @ kernel
+    return windows(rows, len(kernel), axis=0) @ kernel
+
+
+def _planes(image: Float[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "3 height width"]:
+    return np.ascontiguousarray(np.moveaxis(image, -1, 0), dtype=np.float32)
+
+
+def draw_texture(markers: int, *, rng: np.random.Generator) -> Float32[np.ndarray, "3 markers side side"]:
+    """Grain of the markers' print, of unit strength, red and green alike in half."""
+    grain = rng.standard_normal((3, markers, _PATCH, _PATCH), dtype=np.float32)
+    grain[1] = 0.5 * grain[0] + 0.75**0.5 * grain[1]
+    return grain
+
+
+def place(
+    patch: Float[Tensor, "3 items side side"],
+    *,
+    corner: Int[Tensor, "items 2"],
+    frame: Int[np.ndarray, " items"],
+    frames: int,
+    size_px: int,
+    at_once: bool,
+) -> Float[Tensor, "3 frames height width"]:
+    """Add each patch to its frame, its first pixel at a corner (x, y); what sticks out is cut off.
+
+    All at once suits a GPU; on a processor, one after another is several times faster.
+    """
+    side, width, corner = size_px + 2 * _PATCH, patch.shape[-1], corner + _PATCH
+    canvas = torch.zeros((3, frames, side, side), dtype=torch.float32, device=patch.device)
+    if at_once:
+        steps = torch.arange(width, device=patch.device)
+        rows = corner[:, 1:] + steps + side * torch.as_tensor(frame, device=patch.device)[:, None]
+        pixels = rows[:, :, None] * side + (corner[:, :1] + steps)[:, None, :]
+        canvas.view(3, -1).index_add_(1, pixels.reshape(-1), patch.reshape(3, -1))
+    else:
+        target, source = canvas.numpy(), patch.numpy()
+        for item, (index, (column, row)) in enumerate(zip(frame.tolist(), corner.tolist(), strict=True)):
+            target[:, index, row : row + width, column : column + width] += source[:, item]
+    return canvas[:, :, _PATCH:-_PATCH, _PATCH:-_PATCH]
+
+
+def _tensor(values: np.ndarray, device: str | torch.device) -> Tensor:
+    return torch.as_tensor(values, dtype=torch.float32, device=device)
+
+
+def _channels(values: tuple[float, float, float], device: str | torch.device) -> Float[Tensor, "3 1 1 1"]:
+    return torch.tensor(values, dtype=torch.float32, device=device).reshape(3, 1, 1, 1)

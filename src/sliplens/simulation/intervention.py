@@ -158,7 +158,7 @@ def marker_outlines(film: Film, frame: int) -> Outlines:
     """Circles that the markers of a frame fill, and those that they filled at rest."""
     return Outlines(
         rest_px=film.marker_rest_px,
-        rest_radius_px=film.look_at_rest().radius_px[0].max(axis=-1),
+        rest_radius_px=film.untouched().look(slice(0, 1)).radius_px[0].max(axis=-1),
         now_px=film.marker_px[frame],
         now_radius_px=film.look(slice(frame, frame + 1)).radius_px[0].max(axis=-1),
     )
