@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 import zarr
 from zarr.codecs import BloscCodec
 
-from sliplens.images.files import decode_png, encode_png
+from sliplens.images import decode_png, encode_png
 from sliplens.recordings.store import decode_pixels, encode_pixels
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SimulationRecipe, plan_trials, simulate_trial
 from sliplens.simulation.geometry import FlatPad

@@ -5,8 +5,7 @@ import pytest
 from PIL import Image
 
 from sliplens.errors import ImageError, InputError
-from sliplens.images import list_images, read_image, write_png
-from sliplens.images.files import decode_png, encode_png
+from sliplens.images import decode_png, encode_png, list_images, read_image, write_png
 
 
 def save(path: Path, pixels: np.ndarray) -> Path:

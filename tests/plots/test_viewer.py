@@ -13,7 +13,7 @@ import pyarrow as pa
 import pytest
 
 from sliplens.errors import InputError, RecordingError
-from sliplens.images.files import decode_png
+from sliplens.images import decode_png
 from sliplens.plots import viewer as viewer_process
 from sliplens.plots.viewer import open_viewer, write_rrd
 from sliplens.recordings import ContactState, Dataset, Recording, load_dataset

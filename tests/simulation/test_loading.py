@@ -102,11 +102,11 @@ def test_stick_slip_is_a_sawtooth_with_its_frequency():
     grasp = Grasp(friction=0.8, kinetic_ratio=0.75, stick_slip_share=0.5, stick_slip_hz=4.0)
     time_s = np.arange(0, 3, 0.001)
     sliding = slide(time_s, static_friction=np.full(len(time_s), 0.8), grasp=grasp, stuck_until=10**6)
-    assert sliding.friction[0] == 0.8
+    assert sliding.coefficient[0] == 0.8
     assert sliding.slips[0]
     begins = np.flatnonzero(np.diff(sliding.slips.astype(int)) == -1)
     np.testing.assert_allclose(np.diff(time_s[begins]), 0.25, atol=0.0011)
-    pull = sliding.used * sliding.friction
+    pull = sliding.used * sliding.coefficient
     stuck = ~sliding.slips
     # stuck, the spring reloads: force from kinetic friction to what was regained, and the margin falls with it
     assert pull[stuck].min() == pytest.approx(0.6, abs=1e-3)

@@ -95,7 +95,7 @@ def _in_order(splits: Iterable[str]) -> list[str]:
 
 
 def _some(names: Iterable[str]) -> str:
-    from sliplens.images.files import natural_key
+    from sliplens.images import natural_key
 
     ordered = sorted(names, key=natural_key)
     rest = len(ordered) - _SHOWN

@@ -24,8 +24,7 @@ from matplotlib.colors import to_rgba
 
 from sliplens.errors import InputError
 from sliplens.extras import require_packages
-from sliplens.images import absolute_difference
-from sliplens.images.files import encode_png
+from sliplens.images import absolute_difference, encode_png
 from sliplens.plots.audit import Fact, audit_facts
 from sliplens.plots.contact_sheet import STATE_COLOURS, TIMES, brighten, brightening
 from sliplens.plots.layout import written_whole

@@ -18,7 +18,7 @@ import msgspec
 from sliplens._version import __version__
 from sliplens.errors import InputError
 from sliplens.files import write_json
-from sliplens.images.files import natural_key
+from sliplens.images import natural_key
 from sliplens.recordings.dataset import Dataset, load_dataset, write_dataset_table
 from sliplens.recordings.trial import TrialFacts
 

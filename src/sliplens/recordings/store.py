@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 
 from sliplens.codec import from_builtins, to_builtins
 from sliplens.errors import RecordingError
-from sliplens.images.files import decode_png, encode_png
+from sliplens.images import decode_png, encode_png
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.trial import (

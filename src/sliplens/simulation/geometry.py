@@ -4,7 +4,6 @@ Lengths are in metres: x right, y down, z towards the object; the skin's foremos
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -28,11 +27,11 @@ def _squared_distance(
     return np.maximum(square, 0, out=square)
 
 
-def require_positive(values: Mapping[str, float | int]) -> None:
-    """Check the lengths and counts of a shape."""
+def require_positive(**values: float | int) -> None:
+    """Check the lengths and counts of a shape, named in words."""
     for name, value in values.items():
         if not value > 0:
-            raise ContactError(f"{name} must be positive, got {value:.3g}; check the sensor's sheet")
+            raise ContactError(f"{name.replace('_', ' ')} must be positive, got {value:.3g}; check the sensor's sheet")
 
 
 def pixel_grid(size_px: int) -> Float[np.ndarray, "size size 2"]:
@@ -62,7 +61,7 @@ class Dome:
 
     def __post_init__(self) -> None:
         require_positive(
-            {"dome radius": self.radius_m, "focal length": self.focal_px_per_rad, "ring spacing": self.ring_spacing_deg}
+            dome_radius=self.radius_m, focal_length=self.focal_px_per_rad, ring_spacing=self.ring_spacing_deg
         )
         if not -1 < self.camera_offset < 1:
             raise ContactError(
@@ -169,16 +168,9 @@ class FlatPad:
     rows: int
 
     def __post_init__(self) -> None:
-        require_positive(
-            {
-                "ball radius": self.ball_radius_m,
-                "camera distance": self.camera_distance_m,
-                "focal length": self.focal_px,
-                "dot spacing": self.spacing_m,
-                "number of columns": self.columns,
-                "number of rows": self.rows,
-            }
-        )
+        require_positive(ball_radius=self.ball_radius_m, camera_distance=self.camera_distance_m)
+        require_positive(focal_length=self.focal_px, dot_spacing=self.spacing_m)
+        require_positive(number_of_columns=self.columns, number_of_rows=self.rows)
 
     @property
     def sphere_radius_m(self) -> float:

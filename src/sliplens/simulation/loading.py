@@ -1,6 +1,7 @@
 """The load on the fingertip through a trial: touch, press, hold, pull until it slips, slide on, let go."""
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -10,6 +11,8 @@ from sliplens.mechanics import safety_margin, stick_ratio
 from sliplens.recordings import ContactState
 from sliplens.simulation.nuisances import Grasp
 
+Frames: TypeAlias = Float[np.ndarray, " frames"]
+
 _FALL_S = 0.06
 """Time in which friction falls from static to kinetic once the contact slips (assumed)."""
 _SLIP_SHARE = 0.2
@@ -17,33 +20,25 @@ _SLIP_SHARE = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sliding:
-    """Friction of a contact after its first full slip, frame by frame; times before that mean nothing."""
+class Friction:
+    """Friction of a contact and how much of it is used, frame by frame."""
 
-    friction: Float[np.ndarray, " frames"]
-    """The coefficient that holds: kinetic in slip, what the contact has regained where it sticks."""
-    used: Float[np.ndarray, " frames"]
+    coefficient: Frames
+    """The one that holds: static, kinetic in slip, then what the contact has regained where it sticks."""
+    used: Frames
     """Tangential force over what this friction can hold."""
-    carried: Float[np.ndarray, " frames"]
+    carried: Frames
     """Tangential over normal force at which the contact last slipped."""
     slips: Bool[np.ndarray, " frames"]
 
 
-def slide(
-    since_slip_s: Float[np.ndarray, " frames"],
-    *,
-    static_friction: Float[np.ndarray, " frames"],
-    grasp: Grasp,
-    stuck_until: int,
-) -> Sliding:
+def slide(since_slip_s: Frames, *, static_friction: Frames, grasp: Grasp, stuck_until: int) -> Friction:
     """Friction of a sliding contact: a fall from static to kinetic, then stick-slip of a spring-slider.
 
     The spring reloads the stuck contact at a steady rate from kinetic friction to what the contact regained in that
     short time (a share of static less kinetic: friction ages), then the contact slips back. With a share of 0 it slides
-    on evenly.
-
-    `since_slip_s`: time since the first full slip, in seconds; `stuck_until`: frames after the first slip from which on
-    the contact slips for good, at the level it then has: it is let go.
+    on evenly. Frames before the first slip mean nothing. From `stuck_until` frames after it on the contact is let go:
+    it slips for good, at the level it then has.
 
     Persson, *Sliding Friction* (2000), chapter 3 (spring-slider, stick-slip).
     """
@@ -67,7 +62,7 @@ def slide(
             level[first - 1] / static_friction[first - 1] * (static_friction[first:])
         )
         stuck[first:] = False
-    return Sliding(friction=friction, used=level / friction, carried=carried, slips=~stuck)
+    return Friction(coefficient=friction, used=level / friction, carried=carried, slips=~stuck)
 
 
 TRIAL_S = 8.0
@@ -95,25 +90,23 @@ class Loading:
     Before the first slip nothing is carried, and the stick margin is the safety margin.
     """
 
-    time_s: Float[np.ndarray, " frames"]
-    normal_force_n: Float[np.ndarray, " frames"]
-    tangential_force_n: Float[np.ndarray, " frames"]
-    friction_coefficient: Float[np.ndarray, " frames"]
-    static_friction: Float[np.ndarray, " frames"]
-    safety_margin: Float[np.ndarray, " frames"]
-    stick_ratio: Float[np.ndarray, " frames"]
-    carried_friction: Float[np.ndarray, " frames"]
-    stick_margin: Float[np.ndarray, " frames"]
+    time_s: Frames
+    normal_force_n: Frames
+    tangential_force_n: Frames
+    friction_coefficient: Frames
+    static_friction: Frames
+    safety_margin: Frames
+    stick_ratio: Frames
+    carried_friction: Frames
+    stick_margin: Frames
     """NaN without contact, as the safety margin."""
-    held_s: Float[np.ndarray, " frames"]
+    held_s: Frames
     """Time since the object was touched; 0 before."""
     contact_state: tuple[ContactState, ...]
 
 
 def load_grasp(grasp: Grasp, *, frames: int, rng: np.random.Generator, release: bool = False) -> Loading:
-    """Load a grasp: press to its force, hold, pull with an evenly falling margin, then slide.
-
-    Sliding begins with a fall from static to kinetic friction; a spring-slider makes it stick and slip (`slide`).
+    """Load a grasp: press to its force, hold, pull with an evenly falling margin, then slide (`slide`).
 
     `release`: let go at the end: the normal force falls to nothing while the object slides, and the last frames have no
     contact.
@@ -140,69 +133,55 @@ def load_grasp(grasp: Grasp, *, frames: int, rng: np.random.Generator, release: 
     swing = rng.uniform(-0.5, 0.5) * np.sin(2 * np.pi * pulled) / (2 * np.pi)
     used = np.clip(pulled + swing, 0, 1)
     sliding = slide(time_s - time_s[slip], static_friction=static, grasp=grasp, stuck_until=let_go - slip)
-    return _label(
-        time_s,
-        normal=normal,
+    friction = Friction(
+        coefficient=np.where(index < slip, static, sliding.coefficient),
         used=np.where(index < slip, used, sliding.used),
-        friction=np.where(index < slip, static, sliding.friction),
-        static=static,
         carried=np.where(index < slip, 0.0, sliding.carried),
         slips=(index >= slip) & sliding.slips,
-        held_s=np.where(index < touch, 0, time_s - time_s[touch]),
     )
+    held_s = np.where(index < touch, 0, time_s - time_s[touch])
+    return _label(time_s, normal=normal, static=static, friction=friction, held_s=held_s)
 
 
-def load_at_margins(margins: Float[np.ndarray, " frames"], *, grasp: Grasp) -> Loading:
+def load_at_margins(margins: Frames, *, grasp: Grasp) -> Loading:
     """Load a grasp so that its frames have given margins, at its full normal force; NaN is no contact.
 
     `grasp`: force and friction; drift, creep and the kinetic ratio are left out.
     """
     if np.any((margins < 0) | (margins > 1)):
         raise ContactError("safety margins must lie in [0, 1]; give them as fractions, not in percent")
-    nothing = np.zeros(len(margins))
-    return _label(
-        np.arange(len(margins), dtype=np.float64),
-        normal=np.where(np.isnan(margins), 0.0, grasp.normal_force_n),
-        used=1 - np.nan_to_num(margins, nan=1.0),
-        friction=np.full(len(margins), grasp.friction),
-        static=np.full(len(margins), grasp.friction),
-        carried=nothing,
-        slips=margins == 0,
-        held_s=nothing,
-    )
+    nothing, static = np.zeros(len(margins)), np.full(len(margins), grasp.friction)
+    used = 1 - np.nan_to_num(margins, nan=1.0)
+    friction = Friction(coefficient=static, used=used, carried=nothing, slips=margins == 0)
+    normal = np.where(np.isnan(margins), 0.0, grasp.normal_force_n)
+    time_s = np.arange(len(margins), dtype=np.float64)
+    return _label(time_s, normal=normal, static=static, friction=friction, held_s=nothing)
 
 
-def _label(
-    time_s: Float[np.ndarray, " frames"],
-    *,
-    normal: Float[np.ndarray, " frames"],
-    used: Float[np.ndarray, " frames"],
-    friction: Float[np.ndarray, " frames"],
-    static: Float[np.ndarray, " frames"],
-    carried: Float[np.ndarray, " frames"],
-    slips: Bool[np.ndarray, " frames"],
-    held_s: Float[np.ndarray, " frames"],
-) -> Loading:
+def _label(time_s: Frames, *, normal: Frames, static: Frames, friction: Friction, held_s: Frames) -> Loading:
     """Label frames of which is known how much of the friction they use."""
-    tangential = used * friction * normal
+    coefficient, carried, slips = friction.coefficient, friction.carried, friction.slips
+    tangential = friction.used * coefficient * normal
     # rounding alone would leave a sliding contact a margin of 1e-16
-    margin = np.where(slips & (normal > 0), 0.0, safety_margin(normal, tangential, friction))
-    left = friction - carried
-    on_top = np.clip((used * friction - carried) / np.where(left > 0, left, 1), 0, 1)
+    margin = np.where(slips & (normal > 0), 0.0, safety_margin(normal, tangential, coefficient))
+    left = coefficient - carried
+    on_top = np.clip((friction.used * coefficient - carried) / np.where(left > 0, left, 1), 0, 1)
     again = ~np.isnan(margin) & ~slips & (carried > 0)
     stick_margin = np.where(again, 1 - on_top, margin)
+    states = (ContactState.NO_CONTACT, ContactState.CONTACT, ContactState.INCIPIENT_SLIP, ContactState.FULL_SLIP)
+    state = np.select([np.isnan(margin), margin >= 1, margin > 0], [0, 1, 2], default=3)
     return Loading(
         time_s=time_s,
         normal_force_n=normal,
         tangential_force_n=tangential,
-        friction_coefficient=friction,
+        friction_coefficient=coefficient,
         static_friction=static,
         safety_margin=margin,
         stick_ratio=stick_ratio(stick_margin),
         carried_friction=carried,
         stick_margin=stick_margin,
         held_s=held_s,
-        contact_state=tuple(map(_state, margin)),
+        contact_state=tuple(states[index] for index in state),
     )
 
 
@@ -216,15 +195,7 @@ def _phase_ends(frames: int, rng: np.random.Generator, *, release: bool) -> tupl
     return touch, pressed, pull, slip, let_go, gone
 
 
-def _smooth(progress: Float[np.ndarray, " frames"]) -> Float[np.ndarray, " frames"]:
+def _smooth(progress: Frames) -> Frames:
     """Rise from 0 to 1 with a soft start and stop, as a servo makes it."""
     inside = np.clip(progress, 0, 1)
     return inside**2 * (3 - 2 * inside)
-
-
-def _state(margin: float) -> ContactState:
-    if np.isnan(margin):
-        return ContactState.NO_CONTACT
-    if margin >= 1:
-        return ContactState.CONTACT
-    return ContactState.INCIPIENT_SLIP if margin > 0 else ContactState.FULL_SLIP

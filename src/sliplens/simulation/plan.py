@@ -193,12 +193,7 @@ def make_recipe(
 
 
 def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
-    """Lay out the trials of a recipe: names, days, splits and seeds.
-
-    Returns
-    -------
-    tuple of TrialPlan
-        Dry before wet within a day; the same for the same recipe.
+    """Lay out the trials of a recipe: names, days, splits and seeds, the same for the same recipe; dry before wet.
 
     Examples
     --------

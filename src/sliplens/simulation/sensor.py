@@ -14,6 +14,8 @@ from sliplens.mechanics import reduced_modulus
 from sliplens.simulation.geometry import Dome, FlatPad, Geometry, require_positive
 from sliplens.simulation.nuisances import Unit
 
+Rgb: TypeAlias = tuple[float, float, float]
+_NONE: Rgb = (0.0, 0.0, 0.0)
 _FIELDS = 32
 _PLAY_PX = 64
 """How much larger than a frame the fields are: a frame's window lies anywhere in them."""
@@ -23,8 +25,8 @@ _PLAY_PX = 64
 class Noise:
     """Standard deviation of one frame's noise by channel, in grey levels, and its smoothness."""
 
-    background: tuple[float, float, float]
-    marker: tuple[float, float, float]
+    background: Rgb
+    marker: Rgb
     edge: float
     """Excess of the noise of a marker's edge, where the video's compression rings, over that inside: at a share s of
     marker in the pixel the noise has s (1 + edge (1 - s)) of the marker's excess over the background's."""
@@ -32,9 +34,9 @@ class Noise:
     """Weight w of the neighbour's noise in a pixel; the lag-1 correlation is w / (1 + w^2)."""
     red_in_green: float
     """Correlation of red and green, which the camera's debayering ties together."""
-    grain: tuple[float, float, float]
+    grain: Rgb
     """Unevenness of the print, which moves with a marker, over its contrast."""
-    ragged_px: tuple[float, float, float]
+    ragged_px: Rgb
     """Unevenness of a marker's edge."""
 
 
@@ -66,16 +68,18 @@ def mix_noise(
     same on every device.
     """
     bank = _noise_bank(noise, image_size_px + _PLAY_PX, str(device))
-    return sum(  # pyright: ignore[reportReturnType] - of two tensors, never of none
+    size = image_size_px
+    first, second = (
         torch.stack(
             [
-                bank[:, field, row : row + image_size_px, column : column + image_size_px]
+                bank[:, field, row : row + size, column : column + size]
                 for field, (row, column) in zip(picks.field[:, part], picks.corner[:, part], strict=True)
             ],
             dim=1,
         )
         for part in (0, 1)
     )
+    return first + second
 
 
 @lru_cache(maxsize=4)
@@ -87,10 +91,6 @@ def _noise_bank(noise: Noise, side: int, device: str) -> Float[Tensor, "3 fields
     smooth /= (1 + noise.smoothness**2) * np.sqrt(2)
     smooth[1] = noise.red_in_green * smooth[0] + np.sqrt(1 - noise.red_in_green**2) * smooth[1]
     return torch.from_numpy(smooth).to(device)
-
-
-Rgb: TypeAlias = tuple[float, float, float]
-_NONE: Rgb = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,9 +116,8 @@ class MarkerLook:
 
     def __post_init__(self) -> None:
         for name, values in (("marker radius", self.radius_px), ("marker edge", self.edge_px)):
-            require_positive(
-                {f"{name} in {channel}": one for channel, one in zip(("red", "green", "blue"), values, strict=True)}
-            )
+            for channel, value in zip(("red", "green", "blue"), values, strict=True):
+                require_positive(**{f"{name} in {channel}": value})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,15 +141,11 @@ def draw_look(
     touch: Float[np.ndarray, " frames"],
     blur_px: Float[np.ndarray, " frames"],
 ) -> DrawnMarkers:
-    """Look of the markers under a load.
+    """Look of the markers under a load, as a `Motion` tells it, and under the trial's own blur (a standard deviation).
 
     A pressed marker is paler, for the object behind the thin skin throws light back, and it is sharp: pressing brings
     the gel into the focus that the untouched one is out of, most in red and to one side of the image. Markers seen
     aslant are paler, too.
-
-    `scale`: size of each marker over its size at rest; `pressure`: pressure over the peak of the nominal grasp's;
-    `touch`: indentation over that of the nominal grasp; 0 without contact; `blur_px`: standard deviation of the blur
-    that the trial adds.
     """
     rest = geometry.marker_positions()
     aslant = 1 - geometry.slope_cosine(rest)[:, None] ** 2
@@ -235,9 +230,9 @@ class Sensor:
     def __post_init__(self) -> None:
         try:
             reduced_modulus(youngs_modulus_pa=self.youngs_modulus_pa, poisson_ratio=self.poisson_ratio)
-            require_positive({"image size": self.image_size_px})
+            require_positive(image_size=self.image_size_px)
             if self.effective_modulus_pa is not None:
-                require_positive({"effective modulus": self.effective_modulus_pa})
+                require_positive(effective_modulus=self.effective_modulus_pa)
         except ContactError as error:
             raise ContactError(f"sensor {self.name}: {error}") from None
 

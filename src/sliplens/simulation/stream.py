@@ -57,28 +57,17 @@ class SimulatedFrames(Dataset[SimulatedFrame]):
         return int(self._ends[-1]) if len(self._ends) else 0
 
     def __getitem__(self, index: int) -> SimulatedFrame:
-        """Draw one frame.
-
-        Raises
-        ------
-        IndexError
-            If there are fewer frames.
-        """
+        """Draw one frame; there is an `IndexError` if there are fewer."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
         index %= len(self)
         trial = int(np.searchsorted(self._ends, index, side="right"))
         number = index - int(self._ends[trial]) + self.plans[trial].frames
         loading, film, reference = self._prepare(trial)
+        # what follows the two images is named as in the loading
         labels = (
-            torch.tensor(values[number], dtype=torch.float32, device=self.device)
-            for values in (
-                loading.safety_margin,
-                loading.stick_ratio,
-                loading.normal_force_n,
-                loading.tangential_force_n,
-                loading.friction_coefficient,
-            )
+            torch.tensor(getattr(loading, name)[number], dtype=torch.float32, device=self.device)
+            for name in SimulatedFrame._fields[2:]
         )
         return SimulatedFrame(film.draw(slice(number, number + 1), device=self.device)[0], reference, *labels)
 

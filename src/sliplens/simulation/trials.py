@@ -1,8 +1,7 @@
 """Simulated trials: from a plan to a recording, and from a recipe to a data set on disk."""
 
-import shutil
-import tempfile
 import weakref
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import torch
 
 from sliplens.errors import InputError
 from sliplens.extras import require_device
-from sliplens.files import output_folder
+from sliplens.files import output_folder, scratch_folder
 from sliplens.progress import OnProgress, stage, wrote
 from sliplens.recordings import Dataset, GroundTruth, Recording
 from sliplens.recordings.dataset import load_dataset, trial_info, trial_path, write_dataset_table
@@ -21,24 +20,23 @@ from sliplens.simulation.loading import Loading, load_grasp
 from sliplens.simulation.nuisances import draw_grasp, draw_unit
 from sliplens.simulation.plan import SimulationRecipe, TrialPlan, make_recipe, plan_trials
 
+_LABELS = ("time_s", "normal_force_n", "tangential_force_n", "friction_coefficient", "safety_margin", "stick_ratio",
+           "contact_state")  # fmt: skip
+"""What a recording takes from a loading."""
+
 
 def prepare_trial(plan: TrialPlan) -> tuple[Loading, Film]:
     """Load a trial and make it ready to be drawn."""
     recipe, unit_rng = plan.recipe, np.random.default_rng(plan.unit_seed)
-    grasp_rng, load_rng, film_rng = np.random.default_rng(plan.seed).spawn(3)
-    grasp = draw_grasp(recipe.nuisances, day=plan.day_draw, wet=plan.condition == "wet", rng=grasp_rng)
+    grasp_rng, load_rng, rng = np.random.default_rng(plan.seed).spawn(3)
+    day, sensor = plan.day_draw, recipe.sensor
+    grasp = draw_grasp(recipe.nuisances, day=day, wet=plan.condition == "wet", rng=grasp_rng)
     loading = load_grasp(grasp, frames=plan.frames, rng=load_rng, release=recipe.release)
-    film = prepare_film(
-        recipe.sensor,
-        loading=loading,
-        grasp=grasp,
-        day=plan.day_draw,
-        unit=draw_unit(recipe.nuisances, markers=recipe.sensor.geometry.markers, rng=unit_rng),
-        rng=film_rng,
-        noise=recipe.sensor.noise,
-        displacement=recipe.resolved_displacement,
+    unit = draw_unit(recipe.nuisances, markers=sensor.geometry.markers, rng=unit_rng)
+    displacement = recipe.resolved_displacement
+    return loading, prepare_film(
+        sensor, loading=loading, grasp=grasp, day=day, unit=unit, rng=rng, noise=sensor.noise, displacement=displacement
     )
-    return loading, film
 
 
 def simulate_trial(
@@ -61,13 +59,7 @@ def simulate_trial(
         condition=plan.condition,
         reference=reference,
         frames=frames,
-        time_s=loading.time_s,
-        normal_force_n=loading.normal_force_n,
-        tangential_force_n=loading.tangential_force_n,
-        friction_coefficient=loading.friction_coefficient,
-        safety_margin=loading.safety_margin,
-        stick_ratio=loading.stick_ratio,
-        contact_state=loading.contact_state,
+        **{name: getattr(loading, name) for name in _LABELS},
         truth=GroundTruth(
             recipe=plan.recipe_hash,
             displacement=plan.recipe.resolved_displacement,
@@ -88,13 +80,7 @@ def simulate_examples(
     device: str | torch.device = "cpu",
     on_progress: OnProgress | None = None,
 ) -> list[Recording]:
-    """Simulate a few trials that show the range of a recipe, a wet one last.
-
-    Parameters
-    ----------
-    count
-        Trials at most.
-    """
+    """Simulate a few trials, `count` at most, that show the range of a recipe, a wet one last."""
     plans = plan_trials(recipe)
     dry = [plan for plan in plans if plan.condition == "dry"]
     wet = [plan for plan in plans if plan.condition == "wet"][:1]
@@ -140,14 +126,10 @@ def simulate(
     require_device(device)
     recipe = make_recipe(preset, sensor=sensor, **changes)
     if out is None:
-        folder = Path(tempfile.mkdtemp(prefix="sliplens-"))
-        try:
-            with stage(on_progress, "Simulating frames") as count:
-                data = simulate_dataset(folder, recipe, device=device, on_progress=count)
-        except BaseException:
-            shutil.rmtree(folder)
-            raise
-        weakref.finalize(data, shutil.rmtree, folder, ignore_errors=True)
+        with ExitStack() as stack, stage(on_progress, "Simulating frames") as count:
+            folder = stack.enter_context(scratch_folder())
+            data = simulate_dataset(folder, recipe, device=device, on_progress=count)
+            weakref.finalize(data, stack.pop_all().close)
         return data
     out, config = Path(out), {"recipe": recipe, "device": device}
     with output_folder(out, stage="simulate", config=config, overwrite=overwrite) as output:
@@ -163,12 +145,7 @@ def simulate(
 def simulate_dataset(
     folder: Path, recipe: SimulationRecipe, *, device: str | torch.device = "cpu", on_progress: OnProgress | None = None
 ) -> Dataset:
-    """Simulate a data set into a folder; trials that are already there are kept.
-
-    Parameters
-    ----------
-    folder
-        Where to write `trials/*.parquet` and, last, `dataset.json`.
+    """Simulate `trials/*.parquet` and, last, `dataset.json` into a folder; trials that are already there are kept.
 
     Raises
     ------

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from sliplens.errors import InputError, RecordingError
-from sliplens.images.files import decode_png
+from sliplens.images import decode_png
 from sliplens.recordings import ContactState, Dataset, Recording, load_dataset
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sliplens.errors import InputError
 from sliplens.extras import Table
-from sliplens.images.files import IMAGE_SUFFIXES
+from sliplens.images import IMAGE_SUFFIXES
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import DATASET_FILE
 from sliplens.recordings.formats.gelsight import is_gelsight, read_gelsight

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from sliplens.errors import ImageError, RecordingError, SliplensError
-from sliplens.images.files import list_images, read_image
+from sliplens.images import list_images, read_image
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.formats.tables import (
     UNITS,

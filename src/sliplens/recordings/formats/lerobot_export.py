@@ -16,7 +16,7 @@ from jaxtyping import Int64, Shaped
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import require_folder, write_json
-from sliplens.images.files import encode_png, write_png
+from sliplens.images import encode_png, write_png
 from sliplens.progress import OnProgress
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import Dataset, TrialInfo

@@ -14,7 +14,7 @@ from sliplens._version import __version__
 from sliplens.errors import InputError, RecordingError
 from sliplens.extras import require_packages
 from sliplens.files import require_folder
-from sliplens.images.files import encode_png
+from sliplens.images import encode_png
 from sliplens.progress import OnProgress
 from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.dataset import Dataset, TrialInfo

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sliplens.errors import RecordingError
-from sliplens.images.files import natural_key
+from sliplens.images import natural_key
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.formats.images import common_size, read_frame
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
