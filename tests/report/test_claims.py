@@ -174,7 +174,7 @@ def test_estimates_are_the_gaps_that_were_put_in(judged, tmp_path, rng):
     judged(Made(spread=0.0))
     curves = load_results(tmp_path).study.faithfulness["difference"].curves
 
-    gap = compare_gain(curves["grey", "pixel", "poly-cam"], curves["grey", "pixel", "grad-cam"], rng=rng)
+    gap = compare_gain((curves["grey", "pixel", "poly-cam"], curves["grey", "pixel", "grad-cam"]), rng=rng)
 
     # curves were built to have that area; trapezoids of 21 steps add no error to an area set by trapezoids
     assert gap is not None

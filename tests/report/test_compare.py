@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sliplens.intervals import bootstrap_difference
-from sliplens.report.comparisons import agreement, compare_deletion, compare_errors
+from sliplens.report.comparisons import compare_deletion, compare_errors
 from sliplens.results.evaluation import Predictions
 from sliplens.results.faithfulness import DeletionCurve
 
@@ -70,20 +70,3 @@ def test_curves_of_other_frames_are_not_compared(rng):
     )
 
     assert compare_deletion(one, other, rng=rng) is None
-
-
-def test_agreement_of_perfect_answers():
-    labels = np.array([1.0, 0.8, 0.6, 0.4, 0.2, 0.0])
-
-    found = agreement(labels, labels)
-
-    assert (found.mae, found.pairs, found.ordered_pairs) == (0, 15, 15)
-    assert found.constant_mae == pytest.approx(0.3)
-
-
-def test_constant_and_reversed_answers_have_no_pair_in_order():
-    labels = np.array([1.0, 0.5, 0.5, 0.0])
-
-    assert agreement(labels, np.full(4, 0.5)).ordered_pairs == 0
-    assert agreement(labels, 1 - labels).ordered_pairs == 0
-    assert agreement(labels, labels).pairs == 5

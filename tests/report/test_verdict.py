@@ -23,11 +23,11 @@ def test_alarms_of_one_kind_are_one_line_with_a_count():
 
     groups = group_alarms(alarms)
 
-    assert [(group.kind, len(group.sentences)) for group in groups] == [
+    assert [(kind, len(sentences)) for kind, sentences in groups.items()] == [
         ("Methods that do not beat a random order", 2),
         ("The network is asleep.", 1),
     ]
-    assert groups[0].sentences[0] == "Grad-CAM does not beat a random order: its symmetric gain is -0.1."
+    assert next(iter(groups.values()))[0] == "Grad-CAM does not beat a random order: its symmetric gain is -0.1."
 
 
 def test_warnings_of_explainers_are_grouped_by_kind_not_told_frame_by_frame():
@@ -42,7 +42,7 @@ def test_warnings_of_explainers_are_grouped_by_kind_not_told_frame_by_frame():
 
     groups = group_alarms(warnings)
 
-    assert [len(group.sentences) for group in groups] == [2, 2, 2]
+    assert [len(sentences) for sentences in groups.values()] == [2, 2, 2]
 
 
 def test_alarms_are_counted_by_network(workspace):
@@ -159,6 +159,29 @@ def test_real_touch_is_held_against_a_constant_answer(workspace, verdict):
     assert "off by 43 percentage points on average; the best constant answer would be off by 30." in found.text
     assert "0 of 15 pairs of frames in the right order" in found.text
     assert "do not carry over to real touch" in found.text
+
+
+@pytest.mark.parametrize(
+    ("labels", "sign", "told"),
+    [
+        ((1.0, 0.8, 0.6, 0.4, 0.2, 0.0), 1, "It puts 15 of 15 pairs of frames in the right order (all of them)."),
+        # frames with equal labels have no order
+        ((1.0, 0.5, 0.5, 0.5, 0.5, 0.0), 1, "9 of 9 pairs"),
+        ((1.0, 0.5, 0.5, 0.5, 0.5, 0.0), -1, "0 of 9 pairs of frames in the right order (chance gives half)."),
+    ],
+)
+def test_pairs_of_real_frames_are_in_order_or_not(workspace, verdict, labels, sign, told):
+    def label(value):
+        for frame, margin in zip(value["frames"], labels, strict=True):
+            frame.update(safety_margin=margin, prediction=sign * margin)
+
+    edit(workspace / "maps-raw-real" / "result.json", label)
+
+    found = verdict()["Real touch, raw images"]
+
+    assert told in found.text
+    assert ("off by 0 percentage points" in found.text) == (sign > 0)
+    assert found.tone == ("plain" if sign > 0 else "caution")
 
 
 def test_real_frames_without_labels_carry_no_claim(workspace, verdict):

@@ -6,16 +6,15 @@ Polak, *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile 
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 
-from sliplens.intervals import Difference
+from sliplens.intervals import Difference, paired_difference
 from sliplens.plots.style import (
     CONTROLS,
     decimals,
-    fill_name,
     input_name,
     inputs_in_order,
     listed,
@@ -23,14 +22,12 @@ from sliplens.plots.style import (
     percent,
 )
 from sliplens.report.comparisons import (
-    best_control,
     compare_gain,
-    compare_mean_gain,
     compare_thesis_score,
-    gain_over_chance,
+    controls,
+    gap_from,
     mean_at,
-    reversed_gap,
-    settings,
+    removal_by_setting,
     share_of_strongest,
     tell_interval,
 )
@@ -41,8 +38,14 @@ from sliplens.results.study import MapQuality, Truth
 
 Outcome = Literal["holds", "does not hold", "undecided"]
 Record = TypeVar("Record")
+_OPPOSITE: dict[Outcome, Outcome] = {"holds": "does not hold", "does not hold": "holds"}
 _UNSCORED = "its explanations were not scored; `sliplens study` does that"
-OUTCOMES: tuple[Outcome, ...] = ("holds", "does not hold", "undecided")
+POLY_CAM, GRAD_CAM, NOISY = "poly-cam", "grad-cam", "integrated-gradients"
+"""What the thesis compared."""
+_RIVALS = (GRAD_CAM, NOISY)
+_MEASURES = {"total_variation": ("total variation", 1), "noise_stability": ("stability under sensor noise", -1)}
+"""Name, and sign: noisier is more of it, or less."""
+_SMALL_AREA = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +84,66 @@ class Claim:
     answers: tuple[Answer, ...]
 
 
+def judge_claims(results: Results, *, rng: np.random.Generator) -> tuple[Claim, ...]:
+    """Test every claim; where the results it needs are not there, it stays undecided and says why."""
+    study = results.study
+
+    def against_rivals(faithful: RemovalScores) -> list[Answer]:
+        return [_beats_rivals(faithful, one, results, rng=rng) for one in _poly_cams(faithful)]
+
+    return (
+        Claim(
+            id="most-faithful",
+            title="Poly-CAM is the most faithful of the three methods",
+            test="Tested by the symmetric relevance gain (SRG): holds under a fill where Poly-CAM's is larger than "
+            "both others' and the 95 % interval of each difference leaves zero out.",
+            answers=_of_each(results, study.faithfulness, against_rivals, why=_UNSCORED),
+        ),
+        Claim(
+            id="difference",
+            title="Difference images give more faithful explanations than raw images",
+            test="Tested on the same frames, evidence lost in margin units: holds under a fill where the SRG averaged "
+            "over the methods is larger for difference images, beyond the 95 % interval.",
+            answers=(_compare_inputs(results, rng=rng),),
+        ),
+        Claim(
+            id="grad-cam",
+            title="Grad-CAM is not faithful",
+            test="Tested against maps that know nothing of the network: holds under a fill where Grad-CAM's SRG lies "
+            "below chance or below the best control for sure; does not hold where it lies above both for sure.",
+            answers=_of_each(
+                results, study.faithfulness, lambda faithful: [_no_better(faithful, rng=rng)], why=_UNSCORED
+            ),
+        ),
+        Claim(
+            id="noisy",
+            title="Integrated Gradients is noisy",
+            test="Tested by numbers: holds where its maps have a larger total variation than those of every other "
+            "method, beyond the 95 % interval, and are the least stable under sensor noise (means over few frames, no "
+            "interval).",
+            answers=_of_each(
+                results,
+                study.map_quality,
+                lambda looks: [_noisiest(looks)],
+                why="the looks of the maps were not measured; `sliplens study` does that",
+            ),
+        ),
+        Claim(
+            id="two-markers",
+            title="The network looks at the edges of two markers",
+            test="Tested on simulated touch in two parts, both needed: putting back a marker at a time, the strongest "
+            "two hold more than half of all change of the answer; and Poly-CAM's relevance lies on marker edges more "
+            "than their share of the image.",
+            answers=_of_each(
+                results,
+                study.truth,
+                lambda truth: [_looks_at_two(truth, rng=rng)],
+                why="only simulated touch tells what each marker does, and no such result is here",
+            ),
+        ),
+    )
+
+
 def judge_gap(gap: Difference | None) -> Outcome:
     """Positive for sure, negative for sure, or neither."""
     if gap is None or not gap.sure:
@@ -98,102 +161,52 @@ def all_of(outcomes: Iterable[Outcome]) -> Outcome:
 
 def most_of(outcomes: Sequence[Outcome]) -> Outcome:
     """Join settings: more than half of them agree, and none says the opposite."""
-    opposites: dict[Outcome, Outcome] = {"holds": "does not hold", "does not hold": "holds"}
-    for outcome, opposite in opposites.items():
+    for outcome, opposite in _OPPOSITE.items():
         if 2 * outcomes.count(outcome) > len(outcomes) and opposite not in outcomes:
             return outcome
     return "undecided"
 
 
-def tell_settings(by_setting: dict[str, Outcome]) -> str:
-    """Say under which settings a claim holds, does not, or stays open."""
-    names = {found: [name for name, own in by_setting.items() if own == found] for found in OUTCOMES}
-    return _sentence("; ".join(f"{outcome} under {listed(where)}" for outcome, where in names.items() if where))
+def _of_each(
+    results: Results, found: Mapping[str, Record], judge: Callable[[Record], Sequence[Answer]], *, why: str
+) -> tuple[Answer, ...]:
+    """Answer for each network, difference before raw; one without a result stays open, and why."""
+    names = inputs_in_order(results.study.inputs)[::-1]
+    told = [judge(found[name]) if name in found else [_untested(input_name(name), why)] for name in names]
+    return tuple(answer for own in told for answer in own)
 
 
-def tell_first(findings: list[Finding]) -> str:
-    """Write the intervals of the first setting."""
-    told = [one for one in findings if one.gap is not None and one.where == findings[0].where]
-    parts = [f"{one.compared}: {tell_interval(one.gap)}" for one in told if one.gap is not None]
-    return f"Under {findings[0].where}, {'; '.join(parts)}." if parts else ""
+def _untested(subject: str, why: str) -> Answer:
+    return Answer(subject=subject, outcome="undecided", text=f"Not tested: {why}.")
+
+
+def _over_settings(subject: str, by_setting: dict[str, Outcome], findings: list[Finding]) -> Answer:
+    """Answer by what holds under most settings, with the intervals of the first."""
+    names = {found: [name for name, own in by_setting.items() if own == found] for found in (*_OPPOSITE, "undecided")}
+    text = _sentence("; ".join(f"{outcome} under {listed(where)}" for outcome, where in names.items() if where))
+    first = findings[0].where
+    told = [f"{one.compared}: {tell_interval(one.gap)}" for one in findings if one.gap and one.where == first]
+    text += f" Under {first}, {'; '.join(told)}." if told else " "
+    outcome = most_of(list(by_setting.values()))
+    return Answer(subject=subject, outcome=outcome, text=text, findings=tuple(findings))
 
 
 def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}."
 
 
-def _over_settings(subject: str, by_setting: dict[str, Outcome], findings: list[Finding]) -> Answer:
-    """Answer by what holds under most settings."""
-    text = f"{tell_settings(by_setting)} {tell_first(findings)}"
-    outcome = most_of(list(by_setting.values()))
-    return Answer(subject=subject, outcome=outcome, text=text, findings=tuple(findings))
-
-
-def untested(name: str, why: str) -> Answer:
-    """Answer that stays open, and why; the name is that of an input, or empty for both networks."""
-    subject = input_name(name) if name else "Both networks"
-    return Answer(subject=subject, outcome="undecided", text=f"Not tested: {why}.")
-
-
-POLY_CAM, RIVALS = "poly-cam", ("grad-cam", "integrated-gradients")
-"""What the thesis compared."""
-
-
-def claim_difference(results: Results, *, rng: np.random.Generator) -> Claim:
-    """Test it on the same frames, evidence lost in margin units."""
-    found = results.study.faithfulness
-    if not {"difference", "raw"} <= set(found):
-        answer = untested("", "the explanations of both networks are needed, and those of one are there")
-    else:
-        answer = _compare_inputs(found["difference"], found["raw"], results, rng=rng)
-    return Claim(
-        id="difference",
-        title="Difference images give more faithful explanations than raw images",
-        test="Tested on the same frames, evidence lost in margin units: holds under a fill where the SRG averaged over "
-        "the methods is larger for difference images, beyond the 95 % interval.",
-        answers=(answer,),
-    )
-
-
-def _compare_inputs(
-    difference: RemovalScores, raw: RemovalScores, results: Results, *, rng: np.random.Generator
-) -> Answer:
-    findings, by_setting, claimed = [], {}, (*RIVALS, poly_cams(difference)[0])
-    for fill, unit in settings(difference):
-        methods = [one for one in claimed if (fill, unit, one) in difference.curves and (fill, unit, one) in raw.curves]
-        if not methods:
-            continue
-        where = fill_name(fill, unit)
-        pairs = {one: (difference.curves[fill, unit, one], raw.curves[fill, unit, one]) for one in methods}
-        gap = compare_mean_gain(*zip(*pairs.values(), strict=True), rng=rng)
-        by_setting[where] = judge_gap(gap)
-        compared = f"SRG, mean of {len(pairs)} methods, difference less raw"
-        findings.append(Finding(where=where, compared=compared, gap=gap, outcome=by_setting[where]))
-        for one, pair in pairs.items():
-            compared = f"SRG of {method_name(one)}, difference less raw"
-            findings.append(Finding(where=where, compared=compared, gap=compare_gain(*pair, rng=rng)))
-    if not by_setting:
-        return untested("", "no method was scored on both inputs under one fill")
-    findings += _thesis_score_of_inputs(results, rng=rng)
-    return _over_settings("Both networks", by_setting, findings)
-
-
-def _thesis_score_of_inputs(results: Results, *, rng: np.random.Generator) -> list[Finding]:
-    scored = {name: one for (name, source), one in results.scores.items() if source == results.study.source}
-    if not {"difference", "raw"} <= set(scored):
-        return []
-    first, second = scored["difference"].curves, scored["raw"].curves
-    pairs = {
-        f"D of {method_name(one)}, difference less raw": (first[one], second[one])
-        for one in (*RIVALS, THESIS_POLY_CAM, POLY_CAM)
-        if one in first and one in second
-    }
-    return _by_thesis_score(pairs, scored_trials(results, "difference"), rng=rng)
+def _judged(where: str, gaps: Mapping[str, Difference | None]) -> list[Finding]:
+    return [Finding(where=where, compared=name, gap=gap, outcome=judge_gap(gap)) for name, gap in gaps.items()]
 
 
 def _by_thesis_score(
-    pairs: dict[str, tuple[DeletionCurve, DeletionCurve]], trials: dict[str, str], *, rng: np.random.Generator
+    pairs: Mapping[str, tuple[DeletionCurve, DeletionCurve]], faithful: RemovalScores, *, rng: np.random.Generator
 ) -> list[Finding]:
+    trials = {
+        frame: str(trial)
+        for curve in faithful.curves.values()
+        for frame, trial in zip(curve.frame_ids, curve.trials, strict=True)
+    }
     return [
         Finding(
             where="score of the thesis",
@@ -204,257 +217,139 @@ def _by_thesis_score(
     ]
 
 
-def poly_cams(faithful: RemovalScores) -> list[str]:
+def _poly_cams(faithful: RemovalScores) -> list[str]:
     """Poly-CAM as in the thesis, and ours: the claim is of the first, and the second is what is used now."""
     scored = {method for _, _, method in faithful.curves}
     return [one for one in (THESIS_POLY_CAM, POLY_CAM) if one in scored] or [POLY_CAM]
 
 
-def scored_trials(results: Results, name: str) -> dict[str, str]:
-    """Trial of each scored frame of an input."""
-    faithful = results.study.faithfulness.get(name)
-    if faithful is not None:
-        return {
-            frame: str(trial)
-            for curve in faithful.curves.values()
-            for frame, trial in zip(curve.frame_ids, curve.trials, strict=True)
-        }
-    choice = results.study.choice
-    return {} if choice is None else {frame.id: frame.trial for frame in choice.frames if frame.scored}
+def _beats_rivals(faithful: RemovalScores, method: str, results: Results, *, rng: np.random.Generator) -> Answer:
+    findings, by_setting, subject, name = [], {}, input_name(faithful.input), method_name(method)
+    for where, curves in removal_by_setting(faithful):
+        rivals = [one for one in _RIVALS if {one, method} <= set(curves)]
+        if rivals:
+            gaps = {one: compare_gain((curves[method], curves[one]), rng=rng) for one in rivals}
+            by_setting[where] = all_of(judge_gap(gap) for gap in gaps.values())
+            findings += _judged(where, {f"SRG, {name} less {method_name(one)}": gap for one, gap in gaps.items()})
+    if not by_setting:
+        return _untested(subject, f"{name} and another method were not scored together")
+    scored = next((one.curves for (own, _), one in results.scores.items() if own == faithful.input), {})
+    rivals = [one for one in _RIVALS if {one, method} <= set(scored)]
+    pairs = {f"D, {name} less {method_name(one)}": (scored[method], scored[one]) for one in rivals}
+    findings += _by_thesis_score(pairs, faithful, rng=rng)
+    return _over_settings(subject if len(_poly_cams(faithful)) == 1 else f"{subject}, {name}", by_setting, findings)
 
 
-_NOISY = "integrated-gradients"
-_MEASURES = {"total_variation": 1, "noise_stability": -1}  # sign: noisier is more of it, or less
-_MEASURE_NAMES = {"total_variation": "total variation", "noise_stability": "stability under sensor noise"}
-_LOOKERS = ("poly-cam", THESIS_POLY_CAM)  # the finer of the two first: edges are finer than its coarse map
-_TWO = 2
-
-
-def claim_noisy(results: Results) -> Claim:
-    """Integrated Gradients is noisy: rougher than the other methods, and less stable under sensor noise."""
-    unmeasured = "the looks of the maps were not measured; `sliplens study` does that"
-    return Claim(
-        id="noisy",
-        title="Integrated Gradients is noisy",
-        test="Tested by numbers: holds where its maps have a larger total variation than those of every other method, "
-        "beyond the 95 % interval, and are the least stable under sensor noise (means over few frames, no interval).",
-        answers=_of_each(results, results.study.map_quality, lambda looks: [_noisiest(looks)], why=unmeasured),
+def _compare_inputs(results: Results, *, rng: np.random.Generator) -> Answer:
+    findings, by_setting, subject, found = [], {}, "Both networks", results.study.faithfulness
+    if not {"difference", "raw"} <= set(found):
+        return _untested(subject, "the explanations of both networks are needed, and those of one are there")
+    difference, raw = found["difference"], dict(removal_by_setting(found["raw"]))
+    for where, curves in removal_by_setting(difference):
+        methods = [one for one in (*_RIVALS, _poly_cams(difference)[0]) if one in curves and one in raw.get(where, {})]
+        if methods:
+            pairs = {one: (curves[one], raw[where][one]) for one in methods}
+            gap = compare_gain(*pairs.values(), rng=rng)
+            by_setting[where] = judge_gap(gap)
+            findings += _judged(where, {f"SRG, mean of {len(pairs)} methods, difference less raw": gap})
+            for one, pair in pairs.items():
+                compared = f"SRG of {method_name(one)}, difference less raw"
+                findings.append(Finding(where=where, compared=compared, gap=compare_gain(pair, rng=rng)))
+    if not by_setting:
+        return _untested(subject, "no method was scored on both inputs under one fill")
+    first, second = (
+        results.scores[name, results.study.source].curves if (name, results.study.source) in results.scores else {}
+        for name in ("difference", "raw")
     )
+    methods = [one for one in (*_RIVALS, THESIS_POLY_CAM, POLY_CAM) if one in first and one in second]
+    pairs = {f"D of {method_name(one)}, difference less raw": (first[one], second[one]) for one in methods}
+    return _over_settings(subject, by_setting, [*findings, *_by_thesis_score(pairs, difference, rng=rng)])
+
+
+def _no_better(faithful: RemovalScores, *, rng: np.random.Generator) -> Answer:
+    findings, by_setting, subject, name = [], {}, input_name(faithful.input), method_name(GRAD_CAM)
+    for where, curves in removal_by_setting(faithful):
+        own = curves.get(GRAD_CAM)
+        if own is None:
+            continue
+        nothing = paired_difference(own.srg, np.zeros(len(own.srg)), trials=own.trials, rng=rng)
+        gaps: dict[str, Difference] = {"chance": nothing}
+        known = [one for one in sorted(controls(faithful)) if one in curves]
+        best = max(known, key=lambda one: float(curves[one].srg.mean()), default=None)
+        if best is not None and (gap := compare_gain((own, curves[best]), rng=rng)) is not None:
+            gaps[method_name(best)] = gap
+        # not faithful is what is claimed: a gain for sure speaks against it
+        by_setting[where] = _OPPOSITE.get(all_of(judge_gap(gap) for gap in gaps.values()), "undecided")
+        findings += [Finding(where=where, compared=f"SRG, {name} less {one}", gap=gap) for one, gap in gaps.items()]
+        most, chance = mean_at(own, _SMALL_AREA)
+        compared = f"change once {percent(_SMALL_AREA)} of the image is gone, against random order"
+        findings.append(Finding(where=where, compared=compared, value=f"{most:.3f} against {chance:.3f}"))
+    return _over_settings(subject, by_setting, findings) if by_setting else _untested(subject, f"{name} was not scored")
 
 
 def _noisiest(looks: MapQuality) -> Answer:
-    subject = input_name(looks.input)
-    findings, outcomes, parts = [], [], []
-    for measure, sign in _MEASURES.items():
+    subject, findings, outcomes, parts = input_name(looks.input), [], [], []
+    for measure, (name, sign) in _MEASURES.items():
         values = {
-            name: value
-            for name, found in looks.methods.items()
-            if name not in CONTROLS and (value := getattr(found, measure)) is not None
+            method: value
+            for method, found in looks.methods.items()
+            if method not in CONTROLS and (value := getattr(found, measure)) is not None
         }
-        own = values.pop(_NOISY, None)
+        own = values.pop(NOISY, None)
         if own is None or not values:
-            return Answer(subject=subject, outcome="undecided", text=f"Not tested: {_MEASURE_NAMES[measure]} of "
-                          f"{method_name(_NOISY)} and of another method are not both known.")  # fmt: skip
-        noisier = [name for name, value in values.items() if sign * own > sign * value]
-        outcome: Outcome = "holds" if len(noisier) == len(values) else "undecided" if noisier else "does not hold"
-        gaps = _rougher(looks, values) if measure == "total_variation" else {}
+            return _untested(subject, f"{name} of {method_name(NOISY)} and of another method are not both known")
+        noisier = [sign * own > sign * value for value in values.values()]
+        outcome: Outcome = "holds" if all(noisier) else "undecided" if any(noisier) else "does not hold"
+        gaps = {
+            f"{method_name(NOISY)} less {method_name(method)}": gap_from(one, NOISY)
+            for method in values
+            for one in looks.comparisons
+            if measure == "total_variation" and {one.first, one.second} == {NOISY, method}
+        }
         if gaps:
             outcome = all_of(judge_gap(gap) for gap in gaps.values())
-            named = {f"{method_name(_NOISY)} less {method_name(name)}": gap for name, gap in gaps.items()}
-            findings += _judged(_MEASURE_NAMES[measure], named)
+            findings += _judged(name, gaps)
         outcomes.append(outcome)
-        others = listed([f"{method_name(name)} {decimals(value, 3)}" for name, value in values.items()])
-        parts.append(f"{_MEASURE_NAMES[measure]} {decimals(own, 3)} ({others})")
-        findings.append(
-            Finding(
-                where=_MEASURE_NAMES[measure],
-                compared=f"{method_name(_NOISY)} against {others}",
-                value=decimals(own, 3),
-                outcome=outcome,
-            )
-        )
+        others = listed([f"{method_name(method)} {decimals(value, 3)}" for method, value in values.items()])
+        parts.append(f"{name} {decimals(own, 3)} ({others})")
+        compared = f"{method_name(NOISY)} against {others}"
+        findings.append(Finding(where=name, compared=compared, value=decimals(own, 3), outcome=outcome))
     text = _sentence(listed(parts))
     return Answer(subject=subject, outcome=all_of(outcomes), text=text, findings=tuple(findings))
 
 
-def _rougher(looks: MapQuality, others: Iterable[str]) -> dict[str, Difference]:
-    """How much rougher its maps are than those of the others, where that was compared."""
-    gaps = {}
-    for name in others:
-        if (_NOISY, name) in looks.rougher:
-            gaps[name] = looks.rougher[_NOISY, name]
-        elif (name, _NOISY) in looks.rougher:
-            gaps[name] = reversed_gap(looks.rougher[name, _NOISY])
-    return gaps
-
-
-def claim_edges(results: Results, *, rng: np.random.Generator) -> Claim:
-    """The network looks at the edges of two markers: they hold most of its effects, and maps lie on edges."""
-    unknown = "only simulated touch tells what each marker does, and no such result is here"
-    return Claim(
-        id="two-markers",
-        title="The network looks at the edges of two markers",
-        test="Tested on simulated touch in two parts, both needed: putting back a marker at a time, the strongest two "
-        "hold more than half of all change of the answer; and Poly-CAM's relevance lies on marker edges more than "
-        "their share of the image.",
-        answers=_of_each(results, results.study.truth, lambda truth: [_looks_at_two(truth, rng=rng)], why=unknown),
-    )
-
-
 def _looks_at_two(truth: Truth, *, rng: np.random.Generator) -> Answer:
-    share = share_of_strongest(truth.effects, count=_TWO, rng=rng)
-    looker = next((name for name in _LOOKERS if name in truth.methods), _LOOKERS[0])
-    found = truth.methods.get(looker)
-    mass, area = None if found is None else found.mass["edges"], truth.areas["edges"]
-    on_edges: Outcome = "undecided" if mass is None or area is None else "holds" if mass > area else "does not hold"
-    gap = None if found is None else found.edges
-    if gap is not None:
-        on_edges = judge_gap(gap)
-    two: Outcome = "undecided"
+    share = share_of_strongest(truth.effects, count=2, rng=rng)
+    two, told = judge_gap(None), "no marker changes the answer"
     if share is not None:
-        half = type(share)(estimate=share.estimate - 0.5, low=share.low - 0.5, high=share.high - 0.5, units=share.units)
-        two = judge_gap(half)
-    told = (
-        "no marker changes the answer"
-        if share is None
-        else f"{percent(share.estimate)} of the change of the answer ({percent(share.low)} to {percent(share.high)})"
+        two = judge_gap(replace(share, estimate=share.estimate - 0.5, low=share.low - 0.5, high=share.high - 0.5))
+        bounds = f"{percent(share.low)} to {percent(share.high)}"
+        told = f"{percent(share.estimate)} of the change of the answer ({bounds})"
+    # ours first: edges are finer than the coarse map of the thesis's
+    looker = next((name for name in (POLY_CAM, THESIS_POLY_CAM) if name in truth.methods), POLY_CAM)
+    found, area = truth.methods.get(looker), truth.areas["edges"]
+    mass, gap = (None, None) if found is None else (found.mass["edges"], found.edges)
+    on_edges, on_edges_told = judge_gap(gap), "No Poly-CAM map was held against the truth."
+    if mass is not None:
+        if gap is None and area is not None:
+            on_edges = "holds" if mass > area else "does not hold"
+        on_edges_told = (
+            f"{method_name(looker)} puts {percent(mass)} of its relevance on edges, which cover {percent(area)} of "
+            "the image."
+        )
+    marked = Finding(
+        where="each marker put back", compared="share of the two strongest markers", gap=share, outcome=two
     )
-    on_edges_told = (
-        "No Poly-CAM map was held against the truth."
-        if mass is None
-        else f"{method_name(looker)} puts {percent(mass)} of its relevance on edges, which cover {percent(area)} of "
-        "the image."
+    massed = Finding(
+        where="relevance mass",
+        compared=f"on edges, less their {percent(area)} of the image",
+        value="" if gap is not None else percent(mass),
+        gap=gap,
+        outcome=on_edges,
     )
-    markers = len(np.unique(truth.effects.marker))
     return Answer(
         subject=input_name(truth.input),
         outcome=all_of((two, on_edges)),
-        text=f"The two strongest of up to {markers} markers hold {told}. {on_edges_told}",
-        findings=(
-            Finding(
-                where="each marker put back", compared="share of the two strongest markers", gap=share, outcome=two
-            ),
-            Finding(
-                where="relevance mass",
-                compared=f"on edges, less their {percent(area)} of the image",
-                value="" if gap is not None else percent(mass),
-                gap=gap,
-                outcome=on_edges,
-            ),
-        ),
-    )
-
-
-_SMALL_AREA = 0.05
-
-
-def judge_claims(results: Results, *, rng: np.random.Generator) -> tuple[Claim, ...]:
-    """Test every claim; where the results it needs are not there, it stays undecided and says why."""
-    return (
-        _claim_poly_cam(results, rng=rng),
-        claim_difference(results, rng=rng),
-        _claim_grad_cam(results, rng=rng),
-        claim_noisy(results),
-        claim_edges(results, rng=rng),
-    )
-
-
-def _claim_poly_cam(results: Results, *, rng: np.random.Generator) -> Claim:
-    def judge(faithful: RemovalScores) -> list[Answer]:
-        claimants = poly_cams(faithful)
-        return [_best_of(faithful, one, claimants, results, rng=rng) for one in claimants]
-
-    return Claim(
-        id="most-faithful",
-        title="Poly-CAM is the most faithful of the three methods",
-        test="Tested by the symmetric relevance gain (SRG): holds under a fill where Poly-CAM's is larger than both "
-        "others' and the 95 % interval of each difference leaves zero out.",
-        answers=_of_each(results, results.study.faithfulness, judge, why=_UNSCORED),
-    )
-
-
-def _best_of(
-    faithful: RemovalScores, method: str, claimants: list[str], results: Results, *, rng: np.random.Generator
-) -> Answer:
-    findings, by_setting = [], {}
-    for fill, unit in settings(faithful):
-        own = faithful.curves.get((fill, unit, method))
-        others = [one for one in RIVALS if (fill, unit, one) in faithful.curves]
-        if own is None or not others:
-            continue
-        gaps = {one: compare_gain(own, faithful.curves[fill, unit, one], rng=rng) for one in others}
-        where = fill_name(fill, unit)
-        by_setting[where] = all_of(judge_gap(gap) for gap in gaps.values())
-        findings += _judged(where, {f"SRG, {method_name(method)} less {method_name(one)}": gaps[one] for one in gaps})
-    if not by_setting:
-        return untested(faithful.input, f"{method_name(method)} and another method were not scored together")
-    findings += _thesis_score_of_rivals(results, faithful.input, method, rng=rng)
-    named = f", {method_name(method)}" if len(claimants) > 1 else ""
-    return _over_settings(f"{input_name(faithful.input)}{named}", by_setting, findings)
-
-
-def _thesis_score_of_rivals(results: Results, name: str, method: str, *, rng: np.random.Generator) -> list[Finding]:
-    scored = next((one for (own, _), one in results.scores.items() if own == name), None)
-    if scored is None or method not in scored.curves:
-        return []
-    curves = scored.curves
-    named = {f"D, {method_name(method)} less {method_name(one)}": one for one in RIVALS if one in curves}
-    pairs = {compared: (curves[method], curves[one]) for compared, one in named.items()}
-    return _by_thesis_score(pairs, scored_trials(results, name), rng=rng)
-
-
-def _claim_grad_cam(results: Results, *, rng: np.random.Generator) -> Claim:
-    return Claim(
-        id="grad-cam",
-        title="Grad-CAM is not faithful",
-        test="Tested against maps that know nothing of the network: holds under a fill where Grad-CAM's SRG lies below "
-        "chance or below the best control for sure; does not hold where it lies above both for sure.",
-        answers=_of_each(
-            results, results.study.faithfulness, lambda faithful: [_no_better(faithful, rng=rng)], why=_UNSCORED
-        ),
-    )
-
-
-def _no_better(faithful: RemovalScores, *, rng: np.random.Generator) -> Answer:
-    findings, by_setting, method = [], {}, "grad-cam"
-    for fill, unit in settings(faithful):
-        own = faithful.curves.get((fill, unit, method))
-        if own is None:
-            continue
-        where, control = fill_name(fill, unit), best_control(faithful, fill, unit)
-        gaps = {"chance": gain_over_chance(own, rng=rng)}
-        if control is not None:
-            gap = compare_gain(own, faithful.curves[fill, unit, control], rng=rng)
-            gaps |= {} if gap is None else {method_name(control): gap}
-        # not faithful is what is claimed: a gain for sure speaks against it
-        better = all_of(judge_gap(gap) for gap in gaps.values())
-        by_setting[where] = {"holds": "does not hold", "does not hold": "holds"}.get(better, "undecided")
-        findings += [
-            Finding(where=where, compared=f"SRG, {method_name(method)} less {rival}", gap=gap)
-            for rival, gap in gaps.items()
-        ]
-        most, chance = mean_at(own, _SMALL_AREA)
-        findings.append(
-            Finding(
-                where=where,
-                compared=f"change once {percent(_SMALL_AREA)} of the image is gone, against random order",
-                value=f"{most:.3f} against {chance:.3f}",
-            )
-        )
-    if not by_setting:
-        return untested(faithful.input, f"{method_name(method)} was not scored")
-    return _over_settings(input_name(faithful.input), by_setting, findings)
-
-
-def _judged(where: str, gaps: Mapping[str, Difference | None]) -> list[Finding]:
-    return [Finding(where=where, compared=name, gap=gap, outcome=judge_gap(gap)) for name, gap in gaps.items()]
-
-
-def _of_each(
-    results: Results, found: Mapping[str, Record], judge: Callable[[Record], Sequence[Answer]], *, why: str
-) -> tuple[Answer, ...]:
-    """Answer for each network, difference before raw; one without a result stays open, and why."""
-    names = inputs_in_order(results.study.inputs)[::-1]
-    return tuple(
-        answer for name in names for answer in (judge(found[name]) if name in found else [untested(name, why)])
+        text=f"The two strongest of up to {len(np.unique(truth.effects.marker))} markers hold {told}. {on_edges_told}",
+        findings=(marked, massed),
     )

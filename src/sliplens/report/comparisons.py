@@ -1,32 +1,26 @@
 """Comparisons that the report makes: errors, deletion scores, gains, and their intervals."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Float64
 
 from sliplens.intervals import Difference, bootstrap_difference, paired_difference
-from sliplens.plots.style import CONTROL, FILL_NAMES, UNIT_NAMES, in_order, signed
+from sliplens.plots.style import CONTROL, FILL_NAMES, UNIT_NAMES, fill_name, in_order, signed
 from sliplens.results.evaluation import Predictions
-from sliplens.results.faithfulness import DeletionCurve, DeletionScores, RemovalCurve, RemovalScores
-from sliplens.results.study import MarkerEffects
+from sliplens.results.faithfulness import Comparison, DeletionCurve, DeletionScores, RemovalCurve, RemovalScores
+from sliplens.results.study import MarkerEffects, Roughness
 
 
 def compare_errors(first: Predictions, second: Predictions, *, rng: np.random.Generator) -> Difference | None:
     """Difference in MSE of two networks, resampling trials; None unless both answered the very same frames."""
-    order_a, order_b = (np.lexsort((one.frame, one.trial)) for one in (first, second))
-    same = (
-        len(first.trial) == len(second.trial) > 0
-        and np.array_equal(first.trial[order_a], second.trial[order_b])
-        and np.array_equal(first.frame[order_a], second.frame[order_b])
-    )
-    if not same:
+    one, other = (own.where(np.lexsort((own.frame, own.trial))) for own in (first, second))
+    if not len(one.trial) or any(
+        not np.array_equal(getattr(one, key), getattr(other, key)) for key in ("trial", "frame")
+    ):
         return None
-    trials, trial_at = np.unique(first.trial[order_a], return_inverse=True)
-    errors = (_squared_error(first)[order_a], _squared_error(second)[order_b], np.ones(len(trial_at)))
-    sums = (np.bincount(trial_at, weights=one, minlength=len(trials)) for one in errors)
-    return bootstrap_difference(*sums, rng=rng)
+    errors = [(own.prediction - own.safety_margin) ** 2 for own in (one, other)]
+    return paired_difference(errors[0], errors[1], trials=one.trial, rng=rng)
 
 
 def compare_deletion(first: DeletionCurve, second: DeletionCurve, *, rng: np.random.Generator) -> Difference | None:
@@ -37,38 +31,6 @@ def compare_deletion(first: DeletionCurve, second: DeletionCurve, *, rng: np.ran
     return bootstrap_difference(auc[0], auc[1], np.ones(len(auc[0])), rng=rng)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Agreement:
-    """How answers stand to labels: mean absolute error, that of the best constant answer, and pairs in right order."""
-
-    frames: int
-    mae: float
-    constant_mae: float
-    pairs: int
-    ordered_pairs: int
-
-
-def agreement(labels: Float[np.ndarray, " frames"], predictions: Float[np.ndarray, " frames"]) -> Agreement:
-    """Compare answers with labels, in margin units.
-
-    The best constant answer is the median of the labels: a network that cannot beat it has read nothing. Pairs with
-    equal labels have no order and are left out.
-    """
-    first, second = np.triu_indices(len(labels), k=1)
-    rise, answer = labels[first] - labels[second], predictions[first] - predictions[second]
-    return Agreement(
-        frames=len(labels),
-        mae=float(np.abs(predictions - labels).mean()),
-        constant_mae=float(np.abs(labels - np.median(labels)).mean()),
-        pairs=int(np.count_nonzero(rise)),
-        ordered_pairs=int(np.count_nonzero(rise * answer > 0)),
-    )
-
-
-def _squared_error(predictions: Predictions) -> Float[np.ndarray, " frames"]:
-    return (predictions.prediction - predictions.safety_margin) ** 2
-
-
 def against_control(scored: DeletionScores, method: str, *, rng: np.random.Generator) -> Difference | None:
     """Difference of a method's D_AUC from the random control's; None for the control itself or without one."""
     if method == CONTROL or not {method, CONTROL} <= set(scored.curves):
@@ -76,37 +38,26 @@ def against_control(scored: DeletionScores, method: str, *, rng: np.random.Gener
     return compare_deletion(scored.curves[method], scored.curves[CONTROL], rng=rng)
 
 
-def compare_gain(first: RemovalCurve, second: RemovalCurve, *, rng: np.random.Generator) -> Difference | None:
-    """Symmetric relevance gain of the first less that of the second, over the frames both have; None without any."""
-    _, here, there = np.intersect1d(first.frame_ids, second.frame_ids, return_indices=True)
-    if len(here) == 0:
-        return None
-    return paired_difference(first.srg[here], second.srg[there], trials=first.trials[here], rng=rng)
+def compare_gain(*pairs: tuple[RemovalCurve, RemovalCurve], rng: np.random.Generator) -> Difference | None:
+    """Symmetric relevance gain of the first less that of the second, over the frames all have; None without any.
 
-
-def compare_mean_gain(
-    firsts: Sequence[RemovalCurve], seconds: Sequence[RemovalCurve], *, rng: np.random.Generator
-) -> Difference | None:
-    """Compare as `compare_gain` does, the gain of each frame averaged over several methods first, in the same order."""
-    shared = sorted(set.intersection(*(set(curve.frame_ids) for curve in (*firsts, *seconds))))
+    Of several pairs, such as those of several methods, the gains of each frame are averaged first.
+    """
+    shared = sorted(set.intersection(*(set(curve.frame_ids) for pair in pairs for curve in pair)))
     if not shared:
         return None
-    means = [
+    first, second = (
         np.mean([curve.srg[np.searchsorted(curve.frame_ids, shared)] for curve in curves], axis=0)
-        for curves in (firsts, seconds)
-    ]
-    trials = firsts[0].trials[np.searchsorted(firsts[0].frame_ids, shared)]
-    return paired_difference(means[0], means[1], trials=trials, rng=rng)
+        for curves in zip(*pairs, strict=True)
+    )
+    trials = pairs[0][0].trials[np.searchsorted(pairs[0][0].frame_ids, shared)]
+    return paired_difference(first, second, trials=trials, rng=rng)
 
 
-def reversed_gap(gap: Difference) -> Difference:
-    """Difference of the second less the first."""
-    return Difference(estimate=-gap.estimate, low=-gap.high, high=-gap.low, units=gap.units)
-
-
-def gain_over_chance(curve: RemovalCurve, *, rng: np.random.Generator) -> Difference:
-    """Symmetric relevance gain with its interval: a map that tells nothing has 0."""
-    return paired_difference(curve.srg, np.zeros(len(curve.frame_ids)), trials=curve.trials, rng=rng)
+def gap_from(compared: Comparison | Roughness, method: str) -> Difference:
+    """Difference of a method, one of the two that were compared, less the other."""
+    gap = compared.gap
+    return gap if compared.first == method else replace(gap, estimate=-gap.estimate, low=-gap.high, high=-gap.low)
 
 
 def compare_thesis_score(
@@ -152,10 +103,12 @@ def controls(faithful: RemovalScores) -> set[str]:
     return {score.method for score in faithful.scores if score.control}
 
 
-def best_control(faithful: RemovalScores, fill: str, unit: str) -> str | None:
-    """Name the control with the highest gain under a fill and unit."""
-    known = [name for name in sorted(controls(faithful)) if (fill, unit, name) in faithful.curves]
-    return max(known, key=lambda name: float(faithful.curves[fill, unit, name].srg.mean()), default=None)
+def removal_by_setting(faithful: RemovalScores) -> list[tuple[str, dict[str, RemovalCurve]]]:
+    """Name of each fill and unit, and its curves by method, in the order they are read."""
+    return [
+        (fill_name(*setting), {key[2]: curve for key, curve in faithful.curves.items() if key[:2] == setting})
+        for setting in settings(faithful)
+    ]
 
 
 def mean_at(curve: RemovalCurve, area: float) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from sliplens.report import charts, pictures, state_figures, tables
 from sliplens.report.claims import Claim, judge_claims
 from sliplens.report.plates import Plate, explained_of
 from sliplens.report.results import Results
-from sliplens.report.verdict import AlarmGroup, alarms_of, group_alarms
+from sliplens.report.verdict import alarms_of, group_alarms
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +21,8 @@ class Notes:
     layout: ClassVar[str] = "notes"
 
     title: str
-    groups: tuple[AlarmGroup, ...]
+    groups: dict[str, list[str]]
+    """By what they have in common."""
     tone: Literal["plain", "caution"] = "plain"
 
 

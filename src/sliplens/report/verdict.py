@@ -1,8 +1,10 @@
 """The verdict: what a person can rely on, then what to be careful with; no sentence claims more than its numbers."""
 
 import re
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -27,10 +29,9 @@ from sliplens.plots.style import (
 )
 from sliplens.report.comparisons import (
     against_control,
-    agreement,
     compare_errors,
     controls,
-    reversed_gap,
+    gap_from,
     settings,
     tell_interval,
 )
@@ -83,13 +84,9 @@ def judge(results: Results, *, rng: np.random.Generator) -> tuple[Statement, ...
 
 def _accuracy(results: Results) -> list[Statement]:
     statements = []
-    errors = {
-        name: float(np.mean([scores.mse for scores in results.evaluations[name].conditions.values()]))
-        for name in inputs_in_order(results.evaluations)
-    }
+    read = {name: results.evaluations[name].conditions for name in inputs_in_order(results.evaluations)}
     # the network that reads best first
-    for name in sorted(errors, key=lambda name: errors[name]):
-        scores = results.evaluations[name].conditions
+    for name, scores in sorted(read.items(), key=lambda own: np.mean([one.mse for one in own[1].values()])):
         conditions = conditions_in_order(scores)
         r2 = [f"{decimals(scores[condition].r2, 2)} on {condition}" for condition in conditions]
         mae = [decimals(100 * scores[condition].mae, 1) for condition in conditions]
@@ -191,17 +188,20 @@ def _real_touch(explained: Explained) -> Statement:
         text = f"The {len(explained.frames)} real frames have no label, so nothing can be said of the answers on them."
         return Statement(topic=topic, text=text, tone="caution")
     labels, answers = np.array(labelled, dtype=np.float64).T
-    found = agreement(labels, answers)
-    useful = found.mae < found.constant_mae
+    error = np.abs(answers - labels).mean()
+    # that of the best constant: a network that cannot beat it has read nothing
+    constant = np.abs(labels - np.median(labels)).mean()
+    useful = error < constant
     text = (
-        f"On {found.frames} frames of real touch the network is off by {100 * found.mae:.0f} percentage points "
-        f"on average; the best constant answer would be off by {100 * found.constant_mae:.0f}."
+        f"On {len(labels)} frames of real touch the network is off by {100 * error:.0f} percentage points "
+        f"on average; the best constant answer would be off by {100 * constant:.0f}."
     )
-    if found.pairs:
-        text += (
-            f" It puts {found.ordered_pairs} of {found.pairs} pairs of frames in the right order "
-            f"({'all of them' if found.ordered_pairs == found.pairs else 'chance gives half'})."
-        )
+    # frames with equal labels have no order
+    pairs = [(first, second) for first, second in combinations(labelled, 2) if first[0] != second[0]]
+    right = sum((first[0] - second[0]) * (first[1] - second[1]) > 0 for first, second in pairs)
+    if pairs:
+        chance = "all of them" if right == len(pairs) else "chance gives half"
+        text += f" It puts {right} of {len(pairs)} pairs of frames in the right order ({chance})."
     if not useful:
         text += " So its values do not carry over to real touch."
     return Statement(topic=topic, text=text, tone="plain" if useful else "caution")
@@ -274,11 +274,20 @@ def _believe(faithful: RemovalScores, results: Results) -> Statement:
     if not any(one.tested for one in ranked):
         return Statement(topic=topic, text="Not known: no method was compared with a control.", tone="caution")
     best = ranked[0]
+    fills = [FILL_NAMES.get(fill, fill) for fill in _unfit_fills(truth)]
+    unfit = f" Left out: {listed(fills)}, where even a map made from the truth does not win." if fills else ""
     if faithful.trials < FEWEST_UNITS:
         trials = f"{faithful.trials} trials are too few to tell a method from chance; {FEWEST_UNITS} or more are needed"
         return Statement(topic=topic, text=f"Not known: {trials}.", tone="caution")
     if not best.qualifies:
-        return Statement(topic=topic, text=_tell_none(ranked) + _tell_unfit(truth), tone="caution")
+        nearest = max(ranked, key=lambda one: (len(one.beaten), one.mean_gain))
+        text = (
+            "None: no method beats both chance and the best control under most fills. "
+            f"{method_name(nearest.method)} comes nearest, under {len(nearest.beaten)} of {len(nearest.tested)}, its "
+            f"mean gain {signed(nearest.mean_gain, 3)} in margin units. Maps of this network show where a method "
+            f"looked, not what the network used.{unfit}"
+        )
+        return Statement(topic=topic, text=text, tone="caution")
     score = next(one for one in faithful.scores if one.key == (*best.beaten[0], best.method))
     others = [one for one in ranked[1:] if one.qualifies]
     lost = [fill_name(*one) for one in best.tested if one not in best.beaten]
@@ -289,32 +298,33 @@ def _believe(faithful: RemovalScores, results: Results) -> Statement:
         f"95 % interval{but}. "
         f"Under {fill_name(score.fill, score.unit)} its symmetric gain is {tell_interval(score.srg)} in margin units."
     )
-    text += _tell_lead(faithful, best, others) + _tell_truth(results, faithful.input, best.method)
+    text += _tell_lead(faithful, best, others)
+    found = None if truth is None else truth.methods.get(best.method)
+    if found is not None and found.network is not None:
+        text += (
+            " Its map ranks the markers by what they do to the answer with a Spearman correlation of "
+            f"{tell_interval(found.network, digits=2)}, as the simulation tells (1 = alike, 0 = chance)."
+        )
     failing = [method_name(one.method) for one in ranked if not one.qualifies]
     if failing:
         text += f" {listed(failing)} {'does' if len(failing) == 1 else 'do'} not beat the controls under most fills."
-    text += _tell_unfit(truth)
+    text += unfit
     if faithful.alarms:
         count = len(faithful.alarms)
         text += f" {count} {'alarm' if count == 1 else 'alarms'} about these scores: see beside their table."
     return Statement(topic=topic, text=text, tone="good")
 
 
-def _tell_none(ranked: list[Standing]) -> str:
-    nearest = max(ranked, key=lambda one: (len(one.beaten), one.mean_gain))
-    return (
-        "None: no method beats both chance and the best control under most fills. "
-        f"{method_name(nearest.method)} comes nearest, under {len(nearest.beaten)} of {len(nearest.tested)}, its mean "
-        f"gain {signed(nearest.mean_gain, 3)} in margin units. Maps of this network show where a method looked, "
-        "not what the network used."
-    )
-
-
 def _tell_lead(faithful: RemovalScores, best: Standing, others: list[Standing]) -> str:
     if not others:
         return ""
     rival = others[0]
-    gaps = _against(faithful, best.method, rival.method)
+    pair = {best.method, rival.method}
+    gaps = {
+        (one.fill, one.unit): gap_from(one, best.method)
+        for one in faithful.comparisons
+        if {one.first, one.second} == pair
+    }
     ahead, behind = (
         [fill_name(*one) for one, gap in gaps.items() if one in best.tested and told(gap)]
         for told in (_gains, lambda gap: gap.high < 0)
@@ -329,36 +339,8 @@ def _tell_lead(faithful: RemovalScores, best: Standing, others: list[Standing]) 
     return f" It is ahead of {name}, the next, under {listed(ahead)}{but}."
 
 
-def _against(faithful: RemovalScores, method: str, rival: str) -> dict[tuple[str, str], Difference]:
-    gaps = {}
-    for one in faithful.comparisons:
-        if (one.first, one.second) == (method, rival):
-            gaps[one.fill, one.unit] = one.gap
-        elif (one.first, one.second) == (rival, method):
-            gaps[one.fill, one.unit] = reversed_gap(one.gap)
-    return gaps
-
-
 def _unfit_fills(truth: Truth | None) -> list[str]:
     return [] if truth is None else [one.fill for one in truth.meta if not one.holds]
-
-
-def _tell_unfit(truth: Truth | None) -> str:
-    unfit = [FILL_NAMES.get(fill, fill) for fill in _unfit_fills(truth)]
-    if not unfit:
-        return ""
-    return f" Left out: {listed(unfit)}, where even a map made from the truth does not win."
-
-
-def _tell_truth(results: Results, name: str, method: str) -> str:
-    truth = results.study.truth.get(name)
-    found = None if truth is None else truth.methods.get(method)
-    if found is None or found.network is None:
-        return ""
-    return (
-        f" Its map ranks the markers by what they do to the answer with a Spearman correlation of "
-        f"{tell_interval(found.network, digits=2)}, as the simulation tells (1 = alike, 0 = chance)."
-    )
 
 
 def _votes(faithful: RemovalScores, method: str) -> list[tuple[str, str]]:
@@ -372,14 +354,6 @@ def _votes(faithful: RemovalScores, method: str) -> list[tuple[str, str]]:
 
 def _gains(gap: Difference) -> bool:
     return gap.sure and gap.estimate > 0
-
-
-@dataclass(frozen=True, kw_only=True)
-class AlarmGroup:
-    """Alarms of one kind: what they have in common, and each in full."""
-
-    kind: str
-    sentences: tuple[str, ...]
 
 
 _KINDS = {
@@ -400,16 +374,17 @@ _KINDS = {
 }
 
 
-def group_alarms(alarms: Sequence[str]) -> tuple[AlarmGroup, ...]:
-    """Group alarms by what they warn of; one of no known kind stands for itself."""
-    groups: dict[str, list[str]] = {}
+def group_alarms(alarms: Iterable[str]) -> dict[str, list[str]]:
+    """Group alarms by the kind of what they warn of; one of no known kind stands for itself."""
+    groups = defaultdict(list)
     for alarm in alarms:
         shown = name_methods(alarm)
         sentence = f"{shown[:1].upper()}{shown[1:].rstrip('.')}."
         kind = next((kind for pattern, kind in _KINDS.items() if re.search(pattern, alarm)), sentence)
-        groups.setdefault(kind, []).append(sentence)
-    # the same fill can be found wanting by two scores
-    return tuple(AlarmGroup(kind=kind, sentences=tuple(dict.fromkeys(found))) for kind, found in groups.items())
+        # the same fill can be found wanting by two scores
+        if sentence not in groups[kind]:
+            groups[kind].append(sentence)
+    return dict(groups)
 
 
 def alarms_of(results: Results, name: str, stage: str) -> tuple[str, ...]:
@@ -435,14 +410,10 @@ def alarms_of(results: Results, name: str, stage: str) -> tuple[str, ...]:
 
 def count_alarms(results: Results) -> tuple[str, ...]:
     """Write a line for each kind of alarm: how often, and of which networks."""
-    counts: dict[str, dict[str, int]] = {}
+    counts: defaultdict[str, Counter[str]] = defaultdict(Counter)
     for name in inputs_in_order(results.inputs)[::-1]:
         for stage in ("score", "remedies", "faithfulness", "randomisation", "explain"):
-            for group in group_alarms(alarms_of(results, name, stage)):
-                own = counts.setdefault(group.kind, {})
-                own[name] = own.get(name, 0) + len(group.sentences)
-    told = {
-        kind: listed([f"{input_name(name).lower()} {count}" for name, count in own.items()])
-        for kind, own in counts.items()
-    }
-    return tuple(f"{kind.rstrip('.')}: {sum(own.values())} ({told[kind]})" for kind, own in counts.items())
+            for kind, sentences in group_alarms(alarms_of(results, name, stage)).items():
+                counts[kind][input_name(name).lower()] += len(sentences)
+    told = {kind: listed([f"{name} {count}" for name, count in own.items()]) for kind, own in counts.items()}
+    return tuple(f"{kind.rstrip('.')}: {own.total()} ({told[kind]})" for kind, own in counts.items())
