@@ -8,10 +8,8 @@ from torch import Tensor, nn
 from sliplens.explainers import Explanation, IntegratedGradients
 from sliplens.faithfulness.map_quality import gini, total_variation
 from sliplens.recordings import Dataset
-from sliplens.study.map_quality import measure_maps
+from sliplens.study.checks import explain_untrained, measure_maps, randomise_weights, time_explainers
 from sliplens.study.material import Material
-from sliplens.study.randomisation import explain_untrained, randomise_weights
-from sliplens.study.timing import time_explainers
 
 
 class ShowsTheImage:

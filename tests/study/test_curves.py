@@ -112,11 +112,11 @@ def test_an_interrupted_run_goes_on_after_the_last_setting(material: Material, t
 def test_curves_found_in_another_way_are_kept_over_an_interruption(material: Material, tmp_path: Path):
     count, asked = len(material.inputs), []
 
-    def draw(on_frames) -> dict[str, Faithfulness]:
+    def draw(on_progress) -> dict[str, Faithfulness]:
         asked.append("drawn")
         return {name: straight(0.2, 0.1, frames=count) for name in influences(material)}
 
-    def stop(on_frames) -> dict[str, Faithfulness]:
+    def stop(on_progress) -> dict[str, Faithfulness]:
         raise KeyboardInterrupt
 
     true, other = Setting(fill="true", unit="marker"), Setting(fill="other", unit="marker")

@@ -5,7 +5,7 @@ from sliplens.codec import load_result, save_result
 from sliplens.images import absolute_difference
 from sliplens.recordings import Dataset
 from sliplens.results.study import Choice, MarkedFrame, States
-from sliplens.study.states import network_places, show_states
+from sliplens.study.choice import network_places, show_states
 
 
 @pytest.fixture(scope="module")

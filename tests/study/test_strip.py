@@ -5,7 +5,7 @@ from sliplens.codec import load_result, save_result
 from sliplens.errors import RecordingError
 from sliplens.models import load_checkpoint
 from sliplens.results.strip import Strip
-from sliplens.study.strip import explain_trial
+from sliplens.study.workspace import explain_trial
 
 from ..conftest import make_recording
 

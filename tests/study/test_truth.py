@@ -24,8 +24,7 @@ from sliplens.simulation.information import visible_markers
 from sliplens.simulation.intervention import draw_with_markers_back, marker_readings
 from sliplens.study import frames_from_dataset
 from sliplens.study.explaining import network_inputs
-from sliplens.study.scenes import find_places, redrawing, stage_frames
-from sliplens.study.truth import judge_by_truth, shuffle_half, true_curves
+from sliplens.study.truth import find_places, judge_by_truth, redrawing, shuffle_half, stage_frames, true_curves
 
 SIZE = 112
 RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=20, seed=5)

@@ -13,7 +13,7 @@ from sliplens.results.explanation import Explained, load_explained
 from sliplens.results.faithfulness import DeletionScores, Remedies, RemovalScores
 from sliplens.results.simulation import Simulation, describe_simulation
 from sliplens.results.strip import Strip
-from sliplens.results.study import Choice, MapQuality, Randomisation, States, Study, Timing, Truth
+from sliplens.results.study import TABLES, Choice, MapQuality, Randomisation, States, Study, Timing, Truth
 from sliplens.results.training import Training
 
 _OF_A_COMMAND: dict[str, type] = {"train": Training, "evaluate": Evaluation, "score": DeletionScores, "strip": Strip}
@@ -120,17 +120,9 @@ def load_results(workspace: Path) -> Results:
         strip=next(iter(of("strip").values()), None),
         study=Study(
             folder=workspace,
-            evaluations=of("evaluate"),
             choice=of("choice").get(""),
             states=of("states").get(""),
-            explanations=of("explain"),
-            deletion=of("score"),
-            remedies=of("remedies"),
-            faithfulness=of("faithfulness"),
-            randomisation=of("randomisation"),
-            map_quality=of("map-quality"),
-            timing=of("timing"),
-            truth=of("truth"),
+            **{table: of(stage) for stage, table in TABLES.items()},  # pyright: ignore[reportArgumentType]
         ),
         notes=tuple(notes),
     )

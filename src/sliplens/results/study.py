@@ -339,6 +339,20 @@ class Truth:
 _Test = Remedies | RemovalScores | Randomisation | MapQuality | Timing | Truth
 
 
+TABLES = {
+    "evaluate": "evaluations",
+    "explain": "explanations",
+    "score": "deletion",
+    "remedies": "remedies",
+    "faithfulness": "faithfulness",
+    "randomisation": "randomisation",
+    "map-quality": "map_quality",
+    "timing": "timing",
+    "truth": "truth",
+}
+"""Tables of a study by the stage that fills them, a record an input."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Study:
     """A study, stage by stage; tables are by input, and empty where a stage was not run."""

@@ -8,8 +8,7 @@ from sliplens.study.explaining import (
 )
 from sliplens.study.run import run_study
 from sliplens.study.scoring import score_explanations
-from sliplens.study.strip import explain_trial
-from sliplens.study.workspace import explain_source, score_explained
+from sliplens.study.workspace import explain_source, explain_trial, score_explained
 
 __all__ = [
     "ChosenFrames",

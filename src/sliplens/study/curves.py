@@ -51,8 +51,8 @@ Curves = Mapping[Setting, Mapping[str, Faithfulness]]
 """Curves by setting and method, controls included."""
 Influence = Mapping[str, Float[np.ndarray, "images height width"]]
 """Maps to rank parts by, of each method and control."""
-Scoring = Callable[[OnProgress | None], Mapping[str, Faithfulness]]
-"""Finds the curves of every map; takes what is called with the frames done and their number."""
+Scoring = Callable[..., Mapping[str, Faithfulness]]
+"""Finds the curves of every map; takes `on_progress`."""
 
 
 def is_control(name: str) -> bool:
@@ -80,21 +80,14 @@ def score_removal(
     maps: Influence,
     settings: Sequence[Setting] = SETTINGS,
     random_orders: int = RANDOM_ORDERS,
-    further: Mapping[Setting, Scoring] | None = None,
+    further: Mapping[Setting, Scoring] = {},
     seed: int = 0,
     parts: Path | None = None,
     on_progress: OnProgress | None = None,
 ) -> RemovalScores:
-    """Remove parts in the order of every map, under every setting whose unit is known of every frame.
+    """Remove parts in the order of every map (`influences`), under every setting whose unit is known of every frame.
 
-    Parameters
-    ----------
-    maps
-        Influence by method, controls included (`influences`).
-    further
-        What finds curves in another way, such as by drawing the scene anew; they are judged with the others.
-    parts
-        Folder that keeps the curves of each setting, so that an interrupted run goes on after the last.
+    Curves that are found in another way, such as by drawing the scene anew (`further`), are judged with the others.
     """
     inputs, explained = material.inputs, material.explained
     for setting in settings:
@@ -104,8 +97,9 @@ def score_removal(
     orders = 2 * len(maps) + random_orders
     predict = material.fast(len(known) * len(inputs) * orders * (len(STUDY_AREAS) - 2))
 
-    def remove(setting: Setting, on_frames: OnProgress | None) -> Mapping[str, Faithfulness]:
-        return score_maps(
+    works: dict[Setting, Scoring] = {
+        setting: partial(
+            score_maps,
             predict,
             inputs,
             dict(maps),
@@ -118,23 +112,22 @@ def score_removal(
             random_orders=random_orders,
             areas=STUDY_AREAS,
             seed=seed,
-            on_progress=on_frames,
         )
-
-    works: dict[Setting, Scoring] = {setting: partial(remove, setting) for setting in known} | dict(further or {})
+        for setting in known
+    }
+    works |= further
     curves: dict[Setting, dict[str, Faithfulness]] = {}
     for number, (setting, work) in enumerate(works.items()):
         on_frames = continued(on_progress, before=number * len(inputs), total=len(works) * len(inputs))
 
         def find(work: Scoring = work, on_frames: OnProgress | None = on_frames) -> _SettingCurves:
-            found = work(on_frames)
-            return _SettingCurves(
-                areas=next(iter(found.values())).areas, curves={name: one.curves for name, one in found.items()}
-            )
+            scored = work(on_progress=on_frames)
+            areas = next(iter(scored.values())).areas
+            return _SettingCurves(areas=areas, curves={name: own.curves for name, own in scored.items()})
 
         part = None if parts is None else parts / f"{setting.fill}-{setting.unit}"
-        found = keep_part(part, _SettingCurves, find)
-        curves[setting] = {name: Faithfulness(areas=found.areas, curves=own) for name, own in found.curves.items()}
+        kept = keep_part(part, _SettingCurves, find)
+        curves[setting] = {name: Faithfulness(areas=kept.areas, curves=own) for name, own in kept.curves.items()}
     whole = answer_whole(predict, inputs, batch_size=64)
     blank = {setting.fill: _answer_blank(predict, material, setting.fill, seed) for setting in known}
     scores, comparisons = judge_curves(curves, trials=material.trials, seed=seed)

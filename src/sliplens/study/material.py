@@ -16,8 +16,8 @@ from sliplens.models.engines import Engine
 from sliplens.recordings import Dataset
 from sliplens.results.explanation import Explained
 from sliplens.results.study import ChosenFrame, MarkedFrame
+from sliplens.study.choice import network_places
 from sliplens.study.explaining import frames_at, network_inputs, require_methods
-from sliplens.study.states import network_places
 
 THESIS_POLY_CAM = "poly-cam-thesis"
 STUDY_METHODS = ("grad-cam", "integrated-gradients", THESIS_POLY_CAM, "poly-cam", "occlusion")

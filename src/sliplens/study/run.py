@@ -4,7 +4,7 @@ import pickle
 import shutil
 import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -23,6 +23,7 @@ from sliplens.recordings import Dataset, load_dataset
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionScores, Remedies, RemovalScores
 from sliplens.results.study import (
+    TABLES,
     Choice,
     MapQuality,
     Randomisation,
@@ -33,16 +34,13 @@ from sliplens.results.study import (
     UntrainedMaps,
 )
 from sliplens.simulation.intervention import rebuild_trial
-from sliplens.study.choice import choose_frames
-from sliplens.study.curves import RANDOMISED, SETTINGS, STUDY_AREAS, Influence, Setting, influences, score_removal
+from sliplens.study.checks import STAGES, explain_untrained, measure_maps, randomise_weights, time_explainers
+from sliplens.study.choice import choose_frames, show_states
+from sliplens.study.curves import RANDOMISED, SETTINGS, STUDY_AREAS, Setting, influences, score_removal
 from sliplens.study.explaining import explain_frames, frames_at
-from sliplens.study.map_quality import measure_maps
 from sliplens.study.material import STUDY_BUDGET, STUDY_METHODS, Material, gather, method_options, study_explainers
 from sliplens.study.processes import run_together
-from sliplens.study.randomisation import STAGES, explain_untrained, randomise_weights
 from sliplens.study.scoring import STEPS, score_explanations, score_remedies
-from sliplens.study.states import show_states
-from sliplens.study.timing import time_explainers
 from sliplens.study.truth import TRUE_FILL, judge_by_truth, true_curves
 from sliplens.training.evaluation import evaluate
 
@@ -154,37 +152,27 @@ def run_study(
         overwrite=overwrite,
         on_progress=on_progress,
     )
-    evaluations = {
-        name: evaluate(
-            run, stages.data, stages.folder / f"evaluate-{name}", overwrite=overwrite, on_progress=on_progress
-        )
-        for name, run in networks.items()
-    }
+    for name, run in networks.items():
+        folder = stages.folder / f"evaluate-{name}"
+        evaluation = evaluate(run, stages.data, folder, overwrite=overwrite, on_progress=on_progress)
+        stages.found[name] = {"evaluate": evaluation}
     choice, states = stages.choose(split=split, condition=condition, trials=trials, tolerance=tolerance)
     cores = torch.get_num_threads()
+    judging = stages
     if min(jobs, len(networks), cores) > 1:
         # they leave their stages in folders, and what is here reads them
-        work = pickle.dumps(replace(stages, on_progress=None))
+        work = pickle.dumps(replace(stages, on_progress=None, found={name: {} for name in networks}))
         run_together(partial(_judge, work), list(networks), threads=cores // len(networks), on_progress=on_progress)
-        judged = {name: replace(stages, overwrite=False, on_progress=None).judge(name) for name in networks}
-    else:
-        judged = {name: stages.judge(name) for name in networks}
-    return Study(
-        folder=stages.folder,
-        scratch=scratch,
-        evaluations=evaluations,
-        choice=choice,
-        states=states,
-        explanations={name: own.explained for name, own in judged.items()},
-        deletion={name: own.deletion for name, own in judged.items() if own.deletion is not None},
-        remedies={name: own.remedies for name, own in judged.items() if own.remedies is not None},
-        faithfulness={name: own.faithfulness for name, own in judged.items() if own.faithfulness is not None},
-        randomisation={name: own.randomisation for name, own in judged.items() if own.randomisation is not None},
-        map_quality={name: own.map_quality for name, own in judged.items() if own.map_quality is not None},
-        truth={name: own.truth for name, own in judged.items() if own.truth is not None},
-        # while nothing else runs
-        timing={name: stages.time(name, own.explained) for name, own in judged.items() if "timing" in tests},
-    )
+        judging = replace(stages, overwrite=False, on_progress=None)
+    for name in networks:
+        judging.judge(name)
+    for name in networks if "timing" in tests else ():  # while nothing else runs
+        stages.time(name)
+    tables: dict[str, Any] = {
+        table: {name: own[stage] for name, own in stages.found.items() if stage in own}
+        for stage, table in TABLES.items()
+    }
+    return Study(folder=stages.folder, scratch=scratch, choice=choice, states=states, **tables)
 
 
 def load_network(network: Network, name: str, *, device: str = "cpu") -> Run:
@@ -197,26 +185,8 @@ def load_network(network: Network, name: str, *, device: str = "cpu") -> Run:
     return run
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Judged:
-    """What is known of the explanations of one network."""
-
-    explained: Explained
-    deletion: DeletionScores | None
-    remedies: Remedies | None
-    faithfulness: RemovalScores | None
-    randomisation: Randomisation | None
-    map_quality: MapQuality | None
-    truth: Truth | None
-
-
 _NEEDED_BY = {"score": {"score", "remedies"}, "control": {"faithfulness", "truth"}}
 """Tests that need a stage, where it is not that test alone."""
-
-
-def _required(result: _Result | None) -> _Result:
-    assert result is not None  # whatever needs it has it run (`_NEEDED_BY`)
-    return result
 
 
 def _judge(stages: bytes, name: str, on_progress: OnProgress) -> None:
@@ -237,26 +207,23 @@ class _Stages:
     seed: int
     overwrite: bool
     on_progress: OnProgress | None
+    found: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Records by input and stage."""
 
     def choose(self, *, split: str, condition: str, trials: int, tolerance: float) -> tuple[Choice, States]:
         """Choose the frames, and keep what the camera saw of them."""
-        settings: dict[str, Any] = {
-            "split": split,
-            "condition": condition,
-            "trials": trials,
-            "tolerance": tolerance,
-        }
+        wanted: dict[str, Any] = {"split": split, "condition": condition, "trials": trials, "tolerance": tolerance}
         weights = {name: run.manifest.weights_sha256 for name, run in self.networks.items()}
         choice = self._run(
-            "choice",
+            ("choice",),
             Choice,
-            {"data_hash": self.data.hash, "weights_sha256": weights, **settings},
+            {"data_hash": self.data.hash, "weights_sha256": weights, **wanted},
             "Choosing trials",
-            lambda _, count: choose_frames(self.networks, self.data, on_progress=count, **settings),
+            lambda _, count: choose_frames(self.networks, self.data, on_progress=count, **wanted),
         )
         note(self.on_progress, choice.summary)
         states = self._run(
-            "states",
+            ("states",),
             States,
             self._frames,
             "Following markers",
@@ -264,17 +231,17 @@ class _Stages:
         )
         return choice, states
 
-    def judge(self, name: str) -> _Judged:
+    def judge(self, name: str) -> None:
         """Explain the frames with one network's methods, and judge the explanations in every way but by the clock."""
-        run, about = self.networks[name], self._about(name)
+        run, found, seed, chosen = self.networks[name], self.found[name], self.seed, self._choice.frames
         rows: dict[str, list[int]] = {}
-        for frame in self._choice.frames:
+        for frame in chosen:
             rows.setdefault(frame.trial, []).append(frame.frame)
-        explained = self._run(
-            f"explain-{name}",
+        found["explain"] = self._run(
+            ("explain", name),
             Explained,
-            about,
-            f"Explaining {len(self._choice.frames)} frames ({name})",
+            self._about(name),
+            f"Explaining {len(chosen)} frames ({name})",
             lambda parts, count: explain_frames(
                 run,
                 frames_at(run, self.data, rows),
@@ -285,65 +252,83 @@ class _Stages:
             ),
         )
         # gathered where a stage is missing: that takes longer than to see that all are there
-        material = cache(lambda: self._gather(name, explained))
+        material = cache(lambda: self._gather(name))
 
-        def test(
-            stage: str, kind: type[_Result], depends: Mapping[str, Any], title: str, work: _Work[_Result]
-        ) -> _Result | None:
-            if _NEEDED_BY.get(stage, {stage}).isdisjoint(self.tests):
-                return None
-            return self._run(f"{stage}-{name}", kind, {**about, **depends}, f"{title} ({name})", work)
+        def test(stage: str, kind: type, title: str, work: _Work[Any], **depends: object) -> None:
+            if not _NEEDED_BY.get(stage, {stage}).isdisjoint(self.tests):
+                config = {**self._about(name), **depends}
+                found[stage] = self._run((stage, name), kind, config, f"{title} ({name})", work)
 
-        deletion = test(
+        test(
             "score",
             DeletionScores,
-            # the report reads these of every score
-            {"input": name, "source": self.data.source, "fill": "grey"},
             "Deleting pixels, as the thesis did",
-            lambda _, count: score_explanations(run, material().explained, seed=self.seed, on_progress=count),
+            lambda _, count: score_explanations(run, material().explained, seed=seed, on_progress=count),
+            # the report reads these of every score
+            input=name,
+            source=self.data.source,
+            fill="grey",
         )
-        remedies = test(
+        test(
             "remedies",
             Remedies,
-            {"steps": STEPS},
             "Trying the thesis's remedies",
-            lambda _, count: score_remedies(material(), grey=_required(deletion), seed=self.seed, on_progress=count),
+            lambda _, count: score_remedies(material(), grey=found["score"], seed=seed, on_progress=count),
+            steps=STEPS,
         )
-        control = test(
+        test(
             "control",
             UntrainedMaps,
-            _NEW_WEIGHTS,
             "Explaining the network with new weights",
-            lambda _, count: explain_untrained(material(), _CONTROL, seed=self.seed, on_progress=count),
+            lambda _, count: explain_untrained(material(), _CONTROL, seed=seed, on_progress=count),
+            **_NEW_WEIGHTS,
         )
-        influence = cache(lambda: {**influences(material()), RANDOMISED: _required(control).maps})
-        faithfulness = test(
+        influence = cache(lambda: {**influences(material()), RANDOMISED: found["control"].maps})
+        redrawn = "truth" in self.tests and self._redrawn
+
+        def put_back(on_progress: OnProgress | None) -> Mapping[str, Faithfulness]:
+            orders, explained = self.random_orders, material().explained
+            return true_curves(
+                run, explained, self.data, maps=influence(), random_orders=orders, seed=seed, on_progress=on_progress
+            )
+
+        test(
             "faithfulness",
             RemovalScores,
-            {"random_orders": self.random_orders, "areas": STUDY_AREAS, "settings": self.settings, **_NEW_WEIGHTS},
             "Removing parts under every fill",
-            lambda parts, count: self._score_removal(material(), influence(), parts, count),
+            lambda parts, count: score_removal(
+                material(),
+                maps=influence(),
+                settings=self.settings,
+                random_orders=self.random_orders,
+                further={Setting(fill=TRUE_FILL, unit="marker"): put_back} if redrawn else {},
+                seed=seed,
+                parts=parts,
+                on_progress=count,
+            ),
+            random_orders=self.random_orders,
+            areas=STUDY_AREAS,
+            settings=self.settings,
+            **_NEW_WEIGHTS,
         )
-        randomisation = test(
+        test(
             "randomisation",
             Randomisation,
-            {"stages": STAGES, "statistics": "images"},
             "Drawing weights anew, layer by layer",
-            lambda _, count: randomise_weights(material(), seed=self.seed, on_progress=count),
+            lambda _, count: randomise_weights(material(), seed=seed, on_progress=count),
+            stages=STAGES,
+            statistics="images",
         )
-        map_quality = test(
+        test(
             "map-quality",
             MapQuality,
-            {},
             "Measuring how maps look",
-            lambda _, count: measure_maps(material(), self.data, seed=self.seed, on_progress=count),
+            lambda _, count: measure_maps(material(), self.data, seed=seed, on_progress=count),
         )
-        truth = None
-        if "truth" in self.tests and self._redrawn:
-            truth = test(
+        if redrawn:
+            test(
                 "truth",
                 Truth,
-                _NEW_WEIGHTS,
                 "Putting every marker back",
                 lambda parts, count: judge_by_truth(
                     run,
@@ -351,29 +336,21 @@ class _Stages:
                     self.data,
                     maps=influence(),
                     fills=list(dict.fromkeys(setting.fill for setting in SETTINGS)),
-                    seed=self.seed,
+                    seed=seed,
                     parts=parts,
                     on_progress=count,
                 ),
+                **_NEW_WEIGHTS,
             )
-        return _Judged(
-            explained=explained,
-            deletion=deletion,
-            remedies=remedies,
-            faithfulness=faithfulness,
-            randomisation=randomisation,
-            map_quality=map_quality,
-            truth=truth,
-        )
 
-    def time(self, name: str, explained: Explained) -> Timing:
+    def time(self, name: str) -> None:
         """Time one network's methods."""
-        return self._run(
-            f"timing-{name}",
+        self.found[name]["timing"] = self._run(
+            ("timing", name),
             Timing,
             self._about(name),
             f"Timing the methods ({name})",
-            lambda _, count: time_explainers(self._gather(name, explained), on_progress=count),
+            lambda _, count: time_explainers(self._gather(name), on_progress=count),
         )
 
     @cached_property
@@ -389,38 +366,14 @@ class _Stages:
         methods = method_options(self.explainers)
         return {**self._frames, "methods": methods, "seed": self.seed, "weights_sha256": weights}
 
-    def _gather(self, name: str, explained: Explained) -> Material:
+    def _gather(self, name: str) -> Material:
         return gather(
             self.networks[name],
-            explained,
+            self.found[name]["explain"],
             self.data,
             tuple(frame for frame in self._choice.frames if frame.scored),
             markers=load_result(self.folder / "states", States, command=_COMMAND).markers,
             explainers=self.explainers,
-        )
-
-    def _score_removal(self, material: Material, maps: Influence, parts: Path, count: OnProgress) -> RemovalScores:
-        def put_back(on_frames: OnProgress | None) -> Mapping[str, Faithfulness]:
-            return true_curves(
-                material.trained,
-                material.explained,
-                self.data,
-                maps=maps,
-                random_orders=self.random_orders,
-                seed=self.seed,
-                on_progress=on_frames,
-            )
-
-        redrawn = "truth" in self.tests and self._redrawn
-        return score_removal(
-            material,
-            maps=maps,
-            settings=self.settings,
-            random_orders=self.random_orders,
-            further={Setting(fill=TRUE_FILL, unit="marker"): put_back} if redrawn else None,
-            seed=self.seed,
-            parts=parts,
-            on_progress=count,
         )
 
     @cached_property
@@ -437,11 +390,16 @@ class _Stages:
         return True
 
     def _run(
-        self, name: str, kind: type[_Result], config: Mapping[str, Any], title: str, work: _Work[_Result]
+        self,
+        name: tuple[str, ...],
+        kind: type[_Result],
+        config: Mapping[str, Any],
+        title: str,
+        work: _Work[_Result],
     ) -> _Result:
-        """Make a stage that is not there yet, or read it."""
-        target, what = self.folder / name, title[0].lower() + title[1:]
-        with output_folder(target, stage=_stage(name), config=config, overwrite=self.overwrite) as out:
+        """Make a stage (of an input) that is not there yet, or read it."""
+        target, what = self.folder / "-".join(name), title[0].lower() + title[1:]
+        with output_folder(target, stage=name[0], config=config, overwrite=self.overwrite) as out:
             if out.complete:
                 wrote(self.on_progress, target, what, kept=True)
                 return load_result(target, kind, command=_COMMAND)
@@ -450,11 +408,6 @@ class _Stages:
             shutil.rmtree(out.folder / "parts", ignore_errors=True)
             save_result(result, out.folder)
         for alarm in getattr(result, "alarms", ()):
-            note(self.on_progress, f"{name}: {alarm}")
+            note(self.on_progress, f"{target.name}: {alarm}")
         wrote(self.on_progress, target, what)
         return result
-
-
-def _stage(name: str) -> str:
-    """Stage of a folder: its name without the input."""
-    return name.removesuffix("-difference").removesuffix("-raw")

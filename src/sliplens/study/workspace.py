@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import torch
 
 from sliplens.codec import load_result, save_result
-from sliplens.errors import InputError
+from sliplens.errors import InputError, RecordingError
 from sliplens.explainers import EXPLAINERS, ExpectedGradients, Explainer, Occlusion, get_explainer
 from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
 from sliplens.explainers.table import open_run
@@ -21,10 +22,11 @@ from sliplens.models import Run
 from sliplens.plots.saliency import draw_panel, overlay_jet, overlay_saliency, stretch_saliency
 from sliplens.plots.style import drawing_style, method_name, percent
 from sliplens.progress import OnProgress, note, stage, wrote
-from sliplens.recordings import Dataset
+from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.source import open_source
 from sliplens.results.explanation import Explained, load_explained
 from sliplens.results.faithfulness import DeletionScores
+from sliplens.results.strip import Strip, StripReadings
 from sliplens.study.explaining import (
     DEFAULT_LEVELS,
     DEFAULT_METHODS,
@@ -32,8 +34,10 @@ from sliplens.study.explaining import (
     explain_frames,
     frames_from_dataset,
     frames_from_folder,
+    nearest_frame,
     require_methods,
 )
+from sliplens.study.material import study_explainers
 from sliplens.study.scoring import require_same_network, score_explanations
 
 _BY_MARKER = "occlusion-marker"
@@ -270,3 +274,63 @@ def _occlude_markers(
             )
         places = [markers_in_frame(frame, image_size=size) for trial in opened_trials for frame in trial.read_frames()]
     return [Occlusion(markers_px=centres) for centres in places]
+
+
+_LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
+_CONFIDENCE = 0.9
+
+
+def explain_trial(
+    run: Run,
+    recording: Recording,
+    *,
+    source: str,
+    method: str = "poly-cam",
+    budget: float = 1.0,
+    levels: Sequence[float] = _LEVELS,
+    on_progress: OnProgress | None = None,
+) -> Strip:
+    """Read every frame of a trial, and explain those nearest to a few safety margins.
+
+    Parameters
+    ----------
+    source
+        `simulated` or `real`.
+    method
+        Explainer of the maps (`study_explainers`).
+    budget
+        Share of the channels that `poly-cam` measures at first.
+    levels
+        Safety margins whose frames are explained, in [0, 1]; a frame that is nearest to two is shown once.
+    """
+    margin = np.where(recording.labelled, recording.safety_margin, np.nan)
+    if not np.isfinite(margin).any():
+        raise RecordingError(f"trial {recording.trial} has no labelled frame; label it first")
+    shown = tuple(sorted({nearest_frame(margin, level) for level in levels}))
+    inputs = run.encode(recording.frames, recording.reference)
+    estimate = run.estimate(inputs)
+    unknown = np.full(len(margin), np.nan)
+    low, high = estimate.interval(_CONFIDENCE) or (unknown, unknown)
+    reference = run.encoding.empty(recording.reference, image_size=run.manifest.image_size)
+    explainer = study_explainers([method], budget=budget)[method]
+    explanation = explainer(
+        run.model, inputs[list(shown)], reference=reference.expand(len(shown), -1, -1, -1), on_progress=on_progress
+    )
+    return Strip(
+        trial=recording.trial,
+        condition=recording.condition,
+        source=source,
+        input=run.manifest.input,
+        method=method,
+        readings=StripReadings(
+            time_s=recording.time_s.astype(np.float64),
+            contact_state=np.array([str(state) for state in recording.contact_state]),
+            safety_margin=margin.astype(np.float64),
+            prediction=estimate.margin.astype(np.float64),
+            low=low.astype(np.float64),
+            high=high.astype(np.float64),
+        ),
+        shown=shown,
+        pictures=recording.frames[list(shown)],
+        relevance=explanation.relevance.to(torch.float32).cpu().numpy(),
+    )

@@ -1,0 +1,259 @@
+"""What is known of maps without a score: how they look, whether they change with the weights, what they cost."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sliplens.explainers import Explainer, Explanation, IntegratedGradients, PolyCam
+from sliplens.faithfulness.controls import cascade, histogram_entropy, randomisation_scores, smooth_maps
+from sliplens.faithfulness.map_quality import gini, resolution, stability, total_variation
+from sliplens.intervals import paired_difference
+from sliplens.models import Run
+from sliplens.progress import OnProgress, counted
+from sliplens.recordings import Dataset
+from sliplens.results.study import (
+    ChosenFrame,
+    MapMeasures,
+    MapQuality,
+    MethodTime,
+    Randomisation,
+    RandomisedMethod,
+    Roughness,
+    Timing,
+    UntrainedMaps,
+)
+from sliplens.study.explaining import mean_of_known
+from sliplens.study.material import Material, as_the_thesis_ran
+
+_NORMAL_QUARTILE = 0.6745
+"""Median size of a standard normal number."""
+
+
+def measure_maps(
+    material: Material, data: Dataset, *, repeated: int = 3, seed: int = 0, on_progress: OnProgress | None = None
+) -> MapQuality:
+    """Measure resolution, smoothness, sparsity and stability of the maps.
+
+    Stability is the correlation with the map of the same frame under other camera noise, as large as what differs
+    between frames that follow each other, and with the map of the next frame; so the first `repeated` frames are
+    explained twice more.
+    """
+    explained, rng = material.explained, np.random.default_rng(seed)
+    noisy, following, noise_sd = _once_more(material.trained, data, material.chosen[:repeated], rng=rng)
+    references = material.references[:repeated]
+    methods, roughness = {}, {}
+    for name, explainer in counted(material.explainers.items(), on_progress):
+
+        def again(images: Tensor, explainer: Explainer = explainer) -> Float[np.ndarray, "repeated height width"]:
+            return explainer(material.trained.model, images, reference=references).relevance.double().cpu().numpy()
+
+        maps = explained.saliency[name].astype(np.float64)
+        before = explained.relevance[name][:repeated].astype(np.float64)
+        resolutions = [
+            resolution(saliency, material.places(frame.id)[0])
+            for saliency, frame in zip(maps, explained.frames, strict=True)
+            if frame.id in material.markers
+        ]
+        roughness[name] = np.array([total_variation(saliency) for saliency in maps])
+        methods[name] = MapMeasures(
+            resolution=mean_of_known(np.array(resolutions, dtype=np.float64)),
+            total_variation=mean_of_known(roughness[name]),
+            gini=mean_of_known(np.array([gini(saliency) for saliency in maps])),
+            noise_stability=mean_of_known(stability(before, again(noisy))),
+            frame_stability=mean_of_known(stability(before, again(following))),
+        )
+    return MapQuality(
+        input=explained.input,
+        source=explained.source,
+        frames=len(explained.frames),
+        repeated_frames=len(references),
+        noise_sd=noise_sd,
+        methods=methods,
+        # stability was tried on few frames: no interval would mean anything
+        comparisons=tuple(
+            Roughness(
+                first=first,
+                second=second,
+                gap=paired_difference(roughness[first], roughness[second], trials=material.trials, rng=rng),
+            )
+            for first, second in combinations(roughness, 2)
+        ),
+    )
+
+
+def _once_more(
+    trained: Run, data: Dataset, chosen: Sequence[ChosenFrame], *, rng: np.random.Generator
+) -> tuple[Tensor, Tensor, float]:
+    """The frames with more camera noise, and the frames that follow them, as the network gets them; grey levels."""
+    infos = {info.trial: info for info in data.trials}
+    noisy, following, levels = [], [], []
+    for own in chosen:
+        recording = data.load(infos[own.trial], truth=False)
+        frame = recording.frames[own.frame].astype(np.float64)
+        # the last frame has none after it
+        other = recording.frames[own.frame + 1 if own.frame + 1 < len(recording) else own.frame - 1]
+        # most pixels do not move from one frame to the next: what they differ by is noise, twice
+        sd = float(np.median(np.abs(frame - other)) / _NORMAL_QUARTILE / np.sqrt(2))
+        levels.append(sd)
+        shaken = np.clip(np.round(frame + rng.normal(0, sd, frame.shape)), 0, 255).astype(np.uint8)
+        noisy.append(trained.encode(shaken[None], recording.reference))
+        following.append(trained.encode(other[None], recording.reference))
+    return torch.cat(noisy), torch.cat(following), float(np.mean(levels))
+
+
+_REPEATS, _SLOW_REPEATS, _SLOW_S = 5, 3, 3.0
+
+
+def time_explainers(material: Material, *, on_progress: OnProgress | None = None) -> Timing:
+    """Time each method on the first frame: the median and the extremes of a few runs.
+
+    The thesis's Poly-CAM is timed with all its channels, as it was run, even where a budget makes its maps.
+    """
+    model, inputs, references = material.trained.model, material.inputs[:1], material.references[:1]
+    forward = float(np.median(_seconds(lambda: material.trained.predict(inputs))))
+    methods, counts = {}, []
+    for name, explainer in counted(as_the_thesis_ran(material.explainers).items(), on_progress):
+        seconds = _seconds(lambda explainer=explainer: explainer(model, inputs, reference=references).relevance)
+        median = float(np.median(seconds))
+        counts.append(len(seconds))
+        # without the forward pass: the thesis left it out of Grad-CAM's time
+        methods[name] = MethodTime(
+            seconds=median, seconds_without_forward=max(0.0, median - forward), low=min(seconds), high=max(seconds)
+        )
+    return Timing(
+        input=material.explained.input,
+        source=material.explained.source,
+        device=inputs.device.type,
+        threads=torch.get_num_threads(),
+        # of the method that takes longest; the others have more
+        repeats=min(counts),
+        forward_seconds=forward,
+        methods=methods,
+    )
+
+
+def _seconds(work: Callable[[], Tensor]) -> list[float]:
+    """Seconds of each of a few runs, after one that does not count; fewer where one takes long."""
+    seconds: list[float] = []
+    work()
+    while len(seconds) < (_SLOW_REPEATS if seconds and seconds[0] > _SLOW_S else _REPEATS):
+        started = time.perf_counter()
+        result = work()
+        if result.is_cuda:
+            torch.cuda.synchronize(result.device)
+        seconds.append(time.perf_counter() - started)
+    return seconds
+
+
+STAGES = 3
+_SMOOTH_WITHIN_S = 1.0
+"""Methods that take longer a frame are not explained sixteen times over."""
+_STILL_SIMILAR = 0.5
+
+Maps = Float[np.ndarray, "frames height width"]
+
+
+def randomise_weights(
+    material: Material, *, frames: int = 2, seed: int = 0, on_progress: OnProgress | None = None
+) -> Randomisation:
+    """Explain networks whose weights are drawn anew from the output on, to see how far the maps change.
+
+    Parameters
+    ----------
+    frames
+        How many of the frames, from the first on.
+
+    References
+    ----------
+    See `sliplens.faithfulness.controls`.
+    """
+    inputs, references = material.inputs[:frames], material.references[:frames]
+    methods, alarms = {}, []
+    for name, whole in counted(material.explainers.items(), on_progress):
+        explainer = _shortened(whole)
+
+        def explain(model: nn.Module, images: Tensor, explainer: Explainer = explainer) -> Maps:
+            return _influence(explainer(model, images, reference=references))
+
+        started = time.perf_counter()
+        scores = randomisation_scores(
+            explain,
+            material.trained.model,
+            inputs,
+            seed=seed,
+            stages=STAGES,
+            before=material.towards_target(name)[:frames],
+        )
+        seconds = (time.perf_counter() - started) / STAGES / len(inputs)
+        similarity = tuple(mean_of_known(row) for row in scores.similarity)
+        methods[name] = RandomisedMethod(
+            layers=tuple(scores.layers),
+            similarity=similarity,
+            complexity_rise=mean_of_known(scores.complexity_rise),
+            smooth_complexity_rise=_smooth_rise(material, explain, inputs, seed=seed)
+            if seconds <= _SMOOTH_WITHIN_S
+            else None,
+        )
+        if similarity[-1] is not None and similarity[-1] > _STILL_SIMILAR:
+            alarms.append(
+                f"{name} still correlates by {similarity[-1]:.2f} with its maps when all weights are new: it shows the "
+                "image rather than what the network learned"
+            )
+    return Randomisation(
+        input=material.explained.input,
+        source=material.explained.source,
+        frames=len(inputs),
+        methods=methods,
+        alarms=tuple(alarms),
+    )
+
+
+def _shortened(explainer: Explainer) -> Explainer:
+    """Without the passes that a network with new weights takes until its map is complete: a correlation needs none."""
+    if isinstance(explainer, PolyCam):
+        return replace(explainer, likeness=None)
+    if isinstance(explainer, IntegratedGradients):
+        return replace(explainer, max_steps=explainer.steps)
+    return explainer
+
+
+def _smooth_rise(
+    material: Material, explain: Callable[[nn.Module, Tensor], Maps], inputs: Tensor, *, seed: int
+) -> float | None:
+    model = material.trained.model
+    before, after = (
+        np.array([histogram_entropy(values) for values in smooth_maps(explain, network, inputs, seed=seed)])
+        for network in (model, _untrained(model, inputs, seed=seed))
+    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return mean_of_known((after - before) / before)
+
+
+def explain_untrained(
+    material: Material, explainer: Explainer, *, seed: int = 0, on_progress: OnProgress | None = None
+) -> UntrainedMaps:
+    """Explain the network with all weights drawn anew: a control that every map has to beat."""
+    model = _untrained(material.trained.model, material.inputs, seed=seed)
+    maps = []
+    for index in counted(range(len(material.inputs)), on_progress):
+        frame = slice(index, index + 1)
+        maps.append(_influence(explainer(model, material.inputs[frame], reference=material.references[frame]))[0])
+    return UntrainedMaps(
+        input=material.explained.input, source=material.explained.source, maps=np.stack(maps).astype(np.float64)
+    )
+
+
+def _influence(explanation: Explanation) -> Maps:
+    """The part of the relevance that works towards the network's own target: the sign of another's says nothing."""
+    return explanation.influence.double().cpu().numpy()
+
+
+def _untrained(model: nn.Module, images: Tensor, *, seed: int) -> nn.Module:
+    ((_, untrained),) = cascade(model, seed=seed, stages=1, images=images)
+    return untrained
