@@ -5,26 +5,29 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from math import floor, isfinite, prod
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import av
+import msgspec
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 from av.container import InputContainer
 from av.error import FFmpegError
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Float
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.formats.images import open_encoded, rgb_pixels, telling_damage
 from sliplens.recordings.formats.stored import ExportedTrial
 from sliplens.recordings.formats.tables import trial_name
+from sliplens.recordings.formats.video import MOST_PIXELS, open_container
 from sliplens.recordings.store import DAMAGED_PARQUET, load_forces, one_line
-from sliplens.recordings.trial import Labels
 
 _VERSION = re.compile(r"v3\.\d+")
 _FIELD = re.compile(r"\{(video_key|chunk_index|file_index)(?::0?([1-9])d)?\}")
@@ -50,9 +53,9 @@ class Feature:
 
     dtype: str
     shape: tuple[int, ...]
-    names: object
-    info: object
-    video_info: object
+    names: Any = None
+    info: Any = None
+    video_info: Any = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,10 +67,6 @@ class Layout:
     features: dict[str, Feature]
     data_path: str
     video_path: str | None
-
-    def width(self, key: str) -> int:
-        """Numbers that a feature has in each frame."""
-        return prod(self.features[key].shape)
 
 
 def read_layout(folder: Path) -> Layout:
@@ -87,15 +86,17 @@ def read_layout(folder: Path) -> Layout:
             f"{folder} is a LeRobot data set of version {version}, v3.0 is needed; convert it with "
             "`python -m lerobot.scripts.convert_dataset_v21_to_v30`"
         )
-    features, fps = info.get("features"), info.get("fps")
+    fps = info.get("fps")
     if not isinstance(fps, int | float) or not isfinite(fps) or fps <= 0:
         raise RecordingError(f"{path} has fps {fps}; write a positive number of frames a second there")
-    if not isinstance(features, dict):
-        raise RecordingError(f"{path} lacks features with dtype and shape; copy it again")
+    try:
+        features = msgspec.convert(info.get("features"), dict[str, Feature])
+    except msgspec.ValidationError:
+        raise RecordingError(f"{path} lacks features with dtype and shape; copy it again") from None
     return Layout(
         folder=folder,
         fps=float(fps),
-        features={key: _feature(feature, path) for key, feature in features.items()},
+        features=features,
         data_path=str(info.get("data_path")),
         video_path=None if info.get("video_path") is None else str(info["video_path"]),
     )
@@ -105,31 +106,31 @@ def read_episodes(layout: Layout, *, camera_key: str, only: int | None = None) -
     """Episodes of a data set and where their frames from a camera lie, in their order."""
     in_video = layout.features[camera_key].dtype == "video"
     columns = ["episode_index", "length", "data/chunk_index", "data/file_index"]
-    video = [f"videos/{camera_key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
+    if in_video:
+        columns += [f"videos/{camera_key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
     folder = layout.folder / "meta" / "episodes"
     rows = []
     for path in sorted(folder.glob("*/*.parquet")):
-        table = read_columns(path, columns + video * in_video)
-        for name in columns + video[:2] * in_video:
+        table = read_columns(path, columns)
+        for name in columns[:6]:
             if not pa.types.is_integer(table.schema.field(name).type):
                 raise RecordingError(f"{path} has no whole numbers in {name}; copy the data set again")
-        rows += table.to_pylist()
+        rows += zip(*(table.column(name).to_pylist() for name in columns), strict=True)
     if not rows:
         raise RecordingError(f"{folder} lists no episode; record one, or copy it again")
     episodes = []
-    for row in sorted(rows, key=lambda row: row["episode_index"]):
-        if episodes and episodes[-1].index == row["episode_index"]:
-            raise RecordingError(f"{folder} lists episode {row['episode_index']} twice; copy the data set again")
-        data = {"chunk_index": row["data/chunk_index"], "file_index": row["data/file_index"]}
-        chunk, file, start = (row[name] for name in video) if in_video else (0, 0, 0.0)
-        where = {"video_key": camera_key, "chunk_index": chunk, "file_index": file}
+    for index, length, chunk, file, *video in sorted(rows):
+        if episodes and episodes[-1].index == index:
+            raise RecordingError(f"{folder} lists episode {index} twice; copy the data set again")
+        data = {"chunk_index": chunk, "file_index": file}
+        where = {"video_key": camera_key, **dict(zip(data, video, strict=False))}
         episodes.append(
             Episode(
-                index=row["episode_index"],
-                length=row["length"],
+                index=index,
+                length=length,
                 data_file=_expand(layout, layout.data_path, data),
                 video_file=_expand(layout, layout.video_path or "", where) if in_video else None,
-                video_start_s=float(start),
+                video_start_s=float(video[2]) if in_video else 0.0,
             )
         )
     found = [one for one in episodes if only is None or one.index == only]
@@ -161,15 +162,6 @@ def read_columns(path: Path, columns: list[str]) -> pa.Table:
     return table
 
 
-def _feature(feature: Any, path: Path) -> Feature:
-    table = feature if isinstance(feature, dict) else {}
-    dtype, shape = table.get("dtype"), table.get("shape")
-    if not isinstance(dtype, str) or not isinstance(shape, list) or not all(isinstance(size, int) for size in shape):
-        raise RecordingError(f"{path} lacks features with dtype and shape; copy it again")
-    more = {name: table.get(name) for name in ("names", "info", "video_info")}
-    return Feature(dtype=dtype, shape=tuple(shape), **more)
-
-
 def _expand(layout: Layout, template: str, values: dict[str, Any]) -> Path:
     """Fill in a template of `info.json`; it comes from outside, so `str.format` would trust it with too much."""
     path = _FIELD.sub(lambda field: f"{values.get(field[1], '{}')}".rjust(int(field[2] or 0), "0"), template)
@@ -183,51 +175,40 @@ def _expand(layout: Layout, template: str, values: dict[str, Any]) -> Path:
     return layout.folder / path
 
 
-class EpisodeRows:
-    """Rows of episodes one after another; those of one file share what was read of it."""
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """Rows of an episode, in their order."""
 
-    def __init__(self, layout: Layout, columns: list[str]) -> None:
-        self.layout, self.columns = layout, columns
-        self.table: tuple[Path, pa.Table] | None = None
+    layout: Layout
+    episode: Episode
+    table: pa.Table
 
-    def of(self, episode: Episode) -> pa.Table:
-        """Rows of an episode, in their order."""
-        path = episode.data_file
-        if self.table is None or self.table[0] != path:
-            self.table = path, read_columns(path, ["episode_index", *self.columns])
-        table = self.table[1]
-        own: Bool[np.ndarray, " rows"] = table.column("episode_index").to_numpy() == episode.index
-        rows = table.filter(pa.array(own))
-        if rows.num_rows != episode.length or not rows.num_rows:
-            raise RecordingError(
-                f"{path} has {rows.num_rows} frames of episode {episode.index}, its metadata say {episode.length}; "
-                "leave the episode out, or copy the data set again"
-            )
-        return rows
-
-    def vectors(self, rows: pa.Table, key: str, episode: Episode) -> Float[np.ndarray, "frames numbers"]:
+    def vectors(self, key: str) -> Float[np.ndarray, "frames numbers"]:
         """A feature of several floating-point numbers a frame."""
-        width = self.layout.width(key)
-        column = rows.column(key).combine_chunks()
+        width = prod(self.layout.features[key].shape)
+        column = self.table.column(key).combine_chunks()
         numbers = column.flatten() if hasattr(column, "flatten") else column
-        if len(numbers) != len(rows) * width or numbers.null_count or not pa.types.is_floating(numbers.type):
+        if len(numbers) != len(self.table) * width or numbers.null_count or not pa.types.is_floating(numbers.type):
             raise RecordingError(
-                f"{key} of {episode.data_file} does not hold {width} numbers a frame, as meta/info.json says; "
+                f"{key} of {self.episode.data_file} does not hold {width} numbers a frame, as meta/info.json says; "
                 "copy the data set again"
             )
         return numbers.to_numpy().astype(np.float64).reshape(-1, width)
 
-    def numbers(self, rows: pa.Table, key: str, episode: Episode) -> Float[np.ndarray, " frames"]:
-        """A feature of one number a frame, as exact as it is stored."""
-        return self._one(rows, key, episode, pa.types.is_floating, "numbers").astype(np.float64)
+    def values(self, key: str, fits: Callable[[pa.DataType], bool], what: str) -> np.ndarray:
+        """A feature of one value a frame, as exact as it is stored."""
+        column = self.table.column(key)
+        if not fits(column.type):
+            raise RecordingError(f"{key} of {self.episode.data_file} does not hold {what}; copy the data set again")
+        return column.to_numpy()
 
-    def truths(self, rows: pa.Table, key: str, episode: Episode) -> Bool[np.ndarray, " frames"]:
-        """A feature that is true or false."""
-        return self._one(rows, key, episode, pa.types.is_boolean, "true and false").astype(bool)
+    def numbers(self, key: str) -> Float[np.ndarray, " frames"]:
+        """A feature of one number a frame."""
+        return self.values(key, pa.types.is_floating, "numbers").astype(np.float64)
 
-    def words(self, rows: pa.Table, key: str, episode: Episode) -> tuple[str, ...]:
+    def words(self, key: str) -> tuple[str, ...]:
         """A feature whose whole numbers count through words that `meta/info.json` lists."""
-        codes: Int64[np.ndarray, " frames"] = self._one(rows, key, episode, pa.types.is_integer, "whole numbers")
+        codes = self.values(key, pa.types.is_integer, "whole numbers")
         info = self.layout.features[key].info
         words = info.get("values") if isinstance(info, dict) else None
         if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
@@ -236,42 +217,37 @@ class EpisodeRows:
             )
         if codes.min() < 0 or codes.max() >= len(words):
             raise RecordingError(
-                f"{key} of {episode.data_file} leads beyond the {len(words)} values that meta/info.json lists; "
+                f"{key} of {self.episode.data_file} leads beyond the {len(words)} values that meta/info.json lists; "
                 "copy the data set again"
             )
         return tuple(words[code] for code in codes)
 
-    def _one(self, rows: pa.Table, key: str, episode: Episode, fits: Callable[..., bool], what: str) -> np.ndarray:
-        column = rows.column(key)
-        if not fits(column.type):
-            raise RecordingError(f"{key} of {episode.data_file} does not hold {what}; copy the data set again")
-        return column.to_numpy()
+
+def read_rows(layout: Layout, episodes: list[Episode], columns: list[str]) -> Iterator[Rows]:
+    """Rows of episodes one after another; those of one file share what was read of it."""
+    read = lru_cache(maxsize=1)(partial(read_columns, columns=["episode_index", *columns]))
+    for episode in episodes:
+        path = episode.data_file
+        rows = read(path).filter(pc.field("episode_index") == episode.index)
+        if rows.num_rows != episode.length or not rows.num_rows:
+            raise RecordingError(
+                f"{path} has {rows.num_rows} frames of episode {episode.index}, its metadata say {episode.length}; "
+                "leave the episode out, or copy the data set again"
+            )
+        yield Rows(layout=layout, episode=episode, table=rows)
 
 
-# what FFmpeg would guess from the content may be a play list that leads to other files and hosts
-_CONTAINERS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska", ".webm": "webm"}
-_MOST_PIXELS = 100_000_000  # of a frame: a larger one is a damaged header
-
-
-@dataclass(frozen=True, kw_only=True)
-class VideoInfo:
-    """What a video says of its frames, without any being decoded."""
-
-    frame_size: tuple[int, int]
-    codec: str
-    lossy: bool
-
-
-def read_video_info(path: Path) -> VideoInfo:
-    """Read the header of a video."""
+def read_video_header(path: Path) -> tuple[tuple[int, int], tuple[str, ...]]:
+    """Height and width of the frames of a video, and what is said of its coding."""
     with _open_video(path) as container:
         coder = container.streams.video[0].codec_context
         if coder is None:
             raise RecordingError(f"{path} is coded in a way that FFmpeg cannot read; write it as AV1 or H.264")
-        size = coder.height, coder.width
-        if min(size) <= 0 or size[0] * size[1] > _MOST_PIXELS:
+        size, codec = (coder.height, coder.width), coder.codec
+        if min(size) <= 0 or size[0] * size[1] > MOST_PIXELS:
             raise RecordingError(f"{path} claims frames of {size[0]} x {size[1]} pixels; copy it again")
-        return VideoInfo(frame_size=size, codec=coder.codec.canonical_name, lossy=coder.codec.lossy)
+        note = f"Frames are coded with loss ({codec.canonical_name}), which moves markers a little."
+        return size, (note,) * codec.lossy
 
 
 def video_frames(
@@ -311,10 +287,11 @@ def _stored_images(path: Path, key: str, episode: int, *, frame_size: tuple[int,
     index = 0
     try:
         file = pq.ParquetFile(path)
-        groups = _row_groups(file, episode)
+        # without this, each episode would cost all that share its file
+        (fragment,) = ds.dataset(path).get_fragments()
+        groups = [group.id for group in fragment.subset(pc.field("episode_index") == episode).row_groups]
         for batch in file.iter_batches(batch_size=16, row_groups=groups, columns=["episode_index", key]):
-            own = batch.column("episode_index").to_numpy() == episode
-            for cell in batch.filter(pa.array(own)).column(key).to_pylist():
+            for cell in batch.filter(pc.field("episode_index") == episode).column(key).to_pylist():
                 where = f"frame {index} of {key}, episode {episode} of {path},"
                 data = cell.get("bytes") if isinstance(cell, dict) else None
                 if not isinstance(data, bytes) or not data:
@@ -329,21 +306,6 @@ def _stored_images(path: Path, key: str, episode: int, *, frame_size: tuple[int,
                 index += 1
     except DAMAGED_PARQUET as error:
         raise RecordingError(f"{path} is not a readable Parquet file ({one_line(error)}); copy it again") from None
-
-
-def _row_groups(file: pq.ParquetFile, episode: int) -> list[int]:
-    """Row groups that may hold rows of an episode: without this, each episode would cost all that share its file."""
-    # columns with parts, such as images, count as several here
-    column = [file.schema.column(index).path for index in range(len(file.schema))].index("episode_index")
-    found = []
-    for group in range(file.num_row_groups):
-        told = file.metadata.row_group(group).column(column).statistics
-        if told is not None and told.has_min_max and told.physical_type == "INT64":
-            if told.min <= episode <= told.max:
-                found.append(group)
-        else:
-            found.append(group)
-    return found
 
 
 def decode_image(data: bytes, *, where: str) -> Frame:
@@ -368,12 +330,8 @@ def _decode_from(container: InputContainer, start_s: float) -> Iterator[tuple[fl
 def _open_video(path: Path) -> Iterator[InputContainer]:
     if not path.is_file():
         raise RecordingError(f"{path} does not exist; copy the data set again, with its videos")
-    form = _CONTAINERS.get(path.suffix.lower())
-    if form is None:
-        raise RecordingError(f"{path} is no video that can be read; write {', '.join(_CONTAINERS)}")
     try:
-        # an absolute path cannot be taken for an address
-        with av.open(str(path.absolute()), format=form, options={"protocol_whitelist": "file"}) as container:
+        with open_container(path) as container:
             if not container.streams.video:
                 raise RecordingError(f"{path} has no video stream; copy it again")
             yield container
@@ -432,48 +390,43 @@ def kept_captures(layout: Layout, trials: tuple[ExportedTrial, ...], *, episode:
             f"the episodes of {layout.folder} are no longer those that {path} tells of; export the trials again, or "
             "remove that file to read the data set without labels"
         )
-    rows = EpisodeRows(layout, _COLUMNS)
-    wanted = read_episodes(layout, camera_key=CAMERA, only=episode)
-    return [_capture(layout, rows, one, trials[one.index]) for one in wanted]
+    rows = read_rows(layout, read_episodes(layout, camera_key=CAMERA, only=episode), _COLUMNS)
+    return [_capture(one, trials[one.episode.index]) for one in rows]
 
 
-def _capture(layout: Layout, rows: EpisodeRows, episode: Episode, trial: ExportedTrial) -> Capture:
-    table = rows.of(episode)
-    size, read_frames = image_frames(episode, CAMERA)
-    source = f"{trial.trial}, episode {episode.index} of {layout.folder}"
-    time = rows.numbers(table, TIME, episode)
+def _capture(rows: Rows, trial: ExportedTrial) -> Capture:
+    folder, index = rows.layout.folder, rows.episode.index
+    size, read_frames = image_frames(rows.episode, CAMERA)
+    source = f"{trial.trial}, episode {index} of {folder}"
+    time = rows.numbers(TIME)
     if not np.isfinite(time).all():
         raise RecordingError(f"{TIME} of {source} is not a number everywhere; copy the data set again")
-    path = kept_path(layout.folder, "reference", episode.index)
+    path = kept_path(folder, "reference", index)
     try:
         png = path.read_bytes()
     except OSError as error:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); copy the data set again") from None
+    force = rows.vectors(FORCE)
+    if force.shape[1] != len(FORCE_AXES):
+        raise RecordingError(f"{FORCE} of {source} has {force.shape[1]} numbers, not 3; copy the data set again")
+    numbers = {name: rows.numbers(key) for name, key in NUMBERS.items()}
     return Capture(
         **vars(trial.facts),
         source=source,
         frame_time_s=time,
         frame_size=size,
         read_frames=read_frames,
-        forces=_forces(kept_path(layout.folder, "forces", episode.index), trial) if trial.force_samples else None,
-        labels=_labels(rows, table, episode, trial, source),
+        forces=_forces(kept_path(folder, "forces", index), trial) if trial.force_samples else None,
+        labels=trial.labels(
+            {**numbers, "tangential_force_n": force[:, 0].copy(), "normal_force_n": force[:, 2].copy()},
+            states=rows.words(STATE),
+            valid=rows.values(VALID, pa.types.is_boolean, "true and false"),
+            reasons=rows.words(REASON),
+            source=source,
+        ),
         reference=decode_image(png, where=f"{path}"),
         split=trial.split,
         simulated=trial.simulated,
-    )
-
-
-def _labels(rows: EpisodeRows, table: pa.Table, episode: Episode, trial: ExportedTrial, source: str) -> Labels:
-    force = rows.vectors(table, FORCE, episode)
-    if force.shape[1] != len(FORCE_AXES):
-        raise RecordingError(f"{FORCE} of {source} has {force.shape[1]} numbers, not 3; copy the data set again")
-    numbers = {name: rows.numbers(table, key, episode) for name, key in NUMBERS.items()}
-    return trial.labels(
-        {**numbers, "tangential_force_n": force[:, 0].copy(), "normal_force_n": force[:, 2].copy()},
-        states=rows.words(table, STATE, episode),
-        valid=rows.truths(table, VALID, episode),
-        reasons=rows.words(table, REASON, episode),
-        source=source,
     )
 
 
@@ -517,24 +470,20 @@ def read_lerobot(
     force = _choose_force(layout, force_key)
     if force is None:
         notes.append("There are no forces: no feature of 3 or 6 numbers is named like one.")
-    rows = EpisodeRows(layout, ["timestamp", *([force] if force else [])])
-    video_info = cache(read_video_info)  # episodes share files
+    video_header = cache(read_video_header)  # episodes share files
     captures = []
-    for one in read_episodes(layout, camera_key=camera, only=episode):
-        table, own_notes = rows.of(one), []
-        time = table.column("timestamp").to_numpy().astype(np.float64)
+    episodes = read_episodes(layout, camera_key=camera, only=episode)
+    for rows in read_rows(layout, episodes, ["timestamp", *([force] if force else [])]):
+        one, own_notes, forces = rows.episode, (), None
+        time = rows.table.column("timestamp").to_numpy().astype(np.float64)
         source = f"episode {one.index} of {layout.folder}"
-        forces = None
         if force is not None:
-            vectors = rows.vectors(table, force, one)[:, :3].copy()
-            forces = Forces(time_s=time, force_n=vectors, source=f"{force} of {source}")
+            forces = Forces(time_s=time, force_n=rows.vectors(force)[:, :3].copy(), source=f"{force} of {source}")
         if one.video_file is None:
             size, read_frames = image_frames(one, camera)
         else:
-            video = video_info(one.video_file)
-            if video.lossy:
-                own_notes.append(f"Frames are coded with loss ({video.codec}), which moves markers a little.")
-            size, tolerance_s, shown_s = video.frame_size, 0.5 / layout.fps, one.video_start_s + time
+            size, own_notes = video_header(one.video_file)
+            tolerance_s, shown_s = 0.5 / layout.fps, one.video_start_s + time
             read_frames = partial(video_frames, one.video_file, shown_s, tolerance_s=tolerance_s, frame_size=size)
         captures.append(
             Capture(

@@ -163,12 +163,17 @@ def _read_stamps(
     return found, cut
 
 
+def open_container(path: Path) -> InputContainer:
+    """Container of a video, never a play list."""
+    # an absolute path cannot be taken for an address or a pattern of file names
+    return av.open(str(path.absolute()), options=_OPTIONS, **_LENIENT)
+
+
 def _open(path: Path) -> InputContainer:
     if not path.is_file():
         raise RecordingError(f"{path} {'is no file' if path.exists() else 'does not exist'}; name a video file")
     try:
-        # an absolute path cannot be taken for an address or a pattern of file names
-        return av.open(str(path.absolute()), options=_OPTIONS, **_LENIENT)
+        return open_container(path)
     except (FFmpegError, OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise RecordingError(f"{path} cannot be read as a video ({reason}); copy or export it again") from None
