@@ -2,10 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from itertools import islice
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +13,7 @@ from jaxtyping import Int64, Shaped
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import require_folder, write_json
-from sliplens.images import encode_png, write_png
+from sliplens.images import write_png
 from sliplens.progress import OnProgress
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import Dataset, TrialInfo
@@ -32,10 +29,15 @@ from sliplens.recordings.formats.lerobot import (
     VALID,
     kept_path,
 )
-from sliplens.recordings.formats.stored import STATES, ExportedTrial, read_stored_trial
+from sliplens.recordings.formats.stored import (
+    STATES,
+    ExportedTrial,
+    encode_batches,
+    exported_labels,
+    read_stored_trial,
+)
 from sliplens.recordings.formats.tables import require_trial_name
 from sliplens.recordings.store import save_forces
-from sliplens.recordings.trial import Labels
 
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
@@ -109,20 +111,6 @@ _IMAGE = pa.struct({"bytes": pa.binary(), "path": pa.string()})
 _TYPES = {"image": _IMAGE, "float64": pa.float64(), "float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_()}
 
 
-@dataclass(frozen=True, kw_only=True)
-class EpisodeEntry:
-    """A row of `meta/episodes`."""
-
-    first: int
-    """Number of the first frame in the whole data set."""
-    length: int
-    task: str
-    chunk: int
-    """Folder of the data file, and number of the file in it."""
-    file: int
-    stats: dict[str, Stats]
-
-
 class DataFiles:
     """Writes frames; an episode lies in one file, and what would make that too large goes into the next."""
 
@@ -167,12 +155,9 @@ class DataFiles:
 
     def column(self, name: str) -> Shaped[np.ndarray, "frames numbers"]:
         """Read back a feature of all episodes; the files must be closed."""
-        found = []
-        for path in self.paths:
-            column = pq.read_table(path, columns=[name]).column(name).combine_chunks()
-            flat = column.flatten() if pa.types.is_fixed_size_list(column.type) else column
-            found.append(flat.to_numpy(zero_copy_only=False).reshape(len(column), -1))
-        return np.concatenate(found)
+        column = pq.read_table(self.paths, columns=[name]).column(name).combine_chunks()
+        flat = column.flatten() if pa.types.is_fixed_size_list(column.type) else column
+        return flat.to_numpy(zero_copy_only=False).reshape(len(column), -1)
 
     def _close(self) -> None:
         if self.writer is not None:
@@ -191,24 +176,15 @@ def write_tasks(folder: Path, tasks: Sequence[str]) -> None:
     pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(index)}), folder / "meta" / "tasks.parquet")
 
 
-def write_episodes(folder: Path, episodes: Sequence[EpisodeEntry]) -> None:
+def write_episodes(folder: Path, places: Sequence[dict[str, Any]], stats: Sequence[dict[str, Stats]]) -> None:
     """Write `meta/episodes`: where each episode lies, and its statistics."""
-    columns: dict[str, Any] = {
-        "episode_index": range(len(episodes)),
-        "tasks": [[one.task] for one in episodes],
-        "length": [one.length for one in episodes],
-        "data/chunk_index": [one.chunk for one in episodes],
-        "data/file_index": [one.file for one in episodes],
-        "dataset_from_index": [one.first for one in episodes],
-        "dataset_to_index": [one.first + one.length for one in episodes],
-    }
-    for feature, stats in episodes[0].stats.items():
-        for name in stats:
-            columns[f"stats/{feature}/{name}"] = [one.stats[feature][name] for one in episodes]
-    columns |= {f"meta/episodes/{name}": [0] * len(episodes) for name in ("chunk_index", "file_index")}
+    rows = []
+    for place, features in zip(places, stats, strict=True):
+        named = {f"stats/{feature}/{name}": value for feature, one in features.items() for name, value in one.items()}
+        rows.append({**place, **named, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
     path = folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
     path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(pa.table(columns), path)
+    pq.write_table(pa.Table.from_pylist(rows), path)
 
 
 def _data_schema(features: Features) -> pa.Schema:
@@ -250,27 +226,17 @@ def frame_features(height: int, width: int) -> Features:
 
 def frame_columns(capture: Capture, *, fps: int | float, reasons: dict[str, int]) -> dict[str, np.ndarray]:
     """Features of a labelled trial's frames, but for images and places; reasons not met before get a number."""
-    labels, count = capture.labels, len(capture.frame_time_s)
-    assert labels is not None
-    force = np.stack([labels.tangential_force_n, np.zeros(count), labels.normal_force_n], axis=1)
+    assert capture.labels is not None
+    labels, count = exported_labels(capture.labels), len(capture)
     return {
         TIME: capture.frame_time_s,
-        FORCE: force,
-        **{key: _given(labels, name) for name, key in NUMBERS.items()},
-        VALID: _given(labels, "valid"),
-        STATE: np.array([_STATES.index(state) for state in labels.contact_state], dtype=np.int64),
-        REASON: np.array([reasons.setdefault(reason, len(reasons)) for reason in _given(labels, "reason")], np.int64),
+        FORCE: np.stack([labels["tangential_force_n"], np.zeros(count), labels["normal_force_n"]], axis=1),
+        **{key: labels[name] for name, key in NUMBERS.items()},
+        VALID: labels["valid"],
+        STATE: np.array([_STATES.index(state) for state in labels["contact_state"]], dtype=np.int64),
+        REASON: np.array([reasons.setdefault(reason, len(reasons)) for reason in labels["reason"]], dtype=np.int64),
         "timestamp": (np.arange(count) / fps).astype(np.float32),
     }
-
-
-def _given(labels: Labels, name: str) -> Any:
-    """Labels of a name; those that a trial lacks follow from what it has, or are not known."""
-    values = getattr(labels, name)
-    if values is not None:
-        return values
-    known = np.isfinite(labels.safety_margin)
-    return {"safety_margin_sigma": np.full(len(known), np.nan), "valid": known, "reason": [""] * len(known)}[name]
 
 
 def frame_places(frames: int, *, first: int, episode: int, task: int) -> dict[str, np.ndarray]:
@@ -284,7 +250,6 @@ def frame_places(frames: int, *, first: int, episode: int, task: int) -> dict[st
     }
 
 
-_BATCH = 16  # frames that are encoded side by side and written together
 _RATE_WHERE_NONE = 30  # where every trial is one frame
 
 
@@ -302,11 +267,7 @@ def write_lerobot(
     follow each other, for a split is a range of episodes. What LeRobot has no place for lies in `meta/sliplens`:
     reference frames, samples of the force sensor, sensor, day, condition, object, and what the labels rest on. Of a
     simulated trial the ground truth beyond its labels stays behind.
-
-    Parameters
-    ----------
-    folder
-        Folder to write to; `data` and `meta` of an earlier attempt that came to no end are replaced.
+    `data` and `meta` of an earlier attempt that came to no end are replaced.
 
     References
     ----------
@@ -318,7 +279,8 @@ def write_lerobot(
     fps = _frame_rate(data, chosen)
     features, reasons = frame_features(height, width), {"": 0}
     tasks: dict[str, int] = {}
-    episodes: list[EpisodeEntry] = []
+    places: list[dict[str, Any]] = []
+    stats: list[dict[str, Stats]] = []
     pixels, first, total = PixelCount(), 0, sum(info.frames for info in chosen)
     with DataFiles(folder, features) as files:
         for episode, info in enumerate(chosen):
@@ -330,22 +292,35 @@ def write_lerobot(
                 count, first=first, episode=episode, task=tasks.setdefault(task, len(tasks))
             )
             chunk, file = files.begin(count)
-            shown = PixelCount()
-            for done in _write_frames(files, capture, columns, shown):
+            shown, done = PixelCount(), 0
+            for batch, pngs in encode_batches(capture.read_frames()):
+                for frame in batch:
+                    shown.add(frame)
+                some = {name: values[done : done + len(batch)] for name, values in columns.items()}
+                files.write(some, images=CAMERA, pngs=list(pngs), first=done)
+                done += len(batch)
                 if on_progress is not None:
                     on_progress(first + done, total)
-            stats = {
-                CAMERA: shown.stats(),
-                **{name: number_stats(values.reshape(count, -1)) for name, values in columns.items()},
-            }
-            episodes.append(EpisodeEntry(first=first, length=count, task=task, chunk=chunk, file=file, stats=stats))
+            numbers = {name: number_stats(values.reshape(count, -1)) for name, values in columns.items()}
+            stats.append({CAMERA: shown.stats(), **numbers})
+            places.append(
+                {
+                    "episode_index": episode,
+                    "tasks": [task],
+                    "length": count,
+                    "data/chunk_index": chunk,
+                    "data/file_index": file,
+                    "dataset_from_index": first,
+                    "dataset_to_index": first + count,
+                }
+            )
             pixels.join(shown)
             first += count
-    stats = {name: pixels.stats() if name == CAMERA else number_stats(files.column(name)) for name in features}
-    _fill_unknown(episodes, stats)
+    whole = {name: pixels.stats() if name == CAMERA else number_stats(files.column(name)) for name in features}
+    _fill_unknown(stats, whole)
     write_tasks(folder, list(tasks))
-    write_episodes(folder, episodes)
-    write_json(folder / "meta" / "stats.json", stats)
+    write_episodes(folder, places, stats)
+    write_json(folder / "meta" / "stats.json", whole)
     features[REASON]["info"] = {"values": list(reasons)}
     # the last file: it makes the folder a data set
     write_json(
@@ -353,7 +328,7 @@ def write_lerobot(
         {
             "codebase_version": "v3.0",
             "robot_type": None,
-            "total_episodes": len(episodes),
+            "total_episodes": len(places),
             "total_frames": first,
             "total_tasks": len(tasks),
             "chunks_size": CHUNK_FILES,
@@ -415,22 +390,6 @@ def _frame_rate(data: Dataset, trials: Sequence[TrialInfo]) -> int | float:
     return round(rate) if abs(round(rate) / rate - 1) < 0.01 else rate
 
 
-def _write_frames(
-    files: DataFiles, capture: Capture, columns: dict[str, np.ndarray], shown: PixelCount
-) -> Iterator[int]:
-    """Write the frames of a trial in batches, those of a batch encoded side by side; how many there are, each time."""
-    done, frames = 0, capture.read_frames()
-    with ThreadPoolExecutor() as pool:
-        while batch := list(islice(frames, _BATCH)):
-            pngs = pool.map(encode_png, batch)
-            for frame in batch:
-                shown.add(frame)
-            some = {name: values[done : done + len(batch)] for name, values in columns.items()}
-            files.write(some, images=CAMERA, pngs=list(pngs), first=done)
-            done += len(batch)
-            yield done
-
-
 def _keep(folder: Path, episode: int, capture: Capture) -> None:
     """Write what LeRobot has no place for."""
     labels, forces = capture.labels, capture.forces
@@ -443,9 +402,9 @@ def _keep(folder: Path, episode: int, capture: Capture) -> None:
         lines.write(ExportedTrial.of(capture).dump() + "\n")
 
 
-def _fill_unknown(episodes: Sequence[EpisodeEntry], whole: dict[str, Stats]) -> None:
+def _fill_unknown(episodes: Sequence[dict[str, Stats]], whole: dict[str, Stats]) -> None:
     """Give episodes in which a feature is never known the statistics of all, at a count of 0."""
     for one in episodes:
-        for name, stats in one.stats.items():
+        for name, stats in one.items():
             if stats["count"] == [0]:
                 stats.update({**whole[name], "count": [0]})

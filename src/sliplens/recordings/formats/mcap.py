@@ -2,8 +2,6 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,11 +14,11 @@ from sliplens.extras import require_packages
 from sliplens.files import require_folder
 from sliplens.images import encode_png
 from sliplens.progress import OnProgress
-from sliplens.recordings.capture import Capture, Forces, Frame
+from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import Dataset, TrialInfo
-from sliplens.recordings.formats.stored import ExportedTrial, read_stored_trial
+from sliplens.recordings.formats.stored import ExportedTrial, encode_batches, exported_labels, read_stored_trial
 from sliplens.recordings.formats.tables import require_trial_name
-from sliplens.recordings.trial import LABEL_SIGNALS, Labels
+from sliplens.recordings.trial import LABEL_SIGNALS
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -75,7 +73,6 @@ def trial_types() -> "Typestore":
 
 _FRAME_ID = "tactile"
 _LAST_S = 2**31  # a stamp of ROS counts seconds in 32 bits
-_BATCH = 16  # frames that are encoded side by side
 _BLOCK = 1000  # times of wrenches in a message
 
 
@@ -171,17 +168,21 @@ def _write_trial(bag: _Bag, capture: Capture) -> Iterator[None]:
     about = ExportedTrial.of(capture)
     bag.write(TRIAL, start_ns, data=about.dump(stamp_offset_s=offset_s, sliplens_version=__version__))
     bag.write(REFERENCE, start_ns, **_image(bag, encode_png(capture.reference), start_ns))
+    label = {"time_s": capture.frame_time_s, **exported_labels(labels)}
+    label["invalid_reason"] = label.pop("reason")
+    fields = {name: np.asarray(values).tolist() for name, values in label.items()}
     sampled = 0
-    for index, png in enumerate(_encoded(capture.read_frames())):
+    pngs = (png for _, batch in encode_batches(capture.read_frames()) for png in batch)
+    for index, png in enumerate(pngs):
         stamp_ns = frame_ns[index].item()
         if forces is not None:
             until = int(np.searchsorted(force_ns, stamp_ns, side="right"))
             _write_forces(bag, forces, force_ns, sampled, until)
             sampled = until
         bag.write(IMAGE, stamp_ns, **_image(bag, png, stamp_ns))
-        time_s = capture.frame_time_s[index].item()
-        bag.write(LABELS, stamp_ns, header=bag.header(stamp_ns), time_s=time_s, **_label(labels, index))
-        bag.write(MARGIN, stamp_ns, data=labels.safety_margin[index].item())
+        label = {name: values[index] for name, values in fields.items()}
+        bag.write(LABELS, stamp_ns, header=bag.header(stamp_ns), **label)
+        bag.write(MARGIN, stamp_ns, data=label["safety_margin"])
         yield
     if forces is not None:
         _write_forces(bag, forces, force_ns, sampled, len(force_ns))
@@ -203,25 +204,6 @@ def _write_forces(bag: _Bag, forces: Forces, stamps_ns: Int64[np.ndarray, " samp
 
 def _image(bag: _Bag, png: bytes, stamp_ns: int) -> dict[str, Any]:
     return {"header": bag.header(stamp_ns), "format": "png", "data": np.frombuffer(png, dtype=np.uint8)}
-
-
-def _label(labels: Labels, index: int) -> dict[str, Any]:
-    """Fields of a label; what the trial does not have follows from what it has, or is not known."""
-    sigma, valid, reason = labels.safety_margin_sigma, labels.valid, labels.reason
-    return {
-        **{name: getattr(labels, name)[index].item() for name in LABEL_SIGNALS},
-        "safety_margin_sigma": math.nan if sigma is None else sigma[index].item(),
-        "valid": math.isfinite(labels.safety_margin[index]) if valid is None else bool(valid[index]),
-        "contact_state": str(labels.contact_state[index]),
-        "invalid_reason": "" if reason is None else reason[index],
-    }
-
-
-def _encoded(frames: Iterator[Frame]) -> Iterator[bytes]:
-    """PNG of each frame, a few of them made side by side."""
-    with ThreadPoolExecutor() as pool:
-        while batch := list(islice(frames, _BATCH)):
-            yield from pool.map(encode_png, batch)
 
 
 def _stamp_offset_s(capture: Capture) -> int:

@@ -1,8 +1,12 @@
 """Data sets of sliplens as recordings; and what trials say of themselves in the formats of others."""
 
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import partial
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -10,12 +14,13 @@ from jaxtyping import Float
 
 from sliplens.codec import from_builtins, to_builtins
 from sliplens.errors import InputError, RecordingError
-from sliplens.recordings.capture import Capture, Forces
+from sliplens.images import encode_png
+from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_path
 from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.store import forces_path, load_forces, load_recording, stream_frames
-from sliplens.recordings.trial import ContactState, Labels, TrialFacts, require_unit_interval
+from sliplens.recordings.trial import LABEL_SIGNALS, ContactState, Labels, TrialFacts, require_unit_interval
 
 STATES = {str(state): state for state in ContactState}
 """Contact states by their words."""
@@ -64,7 +69,24 @@ FORMAT, VERSION = "sliplens trial", 2
 """What the text of an exported trial calls itself."""
 EXPORTED_OPTIONAL = ("safety_margin_sigma", "valid", "reason")
 """Labels that a trial may lack, though the formats of others have room for them."""
+_BATCH = 16  # frames that are encoded side by side
 _LONGEST = 2**24  # characters of a text that is parsed; those of a trial are some thousands
+
+
+def exported_labels(labels: Labels) -> dict[str, Any]:
+    """A value a frame of each label; those that a trial lacks follow from what it has, or are not known."""
+    known = np.isfinite(labels.safety_margin)
+    missing = {"safety_margin_sigma": np.full(len(known), np.nan), "valid": known, "reason": ("",) * len(known)}
+    found = {name: getattr(labels, name) for name in (*LABEL_SIGNALS, *EXPORTED_OPTIONAL)}
+    found = {name: missing[name] if values is None else values for name, values in found.items()}
+    return {**found, "contact_state": [str(state) for state in labels.contact_state]}
+
+
+def encode_batches(frames: Iterator[Frame]) -> Iterator[tuple[list[Frame], Iterator[bytes]]]:
+    """Frames and their PNG, those of a batch encoded side by side."""
+    with ThreadPoolExecutor() as pool:
+        while batch := list(islice(frames, _BATCH)):
+            yield batch, pool.map(encode_png, batch)
 
 
 @dataclass(frozen=True, kw_only=True)
