@@ -291,7 +291,8 @@ def _stored_images(path: Path, key: str, episode: int, *, frame_size: tuple[int,
         (fragment,) = ds.dataset(path).get_fragments()
         groups = [group.id for group in fragment.subset(pc.field("episode_index") == episode).row_groups]
         for batch in file.iter_batches(batch_size=16, row_groups=groups, columns=["episode_index", key]):
-            for cell in batch.filter(pc.equal(batch.column("episode_index"), episode)).column(key).to_pylist():
+            own = batch.column("episode_index").to_numpy() == episode
+            for cell in batch.filter(pa.array(own)).column(key).to_pylist():
                 where = f"frame {index} of {key}, episode {episode} of {path},"
                 data = cell.get("bytes") if isinstance(cell, dict) else None
                 if not isinstance(data, bytes) or not data:

@@ -3,12 +3,14 @@
 import os
 import sys
 from array import array
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, partial
 from importlib import import_module
 from importlib.util import find_spec, module_from_spec
+from itertools import accumulate
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -34,7 +36,6 @@ from sliplens.recordings.formats.mcap import (
 )
 from sliplens.recordings.formats.stored import FORMAT, ExportedTrial
 from sliplens.recordings.formats.tables import trial_name
-from sliplens.recordings.trial import LABEL_SIGNALS
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
@@ -161,9 +162,7 @@ def _require_room(chunks: Iterable[Any]) -> None:
     # at the same moment what begins counts before what ends
     begins = [(chunk.message_start_time, 0, chunk.uncompressed_size) for chunk in chunks]
     ends = [(max(chunk.message_start_time, chunk.message_end_time), 1, -chunk.uncompressed_size) for chunk in chunks]
-    held = 0
-    for _, _, size in sorted(begins + ends):
-        held += size
+    for held in accumulate(size for _, _, size in sorted(begins + ends)):
         if held > MOST_BYTES:
             raise _beyond("a chunk, or chunks of the same moment together,", MOST_BYTES)
 
@@ -309,107 +308,82 @@ def read_trial_bag(path: Path, topics: dict[str, str]) -> Capture | None:
         raise RecordingError(
             f"{path} lacks {', '.join(f'{topic} ({TOPICS[topic]})' for topic in missing)}; export the trial again"
         )
-    found = _scan(path, needed, images=IMAGE, wrenches=WRENCH, kinds=TOPICS)
+    found, size = _scan(path, needed, images=IMAGE, kinds=TOPICS)
     _require_whole(found, about, path)
-    assert found.size is not None
+    assert size is not None
+    numbers = dict(zip(NUMBERS, found[LABELS].table(len(NUMBERS)).T.copy(), strict=True))
+    time_s = numbers.pop("time_s")
+    if not np.isfinite(time_s).all():
+        raise RecordingError(f"{LABELS} of {path} has a time that is not a number; export the trial again")
+    valid, states, reasons = zip(*found[LABELS].words, strict=True)
     source = f"{about.trial} of {path}"
     return Capture(
         **vars(about.facts),
         source=source,
-        frame_time_s=found.column("time_s"),
-        frame_size=found.size,
+        frame_time_s=time_s,
+        frame_size=size,
         read_frames=partial(_read_frames, path, IMAGE, kinds=TOPICS),
-        forces=found.forces(np.array(found.force_time_s), source=about.force_source) if about.force_samples else None,
-        labels=about.labels(
-            {name: found.column(name) for name in (*LABEL_SIGNALS, "safety_margin_sigma")},
-            states=tuple(found.states),
-            valid=np.array(found.valid, dtype=bool),
-            reasons=tuple(found.reasons),
-            source=source,
-        ),
-        reference=found.reference,
+        forces=Forces(
+            time_s=found[WRENCH_TIMES].table(1)[:, 0], force_n=found[WRENCH].table(3), source=about.force_source
+        )
+        if about.force_samples
+        else None,
+        labels=about.labels(numbers, states=states, valid=np.array(valid), reasons=reasons, source=source),
+        reference=found[REFERENCE].image,
         split=about.split,
         simulated=about.simulated,
     )
 
 
 @dataclass(kw_only=True)
-class _Stamps:
-    """Times of the messages of a topic in nanoseconds, 16 bytes each: an hour at 1 kHz is 58 MB."""
+class _Topic:
+    """What the messages of a topic hold besides pixels of frames; stamps of an hour at 1 kHz are 58 MB."""
 
-    topic: str
     header_ns: array = field(default_factory=lambda: array("q"))
     bag_ns: array = field(default_factory=lambda: array("q"))
-
-    def append(self, message: Any, bag_ns: int) -> None:
-        stamp = message.header.stamp
-        self.header_ns.append(stamp.sec * 1_000_000_000 + stamp.nanosec)
-        self.bag_ns.append(bag_ns)
+    numbers: array = field(default_factory=lambda: array("d"))
+    words: list[tuple[bool, str, str]] = field(default_factory=list)
+    image: Frame | None = None
 
     def times(self, clock: str) -> Int64[np.ndarray, " messages"]:
         return np.array(self.header_ns if clock == "header" else self.bag_ns, dtype=np.int64)
 
-
-@dataclass(kw_only=True)
-class _Scan:
-    """What a bag holds besides pixels; labels, reference and exact times only where `write_mcap` wrote it."""
-
-    frames: _Stamps
-    wrenches: _Stamps
-    labels: _Stamps = field(default_factory=lambda: _Stamps(topic=LABELS))
-    size: tuple[int, int] | None = None
-    force_n: array = field(default_factory=lambda: array("d"))
-    force_time_s: array = field(default_factory=lambda: array("d"))
-    reference: Frame | None = None
-    references: int = 0
-    numbers: array = field(default_factory=lambda: array("d"))
-    valid: list[bool] = field(default_factory=list)
-    states: list[str] = field(default_factory=list)
-    reasons: list[str] = field(default_factory=list)
-
-    def add_label(self, message: Any) -> None:
-        self.numbers.extend(getattr(message, name) for name in NUMBERS)
-        self.valid.append(bool(message.valid))
-        # few words, and often
-        self.states.append(sys.intern(message.contact_state))
-        self.reasons.append(sys.intern(message.invalid_reason))
-
-    def column(self, name: str) -> Float[np.ndarray, " frames"]:
-        """One of `NUMBERS`."""
-        return np.array(self.numbers, dtype=np.float64).reshape(-1, len(NUMBERS))[:, NUMBERS.index(name)].copy()
-
-    def forces(self, time_s: Float[np.ndarray, " samples"], *, source: str) -> Forces:
-        return Forces(time_s=time_s, force_n=np.array(self.force_n).reshape(-1, 3), source=source)
+    def table(self, width: int) -> Float[np.ndarray, "rows width"]:
+        return np.array(self.numbers, dtype=np.float64).reshape(-1, width)
 
 
 def _scan(
-    path: Path, topics: Collection[str], *, images: str, wrenches: str | None, kinds: Mapping[str, str] | None = None
-) -> _Scan:
-    """Read stamps, sizes and forces, but no pixel of a frame."""
-    found = _Scan(frames=_Stamps(topic=images), wrenches=_Stamps(topic=wrenches or "no topic"))
-    for topic, bag_ns, message in bag_messages(path, topics, kinds=kinds):
-        if topic == images:
-            where = _where(len(found.frames.bag_ns), images, path)
-            size = image_size(message, where=where)
-            if found.size is not None and size != found.size:
-                before = f"{found.size[0]} x {found.size[1]}"
+    path: Path, topics: Collection[str], *, images: str, kinds: Mapping[str, str] | None = None
+) -> tuple[dict[str, _Topic], tuple[int, int] | None]:
+    """Stamps, forces and labels, and the size of the frames, but no pixel of one; of `TOPICS` where `kinds` tells it."""
+    found, size = defaultdict(_Topic), None
+    for name, bag_ns, message in bag_messages(path, topics, kinds=kinds):
+        topic = found[name]
+        if name == images:
+            where = _where(len(topic.bag_ns), images, path)
+            before, size = size, image_size(message, where=where)
+            if before not in {None, size}:
                 cure = "cut the bag there" if kinds is None else "export the trial again"
-                raise RecordingError(f"{where} is {size[0]} x {size[1]} pixels, those before it are {before}; {cure}")
-            found.size = size
-            found.frames.append(message, bag_ns)
-        elif topic == wrenches:
-            found.wrenches.append(message, bag_ns)
+                raise RecordingError(
+                    f"{where} is {size[0]} x {size[1]} pixels, those before it are {before[0]} x {before[1]}; {cure}"
+                )
+        elif message.__msgtype__ == TOPICS[WRENCH]:
             force = message.wrench.force
-            found.force_n.extend((force.x, force.y, force.z))
-        elif topic == LABELS:
-            found.labels.append(message, bag_ns)
-            found.add_label(message)
-        elif topic == WRENCH_TIMES:
-            found.force_time_s.extend(message.time_s.tolist())
+            topic.numbers.extend((force.x, force.y, force.z))
+        elif name == LABELS:
+            topic.numbers.extend(getattr(message, number) for number in NUMBERS)
+            # few words, and often
+            topic.words.append(
+                (bool(message.valid), sys.intern(message.contact_state), sys.intern(message.invalid_reason))
+            )
+        elif name == WRENCH_TIMES:
+            topic.numbers.extend(message.time_s.tolist())
         else:
-            found.references += 1
-            found.reference = image_pixels(message, where=f"{REFERENCE} of {path}")
-    return found
+            topic.image = image_pixels(message, where=f"{REFERENCE} of {path}")
+        stamp = message.header.stamp
+        topic.header_ns.append(stamp.sec * 1_000_000_000 + stamp.nanosec)
+        topic.bag_ns.append(bag_ns)
+    return found, size
 
 
 def _read_frames(path: Path, images: str, *, kinds: Mapping[str, str] | None = None) -> Iterator[Frame]:
@@ -417,28 +391,22 @@ def _read_frames(path: Path, images: str, *, kinds: Mapping[str, str] | None = N
         yield image_pixels(message, where=_where(index, images, path))
 
 
-def _require_whole(found: _Scan, about: ExportedTrial, path: Path) -> None:
+def _require_whole(found: dict[str, _Topic], about: ExportedTrial, path: Path) -> None:
     """Check that all that was promised is there, and that labels belong to their frames."""
     counts = {
-        "reference frames": (found.references, 1),
-        "frames": (len(found.frames.bag_ns), about.frames),
-        "labels": (len(found.labels.bag_ns), about.frames),
-        "wrenches": (len(found.wrenches.bag_ns), about.force_samples),
-        "times of wrenches": (len(found.force_time_s), about.force_samples),
+        "reference frames": (len(found[REFERENCE].bag_ns), 1),
+        "frames": (len(found[IMAGE].bag_ns), about.frames),
+        "labels": (len(found[LABELS].bag_ns), about.frames),
+        "wrenches": (len(found[WRENCH].bag_ns), about.force_samples),
+        "times of wrenches": (len(found[WRENCH_TIMES].numbers), about.force_samples),
     }
     for name, (count, promised) in counts.items():
         if count != promised:
             raise RecordingError(f"{path} has {count} {name}, {TRIAL} promises {promised}; export the trial again")
-    apart = found.frames.times("header") != found.labels.times("header")
+    apart = found[IMAGE].times("header") != found[LABELS].times("header")
     if apart.any():
         at = int(np.argmax(apart))
         raise RecordingError(f"label {at} of {path} has another stamp than its frame; export the trial again")
-    if not np.isfinite(found.column("time_s")).all():
-        raise RecordingError(f"{LABELS} of {path} has a time that is not a number; export the trial again")
-
-
-_IMAGES = (RAW, COMPRESSED)
-_WRENCHES = ("geometry_msgs/msg/WrenchStamped",)
 
 
 def read_rosbag(path: Path, *, image_topic: str | None = None, wrench_topic: str | None = None) -> Capture:
@@ -462,27 +430,30 @@ def read_rosbag(path: Path, *, image_topic: str | None = None, wrench_topic: str
             f"{path} has no topic with images ({' or '.join(_IMAGES)}); record the camera too "
             f"(it has {_listed(topics)})"
         )
-    found = _scan(path, {images, wrenches} - {None}, images=images, wrenches=wrenches)
+    found, size = _scan(path, {images, wrenches} - {None}, images=images)
     notes = []
     if wrenches is None:
         notes.append(f"There are no forces: the bag has no topic of {_WRENCHES[0]}.")
-    elif wrench_topic is None and not found.wrenches.bag_ns:
+    elif wrench_topic is None and wrenches not in found:
         notes.append(f"There are no forces: {wrenches} has no message.")
         wrenches = None
-    if found.size is None:
+    if size is None:
         raise RecordingError(f"{images} of {path} has no frame; leave it out or record it again")
-    clock, why = _choose_clock(found)
-    notes += why
-    frame_ns, wrench_ns = found.frames.times(clock), found.wrenches.times(clock)
-    zero = min(series[0] for series in (frame_ns, wrench_ns) if len(series))
+    clock, why = _choose_clock({name: found[name] for name in (images, wrenches) if name in found})
+    times = {name: topic.times(clock) for name, topic in found.items()}
+    zero = min(series[0] for series in times.values())
+    forces = None
+    if wrenches is not None:
+        time_s = (times.get(wrenches, np.zeros(0)) - zero) / 1e9
+        forces = Forces(time_s=time_s, force_n=found[wrenches].table(3), source=f"{wrenches} of {path}")
     return Capture(
         trial=trial_name(path.stem if path.is_file() else path.resolve().name),
         source=f"{images} of {path}",
-        frame_time_s=(frame_ns - zero) / 1e9,
-        frame_size=found.size,
+        frame_time_s=(times[images] - zero) / 1e9,
+        frame_size=size,
         read_frames=partial(_read_frames, path, images),
-        forces=found.forces((wrench_ns - zero) / 1e9, source=f"{wrenches} of {path}") if wrenches else None,
-        notes=tuple(notes),
+        forces=forces,
+        notes=(*notes, *why),
     )
 
 
@@ -502,25 +473,25 @@ def _choose(topics: dict[str, str], named: str | None, *, types: tuple[str, ...]
     return next(iter(fitting), None)
 
 
-def _choose_clock(found: _Scan) -> tuple[str, list[str]]:
-    """Clock that both topics have, "header" or "bag", and a note where it is not the header's."""
-    for stamps in (found.frames, found.wrenches):
-        missing = stamps.header_ns.count(0)
+def _choose_clock(topics: dict[str, _Topic]) -> tuple[str, list[str]]:
+    """Clock that all topics have, "header" or "bag", and a note where it is not the header's."""
+    for name, topic in topics.items():
+        missing = topic.header_ns.count(0)
         if missing:
             return "bag", [
-                f"{missing} of {len(stamps.header_ns)} messages of {stamps.topic} have no header stamp: "
+                f"{missing} of {len(topic.header_ns)} messages of {name} have no header stamp: "
                 "times are those at which the bag received the messages."
             ]
-    if found.wrenches.bag_ns and not _meet("header", found) and _meet("bag", found):
+    if len(topics) == 2 and not _meet("header", *topics.values()) and _meet("bag", *topics.values()):
         return "bag", [
-            f"The header stamps of {found.frames.topic} and {found.wrenches.topic} are of different clocks: "
+            f"The header stamps of {' and '.join(topics)} are of different clocks: "
             "times are those at which the bag received the messages."
         ]
     return "header", []
 
 
-def _meet(clock: str, found: _Scan) -> bool:
-    frames, wrenches = found.frames.times(clock), found.wrenches.times(clock)
+def _meet(clock: str, *topics: _Topic) -> bool:
+    frames, wrenches = (topic.times(clock) for topic in topics)
     return bool(frames[0] <= wrenches[-1] and wrenches[0] <= frames[-1])
 
 
