@@ -311,7 +311,7 @@ def read_trial_bag(path: Path, topics: dict[str, str]) -> Capture | None:
     found, size = _scan(path, needed, images=IMAGE, kinds=TOPICS)
     _require_whole(found, about, path)
     assert size is not None
-    numbers = dict(zip(NUMBERS, found[LABELS].table(len(NUMBERS)).T.copy(), strict=True))
+    numbers: dict[str, np.ndarray] = dict(zip(NUMBERS, found[LABELS].table(len(NUMBERS)).T.copy(), strict=True))
     time_s = numbers.pop("time_s")
     if not np.isfinite(time_s).all():
         raise RecordingError(f"{LABELS} of {path} has a time that is not a number; export the trial again")
@@ -355,14 +355,14 @@ class _Topic:
 def _scan(
     path: Path, topics: Collection[str], *, images: str, kinds: Mapping[str, str] | None = None
 ) -> tuple[dict[str, _Topic], tuple[int, int] | None]:
-    """Stamps, forces and labels, and the size of the frames, but no pixel of one; of `TOPICS` where `kinds` tells it."""
+    """Stamps, forces and labels, and the size of the frames, but no pixel of one."""
     found, size = defaultdict(_Topic), None
     for name, bag_ns, message in bag_messages(path, topics, kinds=kinds):
         topic = found[name]
         if name == images:
             where = _where(len(topic.bag_ns), images, path)
             before, size = size, image_size(message, where=where)
-            if before not in {None, size}:
+            if before is not None and before != size:
                 cure = "cut the bag there" if kinds is None else "export the trial again"
                 raise RecordingError(
                     f"{where} is {size[0]} x {size[1]} pixels, those before it are {before[0]} x {before[1]}; {cure}"
@@ -407,6 +407,9 @@ def _require_whole(found: dict[str, _Topic], about: ExportedTrial, path: Path) -
     if apart.any():
         at = int(np.argmax(apart))
         raise RecordingError(f"label {at} of {path} has another stamp than its frame; export the trial again")
+
+
+_IMAGES, _WRENCHES = (RAW, COMPRESSED), ("geometry_msgs/msg/WrenchStamped",)
 
 
 def read_rosbag(path: Path, *, image_topic: str | None = None, wrench_topic: str | None = None) -> Capture:
