@@ -11,7 +11,7 @@ from sliplens.errors import InputError
 from sliplens.faithfulness.deletion import deletion_order
 from sliplens.plots.style import ORANGE, SKY
 from sliplens.report import load_results
-from sliplens.report.pictures import plate_removal
+from sliplens.report.pictures import paint_effects, plate_removal
 from sliplens.report.plates import (
     Cell,
     Plate,
@@ -23,7 +23,6 @@ from sliplens.report.plates import (
     told_frame,
     write_plates,
 )
-from sliplens.report.state_figures import paint_effects
 from sliplens.report.tables import table_scores
 
 from .study_results import METHODS, Made, write_choice, write_faithfulness

@@ -4,15 +4,26 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from PIL import Image
+from scipy.ndimage import center_of_mass
 
+from sliplens.errors import InputError
+from sliplens.markers import DisplacementField, interpolate_field
+from sliplens.plots.contact_sheet import TIMES, brighten, brightening
 from sliplens.plots.errors import MARGIN_LABEL
 from sliplens.plots.layout import place_axes
+from sliplens.plots.markers import ARROWS, MarkedFrame, draw_fields_beside_saliency, plot_arrows, plot_field
+from sliplens.plots.saliency import DIM, lightness
 from sliplens.plots.strip import draw_strip
 from sliplens.plots.style import (
     BLUE,
     CONTROLS,
     GREY,
+    ORANGE,
+    SKY,
     VERMILLION,
     drawing_style,
     input_name,
@@ -25,6 +36,7 @@ from sliplens.plots.style import (
     signed,
     source_name,
 )
+from sliplens.report.comparisons import tell_interval
 from sliplens.report.plates import (
     CELL_IN,
     THESIS_LEVEL,
@@ -41,9 +53,11 @@ from sliplens.report.plates import (
     told_frame,
 )
 from sliplens.report.results import Results
+from sliplens.report.verdict import rank_methods
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionCurve, DeletionScores
 from sliplens.results.strip import Strip
+from sliplens.results.study import StateFrame, States, Truth
 
 SHARES = (0.01, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Of the image, that are gone in the columns of a figure."""
@@ -57,12 +71,19 @@ _FIGURES = {
     "poly-cam": "fig-21-removal-poly-cam",
     "poly-cam-thesis": "fig-21-removal-poly-cam-thesis",
 }
+_SALIENCY_COLUMNS = (
+    "input", "method", "frame_id", "level", "safety_margin", "prediction", "share_above_half", "centre_x_px",
+    "centre_y_px",
+)  # fmt: skip
+_SURE = 0.2  # confidence of a field below which it is a guess, as `plot_field` draws it
+_FEWEST_STILL_PX = 0.3
+_TRUTH_FRAMES = _TRUTH_METHODS = 3
 _STATE_FIGURES = {"difference": "fig-15-methods-difference", "raw": "fig-16-methods-raw"}
 
 
 def plate_methods(results: Results) -> Plate | None:
     """Draw the methods beside each other at one margin, a row an input (thesis, Fig. 8); None without maps."""
-    rows, numbers, told = [], _Saliencies(), []
+    rows, numbers, told, methods = [], [], [], shown_methods(results)
     for name in inputs_in_order(results.inputs)[::-1]:
         explained = explained_of(results, name)
         frames = [] if explained is None else shown_frames(results, explained)
@@ -71,27 +92,28 @@ def plate_methods(results: Results) -> Plate | None:
         frame = min(frames, key=lambda one: abs(one.level - THESIS_LEVEL) if one.level is not None else 1.0)
         own = explained.frames[frame.index]
         pictures, called = bright_pictures(explained, [frame.index])
-        cells = [Cell(picture=pictures[frame.index], words=_answer(explained, frame.index))]
-        for method in shown_methods(results):
+        picture = pictures[frame.index]
+        cells = [Cell(picture=picture, words=_answer(explained, frame.index))]
+        for method in methods:
             saliency = explained.saliency.get(method)
-            if saliency is None:
-                cells.append(Cell(picture=None))
-                continue
-            cells.append(Cell(picture=show_map(pictures[frame.index], saliency[frame.index])))
-            numbers.add(explained, method, frame)
+            cells.append(Cell(picture=saliency if saliency is None else show_map(picture, saliency[frame.index])))
+            numbers += [] if saliency is None else [_measured(explained, method, frame)]
         rows.append((f"{short_input_name(name)}\n({called.lower()})", cells))
         answer = f"true Γ {percent(own.safety_margin)}, read {percent(own.prediction)}"
         told.append(f"{short_input_name(name).lower()} {own.id}, {answer}")
     if not rows:
         return None
-    heads = ["Input", *(method_name(method) for method in shown_methods(results))]
+    heads = ["Input", *(method_name(method) for method in methods)]
+    spread = ", ".join(
+        f"{method_name(row[1])} {percent(row[6])} ({short_input_name(row[0]).lower()})" for row in numbers
+    )
     return Plate(
         name="fig-08-methods",
         figure=draw_grid(rows, heads=heads, bar=True).figure,
         alt=f"Saliency maps of {listed(heads[1:])} side by side; {'; '.join(told)}",
         caption=f"Methods beside each other on one frame near Γ {percent(THESIS_LEVEL)} ({'; '.join(told)}). Colours "
-        f"are relative to each map's own saliency. {numbers.tell_spread()}",
-        numbers=numbers.columns(),
+        f"are relative to each map's own saliency. Share of the image with a saliency above 0.5: {spread}.",
+        numbers=named_columns(_SALIENCY_COLUMNS, numbers),
         pixels=True,
     )
 
@@ -147,15 +169,19 @@ def _plate(explained: Explained, frames: list[ShownFrame], methods: list[str], *
     if not frames:
         return None
     trials = {explained.frames[one.index].trial for one in frames}
-    numbers = _Saliencies()
     pictures, called = bright_pictures(explained, [one.index for one in frames])
     rows = [(called, [Cell(picture=pictures[one.index], words=_answer(explained, one.index)) for one in frames])]
     for method in methods:
         maps = explained.saliency[method]
         cells = [Cell(picture=show_map(pictures[one.index], maps[one.index])) for one in frames]
         rows.append((method_name(method), cells))
-        for one in frames:
-            numbers.add(explained, method, one)
+    numbers = {method: [_measured(explained, method, one) for one in frames] for method in methods}
+    moves = ""
+    for method, measured in numbers.items():
+        known = [row[8] for row in measured if np.isfinite(row[8])]
+        moves += f", {method_name(method)} {signed(known[-1] - known[0], 0)}" if len(known) > 1 else ""
+    if moves:
+        moves = f"From the first to the last frame the centre of the saliency moves down by, in pixels: {moves[2:]}."
     answers = [explained.frames[one.index] for one in frames]
     errors = [abs(one.prediction - one.safety_margin) for one in answers if one.safety_margin is not None]
     off = f" The network is off by at most {100 * max(errors):.1f} percentage points on these frames." if errors else ""
@@ -166,8 +192,8 @@ def _plate(explained: Explained, frames: list[ShownFrame], methods: list[str], *
         f"{', '.join(percent(one.level) for one in frames)}",
         caption=f"{what}: {'one trial' if len(trials) == 1 else 'frames'} from full stick to full slip.{off} "
         "Colours are relative to each map's own saliency, so brightness does not compare between maps. "
-        f"{numbers.tell_travel(methods)}{_tell_blank(explained, frames, methods)}",
-        numbers=numbers.columns(),
+        f"{moves}{_tell_blank(explained, frames, methods)}",
+        numbers=named_columns(_SALIENCY_COLUMNS, [row for measured in numbers.values() for row in measured]),
         pixels=True,
     )
 
@@ -180,42 +206,14 @@ def _tell_blank(explained: Explained, frames: list[ShownFrame], methods: list[st
     return f" {maps} no colour: there the method finds nothing that speaks for the answer."
 
 
-class _Saliencies:
-    """Numbers of each map drawn: where its weight lies, and on how much of the image."""
-
-    def __init__(self) -> None:
-        self._rows: list[tuple[Any, ...]] = []
-
-    def add(self, explained: Explained, method: str, frame: ShownFrame) -> None:
-        own = explained.frames[frame.index]
-        saliency = explained.saliency[method][frame.index].astype(np.float64)
-        high, wide = saliency.shape
-        total = saliency.sum()
-        y, x = np.mgrid[:high, :wide]
-        right, down = (float((saliency * axis).sum() / total) if total > 0 else float("nan") for axis in (x, y))
-        label = float("nan") if own.safety_margin is None else own.safety_margin
-        above = float((saliency > 0.5).mean())
-        self._rows.append((explained.input, method, own.id, frame.level, label, own.prediction, above, right, down))
-
-    def columns(self) -> dict[str, list]:
-        names = (
-            "input", "method", "frame_id", "level", "safety_margin", "prediction", "share_above_half", "centre_x_px",
-            "centre_y_px",
-        )  # fmt: skip
-        return named_columns(names, self._rows)
-
-    def tell_spread(self) -> str:
-        parts = [f"{method_name(row[1])} {percent(row[6])} ({short_input_name(row[0]).lower()})" for row in self._rows]
-        return f"Share of the image with a saliency above 0.5: {', '.join(parts)}."
-
-    def tell_travel(self, methods: list[str]) -> str:
-        parts = []
-        for method in methods:
-            rows = [row for row in self._rows if row[1] == method and np.isfinite(row[8])]
-            if len(rows) > 1:
-                parts.append(f"{method_name(method)} {signed(rows[-1][8] - rows[0][8], 0)}")
-        head = "From the first to the last frame the centre of the saliency moves down by, in pixels:"
-        return f"{head} {', '.join(parts)}." if parts else ""
+def _measured(explained: Explained, method: str, frame: ShownFrame) -> tuple[Any, ...]:
+    """Numbers of a map drawn: where its weight lies, and on how much of the image."""
+    own = explained.frames[frame.index]
+    saliency = explained.saliency[method][frame.index].astype(np.float64)
+    down, right = center_of_mass(saliency) if saliency.sum() > 0 else (float("nan"),) * 2
+    label = float("nan") if own.safety_margin is None else own.safety_margin
+    above = float((saliency > 0.5).mean())
+    return explained.input, method, own.id, frame.level, label, own.prediction, above, float(right), float(down)
 
 
 def _answer(explained: Explained, index: int) -> str:
@@ -234,8 +232,7 @@ def plate_deletion(results: Results) -> Plate | None:
     for explained, scored, index in _materials(results):
         methods = [one for one in methods_in_order(scored.curves) if one in explained.saliency]
         if methods:
-            method = "poly-cam" if "poly-cam" in methods else methods[-1]
-            return _illustrate(explained, scored, method, index)
+            return _illustrate(explained, scored, "poly-cam" if "poly-cam" in methods else methods[-1], index)
     return None
 
 
@@ -402,3 +399,224 @@ def _tell_fall(explained: Explained, index: int, steps: list[tuple[int, float, f
         if share in _TOLD
     ]
     return "; ".join([f"whole y {percent(explained.frames[index].prediction)}", *parts])
+
+
+def plate_contact_states(states: States) -> Plate | None:
+    """Draw frame with arrows, field, and difference image, a column a contact state (thesis, Fig. 4).
+
+    None where no frame has markers enough for a field.
+    """
+    chosen = _one_a_state(states)
+    fields = {frame.id: _field(frame) for frame in chosen}
+    lengths = [_longest(field) for field in fields.values() if field is not None]
+    if not lengths:
+        return None
+    factor = brightening([frame.difference[None] for frame in chosen])
+    size = chosen[0].raw.shape[:2]
+    rows = [
+        (f"Camera, arrows\n{TIMES}\N{NO-BREAK SPACE}{ARROWS:g}", [Cell(picture=frame.raw) for frame in chosen]),
+        ("Field of the\nmarkers", [Cell(picture=None if fields[frame.id] is None else frame.raw) for frame in chosen]),
+        (
+            "Difference" if factor == 1 else f"Difference\n{TIMES}\N{NO-BREAK SPACE}{factor:g}",
+            [Cell(picture=brighten(frame.difference, factor)) for frame in chosen],
+        ),
+    ]
+    heads = [f"{frame.contact_state.capitalize()}\nΓ {percent(frame.safety_margin)}" for frame in chosen]
+    grid = draw_grid(rows, heads=heads, below_in=0.55, cell_in=1.3 * CELL_IN)
+    top = max(*lengths, _FEWEST_STILL_PX)
+    mappable = None
+    with drawing_style():
+        for column, frame in enumerate(chosen):
+            _bare(plot_arrows(frame.raw, frame.rest_px, frame.now_px - frame.rest_px, ax=grid.axes[0][column]))
+            field = fields[frame.id]
+            if field is not None:
+                grid.axes[1][column].clear()
+                mappable = plot_field(field, size=size, ax=grid.axes[1][column], longest_px=top)
+                _bare(grid.axes[1][column])
+        assert mappable is not None  # there is a field
+        bar = place_axes(grid.figure, 1.25, grid.bottom_in + 0.05, 2.6, 0.12)
+        grid.figure.colorbar(mappable, cax=bar, orientation="horizontal", label="Displacement (px)")
+    told = "; ".join(_tell_motion(frame, fields[frame.id]) for frame in chosen)
+    return Plate(
+        name="fig-04-states",
+        figure=grid.figure,
+        alt=f"Camera image, displacement field and difference image at {listed(heads).replace(chr(10), ', ')}",
+        caption=f"What a touch looks like, trial {states.trial}: camera image with the markers' displacement (from "
+        f"{states.markers_from}), the field between them, and the difference image. Largest displacement: {told}.",
+        numbers=_marker_numbers(chosen),
+        pixels=True,
+    )
+
+
+def plate_fields_beside_saliency(results: Results) -> Plate | None:
+    """Draw raw frame, field and Poly-CAM side by side, a row a state (thesis, Fig. 12); None without all three."""
+    states, explained = results.study.states, explained_of(results, "raw")
+    if states is None or explained is None or "poly-cam" not in explained.saliency:
+        return None
+    known = {explained.frames[one.index].id: one for one in shown_frames(results, explained)}
+    marked, rows = [], []
+    for frame in states.frames:
+        field = _field(frame)
+        if frame.id not in known or field is None:
+            continue
+        fitted = _resized(explained.saliency["poly-cam"][known[frame.id].index], frame.raw.shape[:2])
+        title = f"Γ {percent(frame.safety_margin)}"
+        marked.append(MarkedFrame(title=title, frame=frame.raw, field=field, saliency=fitted))
+        rows.append((frame.id, frame.safety_margin, _longest(field), _share_on_moving(fitted, field)))
+    if not marked:
+        return None
+    shares = ", ".join(f"{percent(share)} at Γ {percent(margin)}" for _, margin, _, share in rows)
+    return Plate(
+        name="fig-12-poly-cam-raw",
+        figure=draw_fields_beside_saliency(marked),
+        alt=f"Raw frame, displacement field and Poly-CAM map side by side at {listed([one.title for one in marked])}",
+        caption="Poly-CAM on raw images beside the displacement of the markers. Share of the saliency that lies where "
+        f"the skin moves by more than half of that frame's largest displacement: {shares}.",
+        numbers=named_columns(("frame_id", "safety_margin", "moves_px", "saliency_moves_share"), rows),
+        pixels=True,
+    )
+
+
+def _one_a_state(states: States) -> list[StateFrame]:
+    by_state: dict[str, list[StateFrame]] = {}
+    for frame in sorted(states.frames, key=lambda one: -one.level):
+        by_state.setdefault(frame.contact_state, []).append(frame)
+    return [frames[len(frames) // 2] for frames in by_state.values()]
+
+
+def _field(frame: StateFrame) -> DisplacementField | None:
+    try:
+        return interpolate_field(frame.rest_px, frame.now_px - frame.rest_px, size=frame.raw.shape[:2])
+    except InputError:
+        return None  # too few markers were followed into this frame
+
+
+def _longest(field: DisplacementField) -> float:
+    length = np.linalg.norm(field.displacement_px, axis=-1)[field.confidence > _SURE]
+    return float(length.max()) if len(length) else 0.0
+
+
+def _share_on_moving(saliency: np.ndarray, field: DisplacementField) -> float:
+    length = np.linalg.norm(field.displacement_px, axis=-1) * (field.confidence > _SURE)
+    high, wide = saliency.shape
+    rows = np.abs(np.arange(high)[:, None] - field.y_px).argmin(axis=1)
+    columns = np.abs(np.arange(wide)[:, None] - field.x_px).argmin(axis=1)
+    moving = (length > length.max() / 2)[rows][:, columns]
+    total = float(saliency.sum())
+    return float(saliency[moving].sum() / total) if total > 0 else float("nan")
+
+
+def _resized(saliency: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Network pixels to camera pixels."""
+    return np.clip(np.asarray(Image.fromarray(saliency).resize(size[::-1], Image.Resampling.BILINEAR)), 0, 1)
+
+
+def _tell_motion(frame: StateFrame, field: DisplacementField | None) -> str:
+    told = "unknown" if field is None else f"{_longest(field):.1f} px"
+    return f"{told} at {frame.contact_state}, Γ {percent(frame.safety_margin)}"
+
+
+def _marker_numbers(frames: list[StateFrame]) -> dict[str, np.ndarray]:
+    counts = [len(frame.rest_px) for frame in frames]
+    rest, now = (np.concatenate([getattr(frame, name) for frame in frames]) for name in ("rest_px", "now_px"))
+    names = {"frame_id": "id", "contact_state": "contact_state", "safety_margin": "safety_margin"}
+    told = {name: np.repeat([getattr(frame, own) for frame in frames], counts) for name, own in names.items()}
+    return told | dict(zip(("rest_x_px", "rest_y_px", "x_px", "y_px"), (*rest.T, *now.T), strict=True))
+
+
+def _bare(ax: Axes) -> None:
+    ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
+    ax.grid(visible=False)
+
+
+def plate_truth(results: Results, name: str) -> Plate | None:
+    """Draw frames, effects of each marker on answer and margin, and the best methods' maps; None without the truth."""
+    truth, explained = results.study.truth.get(name), explained_of(results, name)
+    if truth is None or explained is None:
+        return None
+    places = {frame.id: index for index, frame in enumerate(explained.frames)}
+    chosen = _spread_out([one for one in truth.frame_ids if one in places], explained, places)
+    if not chosen:
+        return None
+    methods = _best_methods(results, name, explained)
+    pictures, called = bright_pictures(explained, [places[one] for one in chosen])
+    rows = []
+    for frame_id in chosen:
+        index, row = places[frame_id], truth.frame_ids.index(frame_id)
+        picture, own = pictures[index], explained.frames[index]
+        effects = (truth.network_maps[row], truth.margin_maps[row])
+        cells = [
+            Cell(picture=picture),
+            *(
+                Cell(picture=paint_effects(picture, one), words=f"up to {100 * np.abs(one).max():.1f} points")
+                for one in effects
+            ),
+            *(Cell(picture=show_map(picture, explained.saliency[method][index])) for method in methods),
+        ]
+        rows.append((f"Γ {percent(own.safety_margin)}\nread {percent(own.prediction)}", cells))
+    heads = [called, "What moves the\nanswer", "What moves the\nmargin", *(method_name(one) for one in methods)]
+    return Plate(
+        name=f"truth-{name}",
+        figure=draw_grid(rows, heads=heads, bar=True).figure,
+        alt=f"{input_name(name)}: effect of each marker on the answer and on the best reading of the margin beside the "
+        f"maps of {listed([method_name(one) for one in methods])}",
+        caption=f"{input_name(name)}: what each marker does to the network's answer and to the best reading of the "
+        "margin, in percentage points (value less value with that marker put back where it rested; orange lowers, blue "
+        "raises, full colour at the largest of each picture), beside the best methods' maps. "
+        f"{_tell_match(truth, methods)}",
+        numbers={
+            **{own: getattr(truth.effects, own) for own in ("frame_id", "marker", "x_px", "y_px")},
+            "network_effect": truth.effects.network,
+            "margin_effect": truth.effects.margin,
+            "state": truth.effects.state,
+        },
+        pixels=True,
+    )
+
+
+def paint_effects(
+    picture: UInt8[np.ndarray, "height width 3"], effects: Float[np.ndarray, "rows columns"]
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Lay signed effects over a picture in dimmed grey: orange below zero, blue above, the stronger the less grey.
+
+    Effects of another height and width than the picture's are repeated.
+    """
+    places = [np.arange(side) * count // side for side, count in zip(picture.shape, effects.shape, strict=False)]
+    fitted = effects[np.ix_(*places)].astype(np.float64)
+    size = np.abs(fitted).max()
+    value = fitted / size if size > 0 else fitted
+    grey = (DIM * lightness(picture))[..., None]
+    alpha = np.abs(value)[..., None]
+    # bright on dark, and told apart under every common colour blindness
+    colour = np.where(value[..., None] < 0, to_rgb(ORANGE), to_rgb(SKY))
+    mixed = (1 - alpha) * grey + alpha * colour
+    return np.round(255 * mixed).astype(np.uint8)
+
+
+def _spread_out(ids: list[str], explained: Explained, places: dict[str, int]) -> list[str]:
+    """Pick a few frames from high to low margin, by their labels."""
+    known = [one for one in ids if explained.frames[places[one]].safety_margin is not None]
+    ranked = sorted(known, key=lambda one: -(explained.frames[places[one]].safety_margin or 0.0))
+    if len(ranked) <= _TRUTH_FRAMES:
+        return ranked
+    return [ranked[place] for place in np.linspace(0, len(ranked) - 1, _TRUTH_FRAMES).round().astype(int)]
+
+
+def _best_methods(results: Results, name: str, explained: Explained) -> list[str]:
+    faithful = results.study.faithfulness.get(name)
+    ranked = [] if faithful is None else [one.method for one in rank_methods(faithful)]
+    known = methods_in_order(set(explained.saliency) - set(CONTROLS))
+    return [*(one for one in ranked if one in known), *(one for one in known if one not in ranked)][:_TRUTH_METHODS]
+
+
+def _tell_match(truth: Truth, methods: list[str]) -> str:
+    parts = [
+        f"{method_name(one)} {signed(value, 2)}"
+        for one in methods
+        if one in truth.methods and (value := truth.methods[one].spearman_network) is not None
+    ]
+    told = f"Spearman's correlation with what moves the answer: {', '.join(parts)}." if parts else ""
+    gap = truth.network_against_margin
+    if gap is not None:
+        told += f" What moves the answer and what moves the margin correlate by {tell_interval(gap, digits=2)}."
+    return told.strip()

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sliplens.plots.style import input_name, inputs_in_order
-from sliplens.report import charts, pictures, state_figures, tables
+from sliplens.report import charts, pictures, tables
 from sliplens.report.claims import Claim, judge_claims
 from sliplens.report.plates import Plate, explained_of
 from sliplens.report.results import Results
@@ -119,7 +119,7 @@ def _randomisation(results: Results, _: np.random.Generator) -> Iterable[Block |
 def _maps(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
     study = results.study
     if study.states is not None:
-        yield state_figures.plate_contact_states(study.states)
+        yield pictures.plate_contact_states(study.states)
         yield _notes("Markers that could not be followed", study.states.untracked, tone="caution")
     yield pictures.plate_methods(results)
     for name in _names(results.inputs):
@@ -128,7 +128,7 @@ def _maps(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
             yield pictures.plate_states(results, explained)
             yield _alarms(results, name, "explain")
     yield pictures.plate_poly_cam(results) if study else None
-    yield state_figures.plate_fields_beside_saliency(results)
+    yield pictures.plate_fields_beside_saliency(results)
     yield tables.table_looks(study.map_quality) if study.map_quality else None
 
 
@@ -152,7 +152,7 @@ def _cost(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
 def _truth(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
     found = results.study.truth
     for name in _names(found):
-        yield state_figures.plate_truth(results, name)
+        yield pictures.plate_truth(results, name)
         yield tables.table_localisation(found[name])
         yield tables.table_meta(found[name])
         yield _notes(f"How this was measured, {input_name(name).lower()}", [found[name].summary])
