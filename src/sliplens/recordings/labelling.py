@@ -79,10 +79,10 @@ class FrictionEstimate:
     """Lower end of the coefficient's 68 % interval."""
     high: float
     """Upper end of the coefficient's 68 % interval."""
-    onset_s: float | None
+    onset_s: float | None = None
     """First gross slip, on the force sensor's clock; None where it is not known to slip."""
-    found: Found
-    method: str
+    found: Found = Found.DECLARED
+    method: str = "given by hand"
     """Words for people."""
     onset_sigma_s: float | None = None
     """Standard uncertainty of the onset; None where it is not known."""
@@ -107,7 +107,13 @@ class FrictionEstimate:
 
 @dataclass(frozen=True, kw_only=True)
 class Lag:
-    """Time by which the camera's stamps are later than the force sensor's, for the same event."""
+    """Time by which the camera's stamps are later than the force sensor's, for the same event.
+
+    Raises
+    ------
+    RecordingError
+        If it is no finite number, or its uncertainty is negative.
+    """
 
     lag_s: float
     """Positive where the camera is late; an event stamped t by the camera is t - lag_s to the force sensor."""
@@ -117,6 +123,13 @@ class Lag:
     """Correlation coefficient of image motion and force rate at this lag; None where it was given by hand."""
     doubt: str = ""
     """Why the lag cannot be told from this trial; empty where it can."""
+
+    def __post_init__(self) -> None:
+        """Check what can be given wrongly."""
+        if not (np.isfinite(self.lag_s) and self.sigma_s >= 0):
+            raise RecordingError(
+                f"a lag of {self.lag_s:g} s with an uncertainty of {self.sigma_s:g} s cannot be; give it in seconds"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

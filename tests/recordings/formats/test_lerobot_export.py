@@ -21,7 +21,7 @@ from sliplens.recordings.formats.lerobot_export import DataFiles, PixelCount, nu
 from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.importing import import_trial
 from sliplens.recordings.labelling import Clip, ForceAxes, Found, LabelBasis, Labelling, Lag, ReferenceChoice
-from sliplens.recordings.labels import given_friction
+from sliplens.recordings.labels import FrictionEstimate
 from sliplens.recordings.store import forces_path, load_recording, save_forces, save_recording
 from sliplens.recordings.trial import Labels
 
@@ -73,7 +73,7 @@ LABELLING = Labelling(
             sign_found=Found.DECLARED,
             tare_found=Found.ASSUMED,
         ),
-        friction=given_friction(0.3, low=0.2, high=0.4),
+        friction=FrictionEstimate(mu=0.3, low=0.2, high=0.4),
         friction_change=0.0,
         slip_s=None,
         lag=Lag(lag_s=0.1, sigma_s=1 / 3),

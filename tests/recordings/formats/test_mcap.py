@@ -22,7 +22,7 @@ from sliplens.recordings.formats.rosbag import read_rosbag
 from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.importing import import_trial
 from sliplens.recordings.labelling import Clip, ForceAxes, Found, LabelBasis, Labelling, Lag, ReferenceChoice
-from sliplens.recordings.labels import given_friction
+from sliplens.recordings.labels import FrictionEstimate
 from sliplens.recordings.store import forces_path
 from sliplens.recordings.trial import LABEL_SIGNALS, ContactState, Labels
 
@@ -63,7 +63,7 @@ LABELLING = Labelling(
             sign_found=Found.DECLARED,
             tare_found=Found.ASSUMED,
         ),
-        friction=given_friction(0.3, low=0.2, high=0.4),
+        friction=FrictionEstimate(mu=0.3, low=0.2, high=0.4),
         friction_change=0.0,
         slip_s=None,
         lag=Lag(lag_s=0.1, sigma_s=1 / 3),

@@ -5,7 +5,14 @@ import pytest
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labels import ContactForces, Found, ImageMotion, apply_axes, estimate_friction, given_friction
+from sliplens.recordings.labels import (
+    ContactForces,
+    Found,
+    FrictionEstimate,
+    ImageMotion,
+    apply_axes,
+    estimate_friction,
+)
 from sliplens.recordings.labels.friction import fit_break
 
 from .conftest import SLIP_S, STATIC, Trial
@@ -97,14 +104,14 @@ def test_too_few_samples_about_the_slip_are_refused(rng: np.random.Generator):
         fit_break(time, time, about_s=0.5, rng=rng, draws=10)
 
 
-def test_friction_by_hand_is_exact_unless_an_interval_is_given():
-    assert given_friction(0.5).sigma == 0
-    assert given_friction(0.5, low=0.4, high=0.7).sigma == pytest.approx(0.15)
-    assert given_friction(0.5).found is Found.DECLARED
+def test_friction_by_hand_is_as_exact_as_its_interval():
+    assert FrictionEstimate(mu=0.5, low=0.5, high=0.5).sigma == 0
+    assert FrictionEstimate(mu=0.5, low=0.4, high=0.7).sigma == pytest.approx(0.15)
+    assert FrictionEstimate(mu=0.5, low=0.5, high=0.5).found is Found.DECLARED
 
 
 def test_friction_that_cannot_be_is_refused():
     with pytest.raises(RecordingError, match="the coefficient of friction is 0; give a positive one"):
-        given_friction(0.0)
+        FrictionEstimate(mu=0.0, low=0.0, high=0.0)
     with pytest.raises(RecordingError, match=r"0\.5 lies outside its interval 0\.6 to 0\.7; give low, mu, high"):
-        given_friction(0.5, low=0.6, high=0.7)
+        FrictionEstimate(mu=0.5, low=0.6, high=0.7)

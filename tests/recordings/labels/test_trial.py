@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.labels import Found, LabelSettings, Lag, given_friction, label_trial
+from sliplens.recordings.labels import Found, FrictionEstimate, LabelSettings, Lag, label_trial
 
 from .conftest import SLIP_S, STATIC, Trial, ratio
 
@@ -42,7 +42,7 @@ def test_what_is_declared_is_used(trial_without_slip: Trial, rng: np.random.Gene
     labels = label_trial(trial.frame_time_s, trial.motion, trial.forces(), settings=settings, rng=rng)
     basis = labels.basis
     assert (basis.axes.tare_found, basis.lag, basis.lag_applied) == (Found.DECLARED, Lag(lag_s=0.01, sigma_s=0.0), True)
-    assert (basis.friction, basis.contact_threshold_n) == (given_friction(STATIC), 0.3)
+    assert (basis.friction, basis.contact_threshold_n) == (FrictionEstimate(mu=STATIC, low=STATIC, high=STATIC), 0.3)
     assert labels.normal_force_n[labels.valid].min() >= 0.3
 
 
@@ -68,3 +68,9 @@ def test_the_same_seed_gives_the_same_labels(trial: Trial):
     ]
     for one, other in pairwise(runs):
         np.testing.assert_array_equal(one, other)
+
+
+def test_a_lag_that_is_no_number_is_refused(trial: Trial, rng: np.random.Generator):
+    settings = LabelSettings(lag_ms=float("nan"))
+    with pytest.raises(RecordingError, match=r"a lag of nan s .* cannot be; give it in seconds"):
+        label_trial(trial.frame_time_s, trial.motion, trial.forces(), settings=settings, rng=rng)

@@ -2,8 +2,8 @@
 
 from sliplens.recordings.labelling import ForceAxes, Found, FrictionEstimate, Lag
 from sliplens.recordings.labels.axes import ContactForces, apply_axes, infer_axes
-from sliplens.recordings.labels.friction import ImageMotion, estimate_friction, given_friction
-from sliplens.recordings.labels.lag import estimate_lag, given_lag, measure_motion
+from sliplens.recordings.labels.friction import ImageMotion, estimate_friction
+from sliplens.recordings.labels.lag import estimate_lag, measure_motion
 from sliplens.recordings.labels.margin import FoundLabels, Reason, contact_threshold, label_frames, label_trial
 from sliplens.recordings.labels.reference import choose_reference
 from sliplens.recordings.options import LabelSettings
@@ -23,8 +23,6 @@ __all__ = [
     "contact_threshold",
     "estimate_friction",
     "estimate_lag",
-    "given_friction",
-    "given_lag",
     "infer_axes",
     "label_frames",
     "label_trial",

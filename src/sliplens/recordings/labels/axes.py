@@ -17,8 +17,6 @@ _TOUCH_SHARE = 0.05  # and by so much of the largest force: drift and vibration 
 _GUARD_S = 0.15  # samples before the touch that are left out of the tare: a soft press begins before it is noticed
 # share of the contact, from its start, in which the object is pressed and held but not yet pulled far
 _PRESS_SHARE = 0.25
-
-
 _SPIKE_SIGMAS = 4.0  # a still sample further from the median is a spike
 _MOST = 0.9  # share of the still samples that cannot all be spikes
 _FEW_STILL = 10  # fewer still samples tell no tare
@@ -48,14 +46,20 @@ def infer_axes(
             f"{forces.source} never departs from its noise: no touch to infer the axes from; "
             "declare normal axis, sign and tare, or leave the trial out"
         )
-    tare = (
-        _read_tare(forces, until_s=until, noise=noise)
-        if tare_n is None
-        else _Tare(value_n=np.array(tare_n, dtype=np.float64), sigma_n=np.zeros(3), found=Found.DECLARED)
-    )
-    press = _mean_press(forces, touch_s=touch, tare_n=tare.value_n)
+    still = forces.force_n[forces.time_s < until]
+    tare, tare_sigma, tare_found = np.zeros(3), np.zeros(3), Found.ASSUMED
+    notes = []
+    if tare_n is not None:
+        tare, tare_found = np.array(tare_n, dtype=np.float64), Found.DECLARED
+    elif len(still) < _FEW_STILL:
+        notes.append("no still samples before contact: the tare is taken as zero; declare it if the sensor has one")
+    else:
+        (tare, tare_sigma), tare_found = _read_tare(still, noise=noise), Found.INFERRED
+    press = np.zeros(3)  # the mean force while the object is pressed and held
+    if np.isfinite(touch):
+        end = touch + _PRESS_SHARE * (forces.time_s[-1] - touch)
+        press = np.mean(forces.force_n[(forces.time_s >= touch) & (forces.time_s <= end)], axis=0) - tare
     axis = AXES[int(np.argmax(np.abs(press)))] if normal is None else normal
-    notes = [tare.note] if tare.note else []
     first, second = np.sort(np.abs(press))[[-1, -2]]
     if normal is None and second > _DOUBTFUL * first:
         notes.append(
@@ -67,35 +71,21 @@ def infer_axes(
     return ForceAxes(
         normal=axis,
         sign=inferred_sign if sign is None else sign,
-        tare_n=_vector(tare.value_n),
+        tare_n=_vector(tare),
         noise_n=_vector(noise),
-        tare_sigma_n=_vector(tare.sigma_n),
+        tare_sigma_n=_vector(tare_sigma),
         still_until_s=None if np.isinf(until) else until,
         normal_found=Found.INFERRED if normal is None else Found.DECLARED,
         sign_found=Found.INFERRED if sign is None else Found.DECLARED,
-        tare_found=tare.found,
+        tare_found=tare_found,
         notes=tuple(notes),
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Tare:
-    value_n: Float[np.ndarray, "3"]
-    sigma_n: Float[np.ndarray, "3"]
-    found: Found
-    note: str = ""
-
-
-def _read_tare(forces: Forces, *, until_s: float, noise: Float[np.ndarray, "3"]) -> _Tare:
-    """Mean of the untouched samples; 0 where there are none."""
-    still = forces.force_n[forces.time_s < until_s]
-    if len(still) < _FEW_STILL:
-        return _Tare(
-            value_n=np.zeros(3),
-            sigma_n=np.zeros(3),
-            found=Found.ASSUMED,
-            note="no still samples before contact: the tare is taken as zero; declare it if the sensor has one",
-        )
+def _read_tare(
+    still: Float[np.ndarray, "samples 3"], *, noise: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Mean of the untouched samples, and its standard uncertainty."""
     # a spike must not move it, and a plain median of Gaussian samples would be less certain by a quarter
     middle = np.median(still, axis=0)
     kept = np.abs(still - middle) <= np.maximum(_SPIKE_SIGMAS * noise, 1e-9 + np.abs(middle) * 1e-9)
@@ -104,19 +94,8 @@ def _read_tare(forces: Forces, *, until_s: float, noise: Float[np.ndarray, "3"])
     white = np.std(still, axis=0, where=kept) / np.sqrt(kept.sum(axis=0))
     # noise with a memory leaves the means of stretches further apart than white noise would
     parts = np.array([part.mean(axis=0) for part in np.array_split(still, _STRETCHES)])
-    return _Tare(
-        value_n=np.mean(still, axis=0, where=kept),
-        sigma_n=np.maximum(white, np.std(parts, axis=0, ddof=1) / np.sqrt(_STRETCHES)),
-        found=Found.INFERRED,
-    )
-
-
-def _mean_press(forces: Forces, *, touch_s: float, tare_n: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Mean force while the object is pressed and held; 0 where it never is."""
-    if np.isinf(touch_s):
-        return np.zeros(3)
-    end = touch_s + _PRESS_SHARE * (forces.time_s[-1] - touch_s)
-    return np.mean(forces.force_n[(forces.time_s >= touch_s) & (forces.time_s <= end)], axis=0) - tare_n
+    sigma = np.maximum(white, np.std(parts, axis=0, ddof=1) / np.sqrt(_STRETCHES))
+    return np.mean(still, axis=0, where=kept), sigma
 
 
 def _vector(values: Float[np.ndarray, "3"]) -> Vector:
@@ -210,14 +189,7 @@ def apply_axes(forces: Forces, axes: ForceAxes) -> ContactForces:
 def magnitude(
     tangential_n: Float[np.ndarray, "samples 2"], *, sigma_n: float | Float[np.ndarray, " samples"]
 ) -> Float[np.ndarray, " samples"]:
-    """Length of a noisy tangential force, the noise's share taken off: on average noise only ever lengthens a vector.
-
-    Parameters
-    ----------
-    tangential_n
-        Two components, averaged as far as they will be.
-    sigma_n
-        Standard deviation of the noise that is left in a component.
+    """Length of a tangential force with this noise left in each component, the noise's share of it taken off.
 
     References
     ----------

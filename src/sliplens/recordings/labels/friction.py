@@ -1,6 +1,5 @@
 """Static friction of a trial: the ratio of tangential to normal force at which the contact slips as a whole."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,64 +45,48 @@ def fit_break(
     Every break within reach and a few lengths of the fall are tried; the bootstrap draws blocks of the residuals anew
     and fits the break anew with each.
     """
-    designs = [
-        _Design.at(moment, fall, time_s=time_s)
+    tried = [
+        (moment, fall)
         for moment in about_s + np.linspace(-_REACH_S, _REACH_S, _TRIES)
         for fall in _FALLS_S
         if np.sum(time_s < moment) >= _LEAST_BEFORE and np.sum(time_s > moment + fall) >= _LEAST_AFTER
     ]
-    if not designs:
+    if not tried:
         raise RecordingError(
             f"only {np.sum(time_s < about_s)} samples before the slip at {about_s:.2f} s and "
             f"{np.sum(time_s > about_s)} after it can be used; record the forces faster or give the friction by hand"
         )
-    (index,), (level,) = _best(designs, values[:, None])
-    basis = designs[index].basis
-    fitted = basis @ (basis.T @ values)
+    moments, falls = np.array(tried).T
+    since = time_s - moments[:, None]
+    before, after = np.minimum(since, 0), np.maximum(since, 0)
+    fall, end = np.minimum(after / falls[:, None], 1), np.maximum(after - falls[:, None], 0)
+    # level at the break, slope and bend before it, depth of the fall, slope after it
+    bases, triangles = np.linalg.qr(np.stack((np.ones_like(since), before, before**2, fall, end), axis=2))
+    (index,), (level,) = _best(bases, triangles, values[:, None])
+    fitted = bases[index] @ (bases[index].T @ values)
     residuals = values - fitted
     # a fit takes from the residuals what its parameters explain of the noise
     residuals = (residuals - residuals.mean()) * np.sqrt(len(values) / max(1, len(values) - _PARAMETERS))
     drawn = fitted[:, None] + residuals[_blocks(residuals, draws=draws, rng=rng)]
-    chosen, levels = _best(designs, drawn)
-    return Break(
-        time_s=designs[index].moment_s,
-        level=float(level),
-        levels=levels,
-        times_s=np.array([designs[one].moment_s for one in chosen]),
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Design:
-    """The least-squares problem of one break, solved for any values."""
-
-    moment_s: float
-    basis: Float[np.ndarray, "samples parameters"]
-    triangle: Float[np.ndarray, "parameters parameters"]
-
-    @classmethod
-    def at(cls, moment_s: float, fall_s: float, *, time_s: Float[np.ndarray, " samples"]) -> "_Design":
-        """Level at the break, slope and bend before it, depth of the fall, slope after it."""
-        since = time_s - moment_s
-        before, after = np.minimum(since, 0), np.maximum(since, 0)
-        columns = (np.ones_like(since), before, before**2, np.minimum(after / fall_s, 1), np.maximum(after - fall_s, 0))
-        basis, triangle = np.linalg.qr(np.stack(columns, axis=1))
-        return cls(moment_s=float(moment_s), basis=basis, triangle=triangle)
+    chosen, levels = _best(bases, triangles, drawn)
+    return Break(time_s=float(moments[index]), level=float(level), levels=levels, times_s=moments[chosen])
 
 
 def _best(
-    designs: Sequence[_Design], values: Float[np.ndarray, "samples draws"]
+    bases: Float[np.ndarray, "breaks samples parameters"],
+    triangles: Float[np.ndarray, "breaks parameters parameters"],
+    values: Float[np.ndarray, "samples draws"],
 ) -> tuple[Int[np.ndarray, " draws"], Float[np.ndarray, " draws"]]:
-    """Which design explains each column best, and its level at the break."""
+    """Which break explains each column best, and the level there."""
     draws = values.shape[1]
     explained, chosen, levels = np.full(draws, -np.inf), np.zeros(draws, dtype=int), np.zeros(draws)
-    for index, design in enumerate(designs):
-        shares = design.basis.T @ values
+    for index, (basis, triangle) in enumerate(zip(bases, triangles, strict=True)):
+        shares = basis.T @ values
         power = np.sum(shares**2, axis=0)
         better = power > explained
         if better.any():
             explained[better], chosen[better] = power[better], index
-            levels[better] = np.linalg.solve(design.triangle, shares[:, better])[0]
+            levels[better] = np.linalg.solve(triangle, shares[:, better])[0]
     return chosen, levels
 
 
@@ -144,28 +127,6 @@ class ImageMotion:
     time_s: Float[np.ndarray, " frames"]
     motion: Float[np.ndarray, " frames"]
     """See `measure_motion`; the first value is not used."""
-
-
-def given_friction(
-    mu: float, *, low: float | None = None, high: float | None = None, onset_s: float | None = None
-) -> FrictionEstimate:
-    """Static coefficient of friction given by hand; without an interval it counts as exact.
-
-    Parameters
-    ----------
-    low, high
-        Ends of the coefficient's 68 % interval.
-    onset_s
-        When the contact first slips, if it is known to.
-    """
-    return FrictionEstimate(
-        mu=mu,
-        low=mu if low is None else low,
-        high=mu if high is None else high,
-        onset_s=onset_s,
-        found=Found.DECLARED,
-        method="given by hand",
-    )
 
 
 def estimate_friction(

@@ -51,19 +51,6 @@ _PART = (0.25, 0.75)  # shares of the load in hold between which a release is ti
 _SUDDEN_STEPS = 2.0  # a fall between these within so many frames tells the time however the gel yields
 
 
-def given_lag(lag_s: float, *, sigma_s: float = 0.0) -> Lag:
-    """Lag given by hand; without an uncertainty it counts as exact.
-
-    Raises
-    ------
-    RecordingError
-        If it is no finite number, or its uncertainty is negative.
-    """
-    if not (np.isfinite(lag_s) and sigma_s >= 0):
-        raise RecordingError(f"a lag of {lag_s:g} s with an uncertainty of {sigma_s:g} s cannot be; give it in seconds")
-    return Lag(lag_s=lag_s, sigma_s=sigma_s)
-
-
 def estimate_lag(
     frame_time_s: Float[np.ndarray, " frames"],
     image_motion: Float[np.ndarray, " frames"],

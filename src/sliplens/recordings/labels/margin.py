@@ -11,8 +11,8 @@ from sliplens.mechanics import safety_margin, stick_ratio
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import FrictionEstimate, LabelBasis, Lag
 from sliplens.recordings.labels.axes import ContactForces, apply_axes, infer_axes, magnitude
-from sliplens.recordings.labels.friction import ImageMotion, estimate_friction, given_friction
-from sliplens.recordings.labels.lag import estimate_lag, given_lag
+from sliplens.recordings.labels.friction import ImageMotion, estimate_friction
+from sliplens.recordings.labels.lag import estimate_lag
 from sliplens.recordings.labels.smoothing import half_window, mean_force, typical_step
 from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.trial import ContactState, Labels
@@ -41,8 +41,8 @@ def interpolate_forces(
     *,
     window_s: float,
     gap_s: float,
-    until_s: float = np.inf,
-    force_range_n: float | None = None,
+    until_s: float,
+    force_range_n: float | None,
 ) -> FrameForces:
     """Interpolate the forces onto given times: the mean, over a window about each, of the line through the samples."""
     samples = forces.time_s
@@ -57,26 +57,17 @@ def interpolate_forces(
     normal_noise = np.minimum(noise.normal * more, max(one.normal, noise.normal))
     tangential_noise = np.minimum(noise.tangential * more, max(one.tangential, noise.tangential))
     tare = forces.tare_sigma_n
+    # the neighbours of a time on a sample are both that sample
+    before = samples[np.maximum(np.searchsorted(samples, time_s, side="right") - 1, 0)]
+    after = samples[np.minimum(np.searchsorted(samples, time_s), len(samples) - 1)]
     return FrameForces(
         normal_n=normal,
         tangential_n=magnitude(tangential, sigma_n=tangential_noise),
         normal_sigma_n=np.hypot(normal_noise, tare.normal),
         tangential_sigma_n=np.hypot(tangential_noise, tare.tangential),
-        missing=_missing(samples, time_s, gap_s=gap_s),
+        missing=(time_s < samples[0]) | (time_s > samples[-1]) | (after - before > gap_s),
         out_of_range=_out_of_range(forces, time_s, window_s=window_s, range_n=force_range_n),
     )
-
-
-def _missing(
-    samples_s: Float[np.ndarray, " samples"], time_s: Float[np.ndarray, " frames"], *, gap_s: float
-) -> Bool[np.ndarray, " frames"]:
-    """Whether the samples on both sides of a time are too far apart, or one side has none."""
-    after = np.searchsorted(samples_s, time_s, side="left")
-    outside = (time_s < samples_s[0]) | (time_s > samples_s[-1])
-    next_one = np.clip(after, 0, len(samples_s) - 1)
-    apart = samples_s[next_one] - samples_s[np.maximum(next_one - 1, 0)]
-    on_sample = samples_s[next_one] == time_s
-    return outside | ((apart > gap_s) & ~on_sample)
 
 
 def _out_of_range(
@@ -137,51 +128,38 @@ def label_frames(
     *,
     friction: FrictionEstimate,
     lag: Lag | None = None,
-    apply_lag: bool = False,
-    contact_threshold_n: float | None = None,
-    force_range_n: float | None = None,
-    window_s: float | None = None,
-    gap_s: float | None = None,
-    friction_change: float = 0.0,
+    settings: LabelSettings = LabelSettings(),  # noqa: B008 (frozen)
 ) -> FoundLabels:
     """Label frames, each at its own time.
 
-    The force of a frame is the mean over a short window of the line through the samples; no window reaches over the
-    onset of slip. Noise, tare, friction, lag and a change of the friction on the way to the slip all enter the
-    uncertainty of the margin, as independent of each other. A lag that is known but not applied counts as an error of
-    its size.
+    The force of a frame is the mean over its time of the line through the samples; no window reaches over the onset of
+    slip. Noise, tare, friction, lag and a change of the friction on the way to the slip all enter the uncertainty of
+    the margin, as independent of each other. A lag that is known but not applied counts as an error of its size.
 
     Parameters
     ----------
     friction
         Static friction, estimated or given. Where it tells no onset, gross slip begins with the first frame whose
         forces clearly lie outside the friction cone.
-    contact_threshold_n
-        Least normal force of a contact; chosen by `contact_threshold` if None.
-    window_s
-        Time over which forces are averaged, the time of a frame if None; 0 interpolates between two samples.
-    gap_s
-        Samples further apart count as missing; a few of their typical steps if None.
-    friction_change
-        Relative standard deviation of the change of friction from touch to slip, where it is known to drift.
 
     Raises
     ------
     RecordingError
         If a lag is to be applied that is not known or doubtful.
     """
+    apply_lag = settings.apply_lag or settings.lag_ms is not None
     if apply_lag and (lag is None or lag.doubt):
         cause = "it is not estimated" if lag is None else lag.doubt
         raise RecordingError(f"the lag cannot be applied: {cause}; give the lag by hand or leave it out")
-    window = typical_step(frame_time_s) if window_s is None else window_s
-    gap = _GAP_STEPS * typical_step(forces.time_s) if gap_s is None else gap_s
-    threshold = contact_threshold(forces, window_s=window) if contact_threshold_n is None else contact_threshold_n
+    window, gap = typical_step(frame_time_s), _GAP_STEPS * typical_step(forces.time_s)
+    threshold = settings.contact_threshold
+    if threshold is None:
+        threshold = contact_threshold(forces, window_s=window)
     onset = np.inf if friction.onset_s is None else friction.onset_s
 
     def forces_at(time_s: Float[np.ndarray, " frames"]) -> FrameForces:
-        return interpolate_forces(
-            forces, time_s, window_s=window, gap_s=gap, until_s=onset, force_range_n=force_range_n
-        )
+        limits = {"window_s": window, "gap_s": gap, "until_s": onset, "force_range_n": settings.force_range}
+        return interpolate_forces(forces, time_s, **limits)
 
     shift = lag.lag_s if lag is not None and apply_lag else 0.0
     unsure = 0.0 if lag is None else lag.sigma_s if apply_lag else float(np.hypot(lag.lag_s, lag.sigma_s))
@@ -195,7 +173,7 @@ def label_frames(
     end = np.minimum(time + reach, onset - window / 2)
     early, late = (_used(forces_at(moment), friction, threshold) for moment in (end - 2 * reach, end))
     swing = (late - early) / 2 * unsure / reach
-    drift = friction_change * _remaining(time, contact, until_s=onset)
+    drift = settings.friction_change * _remaining(time, contact, until_s=onset)
     sigma = np.sqrt(_variance(at, friction, threshold) + swing**2 + (used * drift) ** 2)
 
     reliable = contact & ~at.missing & ~at.out_of_range
@@ -221,14 +199,14 @@ def label_frames(
         basis=LabelBasis(
             axes=forces.axes,
             friction=friction,
-            friction_change=friction_change,
+            friction_change=settings.friction_change,
             slip_s=slip_s,
             lag=lag,
             lag_applied=apply_lag,
             contact_threshold_n=threshold,
             window_s=window,
             gap_s=gap,
-            force_range_n=force_range_n,
+            force_range_n=settings.force_range,
         ),
     )
 
@@ -300,26 +278,15 @@ def label_trial(
     axes = infer_axes(forces, normal=settings.normal_axis, sign=settings.normal_sign, tare_n=settings.tare)
     contact = apply_axes(forces, axes)
     if lag is None and settings.lag_ms is not None:
-        lag = given_lag(settings.lag_ms / 1e3)
+        lag = Lag(lag_s=settings.lag_ms / 1e3, sigma_s=0.0)
     elif lag is None:
         lag = estimate_lag(frame_time_s, image_motion, forces, rng=rng)
-    window = typical_step(frame_time_s)
     threshold = settings.contact_threshold
     if threshold is None:
-        threshold = contact_threshold(contact, window_s=window)
+        threshold = contact_threshold(contact, window_s=typical_step(frame_time_s))
     if settings.mu is not None:
-        friction = given_friction(settings.mu)
+        friction = FrictionEstimate(mu=settings.mu, low=settings.mu, high=settings.mu)
     else:
-        motion = ImageMotion(time_s=frame_time_s - (0.0 if lag.doubt else lag.lag_s), motion=image_motion)
-        friction = estimate_friction(contact, contact_threshold_n=threshold, rng=rng, image=motion)
-    return label_frames(
-        frame_time_s,
-        contact,
-        friction=friction,
-        lag=lag,
-        apply_lag=settings.apply_lag or settings.lag_ms is not None,
-        contact_threshold_n=threshold,
-        force_range_n=settings.force_range,
-        window_s=window,
-        friction_change=settings.friction_change,
-    )
+        image = ImageMotion(time_s=frame_time_s - (0.0 if lag.doubt else lag.lag_s), motion=image_motion)
+        friction = estimate_friction(contact, contact_threshold_n=threshold, rng=rng, image=image)
+    return label_frames(frame_time_s, contact, friction=friction, lag=lag, settings=settings)

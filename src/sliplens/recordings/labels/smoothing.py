@@ -22,14 +22,8 @@ def mean_force(
     """Mean over a window about given times of the force, interpolated linearly between its samples.
 
     It is the exact mean of the broken line through the samples, so it holds for samples that are not evenly spaced,
-    and a window of 0 is plain interpolation. Near the ends of the samples the window shrinks evenly about its time.
-
-    Parameters
-    ----------
-    at_s
-        Where to have the force; beyond the samples it is that of the nearest.
-    until_s
-        A time that no window reaches over, from either side: the onset of slip, where the force breaks off.
+    and a window of 0 is plain interpolation. Near the ends of the samples, and of `until_s`, the onset of slip
+    where the force breaks off, the window shrinks evenly about its time.
     """
     at = np.clip(at_s, time_s[0], time_s[-1])
     half = half_window(time_s, at, window_s=window_s, until_s=until_s)
@@ -43,11 +37,7 @@ def mean_force(
 
 
 def half_window(
-    time_s: Float[np.ndarray, " samples"],
-    at_s: Float[np.ndarray, " times"],
-    *,
-    window_s: float,
-    until_s: float = np.inf,
+    time_s: Float[np.ndarray, " samples"], at_s: Float[np.ndarray, " times"], *, window_s: float, until_s: float
 ) -> Float[np.ndarray, " times"]:
     """Half the length of the windows that `mean_force` takes its means over."""
     room = np.minimum(at_s - time_s[0], time_s[-1] - at_s)
