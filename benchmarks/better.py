@@ -24,8 +24,8 @@ from torch import Tensor
 from sliplens.errors import SliplensError
 from sliplens.explainers import PolyCam, capture, find_layers
 from sliplens.explainers.activations import find_published_layers
-from sliplens.explainers.channels import combine
-from sliplens.explainers.frozen_model import frozen
+from sliplens.explainers.contract import frozen
+from sliplens.explainers.maps import combine
 from sliplens.explainers.occlusion import marker_regions, markers_in_recording
 from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.map_quality import relevance_mass, relevance_rank

@@ -6,7 +6,6 @@ from torchcam.methods import GradCAM, LayerCAM
 
 from sliplens.errors import InputError, ModelError
 from sliplens.explainers import GradCam, HiResCam, LayerCam, capture
-from sliplens.explainers.cam import grad_cam_map, layer_cam_map
 
 
 def captured(model: nn.Module, images, layer: str):
@@ -23,7 +22,7 @@ def test_a_pooled_linear_head_is_the_sum_of_the_map_and_its_bias(name, layer, ne
     model = network(name)
     activations, gradients, prediction = captured(model, images, layer)
     bias = (model.classifier if name == "vgg" else model.fc).bias
-    total = grad_cam_map(activations, gradients).sum(dim=(1, 2)) + bias
+    total = GradCam.cells(activations, gradients).sum(dim=(1, 2)) + bias
     tolerance = 1e-4 * torch.maximum(prediction.abs(), torch.tensor(1.0))
     assert bool(((total - prediction).abs() <= tolerance).all())
 
@@ -51,7 +50,7 @@ def test_equals_torch_cam_after_the_same_relu(name, layer, network, images):
     activations, gradients, _ = captured(model, images, layer)
     with GradCAM(model, target_layer=layer) as extractor:
         oracle = extractor(0, model(images.clone().requires_grad_()), normalized=False)[0]
-    torch.testing.assert_close(torch.relu(grad_cam_map(activations, gradients)), oracle, atol=1e-6, rtol=0)
+    torch.testing.assert_close(torch.relu(GradCam.cells(activations, gradients)), oracle, atol=1e-6, rtol=0)
 
 
 def test_equals_torch_cam_on_the_image(network, images):
@@ -61,7 +60,7 @@ def test_equals_torch_cam_on_the_image(network, images):
         oracle = extractor(0, model(images.clone().requires_grad_()), normalized=False)[0]
     # torch-cam has applied its ReLU to the cells, so compare where the cells have one sign only
     activations, gradients, _ = captured(model, images, "stage3")
-    cells = grad_cam_map(activations, gradients)
+    cells = GradCam.cells(activations, gradients)
     torch.testing.assert_close(torch.relu(cells), oracle, atol=1e-6, rtol=0)
     upsampled = nn.functional.interpolate(cells[None], size=(64, 64), mode="bilinear", align_corners=False)[0]
     torch.testing.assert_close(explanation.relevance, (upsampled / 16**2).float(), atol=1e-6, rtol=0)
@@ -74,7 +73,7 @@ def test_equals_captum_with_its_sign(name, layer, network, images):
     oracle = torch.as_tensor(
         attr.LayerGradCam(lambda x: model(x).flatten(), model.get_submodule(layer)).attribute(images)
     )
-    torch.testing.assert_close(grad_cam_map(activations, gradients), oracle[:, 0].detach(), atol=1e-9, rtol=1e-6)
+    torch.testing.assert_close(GradCam.cells(activations, gradients), oracle[:, 0].detach(), atol=1e-9, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +84,7 @@ def test_layer_cam_equals_torch_cam(name, layer, network, images):
     activations, gradients, _ = captured(model, images, layer)
     with LayerCAM(model, target_layer=layer) as extractor:
         oracle = extractor(0, model(images.clone().requires_grad_()), normalized=False)[0]
-    torch.testing.assert_close(torch.relu(layer_cam_map(activations, gradients)), oracle, atol=1e-6, rtol=0)
+    torch.testing.assert_close(torch.relu(LayerCam.cells(activations, gradients)), oracle, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize(
@@ -177,7 +176,7 @@ def test_the_contrast_is_the_published_map_less_that_of_the_references_activatio
     model = network("shufflenet")
     activations, gradients, _ = captured(model, images, "stage3")
     references, _, _ = captured(model, reference.expand_as(images), "stage3")
-    cells = grad_cam_map(activations, gradients) - grad_cam_map(references, gradients)
+    cells = GradCam.cells(activations, gradients) - GradCam.cells(references, gradients)
     upsampled = nn.functional.interpolate(cells[None], size=(64, 64), mode="bilinear", align_corners=False)[0]
     relevance = GradCam(layer="stage3")(model, images, reference=reference).relevance
     torch.testing.assert_close(relevance, (upsampled / 16**2).float(), atol=1e-6, rtol=0)

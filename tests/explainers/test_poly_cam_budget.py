@@ -171,7 +171,7 @@ def test_all_rounds_use_one_engine(network, images, monkeypatch):
         prepared.append(passes.prepare(*arguments, **options))
         return prepared[-1]
 
-    monkeypatch.setattr("sliplens.explainers.frozen_model.prepare", prepare)
+    monkeypatch.setattr("sliplens.explainers.contract.prepare", prepare)
     explain = PolyCam(budget=0.25, likeness=Likeness(pearson_r=1.0), engine="folded")
     assert explain(network("small shufflenet"), images[:2]).engine == "folded"
     assert len(prepared) == 1

@@ -3,16 +3,18 @@
 import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import partial
 from itertools import groupby, pairwise
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from sliplens.errors import ModelError
-from sliplens.explainers.frozen_model import frozen
+from sliplens.explainers.contract import frozen
 
 
 @contextmanager
@@ -30,21 +32,17 @@ def capture(model: nn.Module, names: Sequence[str], *, differentiable: bool = Fa
     outputs: dict[str, Tensor] = {}
     modules = dict(model.named_modules())
 
-    def listen(name: str):  # noqa: ANN202 (a hook, typed by torch)
-        def hook(_module: nn.Module, _arguments: object, output: Tensor) -> Tensor:
-            outputs[name] = output.detach().requires_grad_(differentiable)
-            # the rest of the network gets a copy: an in-place ReLU would overwrite what is kept
-            return outputs[name].clone()
-
-        return hook
+    def keep(name: str, _module: nn.Module, _arguments: object, output: Tensor) -> Tensor:
+        outputs[name] = output.detach().requires_grad_(differentiable)
+        # the rest of the network gets a copy: an in-place ReLU would overwrite what is kept
+        return outputs[name].clone()
 
     with ExitStack() as stack:
         for name in names:
-            stack.callback(modules[name].register_forward_hook(listen(name)).remove)
+            stack.callback(modules[name].register_forward_hook(partial(keep, name)).remove)
         yield outputs
 
 
-_MAP_AXES = 4
 Shape = tuple[int, int, int]
 """Channels, rows and columns of a map."""
 
@@ -57,7 +55,6 @@ class Layer:
     """Its name in `model.named_modules()`."""
     shape: Shape
     """Channels, rows and columns of the map."""
-    has_parameters: bool = True
 
     @property
     def channels(self) -> int:
@@ -65,15 +62,14 @@ class Layer:
         return self.shape[0]
 
 
-@dataclass
-class _Call:
+class _Call(NamedTuple):
     """One call of a module, with the calls made inside it in the order in which they ran."""
 
     name: str
     module: nn.Module
     input_shape: Shape | None
-    output_shape: Shape | None = None
-    inner: list["_Call"] = field(default_factory=list)
+    output_shape: Shape | None
+    inner: "list[_Call]"
 
 
 def find_layers(
@@ -116,11 +112,7 @@ def find_layers(
 def recall_layers(
     model: nn.Module, images: Float[Tensor, "batch 3 height width"], *, names: Sequence[str] | None = None
 ) -> tuple[Layer, ...]:
-    """As `find_layers`, but searched for once for each network, image size and choice of names.
-
-    A search costs a pass with hooks on every module, as much as a whole Grad-CAM. It is made again when a module was
-    added, taken away or replaced.
-    """
+    """As `find_layers`, whose pass costs as much as a whole Grad-CAM; made again only where its answer may change."""
     modules = tuple((name, weakref.ref(module)) for name, module in model.named_modules())
     key = (modules, tuple(images.shape[1:]), None if names is None else tuple(names))
     known = _RECALLED.get(model)
@@ -135,10 +127,8 @@ _RECALLED: weakref.WeakKeyDictionary[nn.Module, tuple[object, tuple[Layer, ...]]
 def find_published_layers(model: nn.Module, images: Float[Tensor, "batch 3 height width"]) -> tuple[Layer, ...]:
     """Layers as the public code finds them: every module that ends just before the size of the output changes.
 
-    Modules are listed as they end, insides before their block. For TorchVision's ShuffleNetV2 at 224 px these are ten:
-    conv1, maxpool, stage2.0.branch1, stage2.0.branch2.2, stage2, stage3.0.branch1, stage3.0.branch2.2, stage3,
-    stage4.0.branch1 and stage4.0.branch2.2. The size goes down and up again inside a block with two branches, and
-    the last layer is missed, since what follows it is no map.
+    Modules are listed as they end, insides before their block: the size goes down and up again inside a block with two
+    branches, and the last layer is missed, since what follows it is no map.
 
     References
     ----------
@@ -165,31 +155,25 @@ def find_published_layers(model: nn.Module, images: Float[Tensor, "batch 3 heigh
 
 def _record(model: nn.Module, images: Tensor) -> _Call:
     """Run the network and return the tree of its module calls."""
-    top = _Call("", model, None)
-    open_calls = [top]
+    finished: list[_Call] = []  # those whose caller is still at work
+    begun: list[int] = []
 
-    def enter(name: str):  # noqa: ANN202 (a hook, typed by torch)
-        def hook(module: nn.Module, arguments: tuple[object, ...]) -> None:
-            call = _Call(name, module, _map_shape(arguments[0] if arguments else None))
-            open_calls[-1].inner.append(call)
-            open_calls.append(call)
-
-        return hook
-
-    def leave(_module: nn.Module, _arguments: object, output: object) -> None:
-        open_calls.pop().output_shape = _map_shape(output)
+    def leave(name: str, module: nn.Module, arguments: tuple[object, ...], output: object) -> None:
+        first = begun.pop()
+        shapes = (_map_shape(arguments[0] if arguments else None), _map_shape(output))
+        finished[first:] = [_Call(name, module, *shapes, finished[first:])]
 
     with ExitStack() as stack, torch.no_grad(), frozen(model):
         for name, module in model.named_modules():
-            stack.callback(module.register_forward_pre_hook(enter(name)).remove)
-            stack.callback(module.register_forward_hook(leave).remove)
+            stack.callback(module.register_forward_pre_hook(lambda *_: begun.append(len(finished))).remove)
+            stack.callback(module.register_forward_hook(partial(leave, name)).remove)
         model(images[:1])
-    return top.inner[0]
+    return finished[0]
 
 
 def _map_shape(value: object) -> Shape | None:
-    """(channels, height, width) of a map, else None."""
-    if not isinstance(value, Tensor) or value.ndim != _MAP_AXES:
+    """Channels, rows and columns of a map, else None."""
+    if not isinstance(value, Tensor) or value.ndim != 4:
         return None
     channels, height, width = value.shape[1:]
     return channels, height, width
@@ -199,15 +183,14 @@ def _is_spatial(shape: Shape | None) -> bool:
     return shape is not None and shape[1] * shape[2] > 1
 
 
-def _main_path(call: _Call) -> list[Layer]:
+def _main_path(call: _Call) -> list[_Call]:
     # the exact forward: a subclass that overrides it may do more than run its items in a row
     is_sequence = type(call.module).forward is nn.Sequential.forward
     if not (call.name == "" or is_sequence or call.output_shape is None or _shrinks_repeatedly(call)):
-        has_parameters = next(call.module.parameters(), None) is not None
-        return [Layer(call.name, call.output_shape, has_parameters)]
+        return [call]
     steps = [step for inner in call.inner for step in _main_path(inner)]
     if steps and is_sequence and call.name and call.output_shape is not None:
-        steps[-1] = replace(steps[-1], name=call.name)  # the same tensor under the name people know
+        steps[-1] = steps[-1]._replace(name=call.name)  # the same tensor under the name people know
     return steps
 
 
@@ -217,11 +200,11 @@ def _shrinks_repeatedly(call: _Call) -> bool:
     return call.input_shape[1] > 2 * call.output_shape[1] + 1 or call.input_shape[2] > 2 * call.output_shape[2] + 1
 
 
-def _distinct(steps: list[Layer]) -> tuple[Layer, ...]:
+def _distinct(steps: list[_Call]) -> tuple[Layer, ...]:
     layers = []
-    for shape, group in groupby(steps, key=lambda step: step.shape):
+    for shape, group in groupby(steps, key=lambda step: step.output_shape):
         members = list(group)
-        if _is_spatial(shape) and any(step.has_parameters for step in members):
+        if _is_spatial(shape) and any(next(step.module.parameters(), None) is not None for step in members):
             layers.append(Layer(members[-1].name, shape))
     return tuple(layers)
 

@@ -1,6 +1,6 @@
 """Class activation maps that keep their sign."""
 
-from collections.abc import Callable
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, TypeAlias
 
@@ -10,9 +10,8 @@ from torch import Tensor
 
 from sliplens.errors import ModelError
 from sliplens.explainers.activations import Layer, capture, recall_layers
-from sliplens.explainers.contract import Method, require_at_least_one
+from sliplens.explainers.contract import FrozenModel, Method, require_at_least_one
 from sliplens.explainers.explanation import Explanation, check_slopes
-from sliplens.explainers.frozen_model import FrozenModel
 from sliplens.explainers.maps import spread
 from sliplens.progress import OnProgress
 
@@ -20,50 +19,12 @@ _Maps: TypeAlias = Float[Tensor, "batch channels rows columns"]
 _Cells: TypeAlias = Float[Tensor, "batch rows columns"]
 
 
-def grad_cam_map(activations: _Maps, gradients: _Maps) -> _Cells:
-    """Grad-CAM before any ReLU: sum over c of alpha_c A_c, alpha_c the mean over space of df/dA_c.
-
-    In margin units for each cell: for a head f = bias + w . mean over space of A, alpha_c = w_c / (rows x columns), so
-    the cells add up to f - bias without any further normalisation.
-
-    References
-    ----------
-    Selvaraju et al., *Grad-CAM: Visual explanations from deep networks via gradient-based localization*, ICCV 2017,
-    eqs. 1 and 2, without the ReLU of eq. 2: a regressor's negative evidence is evidence.
-    """
-    return (gradients.mean(dim=(2, 3), keepdim=True) * activations).sum(dim=1)
-
-
-def hires_cam_map(activations: _Maps, gradients: _Maps) -> _Cells:
-    """HiResCAM: sum over c of df/dA_c A_c, cell by cell, in margin units; Grad-CAM where the gradient is constant.
-
-    References
-    ----------
-    Draelos and Carin, *Use HiResCAM instead of Grad-CAM for faithful explanations of convolutional neural networks*,
-    2020, eq. 3.
-    """
-    return (gradients * activations).sum(dim=1)
-
-
-def layer_cam_map(activations: _Maps, gradients: _Maps) -> _Cells:
-    """LayerCAM before its last ReLU: sum over c of relu(df/dA_c) A_c, cell by cell, in margin units.
-
-    References
-    ----------
-    Jiang et al., *LayerCAM: Exploring hierarchical class activation maps for localization*, IEEE TIP 2021, eqs. 4 to 6,
-    without the ReLU of eq. 6.
-    """
-    return (torch.relu(gradients) * activations).sum(dim=1)
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Cam(Method):
-    """One layer's cells, weighted by the gradient at the image.
+    """One layer's cells, weighted by the gradient at the image; the map is bilinear between them and keeps their total.
 
-    The published maps weigh the activations A(x). They add up to f(x) less what the layers behind it add on their own:
-    for a classifier's logit that is evidence, for a regressor it is mostly the level that every image has. What sets x
-    apart from the reference is the contrast A(x) - A(b), weighted by the same gradient.
-    The map is bilinear between the layer's cells and keeps their total.
+    The published maps weigh the activations A(x), which for a regressor are mostly the level that every image has. What
+    sets x apart from the reference is the contrast A(x) - A(b), weighted by the same gradient.
     """
 
     layer: str | None = None
@@ -71,11 +32,14 @@ class _Cam(Method):
     batch_size: int = 32
 
     method: ClassVar[str]
-    cells: ClassVar[Callable[[_Maps, _Maps], _Cells]]
-    """Relevance of the layer's cells in margin units, from activations and gradients."""
     one_sided: ClassVar[bool] = False
     """Whether gradients count along the change of the prediction, where some are left out. If not, the contrast adds
     up to f(x) - f(b) for a head linear in the mean over space."""
+
+    @staticmethod
+    @abstractmethod
+    def cells(activations: _Maps, gradients: _Maps) -> _Cells:
+        """Relevance of the layer's cells in margin units, before any ReLU."""
 
     def __post_init__(self) -> None:
         require_at_least_one(type(self).__name__, batch_size=self.batch_size)
@@ -96,7 +60,7 @@ class _Cam(Method):
             activations, prediction = activations[: len(part)], prediction[: len(part)]
             change = (prediction - reference_prediction)[:, None, None, None]
             sign = change.sign() if self.one_sided else torch.ones_like(change)
-            cells = type(self).cells(activations - empty if self.contrast else activations, sign * gradients)
+            cells = self.cells(activations - empty if self.contrast else activations, sign * gradients)
             maps.append(spread(sign[:, 0] * cells, (frozen.images.shape[-2], frozen.images.shape[-1])))
             predictions.append(prediction)
             reference_predictions.append(reference_prediction.expand_as(prediction))
@@ -137,10 +101,9 @@ def _differentiate(frozen: FrozenModel, batch: Tensor, *, count: int, layer: Lay
 class GradCam(_Cam):
     """Grad-CAM of one layer against the reference, signed, in margin units.
 
-    The relevance of a cell is sum over c of alpha_c (A_c(x) - A_c(b)), alpha_c at x (`grad_cam_map`), which for a head
-    linear in the mean over space adds up to f(x) - f(b) exactly, whatever the bias. It takes one pass of the image
-    and the reference together, a backward pass from the output to the layer, and, the first time, one pass to find the
-    layer.
+    The relevance of a cell is sum over c of alpha_c (A_c(x) - A_c(b)), alpha_c the mean over space of df/dA_c at x,
+    which for a head linear in the mean over space adds up to f(x) - f(b) exactly, whatever the bias. A regressor's
+    negative evidence is evidence, so the ReLU of the published map is left out.
 
     Parameters
     ----------
@@ -149,24 +112,40 @@ class GradCam(_Cam):
     contrast
         Take the reference's activations off. False gives the published map, which does not depend on the reference and
         has no completeness gap; the reference then only decides what `saliency` shows.
+
+    References
+    ----------
+    Selvaraju et al., *Grad-CAM: Visual explanations from deep networks via gradient-based localization*, ICCV 2017,
+    eqs. 1 and 2.
     """
 
     method: ClassVar[str] = "grad-cam"
-    cells = staticmethod(grad_cam_map)
+
+    @staticmethod
+    def cells(activations: _Maps, gradients: _Maps) -> _Cells:
+        """Sum over c of alpha_c A_c."""
+        return (gradients.mean(dim=(2, 3), keepdim=True) * activations).sum(dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class HiResCam(_Cam):
     """HiResCAM of one layer against the reference, signed, in margin units.
 
-    As Grad-CAM, but each cell is weighted by its own gradient (`hires_cam_map`), so that the map shows where the layers
-    behind look. With the mean over space as head the two are the same.
+    As Grad-CAM, but each cell is weighted by its own gradient, so that the map shows where the layers behind look. With
+    the mean over space as head the two are the same. Options are those of `GradCam`.
 
-    Options are those of `GradCam`.
+    References
+    ----------
+    Draelos and Carin, *Use HiResCAM instead of Grad-CAM for faithful explanations of convolutional neural networks*,
+    2020, eq. 3.
     """
 
     method: ClassVar[str] = "hires-cam"
-    cells = staticmethod(hires_cam_map)
+
+    @staticmethod
+    def cells(activations: _Maps, gradients: _Maps) -> _Cells:
+        """Sum over c of df/dA_c A_c."""
+        return (gradients * activations).sum(dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,11 +155,18 @@ class LayerCam(_Cam):
     The published map keeps the cells and channels whose gradient is positive, those that raise a class. A regressor's
     prediction may have fallen, so kept are those whose gradient points the way the prediction went: with
     s = sign(f(x) - f(b)) the map is s sum over c of relu(s df/dA_c) (A_c(x) - A_c(b)). The rest is left out, so the map
-    adds up to nothing in particular and has no completeness gap.
+    adds up to nothing in particular and has no completeness gap. Options are those of `GradCam`.
 
-    Options are those of `GradCam`.
+    References
+    ----------
+    Jiang et al., *LayerCAM: Exploring hierarchical class activation maps for localization*, IEEE TIP 2021, eqs. 4 to 6,
+    without the ReLU of eq. 6.
     """
 
     method: ClassVar[str] = "layer-cam"
-    cells = staticmethod(layer_cam_map)
     one_sided: ClassVar[bool] = True
+
+    @staticmethod
+    def cells(activations: _Maps, gradients: _Maps) -> _Cells:
+        """Sum over c of relu(df/dA_c) A_c."""
+        return (torch.relu(gradients) * activations).sum(dim=1)

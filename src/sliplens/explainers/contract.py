@@ -2,17 +2,221 @@
 
 import time
 from abc import ABC, abstractmethod
-from dataclasses import replace
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import torch
-from jaxtyping import Shaped
+from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
-from sliplens.errors import InputError
-from sliplens.explainers.explanation import Explanation
-from sliplens.explainers.frozen_model import FrozenModel, freeze
-from sliplens.progress import OnProgress
+from sliplens.errors import ImageError, InputError, ModelError
+from sliplens.explainers.explanation import Explanation, check_maps
+from sliplens.models.engines import Engine, prepare
+from sliplens.progress import OnProgress, counted
+
+Batch: TypeAlias = Shaped[Tensor, "..."]
+"""Images or a reference as a caller gave them, before they are checked."""
+_SLACK = 1e-6  # rounding of a resize or a division may step over 1
+_FORWARD_BATCH = 32  # bounds the memory of the plain predictions, whatever the number of images
+
+
+@contextmanager
+def frozen(model: nn.Module) -> Iterator[None]:
+    """Put a network into evaluation mode without parameter gradients, and give it back as it was.
+
+    Two threads must not freeze one network at the same time.
+    """
+    training = [(module, module.training) for module in model.modules()]
+    trainable = [(parameter, parameter.requires_grad) for parameter in model.parameters()]
+    try:
+        model.eval()
+        for parameter, _ in trainable:
+            parameter.requires_grad_(False)
+        yield
+    finally:
+        # flag by flag: train() would recurse and undo what a caller had frozen
+        for module, flag in training:
+            module.training = flag
+        for parameter, flag in trainable:
+            parameter.requires_grad_(flag)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrozenModel:
+    """A frozen network with checked images; made by `freeze` and valid inside it only."""
+
+    model: nn.Module
+    images: Float[Tensor, "batch 3 height width"]
+    """Images x in the network's own type and on its device."""
+    references: Float[Tensor, "batch_or_one 3 height width"]
+    """Reference b, one for each image or one for all."""
+
+    def predict(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, " batch"]:
+        """Run the network and return one margin an image, with the graph where gradients are on."""
+        output = self.model(images)
+        if not isinstance(output, Tensor):
+            raise ModelError(
+                f"the model returns {type(output).__name__} instead of a tensor; "
+                "wrap it so that it gives one margin an image"
+            )
+        if tuple(output.shape) not in {(len(images),), (len(images), 1)}:
+            raise ModelError(
+                f"the model's output has shape {tuple(output.shape)} for {len(images)} image(s), not one number an "
+                "image; end it with one output, such as Linear(features, 1)"
+            )
+        return output.reshape(len(images))
+
+    @torch.no_grad()
+    def compare(self) -> "Comparison":
+        """Predict the images and their references, without gradients."""
+        predictions = (
+            torch.cat([self.predict(part) for part in images.split(_FORWARD_BATCH)])
+            for images in (self.images, self.references)
+        )
+        return self.compared(*predictions)
+
+    def compared(
+        self, prediction: Float[Tensor, " batch"], reference_prediction: Float[Tensor, " batch_or_one"]
+    ) -> "Comparison":
+        """Comparison with these predictions, checked."""
+        for values, what in ((prediction, "image"), (reference_prediction, "reference")):
+            for index in torch.nonzero(~values.isfinite()).flatten().tolist():
+                raise ModelError(
+                    f"the model predicts {float(values[index])} for {what} {index}; train or load it again"
+                )
+        both = {"prediction": prediction, "reference_prediction": reference_prediction.expand_as(prediction)}
+        return Comparison(**vars(self) | both)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison(FrozenModel):
+    """Images compared with their references: f(x) less f(b), in margin units, which is explained."""
+
+    prediction: Float[Tensor, " batch"]
+    reference_prediction: Float[Tensor, " batch"]
+
+    @property
+    def reference(self) -> Float[Tensor, "batch 3 height width"]:
+        """Reference b of each image."""
+        return self.references.expand_as(self.images)
+
+    @property
+    def change(self) -> Float[Tensor, " batch"]:
+        """What is explained."""
+        return self.prediction - self.reference_prediction
+
+    def prepare(self, passes: int, *, engine: str = "auto", batch_size: int | None = None) -> Engine:
+        """Make an engine ready for so many passes of the network (`models.engines.prepare`)."""
+        images = torch.cat([self.images[:1], self.reference[:1]])
+        predictions = torch.stack([self.prediction[0], self.reference_prediction[0]])
+        return prepare(self.model, images, predictions, passes=passes, engine=engine, batch_size=batch_size)
+
+    def map_each(
+        self, relevance: Callable[[int], Float[Tensor, "height width"]], *, on_progress: OnProgress | None
+    ) -> Float[Tensor, "batch height width"]:
+        """Maps of all images, made one after another, each from its place in the batch."""
+        return torch.stack([relevance(index) for index in counted(range(len(self.images)), on_progress)])
+
+    def explanation(
+        self,
+        relevance: Float[Tensor, "batch height width"],
+        *,
+        complete: bool,
+        target: str = "f(x) - f(reference)",
+        warnings: Iterable[str] = (),
+        **others: Any,
+    ) -> Explanation:
+        """Record of an explanation, with its warnings; the others are its fields as they are."""
+        gap = (relevance.sum(dim=(1, 2)) - self.change).abs().float() if complete else None
+        single = relevance.float()
+        predictions = {"prediction": self.prediction, "reference_prediction": self.reference_prediction}
+        return Explanation(
+            images=self.images.float(),
+            relevance=single,
+            target=target,
+            **{name: values.float() for name, values in predictions.items()},
+            completeness_gap=gap,
+            seconds=0.0,  # known when the call ends
+            warnings=(*check_maps(single, **predictions, completeness_gap=gap), *warnings),
+            **others,
+        )
+
+
+@contextmanager
+def freeze(model: nn.Module, images: Batch, *, reference: Batch | None) -> Iterator[FrozenModel]:
+    """Check the images and freeze the network, with gradients on and autocast off whatever the caller's mode."""
+    _require_images(images)
+    reference = _require_reference(reference, images=images)
+    with ExitStack() as stack:
+        # a caller inside no_grad or inference_mode may still ask for gradients of the output
+        stack.enter_context(torch.inference_mode(mode=False))
+        stack.enter_context(torch.enable_grad())
+        stack.enter_context(frozen(model))
+        # clone: tensors made in inference mode cannot enter a graph
+        images, reference = (_like_model(model, tensor).detach().clone() for tensor in (images, reference))
+        # differences of predictions are explained, of which half precision leaves two digits
+        stack.enter_context(torch.autocast(images.device.type, enabled=False))
+        yield FrozenModel(model=model, images=images, references=reference)
+
+
+def _require_images(images: Batch) -> None:
+    """Refuse images that are not float, finite, in [0, 1] and shaped (batch, 3, height, width)."""
+    if images.ndim != 4:
+        raise ImageError(
+            f"images have shape {tuple(images.shape)}, which is not (batch, 3, height, width); "
+            "add a batch axis with images[None]"
+        )
+    if images.shape[0] == 0:
+        raise ImageError("there is no image to explain, the batch is empty; pass at least one image")
+    if images.shape[1] != 3:
+        raise ImageError(
+            f"images have {images.shape[1]} channels instead of 3; pass RGB images with the channels on the second axis"
+        )
+    if 0 in images.shape[2:]:
+        raise ImageError(
+            f"images of {images.shape[2]} x {images.shape[3]} pixels are empty; pass images with at least one pixel"
+        )
+    _require_unit_interval(images, what="image")
+
+
+def _require_reference(reference: Tensor | None, *, images: Tensor) -> Tensor:
+    """The reference with a batch axis of one (shared) or of the batch's length, zeros when None is given."""
+    if reference is None:
+        return torch.zeros_like(images[:1])
+    shared = tuple(reference.shape) == tuple(images.shape[1:])
+    if not shared and reference.shape != images.shape:
+        raise ImageError(
+            f"the reference has shape {tuple(reference.shape)} but the images have {tuple(images.shape)}; "
+            f"pass one reference of shape {tuple(images.shape[1:])} or one for each image"
+        )
+    reference = reference[None] if shared else reference
+    _require_unit_interval(reference, what="reference")
+    return reference
+
+
+def _require_unit_interval(images: Tensor, *, what: str) -> None:
+    if not images.is_floating_point():
+        raise ImageError(f"{what} values are {images.dtype} instead of float; divide 8-bit images by 255")
+    for index, image in enumerate(images):
+        bad = int((~image.isfinite()).sum())
+        if bad:
+            raise ImageError(
+                f"{what} {index} holds NaN or infinity in {bad} of {image.numel()} values; "
+                "read the frame again, or drop it from the batch"
+            )
+        low, high = (float(bound) for bound in torch.aminmax(image))
+        if low < -_SLACK or high > 1 + _SLACK:
+            raise ImageError(
+                f"{what} {index} has values from {low:.3g} to {high:.3g}, outside [0, 1]; "
+                "scale it as the network's training images were"
+            )
+
+
+def _like_model(model: nn.Module, images: Tensor) -> Tensor:
+    parameter = next((p for p in model.parameters() if p.is_floating_point()), None)
+    return images if parameter is None else images.to(device=parameter.device, dtype=parameter.dtype)
 
 
 @runtime_checkable
@@ -20,12 +224,7 @@ class Explainer(Protocol):
     """A frozen dataclass whose fields are the options of a method and whose call explains a batch."""
 
     def __call__(
-        self,
-        model: nn.Module,
-        images: Shaped[Tensor, "*batch channels height width"],
-        *,
-        reference: Shaped[Tensor, "..."] | None = None,
-        on_progress: OnProgress | None = None,
+        self, model: nn.Module, images: Batch, *, reference: Batch | None = None, on_progress: OnProgress | None = None
     ) -> Explanation:
         """Explain f(x) - f(reference) of a regressor with one output.
 
@@ -54,12 +253,7 @@ class Method(ABC):
     """An explainer whose own work is one function of checked images and a frozen network."""
 
     def __call__(
-        self,
-        model: nn.Module,
-        images: Shaped[Tensor, "*batch channels height width"],
-        *,
-        reference: Shaped[Tensor, "..."] | None = None,
-        on_progress: OnProgress | None = None,
+        self, model: nn.Module, images: Batch, *, reference: Batch | None = None, on_progress: OnProgress | None = None
     ) -> Explanation:
         """Explain a batch; see `Explainer` for the arguments and errors."""
         start = time.perf_counter()

@@ -9,9 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.explainers.contract import Method, require_at_least_one
+from sliplens.explainers.contract import FrozenModel, Method, freeze, require_at_least_one
 from sliplens.explainers.explanation import Explanation, check_slopes
-from sliplens.explainers.frozen_model import FrozenModel, freeze
 from sliplens.progress import OnProgress
 
 _NODES = 4  # of a piece; the slope along the path has kinks, on which more nodes to a piece are wasted

@@ -7,9 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor, fx, nn
 
-from sliplens.explainers.contract import Method
+from sliplens.explainers.contract import FrozenModel, Method
 from sliplens.explainers.explanation import Explanation
-from sliplens.explainers.frozen_model import FrozenModel
 from sliplens.extras import require_packages
 from sliplens.models.backbones import HistogramRegressor
 from sliplens.models.engines import fold_batch_norm

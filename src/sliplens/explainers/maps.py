@@ -1,4 +1,6 @@
-"""Arithmetic on maps: resizing, spreading a total over pixels, percentiles."""
+"""Arithmetic on maps: resizing, spreading a total over pixels, percentiles, the map that weighted channels make."""
+
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -8,7 +10,6 @@ from torch.nn import functional
 FLOOR = 1e-12
 CHANGE_WINDOW = 15 / 224
 """Side of the square over which a change is averaged, as a share of the image's height: about a marker."""
-_LOW, _HIGH = 0.001, 0.999  # 0.1th and 99.9th percentile
 
 
 def resize(maps: Float[Tensor, "*maps rows columns"], size: tuple[int, int]) -> Float[Tensor, "*maps height width"]:
@@ -25,8 +26,7 @@ def spread(maps: Float[Tensor, "*maps rows columns"], size: tuple[int, int]) -> 
     """Spread each cell's value over the pixels of a larger image, keeping the total of every map.
 
     Pixel p receives sum over cells i of B[p, i] m[i] / sum over p' of B[p', i], B the bilinear weights (corners not
-    aligned). Where the sizes divide evenly, as 7 into 224, the column sums are all (height / rows)(width / columns)
-    and this is the usual bilinear map over that number; elsewhere plain resizing would change the total.
+    aligned); plain resizing would change the total where the sizes do not divide.
 
     Examples
     --------
@@ -50,19 +50,16 @@ def _received(maps: Tensor, *, axis: int, pixels: int) -> Tensor:
 def percentile_bounds(
     maps: Float[Tensor, "*maps rows columns"],
 ) -> tuple[Float[Tensor, "*maps"], Float[Tensor, "*maps"]]:
-    """0.1th and 99.9th percentile of each map, linear between ranks as `numpy.quantile`.
-
-    The rank is a Python float: `torch.quantile` rounds it to the map's type, which in float32 moves the percentile.
-    """
+    """0.1th and 99.9th percentile of each map, linear between ranks as `numpy.quantile`."""
     ordered = maps.flatten(-2).sort(dim=-1).values
-    low, high = (_at_rank(ordered, share * (ordered.shape[-1] - 1)) for share in (_LOW, _HIGH))
-    return low, high
 
+    def at(share: float) -> Tensor:
+        # a Python float: `torch.quantile` rounds the rank to the map's type, which in float32 moves the percentile
+        rank = share * (ordered.shape[-1] - 1)
+        below = int(rank)
+        return torch.lerp(ordered[..., below], ordered[..., min(below + 1, ordered.shape[-1] - 1)], rank - below)
 
-def _at_rank(ordered: Tensor, rank: float) -> Tensor:
-    below = int(rank)
-    above = min(below + 1, ordered.shape[-1] - 1)
-    return torch.lerp(ordered[..., below], ordered[..., above], rank - below)
+    return at(0.001), at(0.999)
 
 
 def to_masks(
@@ -70,8 +67,7 @@ def to_masks(
 ) -> Float[Tensor, "*maps rows columns"]:
     """Turn each map into a mask in [0, 1]: clip((a - lo) / max(hi, 1e-12), 0, 1), lo and hi its extreme percentiles.
 
-    A map below zero all over (hi < 0) gives the empty mask: the formula as it stands would divide by 1e-12 and make
-    a channel that is nowhere active a mask of ones, which `as_published` keeps.
+    A map below zero all over gives the empty mask; `as_published` it gives one of ones, divided by 1e-12.
 
     References
     ----------
@@ -83,14 +79,54 @@ def to_masks(
     return masks if as_published else torch.where(high < 0, torch.zeros_like(masks), masks)
 
 
+def layer_map(
+    activations: Float[Tensor, "channels rows columns"], weights: Float[Tensor, " channels"]
+) -> Float[Tensor, "rows columns"]:
+    """Sum of weight x activation over the channels, above zero."""
+    return torch.relu(torch.einsum("c,chw->hw", weights, activations))
+
+
+def combine(
+    activations: Sequence[Float[Tensor, "_channels _rows _columns"]],
+    weights: Sequence[Float[Tensor, " _channels"]],
+    *,
+    size: tuple[int, int],
+) -> list[Float[Tensor, "height width"]]:
+    """Turn the channel weights of every layer into one saliency a layer, in [0, 1], resized to the image.
+
+    From the last layer on a layer's map is divided by itself resized to the coarser result and back (LNorm), then
+    multiplied by that result; a level's saliency is this product normalised like a mask.
+
+    References
+    ----------
+    Englebert, Cornu and De Vleeschouwer, *Poly-CAM*, ICPR 2022, section III, and its public code.
+    """
+    saliencies = []
+    coarser: Tensor | None = None
+    for activation, weight in zip(reversed(activations), reversed(weights), strict=True):
+        product = layer_map(activation, weight)
+        if coarser is not None:
+            here = product.shape[-2], product.shape[-1]
+            smooth = resize(resize(product, (coarser.shape[-2], coarser.shape[-1])), here)
+            product = torch.relu(product / smooth.clamp_min(FLOOR) * resize(coarser, here))
+        saliencies.append(resize(to_masks(product), size))
+        coarser = product
+    return saliencies[::-1]
+
+
+def scale_to(
+    saliencies: Float[Tensor, "batch height width"], *, total: Float[Tensor, " batch"]
+) -> Float[Tensor, "batch height width"]:
+    """Scale each map so that it adds up to its total; a map of zeros stays."""
+    sums = saliencies.sum(dim=(1, 2))
+    factor = torch.where(sums == 0, torch.zeros_like(sums), total / sums)
+    return saliencies * factor[:, None, None]
+
+
 def local_change(
     image: Float[Tensor, "3 height width"], reference: Float[Tensor, "3 height width"]
 ) -> Float[Tensor, "height width"]:
-    """How much the image differs from the reference around each pixel.
-
-    The mean of |x - b| over the colours and over a square of `CHANGE_WINDOW`; beyond the border the outermost pixels
-    are repeated.
-    """
+    """Mean of |x - b| over the colours and over a square of `CHANGE_WINDOW` around each pixel, the border repeated."""
     change = (image - reference).abs().mean(dim=0)
     reach = round(CHANGE_WINDOW * change.shape[0]) // 2
     padded = functional.pad(change[None, None], [reach] * 4, mode="replicate")

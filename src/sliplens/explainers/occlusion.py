@@ -11,9 +11,8 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.explainers.contract import Method, require_at_least_one
+from sliplens.explainers.contract import FrozenModel, Method, require_at_least_one
 from sliplens.explainers.explanation import Explanation
-from sliplens.explainers.frozen_model import FrozenModel
 from sliplens.markers import detect_markers
 from sliplens.progress import OnProgress
 from sliplens.recordings import Recording

@@ -1,22 +1,126 @@
 """Poly-CAM for a regressor: channel masks, scored by what they keep and what they remove."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeAlias, TypeVar
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from sliplens.errors import InputError
-from sliplens.explainers.activations import Layer, capture, find_layers
-from sliplens.explainers.channels import SCORES, VARIANTS, Regions, combine, measure, scale_to
-from sliplens.explainers.contract import Method
+from sliplens.explainers.activations import Layer, capture, find_layers, find_published_layers
+from sliplens.explainers.contract import Comparison, FrozenModel, Method
 from sliplens.explainers.explanation import Approximation, Explanation, Level, check_approximations, check_weights
-from sliplens.explainers.frozen_model import Comparison, FrozenModel
-from sliplens.explainers.maps import local_change, to_masks
+from sliplens.explainers.maps import combine, local_change, resize, scale_to, to_masks
 from sliplens.explainers.poly_cam_budget import ChannelSearch, Likeness, mask_kernel
 from sliplens.models.engines import Engine
 from sliplens.progress import OnProgress
+
+VARIANTS = {"+": 1, "-": 1, "+/-": 2}
+"""Passes a channel that a variant measures: of the image with only the region kept, with it removed, or both."""
+Points: TypeAlias = Float[Tensor, "points channels"]
+"""Predictions of the masked images of each channel in margin units: a row for what is kept and one for what is removed,
+as far as the variant has them."""
+Item = TypeVar("Item")
+
+
+def _measured(variant: str, kept: Item, removed: Item) -> list[Item]:
+    return [kept] * ("+" in variant) + [removed] * ("-" in variant)
+
+
+def regression_support(image: Tensor, empty: Tensor, points: Points, *, variant: str) -> Tensor:
+    """Share of f(x) - f(b) that each channel's region supports: 0 for the empty mask, 1 for the full one.
+
+    Unlike a softmax or sigmoid of the output it is signed and does not saturate. The division changes no map, since
+    each is normalised, and keeps the numbers clear of the floor of 1e-12 in `combine`.
+    """
+    effect = torch.stack(_measured(variant, points[0] - empty, image - points[-1])).mean(dim=0)
+    change = image - empty
+    return effect / change if change else torch.zeros_like(effect)
+
+
+def thesis_support(image: Tensor, _empty: Tensor, points: Points, *, variant: str) -> Tensor:
+    """What the public code makes the weights of, for a network with one output: of a sigmoid of the percentage.
+
+    In float32 it is 1 from 17 % on, so that there the weights of PCAM+/- are all 1 and those of PCAM- all 0.
+
+    References
+    ----------
+    Englebert, Cornu and De Vleeschouwer, *Poly-CAM*, ICPR 2022, eqs. 8 to 10, and its public code for the sigmoid of
+    a single output.
+    """
+    image, points = torch.sigmoid(100 * image), torch.sigmoid(100 * points)
+    return torch.stack(_measured(variant, points[0], image - points[-1])).sum(dim=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Score:
+    """A way to weigh channels, with what belongs to it."""
+
+    support: Callable[..., Float[Tensor, " channels"]]
+    """How far each channel speaks for the prediction; below 0 it speaks against it, and gets no weight."""
+    layers: Callable[[nn.Module, Tensor], tuple[Layer, ...]]
+    """Layers of a network, fine to coarse or as they run, found with one image."""
+    as_published: bool
+    """Masks as the public code makes them, blended with black; otherwise empty for what is nowhere active, blended
+    with the reference."""
+
+
+SCORES = {
+    "regression": Score(support=regression_support, layers=find_layers, as_published=False),
+    "thesis": Score(support=thesis_support, layers=find_published_layers, as_published=True),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Regions:
+    """One image and the regions of all its channels, those of every layer in a row."""
+
+    image: Float[Tensor, "3 height width"]
+    """Image x."""
+    empty: Float[Tensor, "3 height width"]
+    """What is shown outside a region, b."""
+    masks: list[Float[Tensor, "_channels _rows _columns"]]
+    """Masks M in [0, 1] at the resolution of each layer; see `to_masks`."""
+    variant: str
+
+    def active(self) -> Int[Tensor, " some"]:
+        """Channels whose mask is not empty; an empty one keeps nothing and removes nothing. A mask of NaN is active."""
+        return torch.nonzero(torch.cat([(masks != 0).flatten(1).any(dim=1) for masks in self.masks])).flatten()
+
+    def blends(self, channels: Int[Tensor, " some"]) -> Float[Tensor, "images 3 height width"]:
+        """Masked images of some channels, in rising order: all that are kept, then all that are removed."""
+        parts, first = [], 0
+        for masks in self.masks:
+            inside = channels[(channels >= first) & (channels < first + len(masks))] - first
+            if len(inside):
+                parts.append(resize(masks[inside], _size(self.image)))
+            first += len(masks)
+        content = (self.image - self.empty) * torch.cat(parts)[:, None]
+        return torch.cat(_measured(self.variant, self.empty + content, self.image - content))
+
+    def measure(self, channels: Int[Tensor, " some"], *, engine: Engine, on_channels: Callable[[int], None]) -> Points:
+        """Predictions of the masked images of some channels, in rising order, in batches of the engine."""
+        passes = VARIANTS[self.variant]
+        # of no channels at all, as where nothing differs from the reference, there is still one empty part
+        parts = channels.split(max(1, engine.batch_size // passes)) if len(channels) else ()
+
+        def batches() -> Iterator[Tensor]:
+            for part in parts:
+                # in pieces, where even one channel's images are more than a batch
+                yield from self.blends(part).split(engine.batch_size)
+
+        waiting, points = list(parts), []
+        pieces: list[Tensor] = []
+        for predictions in engine.run(batches()):
+            pieces.append(predictions)
+            if sum(map(len, pieces)) == passes * len(waiting[0]):
+                points.append(torch.cat(pieces).reshape(passes, -1))
+                on_channels(len(waiting.pop(0)))
+                pieces = []
+        return torch.cat(points, dim=1) if points else self.image.new_zeros(passes, 0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +207,7 @@ class PolyCam(Method):
 
         # one engine for all rounds and images
         engine = comparison.prepare(
-            len(comparison.images) * round(self.budget * channels) * VARIANTS[self.variant].passes,
+            len(comparison.images) * round(self.budget * channels) * VARIANTS[self.variant],
             engine=self.engine,
             batch_size=self.batch_size,
         )
@@ -119,14 +223,13 @@ class PolyCam(Method):
             approximations += estimated
             saliencies.append(combine(activations, shares, size=_size(shown_at)))
             shown.append(saliencies[-1][self._place] * shown_at)
-        kept = layers if self.levels else ()
         levels = tuple(
             Level(
                 layer=layer.name,
                 saliency=torch.stack([maps[depth] for maps in saliencies]).float(),
                 weights=torch.stack([shares[depth] for shares in weights]).float(),
             )
-            for depth, layer in enumerate(kept)
+            for depth, layer in enumerate(layers if self.levels else ())
         )
         return comparison.explanation(
             scale_to(torch.stack(shown), total=comparison.change),
@@ -174,43 +277,43 @@ class PolyCam(Method):
         count: Callable[[int], None],
     ) -> tuple[list[Tensor], list[Approximation]]:
         """Weight >= 0 of each channel, layer by layer, and how far they are estimates."""
-        score, variant = SCORES[self.score], VARIANTS[self.variant]
+        score = SCORES[self.score]
         image, empty = comparison.prediction[index], comparison.reference_prediction[index]
         black = torch.zeros_like(comparison.images[index])
         if score.as_published:
             empty = comparison.predict(black[None])[0]
-        regions = Regions(
+        regions = _Regions(
             image=comparison.images[index],
             empty=black if score.as_published else comparison.reference[index],
-            masks=tuple(to_masks(maps, as_published=score.as_published) for maps in activations),
+            masks=[to_masks(maps, as_published=score.as_published) for maps in activations],
+            variant=self.variant,
         )
+        sizes = [len(maps) for maps in activations]
 
-        def supports(points: Float[Tensor, "points some"]) -> Float[Tensor, " some"]:
-            return score.support(image, empty, points, variant=variant)
+        def supports(points: Points) -> Float[Tensor, " some"]:
+            return score.support(image, empty, points, variant=self.variant)
 
-        def measured(channels: Int[Tensor, " some"]) -> Float[Tensor, "points some"]:
-            return measure(regions, channels, engine=engine, variant=variant, on_channels=count)
-
+        measure = partial(regions.measure, engine=engine, on_channels=count)
         # an empty mask keeps nothing and removes nothing, which needs no pass
-        at_empty = torch.stack([empty] * variant.keep + [image] * variant.remove)[:, None]
+        at_empty = torch.stack(_measured(self.variant, empty, image))[:, None]
         active = regions.active()
-        count(sum(regions.layer_sizes) - len(active))
+        count(sum(sizes) - len(active))
         if self.budget < 1 and len(active):
             search = ChannelSearch(
                 activations,
-                mask_kernel(regions, active),
+                mask_kernel((regions.image - regions.empty).abs().mean(dim=0), regions.masks, active),
                 active=active,
                 at_empty=supports(at_empty)[0],
-                measure=lambda channels: supports(measured(channels)),
+                measure=lambda channels: supports(measure(channels)),
                 to_map=lambda weights: combine(activations, weights, size=_size(shown_at))[self._place] * shown_at,
                 seed=self.seed,
             )
             weights, approximation = search.run(budget=self.budget, likeness=self.likeness)
             count(len(active) - approximation.measured)
             return weights, [approximation]
-        points = at_empty.repeat(1, sum(regions.layer_sizes))
-        points[:, active] = measured(active)
-        return list(torch.relu(supports(points)).split(regions.layer_sizes)), []
+        points = at_empty.repeat(1, sum(sizes))
+        points[:, active] = measure(active)
+        return list(torch.relu(supports(points)).split(sizes)), []
 
 
 def _size(image: Tensor) -> tuple[int, int]:

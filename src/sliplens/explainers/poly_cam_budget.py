@@ -11,9 +11,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from sliplens.errors import InputError
-from sliplens.explainers.channels import Regions, layer_map
 from sliplens.explainers.explanation import ALIKE_R, ALIKE_TOP, Approximation
-from sliplens.explainers.maps import FLOOR, pearson_r, top_overlap
+from sliplens.explainers.maps import FLOOR, layer_map, pearson_r, top_overlap
 
 _GRID = 14  # cells a side on which masks are compared; more cells told nothing more
 _LENGTH = 3.0  # of the kernel, in median distances between masks
@@ -21,35 +20,33 @@ _NUGGET = 1e-3  # share of the variance that masks alike may still differ by
 _JITTER = 1e-6
 
 
-def mask_kernel(regions: Regions, channels: Int[Tensor, " some"]) -> Float[Tensor, "some some"]:
+def mask_kernel(
+    contrast: Float[Tensor, "height width"],
+    masks: Sequence[Float[Tensor, "_channels _rows _columns"]],
+    channels: Int[Tensor, " some"],
+) -> Float[Tensor, "some some"]:
     """How alike the effects of two channels should be: exp(-distance of what their masks uncover / length).
 
-    What a mask uncovers is its mean over each of 14 x 14 cells, times the mean |x - b| there: where the image equals
-    the reference a mask shows nothing. The kernel is the roughest of the Matern family, which asks no smoothness of
-    the network; its length is three times the median distance.
+    What a mask uncovers is its mean over each of 14 x 14 cells, times the contrast |x - b| there: where the image
+    equals the reference a mask shows nothing. The kernel asks no smoothness of the network.
 
     References
     ----------
     Rasmussen and Williams, *Gaussian processes for machine learning* (2006), eq. 4.18.
     """
-    content = (regions.image - regions.empty).abs().mean(dim=0)
-    weights = functional.adaptive_avg_pool2d(content[None], _GRID).flatten().double()
-    features = torch.cat([_pooled(masks).flatten(1) for masks in regions.masks])[channels].double() * weights
+    weights = functional.adaptive_avg_pool2d(contrast[None], _GRID).flatten().double()
+    # cells smaller than the grid's are averaged, larger ones repeated
+    pooled = [functional.adaptive_avg_pool2d(maps[:, None], _GRID).flatten(1) for maps in masks]
+    features = torch.cat(pooled)[channels].double() * weights
     distance = torch.cdist(features, features)
     return torch.exp(-distance / (_LENGTH * distance.median().clamp_min(1e-12)))
-
-
-def _pooled(masks: Tensor) -> Tensor:
-    # cells smaller than the grid's are averaged, larger ones repeated
-    return functional.adaptive_avg_pool2d(masks[:, None], _GRID)[:, 0]
 
 
 class GaussianProcess:
     """The effects of all channels as a Gaussian process, of which some are measured one after another.
 
     The factor L of the covariance is built column by column (a pivoted Cholesky decomposition), so that the variance
-    that is left after each choice is known before anything is measured. The kernel is the covariance of the effects up
-    to a factor, with ones on the diagonal.
+    that is left after each choice is known before anything is measured.
 
     References
     ----------
@@ -65,10 +62,7 @@ class GaussianProcess:
         self._effects = kernel.new_zeros(0)
 
     def choose(self, count: int, *, importance: Float[Tensor, " channels"]) -> Int[Tensor, " count"]:
-        """Choose channels, each the one with the most importance x standard deviation left after those before it.
-
-        Importance is what an error of the channel's effect costs, >= 0.
-        """
+        """Choose channels, each the one with the most importance x standard deviation left after those before it."""
         chosen = []
         self._factor = torch.cat([self._factor, self._factor.new_zeros(len(self._factor), count)], dim=1)
         free = torch.ones_like(self._variance)
@@ -91,12 +85,9 @@ class GaussianProcess:
 
     def estimate(self) -> tuple[Float[Tensor, " channels"], Float[Tensor, " channels"]]:
         """Effect of every channel, and its standard deviation: 0 for those measured."""
-        chosen, count = torch.tensor(self.chosen), len(self.chosen)
-        mean = self._effects.mean()
-        residual = torch.linalg.solve_triangular(
-            self._factor[chosen, :count], (self._effects - mean)[:, None], upper=False
-        )
-        estimate = mean + (self._factor[:, :count] @ residual)[:, 0]
+        chosen, factor, mean = torch.tensor(self.chosen), self._factor[:, : len(self.chosen)], self._effects.mean()
+        residual = torch.linalg.solve_triangular(factor[chosen], (self._effects - mean)[:, None], upper=False)
+        estimate = mean + (factor @ residual)[:, 0]
         estimate[chosen] = self._effects
         # the prior variance that makes what was measured most likely (eq. 5.8 solved for a factor of the kernel)
         deviation = (self._variance * (residual**2).mean()).sqrt()
@@ -145,19 +136,11 @@ class Likeness:
 class ChannelSearch:
     """Channels measured where they matter to the map, the supports of the others estimated from them.
 
-    The supports are taken for a Gaussian process over the masks (`mask_kernel`). An error of a channel's support costs
-    its layer's map the channel's activation, so channels are measured in order of the norm of the activation, over that
-    of the layer's map, times the standard deviation of the support that the channels before leave; from the second
-    round on times the probability that the support is above 0 at all, for the others have no weight.
-
-    The error is measured on maps: 16 times the supports that were not measured are drawn from the process, given those
-    that were, and the map is made of them. What these maps have in common with the result is what the exact map, one
-    more such draw as far as anyone knows, is expected to have in common with it. The process's variance is fitted to
-    what was measured, so a network whose answers the masks foretell badly gives a larger expected error; where a score
-    is saturated and all are alike, nothing is left to estimate.
-
-    Rounds go on after the budget is spent until what the map is expected to miss is half of what it may. The draws know
-    what was left open under this kernel, not how wrong the kernel is: hence the half.
+    The supports are taken for a Gaussian process over the masks. Channels are measured in order of what an error of the
+    support costs the map, times its standard deviation, from the second round on times the probability that it is above
+    0 at all. The error is measured on maps that are made of supports drawn from the process: the exact map is one more
+    such draw as far as anyone knows. The draws know what was left open under this kernel, not how wrong the kernel is,
+    so rounds go on until what the map is expected to miss is half of what it may.
 
     Active are the channels whose mask is not empty, all layers in a row; the support of the others is `at_empty`.
     `measure` gives supports of channels in rising order (`Score.support`), `to_map` the map that weights make.
