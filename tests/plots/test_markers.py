@@ -8,13 +8,10 @@ from sliplens.errors import InputError, SaliencyError
 from sliplens.markers import compute_field, interpolate_field, track_markers
 from sliplens.plots.markers import (
     MarkedFrame,
-    choose_states,
-    draw_contact_states,
     draw_fields_beside_saliency,
     plot_arrows,
     plot_field,
 )
-from sliplens.recordings import ContactState
 
 pytest.importorskip("cv2", reason="markers are found with OpenCV, of the extra `markers`")
 
@@ -48,23 +45,6 @@ def test_a_field_is_coloured_by_its_length_and_a_still_one_has_no_streamlines():
     assert not still.collections
 
 
-def test_states_are_shown_in_their_order_by_frames_of_their_own(tracked):
-    trial, tracks = tracked
-    chosen = choose_states(trial)
-    assert list(chosen) == [
-        ContactState.NO_CONTACT,
-        ContactState.CONTACT,
-        ContactState.INCIPIENT_SLIP,
-        ContactState.FULL_SLIP,
-    ]
-    assert list(chosen.values()) == sorted(chosen.values())
-    assert all(trial.contact_state[at] == state for state, at in chosen.items())
-    figure = draw_contact_states(trial, tracks)
-    titles = [axes.get_title(loc="left") for axes in figure.axes[:4]]
-    assert [title.split(",")[0] for title in titles] == ["No contact", "Contact", "Incipient slip", "Full slip"]
-    assert figure.axes[-1].get_ylabel() == "Displacement (px)"
-
-
 def test_frame_field_and_map_stand_side_by_side(tracked):
     trial, tracks = tracked
     field = compute_field(tracks, 10, size=(224, 224))
@@ -77,9 +57,6 @@ def test_frame_field_and_map_stand_side_by_side(tracked):
         )
 
 
-def test_what_does_not_belong_together_is_refused(tracked, dots, grid):
-    trial, _ = tracked
-    with pytest.raises(InputError, match="1 frames were tracked but the trial has 40"):
-        draw_contact_states(trial, track_markers([dots(grid())], dots(grid()), "gelsight-mini"))
+def test_no_frame_is_refused():
     with pytest.raises(InputError, match="no frame to draw"):
         draw_fields_beside_saliency([])

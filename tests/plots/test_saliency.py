@@ -3,7 +3,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from sliplens.errors import SaliencyError
-from sliplens.plots.saliency import overlay_saliency, plot_colour_bar, plot_overlay, stretch_saliency
+from sliplens.plots.saliency import overlay_saliency, plot_colour_bar, stretch_saliency
 
 
 def test_overlay_has_the_size_of_its_picture(rng):
@@ -43,13 +43,6 @@ def test_colours_grow_lighter_with_saliency_over_a_dark_picture():
 def test_map_that_does_not_fit_is_refused(saliency):
     with pytest.raises(SaliencyError):
         overlay_saliency(np.zeros((8, 8, 3), dtype=np.uint8), saliency)
-
-
-def test_plot_overlay_draws_one_image_that_fills_the_picture(rng):
-    ax = plot_overlay(np.zeros((8, 12, 3), dtype=np.uint8), rng.random((8, 12)), ax=Figure().subplots())
-
-    assert len(ax.images) == 1
-    assert ax.images[0].get_extent() == [-0.5, 11.5, 7.5, -0.5]
 
 
 def test_colour_bar_says_what_its_ends_mean():

@@ -26,7 +26,7 @@ from sliplens.plots.contact_sheet import (
     choose_margins,
     plot_margin,
 )
-from sliplens.plots.layout import place_axes, place_text, require_picture_path, save_page, write_over
+from sliplens.plots.layout import place_axes, place_text, save_page, write_over
 from sliplens.plots.style import BLACK, BLUE, GREEN, GREY, PURPLE, SKY, VERMILLION, decimals, drawing_style, signed
 from sliplens.progress import OnProgress, stage
 from sliplens.recordings import ContactState, Dataset, Recording
@@ -44,8 +44,7 @@ class Fact(NamedTuple):
 
     head: str
     words: list[str]
-    doubtful: bool = False
-    """Whether a label may be wrong for it."""
+    doubtful: bool = False  # whether a label may be wrong for it
     indent: str = ""
 
 
@@ -56,45 +55,23 @@ def audit_facts(recording: Recording, labelling: Labelling) -> list[Fact]:
         return _tell_given(recording, labelling)
     axes, limit, notes = basis.axes, basis.force_range_n, [*basis.axes.notes, *labelling.notes]
     pressing = f"normal force is {'+' if axes.sign > 0 else _MINUS}{axes.normal}"
+    told = f"{pressing} (axis {_found(axes.normal_found)}, sign {_found(axes.sign_found)})"
     still = f"untouched until {decimals(axes.still_until_s, 2)} s"
+    noise = [f"± {_three(axes.tare_sigma_n)} N", f"noise of a sample {_three(axes.noise_n)} N"]
+    tare = [f"x, y, z: {_three(axes.tare_n, signed)} N", *noise, still]
     energy, drift = decimals(reference.contact_energy, 2), decimals(reference.drift, 2)
     means = f"means over {_milli(basis.window_s)} ms; gaps over {_milli(basis.gap_s)} ms count as missing"
+    span = "range of the sensor not told" if limit is None else f"range of the sensor ± {limit:g} N"
+    chosen = [f"frame {reference.index}, {reference.method}", f"contact energy {energy}, drift {drift} grey levels"]
+    chosen = [reference.method] if reference.index is None else chosen
     return [
         _tell_frames(recording),
-        Fact(
-            "Axes",
-            [f"{pressing} (axis {_found(axes.normal_found)}, sign {_found(axes.sign_found)})"],
-            any("axis" in note for note in axes.notes),
-        ),
-        Fact(
-            f"Tare {_found(axes.tare_found)}",
-            [
-                f"x, y, z: {_three(axes.tare_n, signed)} N",
-                f"± {_three(axes.tare_sigma_n)} N",
-                f"noise of a sample {_three(axes.noise_n)} N",
-                still,
-            ],
-            axes.tare_found == Found.ASSUMED,
-        ),
+        Fact("Axes", [told], any("axis" in note for note in axes.notes)),
+        Fact(f"Tare {_found(axes.tare_found)}", tare, axes.tare_found == Found.ASSUMED),
         _tell_friction(basis.friction, basis.slip_s),
         _tell_lag(recording, basis.lag, applied=basis.lag_applied),
-        Fact(
-            "Forces",
-            [
-                f"contact from {decimals(basis.contact_threshold_n, 3)} N",
-                means,
-                "range of the sensor not told" if limit is None else f"range of the sensor ± {limit:g} N",
-            ],
-        ),
-        Fact(
-            "Reference",
-            [reference.method]
-            if reference.index is None
-            else [
-                f"frame {reference.index}, {reference.method}",
-                f"contact energy {energy}, drift {drift} grey levels",
-            ],
-        ),
+        Fact("Forces", [f"contact from {decimals(basis.contact_threshold_n, 3)} N", means, span]),
+        Fact("Reference", chosen),
         *([Fact("Notes", [f"• {note}" for note in notes], indent="   ")] if notes else []),
     ]
 
@@ -281,10 +258,10 @@ def draw_audit(recording: Recording, labelling: Labelling, *, read_frames: ReadF
     with drawing_style():
         figure = Figure(figsize=(_WIDTH, _HEIGHT))
         charts = _draw_charts(figure, recording, labelling, bottom=top - _HEAD - _LEADER - _TICKS)
-        index, along = labelling.reference.index, choose_along(recording)
+        columns = [labelling.reference.index, *choose_along(recording)]
         read = recording.frames.__getitem__ if read_frames is None else read_frames
-        _draw_pictures(figure, recording, index, along, read, top=top, height=height)
-        for column, at in enumerate([index, *along]):
+        _draw_pictures(figure, recording, columns, read, top=top, height=height)
+        for column, at in enumerate(columns):
             if at is None:  # the reference was recorded apart from the frames
                 continue
             time_s = recording.time_s[at]
@@ -292,14 +269,6 @@ def draw_audit(recording: Recording, labelling: Labelling, *, read_frames: ReadF
             _lead(figure, charts, float(time_s), middle, top=top - _HEAD - _LEADER)
         _tell(figure, recording, labelling)
     return figure
-
-
-def write_audit(
-    recording: Recording, labelling: Labelling, path: Path, *, read_frames: ReadFrames | None = None
-) -> None:
-    """Save the audit of a trial as .png, .pdf or .svg; it appears when complete."""
-    require_picture_path(path, example="audit.png")
-    save_page(draw_audit(recording, labelling, read_frames=read_frames), path)
 
 
 def write_audits(data: Dataset, folder: Path, *, on_progress: OnProgress | None = None) -> int:
@@ -319,7 +288,7 @@ def write_audits(data: Dataset, folder: Path, *, on_progress: OnProgress | None 
                 # all numbers, but only the pixels that the page shows: memory stays small however long the trial
                 recording = load_recording(path, pixels=False)
                 assert recording.labelling is not None
-                write_audit(recording, recording.labelling, page, read_frames=partial(read_frames, path))
+                save_page(draw_audit(recording, recording.labelling, read_frames=partial(read_frames, path)), page)
                 drawn += 1
             count(done, len(data.trials))
     return drawn
@@ -393,20 +362,14 @@ def _lead(figure: Figure, charts: list[Axes], time_s: float, middle: float, *, t
 
 
 def _draw_pictures(
-    figure: Figure,
-    recording: Recording,
-    index: int | None,
-    along: list[int],
-    read_frames: ReadFrames,
-    *,
-    top: float,
-    height: float,
+    figure: Figure, recording: Recording, columns: list[int | None], read: ReadFrames, *, top: float, height: float
 ) -> None:
+    index, *along = columns
     reference, second = recording.reference, top + height + _GAP
     free = [at for at, state in enumerate(recording.contact_state) if state == ContactState.NO_CONTACT]
     # the reference less itself would tell nothing, an untouched frame long before or after it tells how it drifts
     far = max(free, key=lambda at: abs(at - (index or 0)), default=index)
-    shown = read_frames(along if far is None else [*along, far])
+    shown = read([at for at in (*along, far) if at is not None])
     frames = [reference, *shown[: len(along)]]
     untouched = reference if far is None else shown[-1]
     differences = absolute_difference(np.stack([untouched, *frames[1:]]), reference)
@@ -414,7 +377,7 @@ def _draw_pictures(
     for text, middle in (("camera", top + height / 2), (f"difference\n{TIMES} {factor:g}", second + height / 2)):
         turned = {"rotation": 90, "ha": "right", "va": "center", "multialignment": "center"}
         place_text(figure, _LEFT - 0.06, middle, text, fontsize=8.5, color=GREY, **turned)
-    for column, (at, frame, difference) in enumerate(zip([index, *along], frames, differences, strict=True)):
+    for column, (at, frame, difference) in enumerate(zip(columns, frames, differences, strict=True)):
         x = _LEFT + column * (_PICTURE + _GAP)
         state = ContactState.NO_CONTACT if at is None else recording.contact_state[at]
         for y, picture in ((top, frame), (second, brighten(difference, factor))):

@@ -2,19 +2,19 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple
 
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import binary_dilation
 
 from sliplens.errors import InputError
 from sliplens.images import absolute_difference
@@ -41,18 +41,14 @@ _SMALL, _LARGE = (480, 640), (720, 960)
 _DPI, _EDGE, _HEAD, _FOOT, _AXIS, _CHART, _STATUS, _LEAST = 100, 18, 74, 54, 76, 560, 84, 448
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Stage:
+class _Stage(NamedTuple):
     """What no frame of a clip changes, and where the rest goes, in pixels as (top, left)."""
 
-    factor: float
-    """Of the differences' brightness."""
+    factor: float  # of the differences' brightness
     still: UInt8[np.ndarray, "rows columns 3"]
-    places: tuple[tuple[int, int], ...]
-    """Of the camera frame, the difference image and the state."""
+    places: tuple[tuple[int, int], ...]  # of the camera frame, the difference image and the state
     cursor_rows: slice
-    cursor_column: Callable[[float], int]
-    """Of a time in seconds."""
+    cursor_column: Callable[[float], int]  # of a time in seconds
 
 
 def write_clip(
@@ -64,18 +60,14 @@ def write_clip(
     forces and safety margin under a moving cursor. It is for the eye only: lossy video moves markers, so measure in the
     recording, never in its clip.
 
-    Parameters
-    ----------
-    recording
-        Trial of any frame size and rate; its frames are repeated or left out to keep time.
-    frames_per_s
-        Frames a second of the clip; by default the recording's own if between 25 and 30, otherwise 30.
+    Frames of the recording are repeated or left out to keep time; by default the clip has its frames a second if they
+    are between 25 and 30, otherwise 30.
     """
-    require_clip_path(path)
     rate = natural_rate(recording.time_s) if frames_per_s is None else frames_per_s
-    with _open_clip(path, frames_per_s=rate) as open_stream:
-        indices, stage = clip_frames(recording.time_s, rate), _set_stage(recording)
-        add = open_stream(stage.still.shape[:2])
+    require_clip_path(path)
+    stage = _set_stage(recording)
+    with _open_clip(path, stage.still.shape[:2], rate) as add:
+        indices = clip_frames(recording.time_s, rate)
         for done, pixels in enumerate(_draw_frames(recording, indices, stage, rate), start=1):
             add(pixels)
             if on_progress is not None:
@@ -205,18 +197,11 @@ def paint_outlines(camera: UInt8[np.ndarray, "rows columns 3"], contact: UInt8[n
     contact = contact[::down, ::down].repeat(up, axis=0).repeat(up, axis=1)
     touches, loose = contact != OUTSIDE, contact != STICKS
     for zone, steps, colour in ((touches, 3, BLACK), (touches, 2, "white"), (loose, 3, BLACK), (loose, 2, SKY)):
-        camera[_grow(zone, steps) & ~zone] = _bytes(colour)
+        camera[binary_dilation(zone, iterations=steps) & ~zone] = _bytes(colour)
 
 
 def _bytes(colour: str) -> UInt8[np.ndarray, "3"]:
     return np.round(255 * np.array(to_rgb(colour))).astype(np.uint8)
-
-
-def _grow(zone: Bool[np.ndarray, "rows columns"], steps: int) -> Bool[np.ndarray, "rows columns"]:
-    for _ in range(steps):
-        wide = np.pad(zone, 1)
-        zone = zone | wide[2:, 1:-1] | wide[:-2, 1:-1] | wide[1:-1, 2:] | wide[1:-1, :-2]
-    return zone
 
 
 _COLOURS = {MarkerStatus.FOLLOWED: YELLOW, MarkerStatus.BROKEN: VERMILLION, MarkerStatus.NEW: SKY}
@@ -225,12 +210,7 @@ _MAGNIFIED = 3  # arrows, so that a pixel of motion shows
 
 
 def draw_tracked(
-    frame: UInt8[np.ndarray, "height width 3"],
-    tracked: TrackedFrame,
-    *,
-    rest_px: Float[np.ndarray, "markers 2"],
-    scale: int = 1,
-    magnified: float = _MAGNIFIED,
+    frame: UInt8[np.ndarray, "height width 3"], tracked: TrackedFrame, rest_px: np.ndarray, scale: int
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     """Frame, enlarged, with a ring round every marker that is seen and an arrow, magnified, along its displacement.
 
@@ -238,18 +218,17 @@ def draw_tracked(
     """
     image = Image.fromarray(frame).resize((frame.shape[1] * scale, frame.shape[0] * scale), Image.Resampling.BICUBIC)
     draw = ImageDraw.Draw(image)
-    for index, (place, radius, status) in enumerate(
-        zip(tracked.position_px, tracked.radius_px, tracked.status.tolist(), strict=True)
-    ):
-        colour = _COLOURS.get(MarkerStatus(status))
-        if colour is None:
+    markers = zip(tracked.position_px, tracked.radius_px, tracked.status.tolist(), strict=True)
+    for index, (place, radius, status) in enumerate(markers):
+        if status not in _COLOURS:
             continue
+        colour = _COLOURS[status]
         x, y = (place + 0.5) * scale - 0.5
         reach = radius * scale
-        draw.ellipse((x - reach, y - reach, x + reach, y + reach), outline=colour, width=max(1, scale))
+        draw.ellipse((x - reach, y - reach, x + reach, y + reach), outline=colour, width=scale)
         if status == MarkerStatus.FOLLOWED:
-            shift = (place - rest_px[index]) * scale * magnified
-            _arrow(draw, (x, y), (x + shift[0], y + shift[1]), width=max(1, scale))
+            shift = (place - rest_px[index]) * scale * _MAGNIFIED
+            _arrow(draw, (x, y), (x + shift[0], y + shift[1]), width=scale)
     return np.asarray(image)
 
 
@@ -280,19 +259,15 @@ def clip_writer(
     scale = max(1, _LEAST_SIDE // max(size))
     # H.264 keeps one colour for two by two pixels
     rows, columns = (side * scale // 2 * 2 for side in size)
-    with _open_clip(path, frames_per_s=frames_per_s) as open_stream:
-        add = open_stream((rows, columns))
-        yield lambda frame, tracked, rest_px: add(
-            draw_tracked(frame, tracked, rest_px=rest_px, scale=scale)[:rows, :columns]
-        )
-
-
-_Add: TypeAlias = Callable[[UInt8[np.ndarray, "rows columns 3"]], None]
+    with _open_clip(path, (rows, columns), frames_per_s) as add:
+        yield lambda frame, tracked, rest_px: add(draw_tracked(frame, tracked, rest_px, scale)[:rows, :columns])
 
 
 @contextmanager
-def _open_clip(path: Path, *, frames_per_s: float) -> Iterator[Callable[[tuple[int, int]], _Add]]:
-    """Give what begins a clip of a height and width, and so gives what adds a picture to it."""
+def _open_clip(
+    path: Path, size: tuple[int, int], frames_per_s: float
+) -> Iterator[Callable[[UInt8[np.ndarray, "rows columns 3"]], None]]:
+    """Give what adds a picture to a clip of a height and width."""
     require_clip_path(path)
     if not 1 <= frames_per_s <= 120:
         raise InputError(f"{frames_per_s:g} frames a second cannot be watched; ask for {_SLOWEST} to {_FASTEST}")
@@ -305,14 +280,10 @@ def _open_clip(path: Path, *, frames_per_s: float) -> Iterator[Callable[[tuple[i
     ):
         rate = Fraction(frames_per_s).limit_denominator(1001)
         stream = container.add_stream("libx264", rate=rate, options={"crf": "20", "preset": "veryfast"})
-
-        def open_stream(size: tuple[int, int]) -> _Add:
-            stream.height, stream.width, stream.pix_fmt = *size, "yuv420p"
-            # what FFmpeg turns RGB into, BT.601: untold, a player guesses by the size
-            stream.codec_context.colorspace = 5
-            return lambda pixels: container.mux(
-                stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24"))
-            )
-
-        yield open_stream
+        stream.height, stream.width, stream.pix_fmt = *size, "yuv420p"
+        # what FFmpeg turns RGB into, BT.601: untold, a player guesses by the size
+        stream.codec_context.colorspace = 5
+        yield lambda pixels: container.mux(
+            stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24"))
+        )
         container.mux(stream.encode())

@@ -1,12 +1,13 @@
 """Errors of a network: by margin, frame, trial and epoch."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from sliplens.plots.layout import place_axes, place_text, require_picture_path, save_page, write_over
 from sliplens.plots.style import (
@@ -28,59 +29,45 @@ from sliplens.plots.style import (
     methods_in_order,
     short_input_name,
 )
-from sliplens.results.evaluation import (
-    BaselineScores,
-    BinScore,
-    Evaluation,
-    Predictions,
-    RegressionScores,
-    Reliability,
-)
+from sliplens.results.evaluation import BaselineScores, BinScore, Evaluation, Predictions, RegressionScores, Reliability
 from sliplens.results.faithfulness import DeletionCurve
 from sliplens.results.training import Training
 
 MARGIN_LABEL = "Safety margin Γ (%)"
+_MSE_LABEL, _EPOCH_LABEL = "MSE (Γ as a fraction, squared)", "Epoch (passes over the training frames)"
+_DOTS: Any = {"linewidths": 0, "rasterized": True}  # thousands of dots as vectors would swell the page
 
 
 def plot_bins(bins: Mapping[str, tuple[BinScore, ...]], *, ax: Axes) -> Axes:
     """Draw the MSE in each bin of the safety margin as bars, one colour an input (thesis, Fig. 7)."""
     names = inputs_in_order(bins)
-    width = 0.8 / max(1, len(names))
-    for index, name in enumerate(names):
-        shown = [(place, score.mse) for place, score in enumerate(bins[name]) if score.mse is not None]
-        ax.bar(
-            [place + (index - (len(names) - 1) / 2) * width for place, _ in shown],
-            [mse for _, mse in shown],
-            width=width,
-            color=INPUT_COLOURS.get(name, PURPLE),
-            label=short_input_name(name),
-        )
+    _draw_bins([(short_input_name(name), INPUT_COLOURS.get(name, PURPLE), bins[name]) for name in names], ax=ax)
     edges = next(iter(bins.values()), ())
     ax.set_xticks(
         np.arange(len(edges) + 1) - 0.5,
         [f"{100 * edge:.0f}" for edge in [*(row.low for row in edges), 1.0]][: len(edges) + 1],
     )
     ax.grid(visible=False, axis="x")
-    ax.set(xlabel=MARGIN_LABEL, ylabel="MSE (Γ as a fraction, squared)", xlim=(-0.6, len(edges) - 0.4))
+    ax.set(xlabel=MARGIN_LABEL, ylabel=_MSE_LABEL, xlim=(-0.6, len(edges) - 0.4))
     _legend_above(ax)
     return ax
+
+
+def _draw_bins(rows: Sequence[tuple[str, str, Sequence[BinScore]]], *, ax: Axes) -> None:
+    """Bars of the MSE in each bin, side by side, each row with its name and colour."""
+    width = 0.8 / max(1, len(rows))
+    for index, (name, colour, bins) in enumerate(rows):
+        at = np.arange(len(bins)) + (index - (len(rows) - 1) / 2) * width
+        heights = [np.nan if one.mse is None else one.mse for one in bins]
+        ax.bar(at, heights, width=width, color=colour, label=name)
 
 
 def plot_predictions(predictions: Predictions, *, colour: str, ax: Axes) -> Axes:
     """Draw the answer against the label of every frame, in percent, with the line of perfect answers."""
     ax.plot([0, 100], [0, 100], color=BLACK, linewidth=1, linestyle="--", label="perfect", zorder=3)
-    ax.scatter(
-        100 * predictions.safety_margin,
-        100 * predictions.prediction,
-        s=9,
-        color=colour,
-        alpha=0.45,
-        linewidths=0,
-        rasterized=True,  # thousands of dots as vectors would swell the page
-        label="one frame",
-    )
-    low, high = _limits(predictions.prediction)
-    ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103), ylim=(low, high))
+    label, read = 100 * predictions.safety_margin, 100 * predictions.prediction
+    ax.scatter(label, read, s=9, color=colour, alpha=0.45, label="one frame", **_DOTS)
+    ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103), ylim=_limits(predictions.prediction))
     ax.legend(loc="best")
     return ax
 
@@ -88,11 +75,10 @@ def plot_predictions(predictions: Predictions, *, colour: str, ax: Axes) -> Axes
 def plot_learning_curves(trainings: Mapping[str, Training], *, ax: Axes) -> Axes:
     """Draw the error on the training and validation frames by epoch, one colour an input."""
     for name in inputs_in_order(trainings):
-        training, colour = trainings[name], INPUT_COLOURS.get(name, PURPLE)
-        label = short_input_name(name)
-        ax.plot(training.curve.epoch, training.curve.train_mse, color=colour, linestyle=":", label=f"{label}, training")
-        ax.plot(training.curve.epoch, training.curve.validation_mse, color=colour, label=f"{label}, validation")
-    ax.set(xlabel="Epoch (passes over the training frames)", ylabel="MSE (Γ as a fraction, squared)", yscale="log")
+        curve, colour, label = trainings[name].curve, INPUT_COLOURS.get(name, PURPLE), short_input_name(name)
+        ax.plot(curve.epoch, curve.train_mse, color=colour, linestyle=":", label=f"{label}, training")
+        ax.plot(curve.epoch, curve.validation_mse, color=colour, label=f"{label}, validation")
+    ax.set(xlabel=_EPOCH_LABEL, ylabel=_MSE_LABEL, yscale="log")
     ax.legend()
     return ax
 
@@ -107,14 +93,8 @@ def plot_faithfulness(curves: Mapping[str, DeletionCurve], *, pixels: int, ax: A
         share = 100 * curve.pixels_removed / pixels
         low, high = np.quantile(curve.scores, [0.25, 0.75], axis=0)
         ax.fill_between(share, low, high, color=colour, alpha=0.12, linewidth=0)
-        ax.plot(
-            share,
-            curve.scores.mean(axis=0),
-            color=colour,
-            linestyle=METHOD_LINES.get(name, "-"),
-            linewidth=2.2 if name != CONTROL else 2.4,
-            label=method_name(name),
-        )
+        line = {"linestyle": METHOD_LINES.get(name, "-"), "linewidth": 2.2 if name != CONTROL else 2.4}
+        ax.plot(share, curve.scores.mean(axis=0), color=colour, label=method_name(name), **line)
     ax.set(xlabel="Pixels removed (%)", ylabel="Deletion score D (no unit)", xlim=(0, 100), ylim=(0, 1.03))
     ax.legend()
     return ax
@@ -122,25 +102,15 @@ def plot_faithfulness(curves: Mapping[str, DeletionCurve], *, pixels: int, ax: A
 
 def plot_margin_over_time(trials: Mapping[str, Predictions], *, ax: Axes) -> Axes:
     """Draw the label and each network's answer through one trial, its frames by input."""
-    names = inputs_in_order(trials)
-    label = trials[names[0]]
-    order = np.argsort(label.time_s)
-    ax.plot(label.time_s[order], 100 * label.safety_margin[order], color=BLACK, linewidth=2.4, label="true")
-    for name in names:
-        trial = trials[name]
-        order = np.argsort(trial.time_s)
-        ax.plot(
-            trial.time_s[order],
-            100 * trial.prediction[order],
-            color=INPUT_COLOURS.get(name, PURPLE),
-            marker="o",
-            markersize=3,
-            linewidth=1.2,
-            label=short_input_name(name),
-        )
+    ordered = {name: trials[name].where(np.argsort(trials[name].time_s)) for name in inputs_in_order(trials)}
+    label = next(iter(ordered.values()))
+    ax.plot(label.time_s, 100 * label.safety_margin, color=BLACK, linewidth=2.4, label="true")
+    for name, trial in ordered.items():
+        line = {"color": INPUT_COLOURS.get(name, PURPLE), "marker": "o", "markersize": 3, "linewidth": 1.2}
+        ax.plot(trial.time_s, 100 * trial.prediction, label=short_input_name(name), **line)
     ax.axhline(0, color=GREY, linewidth=0.8)
-    low, high = _limits(np.concatenate([trial.prediction for trial in trials.values()]))
-    ax.set(xlabel="Time (s)", ylabel=MARGIN_LABEL, ylim=(low, high))
+    ylim = _limits(np.concatenate([trial.prediction for trial in trials.values()]))
+    ax.set(xlabel="Time (s)", ylabel=MARGIN_LABEL, ylim=ylim)
     _legend_above(ax)
     return ax
 
@@ -178,7 +148,11 @@ def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
         charts = [place_axes(figure, left, top, *_CHART) for top in tops for left in lefts]
         predictions = evaluation.predictions
         plot_answers(predictions, conditions, ax=charts[0])
-        _plot_bins(evaluation.conditions, conditions, ax=charts[1])
+        bins = [(name, _COLOURS.get(name, GREEN), evaluation.conditions[name].bins) for name in conditions]
+        _draw_bins(bins, ax=charts[1])
+        charts[1].set(xlabel="True Γ, lower edge of the bin (%)", ylabel=_MSE_LABEL, title="Error by margin")
+        charts[1].set_xticks(range(10), [str(10 * one) for one in range(10)])
+        charts[1].legend(fontsize=8)
         _plot_trials(predictions, conditions, ax=charts[2])
         _plot_coverage(evaluation.reliability, conditions, ax=charts[3])
         _plot_uncertainty(predictions, conditions, evaluation.wet_auroc, ax=charts[4])
@@ -195,31 +169,11 @@ def plot_answers(predictions: Predictions, conditions: list[str], *, ax: Axes) -
     for name in conditions:
         rows = np.flatnonzero(predictions.condition == name)
         rows = rows[:: max(1, len(rows) // _MOST_DOTS)]
-        ax.scatter(
-            100 * predictions.safety_margin[rows],
-            100 * predictions.prediction[rows],
-            s=5,
-            alpha=0.35,
-            linewidths=0,
-            rasterized=True,
-            color=_COLOURS.get(name, GREEN),
-            label=name,
-        )
+        label, read = 100 * predictions.safety_margin[rows], 100 * predictions.prediction[rows]
+        ax.scatter(label, read, s=5, alpha=0.35, color=_COLOURS.get(name, GREEN), label=name, **_DOTS)
     ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="perfect")
     ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103), title="Answers")
     ax.legend(markerscale=2.5, fontsize=8, loc="upper left")
-
-
-def _plot_bins(scores: Mapping[str, RegressionScores], conditions: list[str], *, ax: Axes) -> None:
-    width = 0.8 / max(1, len(conditions))
-    for index, name in enumerate(conditions):
-        bins = scores[name].bins
-        at = np.arange(len(bins)) + (index - (len(conditions) - 1) / 2) * width
-        heights = [np.nan if one.mse is None else one.mse for one in bins]
-        ax.bar(at, heights, width=width, color=_COLOURS.get(name, GREEN), label=name)
-    ax.set(xlabel="True Γ, lower edge of the bin (%)", ylabel="MSE (Γ as a fraction, squared)", title="Error by margin")
-    ax.set_xticks(range(10), [str(10 * one) for one in range(10)])
-    ax.legend(fontsize=8)
 
 
 def _plot_trials(predictions: Predictions, conditions: list[str], *, ax: Axes) -> None:
@@ -230,9 +184,8 @@ def _plot_trials(predictions: Predictions, conditions: list[str], *, ax: Axes) -
         spread = np.linspace(-0.25, 0.25, len(biases)) if len(biases) > 1 else np.zeros(1)
         ax.scatter(np.sort(biases), place + spread, s=14, color=_COLOURS.get(name, GREEN), linewidths=0)
     ax.axvline(0, color=BLACK, linewidth=1, linestyle="--")
-    ax.set(
-        xlabel="Mean of predicted less true Γ (points)", title="Bias of each trial", ylim=(len(conditions) - 0.5, -0.5)
-    )
+    ax.set(xlabel="Mean of predicted less true Γ (points)", title="Bias of each trial")
+    ax.set_ylim(len(conditions) - 0.5, -0.5)
     ax.set_yticks(range(len(conditions)), conditions)
 
 
@@ -325,33 +278,26 @@ def draw_learning_curve(training: Training, path: Path, *, title: str) -> None:
     curve = training.curve
     epoch, train, validation = curve.epoch, curve.train_mse, curve.validation_mse
     best = int(np.argmin(validation))
+    # few epochs have a dot each: one alone makes no line
+    colour, dot = INPUT_COLOURS.get(training.input, BLUE), "o" if len(epoch) <= 40 else ""
+    ring: Any = {"markersize": 10, "markerfacecolor": "none", "markeredgewidth": 1.6, "color": VERMILLION}
+    errors = np.concatenate([train, validation])
     with drawing_style():
         figure = Figure(figsize=(7.0, 4.4))
         ax = place_axes(figure, 0.95, 0.75, 5.8, 3.05)
-        _plot(ax, epoch, train, validation, best=best, colour=INPUT_COLOURS.get(training.input, BLUE))
+        ax.plot(epoch, train, color=colour, linestyle=":", marker=dot, markersize=3, label="training, augmented")
+        ax.plot(epoch, validation, color=colour, marker=dot, markersize=3, label="validation")
+        ax.plot(epoch[best], validation[best], marker="o", linestyle="", label="kept", **ring)
+        ax.set(xlabel=_EPOCH_LABEL, ylabel=_MSE_LABEL, yscale="log", xlim=(0, 1.03 * max(1.0, float(epoch[-1]))))
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        # room above and below, so that a curve that hardly falls looks like one
+        ax.set_ylim(0.7 * float(errors.min()), 1.4 * float(errors.max()))
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
+        ax.yaxis.set_major_formatter("{x:g}")
+        ax.yaxis.set_minor_locator(NullLocator())
+        ax.legend()
         place_text(figure, 0.25, 0.15, title, fontsize=12, fontweight="bold", parse_math=False)
         kept = f"kept: epoch {epoch[best]:.4g}, validation MSE {validation[best]:.4g}"
         kept += f", root mean square error {100 * np.sqrt(validation[best]):.1f} points of Γ"
         place_text(figure, 0.25, 0.42, kept, fontsize=9, color=GREY)
         save_page(figure, path)
-
-
-def _plot(ax: Axes, epoch: np.ndarray, train: np.ndarray, validation: np.ndarray, *, best: int, colour: str) -> None:
-    # few epochs have a dot each: one alone makes no line
-    style = {"color": colour, "marker": "o" if len(epoch) <= 40 else "", "markersize": 3}
-    ax.plot(epoch, train, linestyle=":", label="training, augmented", **style)
-    ax.plot(epoch, validation, label="validation", **style)
-    ax.plot(
-        epoch[best], validation[best], marker="o", markersize=10, markerfacecolor="none", markeredgewidth=1.6,
-        linestyle="", color=VERMILLION, label="kept",
-    )  # fmt: skip
-    ax.set(xlabel="Epoch (passes over the training frames)", ylabel="MSE (Γ as a fraction, squared)", yscale="log")
-    ax.set_xlim(0, 1.03 * max(1.0, float(epoch[-1])))
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    # room above and below, so that a curve that hardly falls looks like one
-    errors = np.concatenate([train, validation])
-    ax.set_ylim(0.7 * float(errors.min()), 1.4 * float(errors.max()))
-    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    ax.yaxis.set_minor_locator(NullLocator())
-    ax.legend()

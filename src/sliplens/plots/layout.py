@@ -91,9 +91,8 @@ def figure_picture(figure: Figure, *, alt: str, pixels: bool = False) -> Picture
             # no date: the same results make the same page
             figure.savefig(buffer, format="svg", dpi=200, metadata={"Date": None, "Creator": None})
     width, height = (round(side * _CSS_PIXELS_PER_INCH) for side in figure.get_size_inches())
-    return Picture(
-        uri=_data_uri("png" if pixels else "svg+xml", buffer.getvalue()), alt=alt, width=width, height=height
-    )
+    uri = f"data:image/{'png' if pixels else 'svg+xml'};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
+    return Picture(uri=uri, alt=alt, width=width, height=height)
 
 
 def _fewer_colours(png: io.BytesIO) -> io.BytesIO:
@@ -106,7 +105,3 @@ def _fewer_colours(png: io.BytesIO) -> io.BytesIO:
     reduced.putpalette([_WHITE if level > _NEARLY_WHITE else level for level in reduced.getpalette() or []])
     reduced.save(smaller, "png", optimize=True)
     return smaller
-
-
-def _data_uri(kind: str, data: bytes) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"

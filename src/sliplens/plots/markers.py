@@ -12,12 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import Normal, Stroke
 
 from sliplens.errors import InputError
-from sliplens.images import absolute_difference
-from sliplens.markers import DisplacementField, Tracks, compute_field
-from sliplens.plots.contact_sheet import NAMED_STATES, TIMES, brighten, brightening
-from sliplens.plots.saliency import plot_colour_bar, plot_overlay, stretch_saliency
-from sliplens.plots.style import BLACK, GREY, drawing_style, percent
-from sliplens.recordings import ContactState, Recording
+from sliplens.markers import DisplacementField
+from sliplens.plots.saliency import overlay_saliency, plot_colour_bar, stretch_saliency
+from sliplens.plots.style import BLACK, GREY, drawing_style
 
 # light is far: read alike under every common colour blindness
 FIELD_COLOURS = "cividis"
@@ -26,7 +23,6 @@ ARROWS = 5.0
 """Length of arrows over the displacement."""
 _STILL_PX = 0.3  # below which a direction is noise
 _PANEL_IN = 2.2
-_FIELD_LABEL = "Displacement (px)"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,14 +42,13 @@ def plot_arrows(
     displacement_px: Float[np.ndarray, "markers 2"],
     *,
     ax: Axes,
-    magnified: float = ARROWS,
 ) -> Axes:
     """Draw a frame with an arrow from each marker's place at rest along its displacement, where that is known."""
     known = np.all(np.isfinite(displacement_px), axis=1) & np.all(np.isfinite(rest_px), axis=1)
     place, way = rest_px[known], displacement_px[known]
     ax.imshow(frame)
     ax.quiver(
-        *place.T, *way.T, angles="xy", scale_units="xy", scale=1 / magnified, color="white", width=0.008,
+        *place.T, *way.T, angles="xy", scale_units="xy", scale=1 / ARROWS, color="white", width=0.008,
         headlength=3, headaxislength=2.7, edgecolor=BLACK, linewidth=0.6, minlength=0.5,
     )  # fmt: skip
     height, width = frame.shape[:2]
@@ -87,51 +82,6 @@ def plot_field(
     return ScalarMappable(norm, FIELD_COLOURS)
 
 
-def choose_states(recording: Recording) -> dict[ContactState, int]:
-    """Pick a frame for each contact state: the last without slip, and the middle of those in which it slips."""
-    chosen = {}
-    for state in NAMED_STATES:
-        places = [at for at, own in enumerate(recording.contact_state) if own == state]
-        # a trial that lets go ends as it began: what came before the slip is meant
-        if state is ContactState.NO_CONTACT:
-            places = places[: next((at for at, place in enumerate(places) if place != at), len(places))]
-        if places:
-            slips = state in {ContactState.INCIPIENT_SLIP, ContactState.FULL_SLIP}
-            chosen[state] = places[len(places) // 2] if slips else places[-1]
-    return chosen
-
-
-def draw_contact_states(recording: Recording, tracks: Tracks) -> Figure:
-    """Draw raw frame with arrows, field, and difference image across the contact states (thesis, Fig. 4)."""
-    if len(tracks) != len(recording):
-        raise InputError(f"{len(tracks)} frames were tracked but the trial has {len(recording)}; track it anew")
-    chosen = choose_states(recording)
-    if not chosen:
-        raise InputError(f"no frame of trial {recording.trial} has a known contact state; label it first")
-    size = recording.reference.shape[:2]
-    fields = {state: compute_field(tracks, at, size=size) for state, at in chosen.items()}
-    lengths = [np.linalg.norm(one.displacement_px, axis=-1)[one.confidence > _SURE].max() for one in fields.values()]
-    differences = {
-        state: absolute_difference(recording.frames[at], recording.reference) for state, at in chosen.items()
-    }
-    factor = brightening([one[None] for one in differences.values()])
-    with drawing_style():
-        figure = Figure(figsize=(_PANEL_IN * len(chosen) + 1.4, 3 * _PANEL_IN + 0.7), layout="constrained")
-        axes = figure.subplots(3, len(chosen), squeeze=False)
-        mappable = None
-        for column, (state, at) in zip(axes.T, chosen.items(), strict=True):
-            plot_arrows(recording.frames[at], tracks.rest_px, tracks.displacement_px[at], ax=column[0])
-            mappable = plot_field(fields[state], size=size, ax=column[1], longest_px=max(*lengths, _STILL_PX))
-            column[2].imshow(brighten(differences[state], factor))
-            margin = float(recording.safety_margin[at])
-            told = "" if np.isnan(margin) else f", Γ {percent(margin)}"
-            column[0].set_title(f"{str(state).capitalize()}{told}")
-        _share_axes(axes, (f"Camera, arrows {TIMES} {ARROWS:g}", "Field", f"Difference {TIMES} {factor:g}"))
-        assert mappable is not None  # there is a state
-        figure.colorbar(mappable, ax=axes[1], label=_FIELD_LABEL, shrink=0.9)
-    return figure
-
-
 def draw_fields_beside_saliency(frames: Sequence[MarkedFrame]) -> Figure:
     """Draw each frame, its field and the saliency on it side by side, a row a frame (thesis, Fig. 12)."""
     if not frames:
@@ -147,14 +97,19 @@ def draw_fields_beside_saliency(frames: Sequence[MarkedFrame]) -> Figure:
         for one, row in zip(frames, axes, strict=True):
             row[0].imshow(one.frame)
             mappable = plot_field(one.field, size=one.frame.shape[:2], ax=row[1], longest_px=longest)
-            plot_overlay(one.frame, stretch_saliency(one.saliency), ax=row[2])
-            row[2].set_axis_on()
-        _share_axes(axes, tuple(one.title for one in frames))
+            row[2].imshow(overlay_saliency(one.frame, stretch_saliency(one.saliency)))
+            for place in row:
+                place.grid(visible=False)
+                place.set(xlabel="", ylabel="")
+                place.tick_params(labelleft=place is row[0], labelbottom=place in axes[-1])
+            row[0].set_ylabel(f"{one.title}\ny (px)", color=GREY)
+        for place in axes[-1]:
+            place.set_xlabel("x (px)")
         for place, title in zip(axes[0], ("Camera", "Displacement field", "Saliency"), strict=True):
             place.set_title(title)
         bars = [figure.add_subplot(grid[-1, column]) for column in (1, 2)]
         assert mappable is not None  # there is a frame
-        figure.colorbar(mappable, cax=bars[0], orientation="horizontal", label=_FIELD_LABEL)
+        figure.colorbar(mappable, cax=bars[0], orientation="horizontal", label="Displacement (px)")
         plot_colour_bar(ax=bars[1])
         bars[1].set_xlabel("Saliency (share of the brightest)")
     return figure
@@ -164,17 +119,3 @@ def _ends(places: Float[np.ndarray, " places"]) -> tuple[float, float]:
     """Outer edges of the cells of an even grid."""
     half = (places[1] - places[0]) / 2
     return float(places[0] - half), float(places[-1] + half)
-
-
-def _share_axes(axes: np.ndarray, names: Sequence[str]) -> None:
-    """Name the pixel axes at the left and at the bottom alone, and the rows."""
-    for row, name in zip(axes, names, strict=True):
-        for place in row:
-            place.grid(visible=False)
-            place.set(xlabel="", ylabel="")
-            place.tick_params(labelleft=False, labelbottom=False)
-        row[0].tick_params(labelleft=True)
-        row[0].set_ylabel(f"{name}\ny (px)", color=GREY)
-    for place in axes[-1]:
-        place.tick_params(labelbottom=True)
-        place.set_xlabel("x (px)")

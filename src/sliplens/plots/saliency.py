@@ -38,15 +38,6 @@ def stretch_saliency(saliency: Float[np.ndarray, "rows columns"]) -> Float[np.nd
     return np.clip(saliency / top, 0, 1) if top > 0 else saliency
 
 
-def plot_overlay(
-    picture: UInt8[np.ndarray, "height width 3"], saliency: Float[np.ndarray, "rows columns"], *, ax: Axes
-) -> Axes:
-    """Draw a picture with its saliency; both fill the same extent, since they are one image."""
-    ax.imshow(overlay_saliency(picture, saliency))
-    ax.set_axis_off()
-    return ax
-
-
 def plot_colour_bar(*, ax: Axes) -> Axes:
     """Draw the colours of `overlay_saliency` from least to most important, over a mid-grey picture."""
     value = np.linspace(0, 1, 256)[None]

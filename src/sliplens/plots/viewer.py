@@ -10,7 +10,6 @@ import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from types import ModuleType
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from matplotlib.colors import to_rgba
 
 from sliplens.errors import InputError
@@ -33,8 +32,9 @@ from sliplens.progress import OnProgress
 from sliplens.recordings import ContactState, Dataset, Recording, TrialInfo
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.dataset import trial_path
-from sliplens.recordings.labelling import Labelling
+from sliplens.recordings.labelling import LabelBasis
 from sliplens.recordings.store import (
+    TruthHeader,
     decode_pixels,
     forces_path,
     load_forces,
@@ -90,11 +90,22 @@ def start_viewer() -> str:
                 return f"rerun+http://{_LOOPBACK}:{port}/proxy"
             time.sleep(0.05)
         if process.poll() is None:
-            _end(process)
+            if hasattr(os, "killpg"):  # the viewer is a child of the process that was started
+                os.killpg(process.pid, signal.SIGTERM)
+            process.kill()
+            process.wait()
         said.seek(0)
         words = said.read().decode(errors="replace").strip().splitlines()
     why = words[-1].strip() if words else "it said nothing"
     raise InputError(f"the Rerun viewer did not start ({why}); write a file with --output and open it elsewhere")
+
+
+def _listens(port: int) -> bool:
+    try:
+        socket.create_connection((_LOOPBACK, port), timeout=0.2).close()
+    except OSError:
+        return False
+    return True
 
 
 def _stays(process: subprocess.Popen[bytes]) -> bool:
@@ -104,21 +115,6 @@ def _stays(process: subprocess.Popen[bytes]) -> bool:
     except subprocess.TimeoutExpired:
         return True
     return False
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    if hasattr(os, "killpg"):  # the viewer is a child of the process that was started
-        os.killpg(process.pid, signal.SIGTERM)
-    process.kill()
-    process.wait()
-
-
-def _listens(port: int) -> bool:
-    try:
-        socket.create_connection((_LOOPBACK, port), timeout=0.2).close()
-    except OSError:
-        return False
-    return True
 
 
 # colours that are read on a dark ground and on a light one: the viewer has both, so nothing is black
@@ -139,31 +135,14 @@ SAMPLE_LINES = {"x (N), as recorded": VERMILLION, "y (N), as recorded": GREEN, "
 """The same of each axis of the force sensor."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Shown:
-    """What of a trial there is to lay out."""
-
-    size: tuple[int, int]
-    """Height and width of a frame, in pixels."""
-    factor: float
-    """Of the differences' brightness."""
-    highest_ratio: float
-    """Of F_t / F_n that is worth seeing."""
-    truth: bool
-    """Whether contact and markers are known."""
-    sensor: bool
-    """Whether samples of the force sensor are kept."""
-
-
-def lay_out(shown: Shown) -> "Blueprint":
+def lay_out(*, size: tuple[int, int], factor: float, highest_ratio: float, truth: bool, sensor: bool) -> "Blueprint":
     """Lay out a trial: what is seen at first sight, before anything is moved."""
     rrb = require_rerun().blueprint
-    height, width = shown.size
+    height, width = size
     bounds = rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height))
-    truth = ": contact, stick zone, markers" if shown.truth else ""
     pictures = (
-        ("camera", f"camera T_n{truth}"),
-        ("difference", f"difference |T_n \N{MINUS SIGN} T_0| {TIMES} {shown.factor:g}"),
+        ("camera", f"camera T_n{': contact, stick zone, markers' if truth else ''}"),
+        ("difference", f"difference |T_n \N{MINUS SIGN} T_0| {TIMES} {factor:g}"),
         ("reference", "reference T_0"),
     )
     camera, difference, reference = (
@@ -173,8 +152,8 @@ def lay_out(shown: Shown) -> "Blueprint":
     charts = [
         _chart("margin", "safety margin Γ and stick ratio (%)", "LeftBottom", (-5.0, 105.0)),
         _chart("force", "forces (N)", "RightBottom"),
-        _chart("ratio", "F_t / F_n in contact, beside friction", "RightBottom", (0.0, shown.highest_ratio)),
-        *([_chart("sensor", "force sensor, as recorded (N)", "RightBottom")] if shown.sensor else []),
+        _chart("ratio", "F_t / F_n in contact, beside friction", "RightBottom", (0.0, highest_ratio)),
+        *([_chart("sensor", "force sensor, as recorded (N)", "RightBottom")] if sensor else []),
     ]
     about = rrb.TextDocumentView(origin="about", name="about this trial")
     return rrb.Blueprint(
@@ -202,8 +181,8 @@ def _chart(origin: str, name: str, legend: str, span: tuple[float, float] | None
 _MARKS = re.compile(r"([\\`*_{}\[\]<>#|~])")
 
 
-def describe_trial(trial: Recording, info: TrialInfo, labelling: Labelling | None, *, truth: str | None) -> str:
-    """Tell in Markdown what a trial is, and what its labels rest on; `truth` names what moved simulated markers."""
+def describe_trial(trial: Recording, info: TrialInfo, truth: TruthHeader | None) -> str:
+    """Tell in Markdown what a trial is, and what its labels rest on."""
     span = float(trial.time_s[-1] - trial.time_s[0])
     told = {
         "sensor": info.sensor,
@@ -214,24 +193,23 @@ def describe_trial(trial: Recording, info: TrialInfo, labelling: Labelling | Non
         "frames": f"{info.frames:,} of {info.width} × {info.height} pixels in {span:.2f} s",  # noqa: RUF001 (times is meant)
     }
     about = [f"- {name}: {_plain(value)}" for name, value in told.items() if value]
-    facts = _facts(trial, labelling, truth=truth)
-    return "\n".join([f"# {_plain(info.trial)}", *about, "", "## What its labels rest on", *map(_paragraph, facts)])
+    lines = [f"# {_plain(info.trial)}", *about, "", "## What its labels rest on"]
+    for fact in _facts(trial, truth):
+        lines.append(f"\n**{'▲ ' if fact.doubtful else ''}{_plain(fact.head)}**\n")
+        lines += [f"- {_plain(words)}" for words in fact.words if words]
+    return "\n".join(lines)
 
 
-def _facts(trial: Recording, labelling: Labelling | None, *, truth: str | None) -> list[Fact]:
+def _facts(trial: Recording, truth: TruthHeader | None) -> list[Fact]:
     if truth is not None:
-        nominal = "nominal" if truth == "calibrated" else "exact"
-        moved = f"markers moved as {truth}: the stick zone is {nominal}"
+        nominal = "nominal" if truth.displacement == "calibrated" else "exact"
+        moved = f"markers moved as {truth.displacement}: the stick zone is {nominal}"
         return [Fact("Simulated", ["labels are the mechanics' own, without error", moved])]
+    labelling = trial.labelling
     if labelling is None:
         return [Fact("Not told", ["nothing is kept of where they come from"], doubtful=True)]
     sources = [words for words in (labelling.source, labelling.forces) if words]
     return [Fact("Recorded", sources), *audit_facts(trial, labelling)]
-
-
-def _paragraph(fact: Fact) -> str:
-    mark = "▲ " if fact.doubtful else ""
-    return "\n".join([f"\n**{mark}{_plain(fact.head)}**\n", *(f"- {_plain(words)}" for words in fact.words if words)])
 
 
 def _plain(words: str) -> str:
@@ -303,9 +281,9 @@ def log_states(stream: "RecordingStream", trial: Recording) -> None:
         stream.send_columns(entity, clock(trial.time_s[begins], begins), columns)
 
 
-def log_samples(stream: "RecordingStream", forces: Forces, labelling: Labelling | None) -> None:
+def log_samples(stream: "RecordingStream", forces: Forces, basis: LabelBasis | None) -> None:
     """Log what the force sensor recorded, on the clock of the camera if its lag was applied to the labels."""
-    rerun, basis = require_rerun(), labelling.basis if labelling else None
+    rerun = require_rerun()
     late_s = basis.lag.lag_s if basis and basis.lag and basis.lag_applied else 0.0
     names, colours = list(SAMPLE_LINES), [rgba(colour) for colour in SAMPLE_LINES.values()]
     stream.log("sensor/force", rerun.SeriesLines(names=names, colors=colours, widths=[1.0] * len(names)), static=True)
@@ -354,34 +332,10 @@ _OPACITY = 0.35
 _HALF_PX = 0.5  # Rerun's pixels reach from one whole number to the next, ours have their centres there
 
 
-@dataclass(frozen=True, kw_only=True)
-class StoredTruth:
-    """What is small of the truth of a stored trial."""
-
-    displacement: str
-    """Which model moved the markers."""
-    marker_rest_px: Float32[np.ndarray, "markers 2"]
-    static_friction: Float[np.ndarray, " frames"]
-    """mu_s, whether or not the contact slips."""
-
-
-def read_truth(path: Path) -> StoredTruth | None:
-    """Read the truth of a trial without its markers and maps; None where there is none."""
-    header = read_header(path).truth
-    if header is None:
-        return None
-    with reading(path):
-        friction = pq.read_table(path, columns=["static_friction"]).column("static_friction")
-    return StoredTruth(
-        displacement=header.displacement,
-        marker_rest_px=np.array(header.marker_rest_px, dtype=np.float32).reshape(-1, 2),
-        static_friction=friction.to_numpy().astype(np.float64),
-    )
-
-
-def log_truth(stream: "RecordingStream", path: Path, trial: Recording, truth: StoredTruth) -> None:
+def log_truth(stream: "RecordingStream", path: Path, trial: Recording, truth: TruthHeader) -> None:
     """Log contact and stick zone, and markers with how far they went, over the camera frames of a simulated trial."""
-    rerun, rest_px, done = require_rerun(), truth.marker_rest_px, 0
+    rerun, done = require_rerun(), 0
+    rest_px = np.array(truth.marker_rest_px, dtype=np.float32).reshape(-1, 2)
     height, width = trial.reference.shape[:2]
     zones = [(OUTSIDE, "no contact", [0, 0, 0, 0]), (SLIPS, "slips", rgba(ORANGE)), (STICKS, "sticks", rgba(SKY))]
     stream.log("camera/zones", rerun.AnnotationContext(zones), static=True)
@@ -446,28 +400,25 @@ def log_trial(
     """
     rerun = require_rerun()
     path, samples = trial_path(data.folder, info.trial), forces_path(data.folder, info.trial)
-    trial, truth = load_recording(path, pixels=False), read_truth(path)
-    labelling = trial.labelling
-    friction = _static_friction(trial, labelling, truth)
+    trial, truth, sensor = load_recording(path, pixels=False), read_header(path).truth, bool(info.forces_sha256)
+    basis = trial.labelling.basis if trial.labelling else None
+    friction = _static_friction(path, trial, truth, basis)
     some = read_frames(path, range(0, len(trial), -(-len(trial) // _SAMPLED)))
-    shown = Shown(
-        size=trial.reference.shape[:2],
-        factor=brightening([absolute_difference(some, trial.reference)]),
-        highest_ratio=_highest_ratio(trial, friction),
-        truth=truth is not None,
-        sensor=bool(info.forces_sha256),
-    )
+    size, factor = trial.reference.shape[:2], brightening([absolute_difference(some, trial.reference)])
+    highest = _highest_ratio(trial, friction)
     stream.send_recording_name(info.trial)
-    stream.send_blueprint(lay_out(shown))
-    about = describe_trial(trial, info, labelling, truth=truth and truth.displacement)
+    stream.send_blueprint(
+        lay_out(size=size, factor=factor, highest_ratio=highest, truth=truth is not None, sensor=sensor)
+    )
+    about = describe_trial(trial, info, truth)
     stream.log("about", rerun.TextDocument(about, media_type=rerun.MediaType.MARKDOWN), static=True)
     log_numbers(stream, trial, friction)
     log_states(stream, trial)
-    if shown.sensor:
-        log_samples(stream, load_forces(samples), labelling)
+    if sensor:
+        log_samples(stream, load_forces(samples), basis)
     if truth is not None:
         log_truth(stream, path, trial, truth)
-    log_frames(stream, path, trial, shown.factor, on_progress)
+    log_frames(stream, path, trial, factor, on_progress)
 
 
 def _log_whole(
@@ -483,13 +434,13 @@ def _log_whole(
 
 
 def _static_friction(
-    trial: Recording, labelling: Labelling | None, truth: StoredTruth | None
+    path: Path, trial: Recording, truth: TruthHeader | None, basis: LabelBasis | None
 ) -> Float[np.ndarray, " frames"] | None:
     """mu_s of each frame: that of the simulator, or what was estimated; None where neither is told."""
-    if truth is not None:
-        return truth.static_friction
-    basis = labelling.basis if labelling else None
-    return None if basis is None else np.full(len(trial), basis.friction.mu)
+    if truth is None:
+        return None if basis is None else np.full(len(trial), basis.friction.mu)
+    with reading(path):
+        return pq.read_table(path, columns=["static_friction"])["static_friction"].to_numpy().astype(np.float64)
 
 
 def _highest_ratio(trial: Recording, static_friction: Float[np.ndarray, " frames"] | None) -> float:
