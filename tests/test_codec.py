@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jaxtyping import Float32, Float64, Int64
 
-from sliplens.codec import Columns, load_record, load_result, save_arrays, save_record, save_result
+from sliplens.codec import Columns, load_record, load_result, save_record, save_result
 from sliplens.errors import InputError
 
 
@@ -116,7 +116,7 @@ def test_maps_of_another_shape_are_told(tmp_path):
         maps: Mapping[str, Float32[np.ndarray, "frames pixels"]]
 
     save_result(Flat(maps={"a": np.ones((2, 3), dtype=np.float32)}), tmp_path)
-    save_arrays({"maps/a": np.ones((2, 3, 3), dtype=np.float32)}, tmp_path / "arrays.npz")
+    np.savez_compressed(tmp_path / "arrays.npz", **{"maps/a": np.ones((2, 3, 3), dtype=np.float32)})
     with pytest.raises(InputError, match="shape"):
         load_result(tmp_path, Flat, command="sliplens x")
 

@@ -6,7 +6,8 @@ not finite is told in one sentence with its place and its cure, by msgspec for J
 
 import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from copy import copy
+from dataclasses import dataclass, fields, is_dataclass, make_dataclass
 from pathlib import Path
 from types import NoneType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
@@ -18,7 +19,7 @@ import pyarrow.parquet as pq
 from jaxtyping import AbstractArray, jaxtyped
 
 from sliplens.errors import InputError
-from sliplens.files import to_builtins, write_json
+from sliplens.files import read_json, to_builtins, write_json
 
 RESULT_FILE = "result.json"
 """Record of a folder."""
@@ -63,20 +64,13 @@ class Columns:
     @classmethod
     def joined(cls: type[_Columns], pieces: Sequence[_Columns]) -> _Columns:
         """One table of the rows of several."""
-        return cls(
-            **{field.name: np.concatenate([getattr(one, field.name) for one in pieces]) for field in fields(cls)}
-        )
+        names = [field.name for field in fields(cls)]
+        return cls(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names})
 
 
 def save_record(record: object, path: Path) -> None:
-    """Write a record as one indented JSON file, whole or not at all.
-
-    Raises
-    ------
-    ValueError
-        If a number is not finite: JSON has no NaN.
-    """
-    write_json(path, to_builtins(record))
+    """Write a record as one indented JSON file, whole or not at all; numbers are finite, for JSON has no NaN."""
+    write_json(path, record)
 
 
 def load_record(path: Path, kind: type[Record], *, command: str) -> Record:
@@ -101,16 +95,11 @@ def load_record(path: Path, kind: type[Record], *, command: str) -> Record:
     ...     load_record(Path(folder) / "grip.json", Grip, command="sliplens grip")
     Grip(normal_force_n=2.5)
     """
-    return from_builtins(_read_json(path, command=command), kind, where=path, command=command)
+    return from_builtins(_read_json(path, command), kind, where=path, command=command)
 
 
 def from_builtins(values: object, kind: type[Record], *, where: Path | str, command: str) -> Record:
     """Record from what JSON holds of it (`to_builtins`).
-
-    Raises
-    ------
-    InputError
-        If it holds something else than the record declares.
 
     Examples
     --------
@@ -129,7 +118,11 @@ def from_builtins(values: object, kind: type[Record], *, where: Path | str, comm
     try:
         return msgspec.convert(values, kind, dec_hook=_decode, str_keys=True)
     except msgspec.ValidationError as error:
-        raise InputError(f"{where} {_told(error)}; make it again with `{command}`") from None
+        # in the words of this package: "expected `str`, got `int` at trials[2].day"
+        text, _, place = str(error).partition(" - at ")
+        place = place.strip("`").removeprefix("$").removeprefix(".") or "its top"
+        said = f"is not what was written: {text[0].lower()}{text[1:]} at {place}"
+        raise InputError(f"{where} {said}; {_cure(command)}") from None
 
 
 def save_result(result: object, folder: Path) -> None:
@@ -142,7 +135,7 @@ def save_result(result: object, folder: Path) -> None:
     for field in fields(result):
         value = getattr(result, field.name)
         if isinstance(value, Columns):
-            save_columns(value, folder / f"{field.name}.parquet")
+            write_tables([value.table()], folder / f"{field.name}.parquet", value.table().schema)
         elif isinstance(value, np.ndarray):
             arrays[field.name] = value
         elif _is_array_mapping(value):
@@ -150,7 +143,10 @@ def save_result(result: object, folder: Path) -> None:
         else:
             short[field.name] = value
     if arrays:
-        save_arrays(arrays, folder / ARRAYS_FILE)
+        part = folder / f"{ARRAYS_FILE}.part"
+        with part.open("wb") as stream:
+            np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
+        part.replace(folder / ARRAYS_FILE)
     save_record(short, folder / RESULT_FILE)  # last: a folder with this file is whole
 
 
@@ -162,43 +158,26 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
     InputError
         If a file is missing or damaged, or holds something else than the record declares.
     """
-    path = folder / RESULT_FILE
-    values = _read_json(path, command=command)
+    path, cure = folder / RESULT_FILE, _cure(command)
+    values = _read_json(path, command)
     if not isinstance(values, dict):
-        raise InputError(f"{path} holds no JSON object; make it again with `{command}`")
+        raise InputError(f"{path} holds no JSON object; {cure}")
     declared = get_type_hints(kind)
-    beside = {name for name, hint in declared.items() if _is_array(hint) or _is_array_mapping_type(hint)}
+    arrays = {name: hint for name, hint in declared.items() if _array_type(hint) is not None}
     columns = {name: _columns_type(hint) for name, hint in declared.items()}
     # None stands in the JSON where there is no table
     tables = {name: table for name, table in columns.items() if table and values.get(name, ...) is not None}
     # one dataclass of what is in the JSON, so that msgspec checks it as declared; defaults are kept
-    inside = [field for field in fields(kind) if field.name not in beside | tables.keys()]  # pyright: ignore[reportArgumentType]
-    partial = msgspec.defstruct(
-        kind.__name__, [(field.name, declared[field.name], _default(field)) for field in inside], kw_only=True
-    )
-    told = from_builtins(values, partial, where=path, command=command)
-    given = {field.name: getattr(told, field.name) for field in inside}
-    given |= {name: load_columns(folder / f"{name}.parquet", table, command=command) for name, table in tables.items()}
-    if beside:
-        arrays = load_arrays(folder / ARRAYS_FILE, command=command)
-        with jaxtyped("context"):  # "frames" of one array are as many as "frames" of another
-            for name in (field.name for field in fields(kind) if field.name in beside):  # pyright: ignore[reportArgumentType]
-                alone = _is_array(declared[name])
-                array_kind = declared[name] if alone else get_args(declared[name])[1]
-                keys = [name] if alone else [key for key in arrays if key.startswith(f"{name}/")]
-                for key in keys:
-                    if key not in arrays:
-                        raise InputError(f"{folder / ARRAYS_FILE} lacks {key!r}; make it again with `{command}`")
-                    if not isinstance(arrays[key], array_kind):
-                        raise InputError(
-                            f"{folder / ARRAYS_FILE} holds {arrays[key].dtype} of shape {arrays[key].shape} as {key!r} "
-                            f"where {_shown(array_kind)} belongs; make it again with `{command}`"
-                        )
-                given[name] = arrays[name] if alone else {key.removeprefix(f"{name}/"): arrays[key] for key in keys}
+    inside = [field for field in fields(kind) if field.name not in arrays | tables]  # pyright: ignore[reportArgumentType]
+    partial = make_dataclass(kind.__name__, [(one.name, declared[one.name], copy(one)) for one in inside])
+    read = from_builtins(values, partial, where=path, command=command)
+    given = {field.name: getattr(read, field.name) for field in inside}
+    given |= {name: _load_columns(folder / f"{name}.parquet", table, cure) for name, table in tables.items()}
+    given |= _load_arrays(folder / ARRAYS_FILE, arrays, cure) if arrays else {}
     try:
         return kind(**given)
     except ValueError as error:  # of a record that checks what its fields have to do with one another
-        raise InputError(f"{folder} {error}; make it again with `{command}`") from None
+        raise InputError(f"{folder} {error}; {cure}") from None
 
 
 def keep_part(part: Path | None, kind: type[Record], make: Callable[[], Record]) -> Record:
@@ -212,22 +191,7 @@ def keep_part(part: Path | None, kind: type[Record], make: Callable[[], Record])
     return load_result(part, kind, command="sliplens")
 
 
-def save_columns(columns: Columns, path: Path) -> None:
-    """Write columns as a Parquet file, whole or not at all."""
-    part = path.with_name(path.name + ".part")
-    pq.write_table(columns.table(), part, compression="zstd")
-    part.replace(path)
-
-
-def load_columns(path: Path, kind: type[_Columns], *, command: str) -> _Columns:
-    """Read what `save_columns` wrote.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or damaged, lacks a column, or a column is of another type or has gaps.
-    """
-    cure = f"make it again with `{command}`"
+def _load_columns(path: Path, kind: type[_Columns], cure: str) -> _Columns:
     names = [field.name for field in fields(kind)]
     try:
         table = pq.read_table(path)
@@ -247,13 +211,13 @@ def load_columns(path: Path, kind: type[_Columns], *, command: str) -> _Columns:
             value = np.array(column.to_pylist(), dtype=str)
         else:
             value = column.to_numpy()
+        texts = hint is np.ndarray or _shown(hint).startswith("Shaped")
         # a context of its own: "rows" of one table need not be as many as "rows" of another
         with jaxtyped("context"):
-            fits = not _is_array(hint) or isinstance(value, hint)
-        if not fits:
-            raise InputError(f"{path} holds {column.type} as {name!r} where {_shown(hint)} belongs; {cure}")
-        if (hint is np.ndarray or _shown(hint).startswith("Shaped")) and value.dtype.kind != "U":
-            raise InputError(f"{path} holds {column.type} as {name!r} where texts belong; {cure}")
+            fits = _array_type(hint) is None or isinstance(value, hint)
+        if not fits or (texts and value.dtype.kind != "U"):
+            wanted = "texts belong" if texts else f"{_shown(hint)} belongs"
+            raise InputError(f"{path} holds {column.type} as {name!r} where {wanted}; {cure}")
         values[name] = value
     return kind(**values)
 
@@ -286,30 +250,28 @@ def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schem
     return None
 
 
-def save_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> None:
-    """Write arrays as a compressed NPZ file, whole or not at all."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as stream:
-        np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
-    part.replace(path)
-
-
-def load_arrays(path: Path, *, command: str) -> dict[str, np.ndarray]:
-    """Read what `save_arrays` wrote.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or damaged.
-    """
-    cure = f"make it again with `{command}`"
+def _load_arrays(path: Path, declared: Mapping[str, Any], cure: str) -> dict[str, Any]:
+    """Arrays of the fields of a record, each alone or a mapping of several."""
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive}
+            arrays = {name: archive[name] for name in archive}
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; {cure}") from None
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path} cannot be read as arrays ({_one_line(error)}); {cure}") from None
+    given = {}
+    with jaxtyped("context"):  # "frames" of one array are as many as "frames" of another
+        for name, hint in declared.items():
+            kind = _array_type(hint)
+            keys = [name] if kind is hint else [key for key in arrays if key.startswith(f"{name}/")]
+            for key in keys:
+                if key not in arrays:
+                    raise InputError(f"{path} lacks {key!r}; {cure}")
+                if not isinstance(arrays[key], kind):
+                    held = f"{arrays[key].dtype} of shape {arrays[key].shape}"
+                    raise InputError(f"{path} holds {held} as {key!r} where {_shown(kind)} belongs; {cure}")
+            given[name] = arrays[name] if kind is hint else {key[len(name) + 1 :]: arrays[key] for key in keys}
+    return given
 
 
 def _columns_type(hint: object) -> type[Columns] | None:
@@ -318,12 +280,10 @@ def _columns_type(hint: object) -> type[Columns] | None:
     return kinds[0] if len(kinds) == 1 and isinstance(kinds[0], type) and issubclass(kinds[0], Columns) else None
 
 
-def _is_array(hint: object) -> bool:
-    return isinstance(hint, type) and (issubclass(hint, AbstractArray) or hint is np.ndarray)
-
-
-def _is_array_mapping_type(hint: object) -> bool:
-    return get_origin(hint) in {dict, Mapping} and _is_array(get_args(hint)[1])
+def _array_type(hint: object) -> Any:
+    """Type of the arrays that a field declares, `X` or `Mapping[str, X]`; None where it declares none."""
+    kind = get_args(hint)[1] if get_origin(hint) in {dict, Mapping} else hint
+    return kind if isinstance(kind, type) and (issubclass(kind, AbstractArray) or kind is np.ndarray) else None
 
 
 def _is_array_mapping(value: object) -> bool:
@@ -334,12 +294,6 @@ def _shown(hint: Any) -> str:
     return getattr(hint, "__name__", str(hint)).replace("ndarray, ", "")
 
 
-def _default(field: Field[Any]) -> Any:
-    if field.default_factory is not MISSING:
-        return msgspec.field(default_factory=field.default_factory)
-    return msgspec.NODEFAULT if field.default is MISSING else field.default
-
-
 def _decode(kind: Any, value: object) -> object:
     if kind is object:  # whatever JSON holds
         return value
@@ -348,20 +302,12 @@ def _decode(kind: Any, value: object) -> object:
     raise NotImplementedError(f"{kind} has no form in JSON")
 
 
-def _read_json(path: Path, *, command: str) -> object:
-    try:
-        return msgspec.json.decode(path.read_bytes())
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; make it with `{command}`") from None
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{path} is not valid JSON ({_one_line(error)}); make it again with `{command}`") from None
+def _cure(command: str) -> str:
+    return f"make it again with `{command}`"
 
 
-def _told(error: msgspec.ValidationError) -> str:
-    """What msgspec found, in the words of this package: "holds str at trials[2].day where int belongs"."""
-    text, _, place = str(error).partition(" - at ")
-    place = place.strip("`").removeprefix("$").removeprefix(".") or "its top"
-    return f"is not what was written: {text[0].lower()}{text[1:]} at {place}"
+def _read_json(path: Path, command: str) -> object:
+    return read_json(path, missing=f"make it with `{command}`", damaged=_cure(command))
 
 
 def _one_line(error: Exception) -> str:
@@ -369,19 +315,6 @@ def _one_line(error: Exception) -> str:
 
 
 __all__ = [
-    "ARRAYS_FILE",
-    "RESULT_FILE",
-    "Columns",
-    "from_builtins",
-    "keep_part",
-    "load_arrays",
-    "load_columns",
-    "load_record",
-    "load_result",
-    "save_arrays",
-    "save_columns",
-    "save_record",
-    "save_result",
-    "to_builtins",
+    "Columns", "from_builtins", "keep_part", "load_record", "load_result", "save_record", "save_result", "to_builtins",
     "write_tables",
-]
+]  # fmt: skip

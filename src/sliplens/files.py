@@ -109,14 +109,16 @@ def write_json(path: Path, value: Any) -> None:
     part.replace(path)
 
 
-def read_json(path: Path) -> Any:
-    """Read a JSON file."""
+def read_json(
+    path: Path, *, missing: str = "name a folder that a sliplens command wrote", damaged: str = "make the folder again"
+) -> Any:
+    """Read a JSON file; what is missing or damaged is told with its cure."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return msgspec.json.decode(path.read_bytes())
     except FileNotFoundError:
-        raise InputError(f"{path} does not exist; name a folder that a sliplens command wrote") from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path} is not valid JSON ({error}); make the folder again") from None
+        raise InputError(f"{path} does not exist; {missing}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{path} is not valid JSON ({error}); {damaged}") from None
 
 
 def require_folder(path: Path, *, what: str) -> Path:
