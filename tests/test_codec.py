@@ -116,7 +116,8 @@ def test_maps_of_another_shape_are_told(tmp_path):
         maps: Mapping[str, Float32[np.ndarray, "frames pixels"]]
 
     save_result(Flat(maps={"a": np.ones((2, 3), dtype=np.float32)}), tmp_path)
-    np.savez_compressed(tmp_path / "arrays.npz", **{"maps/a": np.ones((2, 3, 3), dtype=np.float32)})
+    deep = {"maps/a": np.ones((2, 3, 3), dtype=np.float32)}
+    np.savez_compressed(tmp_path / "arrays.npz", **deep)  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="shape"):
         load_result(tmp_path, Flat, command="sliplens x")
 

@@ -9,17 +9,9 @@ from sliplens.errors import SaliencyError
 
 
 def require_saliency(
-    saliency: Float[np.ndarray, "height width"],
-    shape: Sequence[int],
-    *,
-    where: str = "the saliency map",
+    saliency: Float[np.ndarray, "height width"], shape: Sequence[int], *, where: str = "the saliency map"
 ) -> Float[np.ndarray, "height width"]:
-    """Return the map unchanged when it is finite and has the image's height and width.
-
-    Parameters
-    ----------
-    shape
-        Height and width of the image that the map explains, in pixels.
+    """Return the map unchanged when it is finite and has the image's height and width, its shape in pixels.
 
     Examples
     --------

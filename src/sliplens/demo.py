@@ -69,19 +69,10 @@ def run_demo(
     real_frames
         Folder of real difference images named ..._GG.png with the safety margin in percent. The public ChromaTouch
         images where `SLIPLENS_REFERENCE` (or ../shared/reference) holds them, if None.
-    seed
-        Of the simulation and of the random orders.
     jobs
         Networks to judge at the same time (`run_study`).
     on_page
         Called with the page each time it was written.
-    on_progress
-        Takes the steps done and their number, stage by stage.
-
-    Returns
-    -------
-    Path
-        The page.
 
     Raises
     ------
@@ -119,20 +110,10 @@ def run_demo(
         evaluate(networks[name], data, folder / f"evaluate-{name}", on_progress=on_progress)
     show(*later[1:])
     run_study(
-        data,
-        out=folder,
-        difference=networks["difference"],
-        raw=networks["raw"],
-        methods=METHODS,
-        trials=_TRIALS,
-        budget=_BUDGET,
-        tests=_TESTS,
-        settings=_SETTINGS,
-        random_orders=_RANDOM_ORDERS,
-        jobs=jobs,
-        seed=seed,
+        data, out=folder, difference=networks["difference"], raw=networks["raw"], methods=METHODS, trials=_TRIALS,
+        budget=_BUDGET, tests=_TESTS, settings=_SETTINGS, random_orders=_RANDOM_ORDERS, jobs=jobs, seed=seed,
         on_progress=on_progress,
-    )
+    )  # fmt: skip
     if real is not None:
         explanations = folder / "explain-real"
         explain_source(

@@ -34,12 +34,6 @@ class SaliencyError(SliplensError):
 
 
 __all__ = [
-    "CheckpointError",
-    "ContactError",
-    "ImageError",
-    "InputError",
-    "ModelError",
-    "RecordingError",
-    "SaliencyError",
+    "CheckpointError", "ContactError", "ImageError", "InputError", "ModelError", "RecordingError", "SaliencyError",
     "SliplensError",
-]
+]  # fmt: skip

@@ -20,14 +20,8 @@ class Table(Mapping[str, Row]):
     A package names its rows in its metadata: `[project.entry-points."sliplens.fills"]`, `my-fill = "package:row"`. They
     are imported when the table is walked or a name is not one of ours, not before: a package may import sliplens first.
 
-    Parameters
-    ----------
-    noun
-        What a row is, for messages.
-    group
-        Group of the entry points, such as `sliplens.fills`.
-    rows
-        Those of sliplens; no package replaces one.
+    `noun` says in messages what a row is; the group of entry points is named as `sliplens.fills`. No package replaces a
+    row of sliplens.
 
     Examples
     --------
@@ -66,17 +60,14 @@ class Table(Mapping[str, Row]):
         rows = {}
         for point in metadata.entry_points(group=self.group):
             package = point.dist.name if point.dist else point.value
+            adds = f"the package {package} adds the {self.noun} {point.name!r}"
             if point.name in self._rows or point.name in rows:
-                raise InputError(
-                    f"the package {package} adds the {self.noun} {point.name!r}, a name that is taken; "
-                    f"rename it there, or uninstall {package}"
-                )
+                raise InputError(f"{adds}, a name that is taken; rename it there, or uninstall {package}")
             try:
                 rows[point.name] = point.load()
             except Exception as error:  # whatever another package's import may raise
                 raise InputError(
-                    f"the package {package} adds the {self.noun} {point.name!r}, but {point.value} cannot be imported "
-                    f"({error}); update or uninstall {package}"
+                    f"{adds}, but {point.value} cannot be imported ({error}); update or uninstall {package}"
                 ) from error
         return rows
 
@@ -93,9 +84,8 @@ def missing_packages(*names: str, extra: str) -> str | None:
     Packages are named as they are imported, extras of sliplens divided by commas. Nothing is imported.
     """
     # find_spec fails for what is known to be missing: None among the modules
-    missing = [
-        _NAMES.get(name, name) for name in names if sys.modules.get(name, ...) is None or find_spec(name) is None
-    ]
+    absent = (name for name in names if sys.modules.get(name, ...) is None or find_spec(name) is None)
+    missing = [_NAMES.get(name, name) for name in absent]
     if not missing:
         return None
     verb = "is" if len(missing) == 1 else "are"
@@ -111,8 +101,6 @@ def require_packages(*names: str, extra: str, purpose: str) -> None:
 def import_onnxruntime() -> ModuleType:
     """ONNX Runtime, silenced: from 1.29 on it reports its use to Microsoft unless told not to before it is loaded.
 
-    References
-    ----------
     Privacy.md of the package ("Disabling Telemetry").
     """
     require_packages("onnxruntime", extra="onnx", purpose="ONNX Runtime")

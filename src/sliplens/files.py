@@ -8,7 +8,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -30,10 +30,8 @@ def versions() -> dict[str, str]:
     """Versions of sliplens, Python and the libraries that shape a result, read without importing them."""
     found = {"sliplens": __version__, "python": platform.python_version()}
     for name in _PACKAGES:
-        try:
+        with suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
     return found
 
 
@@ -50,12 +48,8 @@ class Machine:
 
 def machine() -> Machine:
     """System, processor and cores of this machine."""
-    return Machine(
-        system=platform.system(),
-        processor=platform.machine(),
-        cores=os.cpu_count(),
-        implementation=sys.implementation.name,
-    )
+    system, processor, implementation = platform.system(), platform.machine(), sys.implementation.name
+    return Machine(system=system, processor=processor, cores=os.cpu_count(), implementation=implementation)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,13 +155,7 @@ def partial_folder(target: Path) -> Path:
 
 @contextmanager
 def output_folder(
-    target: Path,
-    *,
-    stage: str,
-    config: object,
-    overwrite: bool = False,
-    run_file: str = RUN_FILE,
-    resumable: bool = True,
+    target: Path, *, stage: str, config: Any, overwrite: bool = False, run_file: str = RUN_FILE, resumable: bool = True
 ) -> Iterator[Output]:
     """Write a folder that is complete or absent.
 
@@ -178,19 +166,12 @@ def output_folder(
 
     Parameters
     ----------
-    stage
-        Name of the command, kept in `run.json`.
     config
         All that shapes the result: the recipe that decides whether a partial or complete folder is the same.
     run_file
         Where `run.json` goes in a folder of another format, below it: where that format's readers do not look.
     resumable
         Keep what is finished for the next call; a folder of another format begins empty every time.
-
-    Yields
-    ------
-    Output
-        `complete` is True when the target already holds the result of this very configuration.
 
     Examples
     --------
@@ -233,13 +214,9 @@ def output_folder(
             shutil.rmtree(partial)
         raise
     state.unlink(missing_ok=True)
+    finished = datetime.now(UTC).isoformat(timespec="seconds")
     provenance = Provenance(
-        stage=stage,
-        config=recipe,
-        config_hash=config_hash,
-        versions=versions(),
-        machine=machine(),
-        finished=datetime.now(UTC).isoformat(timespec="seconds"),
+        stage=stage, config=recipe, config_hash=config_hash, versions=versions(), machine=machine(), finished=finished
     )
     (partial / run_file).parent.mkdir(parents=True, exist_ok=True)
     write_json(partial / run_file, provenance)

@@ -36,12 +36,8 @@ def bootstrap_difference(
 ) -> Difference:
     """Difference of two means over the same units, resampled together.
 
-    Parameters
-    ----------
-    first, second
-        Sum of each unit: the squared errors of a trial's frames, or one frame's score.
-    counts
-        Terms in each of those sums.
+    Given are each unit's sums, such as the squared errors of a trial's frames or one frame's score, and the number of
+    terms in them.
 
     Examples
     --------
@@ -66,16 +62,9 @@ def paired_difference(
     trials: Shaped[np.ndarray, " images"] | None = None,
     rng: np.random.Generator,
 ) -> Difference:
-    """Difference of two scores of the same images; whole trials are resampled where they are named.
+    """Difference of two scores of the same images; whole trials are resampled where each image's trial is named.
 
     Frames of one trial resemble one another: resampled one by one they would feign more evidence than there is.
-
-    Parameters
-    ----------
-    first, second
-        Scores, image by image.
-    trials
-        Trial of each image.
 
     Examples
     --------
@@ -89,5 +78,5 @@ def paired_difference(
     (0.1, 4, False)
     """
     _, member = np.unique(np.arange(len(first)) if trials is None else trials, return_inverse=True)
-    sums = [np.bincount(member, weights=values) for values in (first, second, np.ones(len(first)))]
-    return bootstrap_difference(sums[0], sums[1], sums[2], rng=rng)
+    ones = np.ones(len(first))
+    return bootstrap_difference(*(np.bincount(member, weights=values) for values in (first, second, ones)), rng=rng)
