@@ -15,9 +15,9 @@ from sliplens.images import absolute_difference, write_png
 from sliplens.models import Run, load_checkpoint
 from sliplens.models.predictions import predict as predict_source
 from sliplens.recordings import Dataset, Recording
+from sliplens.recordings.capture import Capture
 from sliplens.recordings.formats.lerobot_export import write_lerobot
 from sliplens.recordings.options import ReadOptions
-from sliplens.recordings.source import TrialFrames
 
 TRIAL = "test-wet-7"
 
@@ -209,14 +209,15 @@ def test_signed_images_need_a_reference(wet: Recording, tmp_path: Path, networks
     np.testing.assert_allclose(rows["prediction"], expected, atol=1e-5, rtol=1e-5)
 
 
-def frames_of(recording: Recording, read_frames: Callable[[], Iterator[np.ndarray]], *, frames: int) -> TrialFrames:
+def frames_of(recording: Recording, read_frames: Callable[[], Iterator[np.ndarray]], *, frames: int) -> Capture:
     size = recording.reference.shape[:2]
-    return TrialFrames(
-        name="trial",
-        frames=frames,
+    return Capture(
+        trial="trial",
+        source="a test",
+        frame_time_s=np.full(frames, np.nan),
         frame_size=(size[0], size[1]),
         read_frames=read_frames,
-        read_reference=lambda: recording.reference,
+        reference=recording.reference,
     )
 
 

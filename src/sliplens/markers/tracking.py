@@ -20,8 +20,9 @@ from sliplens.markers.tracker import Tracker
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame
 from sliplens.progress import OnProgress, note, stage
 from sliplens.recordings import Dataset
+from sliplens.recordings.capture import Capture
 from sliplens.recordings.options import ReadOptions
-from sliplens.recordings.source import Frame, Frames, TrialFrames, open_source
+from sliplens.recordings.source import Frame, Frames, open_source
 
 OnTracked: TypeAlias = Callable[[Frame, TrackedFrame, Float[np.ndarray, "markers 2"]], None]
 """Takes a frame, its markers and where they were at rest, in pixels."""
@@ -84,7 +85,7 @@ class Tracking:
 
 
 def track(
-    source: Path | str | Frames | Dataset | Sequence[TrialFrames],
+    source: Path | str | Frames | Dataset | Sequence[Capture],
     *,
     markers: str = "auto",
     reference: Path | str | Frame | None = None,
@@ -140,7 +141,7 @@ def track(
         )
     for sentence in dict.fromkeys(words for one in source for words in (*one.notes, *_require_movement(one))):
         note(on_progress, sentence)
-    metadata = {"sliplens.version": __version__, "sliplens.source": source[0].source, "sliplens.markers": markers}
+    metadata = {"sliplens.version": __version__, "sliplens.source": source[0].opened, "sliplens.markers": markers}
     schema = pa.schema(list(_COLUMNS.items()), metadata=metadata)
     outcomes: list[TrialTracking] = []
     with stage(on_progress, "Following markers") as count:
@@ -149,7 +150,7 @@ def track(
     return Tracking(trials=tuple(outcomes), path=path, rows=rows)
 
 
-def _require_movement(trial: TrialFrames) -> Iterator[str]:
+def _require_movement(trial: Capture) -> Iterator[str]:
     """Refuse a trial that cannot have moved; gives what is assumed of one without a reference."""
     if trial.read_reference is not None:
         return
@@ -162,7 +163,7 @@ def _require_movement(trial: TrialFrames) -> Iterator[str]:
 
 
 def _tables(
-    trials: Sequence[TrialFrames],
+    trials: Sequence[Capture],
     markers: str,
     *,
     schema: pa.Schema,

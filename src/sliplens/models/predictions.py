@@ -19,8 +19,9 @@ from sliplens.models.checkpoint import Estimate, Run, load
 from sliplens.models.engines import Engine, make_engine
 from sliplens.progress import OnProgress, note, stage
 from sliplens.recordings import Dataset
+from sliplens.recordings.capture import Capture
 from sliplens.recordings.options import ReadOptions
-from sliplens.recordings.source import Frame, Frames, TrialFrames, open_source
+from sliplens.recordings.source import Frame, Frames, open_source
 
 LEVEL = 0.9
 """Confidence of the intervals."""
@@ -65,7 +66,7 @@ class Predictions:
 
 def predict(
     run: Run | Path | str,
-    source: Path | str | Frames | Dataset | Sequence[TrialFrames],
+    source: Path | str | Frames | Dataset | Sequence[Capture],
     *,
     reference: Path | str | Frame | None = None,
     reference_frame: int | None = None,
@@ -148,7 +149,7 @@ def predict(
         ready = make_engine(engine, trained, frames=total, batch_size=batch_size, onnx_file=onnx_file)
     metadata = {
         "sliplens.engine": ready.name,
-        "sliplens.source": source[0].source,
+        "sliplens.source": source[0].opened,
         "sliplens.manifest_hash": hash_json(trained.manifest),
         "sliplens.weights_sha256": trained.manifest.weights_sha256,
     }
@@ -158,7 +159,7 @@ def predict(
     return Predictions(frames=total, engine=ready.name, path=path, rows=rows, notes=notes)
 
 
-def _require_comparable(trained: Run, trial: TrialFrames) -> Iterator[str]:
+def _require_comparable(trained: Run, trial: Capture) -> Iterator[str]:
     """Refuse a trial that the network cannot read; gives what is assumed of one that it can."""
     trained.require_frame_size(trial.frame_size)
     encoding = trained.encoding
@@ -173,7 +174,7 @@ def _require_comparable(trained: Run, trial: TrialFrames) -> Iterator[str]:
     yield f"{trial.name}: no reference was given, so its images were taken for difference images."
 
 
-def _schema(trials: Sequence[TrialFrames], metadata: dict[str, str]) -> pa.Schema:
+def _schema(trials: Sequence[Capture], metadata: dict[str, str]) -> pa.Schema:
     known = {
         "file": any(trial.files is not None for trial in trials),
         "safety_margin": any(trial.safety_margin is not None for trial in trials),
@@ -183,13 +184,13 @@ def _schema(trials: Sequence[TrialFrames], metadata: dict[str, str]) -> pa.Schem
 
 
 def _tables(
-    engine: Engine, trained: Run, trials: Sequence[TrialFrames], schema: pa.Schema, on_progress: OnProgress
+    engine: Engine, trained: Run, trials: Sequence[Capture], schema: pa.Schema, on_progress: OnProgress
 ) -> Iterator[pa.Table]:
     # plain numbers: small arrays kept between the large ones of each batch would leave holes in the memory
     waiting: dict[str, list] = {name: [] for name in schema.names}
     total, done = sum(trial.frames for trial in trials), 0
     # batches are encoded while the ones before are under way
-    encoded: deque[tuple[TrialFrames, int]] = deque()
+    encoded: deque[tuple[Capture, int]] = deque()
     for answers in engine.answers(_encode(trained, trials, engine.batch_size, encoded)):
         trial, first = encoded.popleft()
         estimate = trained.to_estimate(*answers)
@@ -206,7 +207,7 @@ def _tables(
 
 
 def _encode(
-    trained: Run, trials: Sequence[TrialFrames], batch_size: int, encoded: deque[tuple[TrialFrames, int]]
+    trained: Run, trials: Sequence[Capture], batch_size: int, encoded: deque[tuple[Capture, int]]
 ) -> Iterator[Tensor]:
     """Batches of encoded frames; trial and first frame of each are appended to `encoded`."""
     for trial in trials:
@@ -218,7 +219,7 @@ def _encode(
             yield trained.encode(np.stack(batch), reference)
 
 
-def _columns(estimate: Estimate, trial: TrialFrames, first: int) -> dict[str, pa.Array]:
+def _columns(estimate: Estimate, trial: Capture, first: int) -> dict[str, pa.Array]:
     count = len(estimate.margin)
     here = slice(first, first + count)
     low, high = estimate.interval(LEVEL) or (None, None)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import TypeAlias
 
 import numpy as np
@@ -48,12 +49,12 @@ class Capture(TrialFacts):
     source: str
     """File, folder or topic, for people."""
     frame_time_s: Float[np.ndarray, " _"]
-    """On the clock of the camera, from the same zero as the forces."""
+    """On the clock of the camera, from the same zero as the forces; all NaN where nobody tells them."""
     frame_size: tuple[int, int]
     """Height and width, in pixels."""
     read_frames: Callable[[], Iterator[Frame]]
     """Begins anew at every call: one RGB image for each time, in their order."""
-    forces: Forces | None
+    forces: Forces | None = None
     """None where only images were recorded."""
     notes: tuple[str, ...] = ()
     """Assumptions and omissions of the reader, a sentence each, to be shown to the user."""
@@ -68,11 +69,16 @@ class Capture(TrialFacts):
     split: str = ""
     """Split that the source tells; empty where it tells none."""
     simulated: bool = False
+    files: tuple[str, ...] | None = None
+    """Names of the images of a folder."""
+    opened: str = "frames in memory"
+    """Path that was opened, for people and metadata."""
 
     def __post_init__(self) -> None:
         if len(self.frame_time_s) == 0:
             raise RecordingError(f"{self.source} has no frame; leave it out or record it again")
-        _require_rising(self.frame_time_s, what=f"the frames of {self.source}")
+        if self.time_s is not None:
+            _require_rising(self.frame_time_s, what=f"the frames of {self.source}")
         if self.labels is not None and len(self.labels.safety_margin) != len(self.frame_time_s):
             raise RecordingError(
                 f"{self.source} has {len(self.frame_time_s)} frames but {len(self.labels.safety_margin)} labels; "
@@ -86,6 +92,43 @@ class Capture(TrialFacts):
 
     def __len__(self) -> int:
         return len(self.frame_time_s)
+
+    @property
+    def name(self) -> str:
+        """Name of the trial."""
+        return self.trial
+
+    @property
+    def frames(self) -> int:
+        """How many there are."""
+        return len(self)
+
+    @property
+    def time_s(self) -> Float[np.ndarray, " frames"] | None:
+        """Times of the frames; None where they are not known."""
+        return None if np.isnan(self.frame_time_s).all() else self.frame_time_s
+
+    @property
+    def safety_margin(self) -> Float[np.ndarray, " frames"] | None:
+        """Labels, NaN where a frame has none that can be trusted; None where the source has none at all."""
+        labels = self.labels
+        return None if labels is None else np.where(labels.labelled, labels.safety_margin, np.nan)
+
+    @property
+    def read_reference(self) -> Callable[[], Frame] | None:
+        """The sensor untouched, T_0; None where neither the source nor the user names it."""
+        if self.reference is not None:
+            return lambda: self.reference
+        if self.reference_index is None:
+            return None
+        return lambda: next(islice(self.read_frames(), self.reference_index, None))
+
+    @property
+    def frame_rate_hz(self) -> float:
+        """Frames a second at which it can be watched, 1 to 120; 25 where times are not known."""
+        if self.time_s is None or len(self) < 2:
+            return 25.0
+        return float(np.clip(1 / np.median(np.diff(self.time_s)), 1, 120))
 
 
 def _require_rising(time_s: Float[np.ndarray, " samples"], *, what: str) -> None:

@@ -14,11 +14,11 @@ from sliplens.files import output_folder
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.dataset import Dataset, load_dataset, trial_info, trial_path, write_dataset_table
-from sliplens.recordings.formats import open_captures
 from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.labelling import Labelling, ReferenceChoice
 from sliplens.recordings.labels import Reason, choose_reference, label_trial, measure_motion
 from sliplens.recordings.options import LabelSettings, ReadOptions
+from sliplens.recordings.source import open_source
 from sliplens.recordings.splits import SPLITS_FILE, SplitPlan, assign_splits, read_splits, write_split_record
 from sliplens.recordings.store import encode_frames, forces_path, save_forces, write_trial
 from sliplens.recordings.trial import Labels
@@ -83,7 +83,7 @@ def import_recordings(
         raise InputError("one table of forces goes with one recording; import the trials one by one")
     facts = {"sensor": sensor, "day": day, "condition": condition, "object": object}
     with stage(on_progress, "Opening the recordings"):
-        found = [one for path in paths for one in open_captures(path, format=format, options=reading)]
+        found = [one for path in paths for one in open_source(path, format=format, options=reading, whole=True)]
     captures = [replace(one, **{name: fact for name, fact in facts.items() if fact is not None}) for one in found]
     _require_names(captures)
     if splits is not None and (validation_trials is not None or test_trials is not None):

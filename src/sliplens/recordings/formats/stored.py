@@ -20,7 +20,7 @@ from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_
 from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.store import forces_path, load_forces, load_recording, stream_frames
-from sliplens.recordings.trial import LABEL_SIGNALS, ContactState, Labels, TrialFacts, require_unit_interval
+from sliplens.recordings.trial import LABEL_SIGNALS, ContactState, Labels, Recording, TrialFacts, require_unit_interval
 
 STATES = {str(state): state for state in ContactState}
 """Contact states by their words."""
@@ -36,8 +36,8 @@ def read_stored(folder: Path) -> list[Capture]:
     return [read_stored_trial(data, info) for info in data.trials]
 
 
-def read_stored_trial(data: Dataset, info: TrialInfo) -> Capture:
-    """Read one trial of a data set as `read_stored` does."""
+def read_stored_trial(data: Dataset, info: TrialInfo, *, samples: bool = True) -> Capture:
+    """Read one trial of a data set as `read_stored` does, with the samples of its forces or without."""
     path = trial_path(data.folder, info.trial)
     stored = load_recording(path, pixels=False)
     return Capture(
@@ -46,9 +46,7 @@ def read_stored_trial(data: Dataset, info: TrialInfo) -> Capture:
         frame_time_s=stored.time_s,
         frame_size=(info.height, info.width),
         read_frames=partial(stream_frames, path),
-        forces=load_forces(forces_path(data.folder, info.trial))
-        if info.forces_sha256
-        else _forces_of_frames(stored.time_s, stored, info.trial),
+        forces=_forces(data, info, stored) if samples else None,
         labels=stored,
         reference=stored.reference,
         split=info.split,
@@ -56,13 +54,15 @@ def read_stored_trial(data: Dataset, info: TrialInfo) -> Capture:
     )
 
 
-def _forces_of_frames(time_s: Float[np.ndarray, " frames"], labels: Labels, trial: str) -> Forces | None:
-    pull, press = labels.tangential_force_n, labels.normal_force_n
+def _forces(data: Dataset, info: TrialInfo, stored: Recording) -> Forces | None:
+    if info.forces_sha256:
+        return load_forces(forces_path(data.folder, info.trial))
+    pull, press = stored.tangential_force_n, stored.normal_force_n
     known = np.isfinite(pull) & np.isfinite(press)
     if not known.any():
         return None
     samples = np.stack([pull, np.zeros_like(pull), press], axis=-1)[known]
-    return Forces(time_s=time_s[known], force_n=samples, source=f"the frames of {trial}")
+    return Forces(time_s=stored.time_s[known], force_n=samples, source=f"the frames of {info.trial}")
 
 
 FORMAT, VERSION = "sliplens trial", 2
