@@ -8,7 +8,6 @@ from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from PIL import Image
-from scipy.ndimage import center_of_mass
 
 from sliplens.errors import InputError
 from sliplens.markers import DisplacementField, interpolate_field
@@ -104,15 +103,13 @@ def plate_methods(results: Results) -> Plate | None:
     if not rows:
         return None
     heads = ["Input", *(method_name(method) for method in methods)]
-    spread = ", ".join(
-        f"{method_name(row[1])} {percent(row[6])} ({short_input_name(row[0]).lower()})" for row in numbers
-    )
+    spread = [f"{method_name(row[1])} {percent(row[6])} ({short_input_name(row[0]).lower()})" for row in numbers]
     return Plate(
         name="fig-08-methods",
         figure=draw_grid(rows, heads=heads, bar=True).figure,
         alt=f"Saliency maps of {listed(heads[1:])} side by side; {'; '.join(told)}",
         caption=f"Methods beside each other on one frame near Γ {percent(THESIS_LEVEL)} ({'; '.join(told)}). Colours "
-        f"are relative to each map's own saliency. Share of the image with a saliency above 0.5: {spread}.",
+        f"are relative to each map's own saliency. Share of the image with a saliency above 0.5: {', '.join(spread)}.",
         numbers=named_columns(_SALIENCY_COLUMNS, numbers),
         pixels=True,
     )
@@ -210,10 +207,11 @@ def _measured(explained: Explained, method: str, frame: ShownFrame) -> tuple[Any
     """Numbers of a map drawn: where its weight lies, and on how much of the image."""
     own = explained.frames[frame.index]
     saliency = explained.saliency[method][frame.index].astype(np.float64)
-    down, right = center_of_mass(saliency) if saliency.sum() > 0 else (float("nan"),) * 2
+    total, (y, x) = saliency.sum(), np.indices(saliency.shape)
+    right, down = (float((saliency * axis).sum() / total) if total > 0 else float("nan") for axis in (x, y))
     label = float("nan") if own.safety_margin is None else own.safety_margin
     above = float((saliency > 0.5).mean())
-    return explained.input, method, own.id, frame.level, label, own.prediction, above, float(right), float(down)
+    return explained.input, method, own.id, frame.level, label, own.prediction, above, right, down
 
 
 def _answer(explained: Explained, index: int) -> str:
@@ -508,7 +506,7 @@ def _share_on_moving(saliency: np.ndarray, field: DisplacementField) -> float:
 
 def _resized(saliency: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Network pixels to camera pixels."""
-    return np.clip(np.asarray(Image.fromarray(saliency).resize(size[::-1], Image.Resampling.BILINEAR)), 0, 1)
+    return np.clip(np.asarray(Image.fromarray(saliency).resize((size[1], size[0]), Image.Resampling.BILINEAR)), 0, 1)
 
 
 def _tell_motion(frame: StateFrame, field: DisplacementField | None) -> str:
@@ -547,10 +545,7 @@ def plate_truth(results: Results, name: str) -> Plate | None:
         effects = (truth.network_maps[row], truth.margin_maps[row])
         cells = [
             Cell(picture=picture),
-            *(
-                Cell(picture=paint_effects(picture, one), words=f"up to {100 * np.abs(one).max():.1f} points")
-                for one in effects
-            ),
+            *(Cell(picture=paint_effects(picture, one), words=_points(one)) for one in effects),
             *(Cell(picture=show_map(picture, explained.saliency[method][index])) for method in methods),
         ]
         rows.append((f"Γ {percent(own.safety_margin)}\nread {percent(own.prediction)}", cells))
@@ -607,6 +602,10 @@ def _best_methods(results: Results, name: str, explained: Explained) -> list[str
     ranked = [] if faithful is None else [one.method for one in rank_methods(faithful)]
     known = methods_in_order(set(explained.saliency) - set(CONTROLS))
     return [*(one for one in ranked if one in known), *(one for one in known if one not in ranked)][:_TRUTH_METHODS]
+
+
+def _points(effects: np.ndarray) -> str:
+    return f"up to {100 * np.abs(effects).max():.1f} points"
 
 
 def _tell_match(truth: Truth, methods: list[str]) -> str:

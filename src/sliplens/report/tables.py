@@ -1,8 +1,8 @@
 """Tables of the page: cells as text, so that the template only lays them out."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from sliplens.plots.style import (
 from sliplens.report.comparisons import against_control, mean_at, settings, tell_bounds, tell_interval
 from sliplens.report.results import Results
 from sliplens.report.thesis import ACCURACY, DELETION, MARK, NETWORK_PIXELS, SECONDS, thesis_row
+from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionScores, MethodScore, Remedies, RemovalScore, RemovalScores
 from sliplens.results.study import MAP_MEASURES, REGIONS, Choice, MapQuality, Randomisation, Timing, Truth
 
@@ -72,22 +73,22 @@ def make_table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str | 
     kinds: list[Kind] = [
         "name" if place < names else "thesis" if cell.kind == "thesis" else "number" for place, cell in enumerate(heads)
     ]
-    return Table(
-        caption=caption,
-        head=heads,
-        rows=tuple(
-            tuple(
-                one if isinstance(one, Cell) else Cell(text=one, kind=kind)
-                for one, kind in zip(row, kinds, strict=True)
-            )
-            for row in rows
-        ),
+    cells = tuple(
+        tuple(one if isinstance(one, Cell) else Cell(text=one, kind=kind) for one, kind in zip(row, kinds, strict=True))
+        for row in rows
     )
+    return Table(caption=caption, head=heads, rows=cells)
 
 
 def tell_spread(mean: float, sd: float) -> str:
     """Write a mean with its standard deviation."""
     return f"{mean:.3f} ± {sd:.3f}"
+
+
+def _each_method(records: Mapping[str, Any]) -> list[tuple[str, str, Any]]:
+    """Input, method, and what a record of the input holds of the method, in the order they are read."""
+    found = {name: records[name].methods for name in inputs_in_order(records)}
+    return [(name, method, methods[method]) for name, methods in found.items() for method in methods_in_order(methods)]
 
 
 def _best(text: str, best: bool) -> Cell:
@@ -105,23 +106,14 @@ def table_accuracy(results: Results) -> Table:
         }
         lowest = min(score.mse for score in scores.values())
         for name, score in scores.items():
-            thesis = ACCURACY.get((name, condition), (None, None))
-            rows.append(
-                (
-                    condition.capitalize(),
-                    input_name(name),
-                    _best(decimals(score.mse, 4), score.mse == lowest and len(scores) > 1),
-                    decimals(thesis[0], 4),
-                    decimals(score.r2, 3),
-                    decimals(thesis[1], 2),
-                    decimals(100 * score.mae, 1),
-                    f"{score.frames} / {score.trials}",
-                )
-            )
+            thesis_mse, thesis_r2 = ACCURACY.get((name, condition), (None, None))
+            mse = _best(decimals(score.mse, 4), score.mse == lowest and len(scores) > 1)
+            r2, mae, counts = decimals(score.r2, 3), decimals(100 * score.mae, 1), f"{score.frames} / {score.trials}"
+            thesis = decimals(thesis_mse, 4), decimals(thesis_r2, 2)
+            rows.append((condition.capitalize(), input_name(name), mse, thesis[0], r2, thesis[1], mae, counts))
     return make_table(
         "How well each network reads the safety margin on test trials. MSE in squared margin units (Γ from 0 to 1), "
-        "MAE in percentage points of Γ; the lower MSE of each condition is bold. Grey columns: the "
-        f"{MARK}.",
+        f"MAE in percentage points of Γ; the lower MSE of each condition is bold. Grey columns: the {MARK}.",
         ("Objects", "Input", "MSE", "MSE, thesis", "R²", "R², thesis", "MAE (points)", "Frames / trials"),
         rows,
         names=2,
@@ -131,22 +123,13 @@ def table_accuracy(results: Results) -> Table:
 def table_deletion(scores: Mapping[str, DeletionScores], *, rng: np.random.Generator) -> Table:
     """Tabulate the deletion score by input and method, with the random control (thesis, Table 2)."""
     rows = []
-    for name in inputs_in_order(scores):
+    for name, method, score in _each_method(scores):
         scored = scores[name]
-        lowest = min((score.mean for method, score in scored.methods.items() if method != CONTROL), default=None)
-        for method in methods_in_order(scored.methods):
-            score = scored.methods[method]
-            rows.append(
-                (
-                    input_name(name),
-                    method_name(method),
-                    _best(tell_spread(score.mean, score.sd), score.mean == lowest),
-                    _interval(against_control(scored, method, rng=rng), digits=3),
-                    decimals(score.last_step_mean, 3),
-                    _thesis_score(name, method, scored.methods),
-                    str(score.frames),
-                )
-            )
+        lowest = min((own.mean for other, own in scored.methods.items() if other != CONTROL), default=None)
+        against = _interval(against_control(scored, method, rng=rng), digits=3)
+        last, thesis = decimals(score.last_step_mean, 3), _thesis_score(name, method, scored.methods)
+        cells = (_score_cell(score, lowest), against, last, thesis, str(score.frames))
+        rows.append((input_name(name), method_name(method), *cells))
     sources = " and ".join(sorted({source_name(scored.source) for scored in scores.values()}))
     return make_table(
         f"Deletion score D on {sources}, averaged over all steps, mean ± standard deviation over frames; lower = more "
@@ -172,11 +155,8 @@ def table_seconds(results: Results) -> Table:
         [
             (
                 method_name(method),
-                *(
-                    decimals(one.methods[method].seconds_per_frame if method in one.methods else None, 3)
-                    for one in explained.values()
-                ),
-                decimals(SECONDS.get(thesis_row(method, methods) or ""), 3),
+                *(_seconds_of(one, method) for one in explained.values()),
+                _thesis_seconds(method, methods),
             )
             for method in methods_in_order(methods)
         ],
@@ -187,19 +167,15 @@ def table_real(results: Results) -> Table:
     """Tabulate label and answers of each real frame."""
     explained = {name: one for (name, source), one in results.explanations.items() if source == "real"}
     names = inputs_in_order(explained)
-    answers = {(name, frame.id): frame.prediction for name in names for frame in explained[name].frames}
+    read = {(name, frame.id): frame.prediction for name in names for frame in explained[name].frames}
     frames = {frame.id: frame for name in names for frame in explained[name].frames}
+    answers = {frame: [read.get((name, frame)) for name in names] for frame in frames}
     return make_table(
         f"{len(frames)} real frames: the recorded safety margin, and what each network reads.",
         ("Frame", "Objects", "True Γ", *(f"Read from {input_name(name).lower()}" for name in names)),
         [
-            (
-                frame.id,
-                frame.condition.capitalize(),
-                percent(frame.safety_margin),
-                *(percent(answers.get((name, frame.id))) for name in names),
-            )
-            for frame in sorted(frames.values(), key=lambda one: (-(one.safety_margin or 0), one.id))
+            (one.id, one.condition.capitalize(), *(percent(value) for value in (one.safety_margin, *answers[one.id])))
+            for one in sorted(frames.values(), key=lambda one: (-(one.safety_margin or 0), one.id))
         ],
         names=2,
     )
@@ -207,32 +183,22 @@ def table_real(results: Results) -> Table:
 
 def table_training(results: Results) -> Table:
     """Tabulate how each network was trained."""
-    trainings = [results.trainings[name] for name in inputs_in_order(results.trainings)]
-    return make_table(
-        "How the networks were trained.",
-        ("", *(input_name(one.input) for one in trainings)),
-        zip(
-            (
-                "Backbone", "Image side (camera)", "Frames: training / validation", "Epochs", "Minutes", "Stopped by",
-                "Best validation MSE", "Parameters", "Seed",
-            ),
-            *(
-                (
-                    one.backbone,
-                    f"{one.image_size} px ({' x '.join(map(str, one.frame_size))})",
-                    f"{_whole(one.train_frames)} / {_whole(one.validation_frames)}",
-                    decimals(one.epochs, 1),
-                    decimals(one.minutes, 1),
-                    one.stopped_by,
-                    decimals(one.best_validation_mse, 4),
-                    _whole(one.parameters),
-                    str(one.seed),
-                )
-                for one in trainings
-            ),
-            strict=True,
+    runs = [results.trainings[name] for name in inputs_in_order(results.trainings)]
+    rows = (
+        ("Backbone", *(one.backbone for one in runs)),
+        ("Image side (camera)", *(f"{one.image_size} px ({' x '.join(map(str, one.frame_size))})" for one in runs)),
+        (
+            "Frames: training / validation",
+            *(f"{_whole(one.train_frames)} / {_whole(one.validation_frames)}" for one in runs),
         ),
-    )  # fmt: skip
+        ("Epochs", *(decimals(one.epochs, 1) for one in runs)),
+        ("Minutes", *(decimals(one.minutes, 1) for one in runs)),
+        ("Stopped by", *(one.stopped_by for one in runs)),
+        ("Best validation MSE", *(decimals(one.best_validation_mse, 4) for one in runs)),
+        ("Parameters", *(_whole(one.parameters) for one in runs)),
+        ("Seed", *(str(one.seed) for one in runs)),
+    )
+    return make_table("How the networks were trained.", ("", *(input_name(one.input) for one in runs)), rows)
 
 
 def table_scores(faithful: RemovalScores, scored: DeletionScores | None) -> Table:
@@ -350,9 +316,7 @@ def table_looks(looks: Mapping[str, MapQuality]) -> Table:
         ("Input", "Method", *(_LOOK_NAMES[measure] for measure in MAP_MEASURES)),
         [
             (input_name(name), method_name(method), *(decimals(getattr(measures, one), 3) for one in MAP_MEASURES))
-            for name in inputs_in_order(looks)
-            for method in methods_in_order(looks[name].methods)
-            for measures in [looks[name].methods[method]]
+            for name, method, measures in _each_method(looks)
         ],
         names=2,
     )
@@ -372,12 +336,9 @@ def table_randomisation(randomisation: Mapping[str, Randomisation]) -> Table:
                 input_name(name),
                 method_name(method),
                 *(decimals(one.similarity[place] if one.similarity else None, 2) for place in (0, -1)),
-                decimals(one.complexity_rise, 2),
-                decimals(one.smooth_complexity_rise, 2),
+                *(decimals(rise, 2) for rise in (one.complexity_rise, one.smooth_complexity_rise)),
             )
-            for name in inputs_in_order(randomisation)
-            for method in methods_in_order(randomisation[name].methods)
-            for one in [randomisation[name].methods[method]]
+            for name, method, one in _each_method(randomisation)
         ],
         names=2,
     )
@@ -393,7 +354,7 @@ def table_times(timing: Mapping[str, Timing]) -> Table:
             spread = "" if one is None or one.low is None else f" ({_seconds(one.low)} to {_seconds(one.high)})"
             cells.append(UNKNOWN if one is None else f"{_seconds(one.seconds)}{spread}")
             cells.append(_seconds(None if one is None else one.seconds_without_forward))
-        rows.append((method_name(method), *cells, decimals(SECONDS.get(thesis_row(method, methods) or ""), 3)))
+        rows.append((method_name(method), *cells, _thesis_seconds(method, methods)))
     told = "; ".join(
         f"{input_name(name).lower()}: {one.device}"
         f"{f' with {one.threads} threads' if one.threads and one.device == 'cpu' else ''}, "
@@ -434,17 +395,13 @@ def table_trials(choice: Choice) -> Table:
 def table_localisation(truth: Truth) -> Table:
     """Tabulate where relevance lies, and how well maps rank the markers."""
     names = [*methods_in_order(set(truth.methods) - set(_TRUTHS)), *(one for one in _TRUTHS if one in truth.methods)]
+    heads = [f"{what}, {_REGION_NAMES[region]}" for what in ("Mass", "Strongest") for region in REGIONS]
     nothing = ("A map that knows nothing", *(percent(truth.areas[region]) for region in REGIONS * 2), "0", "0")
     return make_table(
         f"{input_name(truth.input)}, {truth.frames} simulated frames: share of the relevance, and of the strongest "
         "pixels, in three regions; and Spearman's correlation of the map's mean on each marker with what putting that "
         "marker back does to the network's answer and to the best reading of the margin (95 % interval over trials).",
-        (
-            "Method",
-            *(f"{what}, {_REGION_NAMES[region]}" for what in ("Mass", "Strongest") for region in REGIONS),
-            "With the answer",
-            "With the best reading",
-        ),
+        ("Method", *heads, "With the answer", "With the best reading"),
         [
             *(
                 (
@@ -488,10 +445,17 @@ def _interval(gap: Difference | None, value: float | None = None, *, digits: int
     return decimals(value, digits) if gap is None else tell_interval(gap, digits=digits)
 
 
-def _thesis_score(name: str, method: str, among: Iterable[str]) -> str:
-    row = thesis_row(method, set(among))
-    thesis = DELETION.get((name, row)) if row else None
+def _thesis_score(name: str, method: str, among: Collection[str]) -> str:
+    thesis = DELETION.get((name, thesis_row(method, among) or ""))
     return tell_spread(*thesis) if thesis else UNKNOWN
+
+
+def _thesis_seconds(method: str, among: Collection[str]) -> str:
+    return decimals(SECONDS.get(thesis_row(method, among) or ""), 3)
+
+
+def _seconds_of(explained: Explained, method: str) -> str:
+    return decimals(explained.methods[method].seconds_per_frame if method in explained.methods else None, 3)
 
 
 def _score_cell(score: MethodScore | None, best: float | None) -> Cell:
