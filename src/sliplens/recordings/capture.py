@@ -117,11 +117,10 @@ class Capture(TrialFacts):
     @property
     def read_reference(self) -> Callable[[], Frame] | None:
         """The sensor untouched, T_0; None where neither the source nor the user names it."""
-        if self.reference is not None:
-            return lambda: self.reference
-        if self.reference_index is None:
-            return None
-        return lambda: next(islice(self.read_frames(), self.reference_index, None))
+        image, index = self.reference, self.reference_index
+        if image is not None:
+            return lambda: image
+        return None if index is None else lambda: next(islice(self.read_frames(), index, None))
 
     @property
     def frame_rate_hz(self) -> float:

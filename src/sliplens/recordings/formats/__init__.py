@@ -94,14 +94,7 @@ def recognise(path: Path) -> str | None:
 
 
 def open_captures(path: Path, *, format: str | None = None, options: ReadOptions) -> tuple[Capture, ...]:
-    """Open a source with the reader of its format.
-
-    Parameters
-    ----------
-    format
-        Row of `FORMATS`; recognised by names if None.
-    options
-        What is known of the source.
+    """Open a source with the reader of its format: a row of `FORMATS`, recognised by names if None.
 
     Raises
     ------

@@ -22,11 +22,6 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
 
     No frame has a label; what is known of the whole clip is kept beside. Its reference is the frame with the least
     relief: a candidate, to be looked at before it is used.
-
-    Parameters
-    ----------
-    path
-        `slip/GRASP/camera_N.avi` or `noslip/GRASP/camera_N.avi`.
     """
     table = path.absolute().parent.parent.parent / LABELS_FILE if labels is None else labels
     rows = _read_labels(table)
@@ -34,11 +29,10 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
     key = "/".join(path.absolute().parts[-3:])
     if key not in rows:
         raise RecordingError(f"{table} does not list {key}; name a clip of the data set it belongs to")
-    row = rows[key]
-    whole = read_video(path)
-    if len(whole.frame_time_s) != int(row["n_frames"]):
+    row, whole = rows[key], read_video(path)
+    if len(whole) != int(row["n_frames"]):
         raise RecordingError(
-            f"{path} has {len(whole.frame_time_s)} frames but {table.name} says {row['n_frames']}; copy the clip again"
+            f"{path} has {len(whole)} frames but {table.name} says {row['n_frames']}; copy the clip again"
         )
     copies = small_copies(whole.read_frames())
     stale = count_stale(copies)
@@ -65,19 +59,11 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
 
 
 def read_gelsight(path: Path, *, frame_rate: float | None = None) -> list[Capture]:
-    """Read clips as captures without a label of any frame; what is known of the whole clip is kept beside.
-
-    Parameters
-    ----------
-    path
-        The data set's folder, for all clips that are there; the folder of a grasp; or a clip.
-    """
-    if path.is_file():
-        clips = [path]
-    elif (path / LABELS_FILE).is_file():
+    """Read clips: all of the data set's folder that are there, those of the folder of a grasp, or a single one."""
+    if (path / LABELS_FILE).is_file():
         clips = list_gelsight_clips(path)
     else:
-        clips = sorted(path.glob("*.avi"))
+        clips = [path] if path.is_file() else sorted(path.glob("*.avi"))
     if not clips:
         raise RecordingError(f"{path} holds no clip; name a clip, the folder of a grasp, or that of {LABELS_FILE}")
     rate = FRAME_RATE_HZ if frame_rate is None else frame_rate

@@ -273,7 +273,9 @@ def write_lerobot(
     ----------
     https://huggingface.co/docs/lerobot/lerobot-dataset-v3
     """
-    chosen = _in_splits(data.trials if trials is None else trials)
+    chosen = data.trials if trials is None else trials
+    splits = list(dict.fromkeys(info.split for info in chosen))
+    chosen = sorted(chosen, key=lambda info: splits.index(info.split))
     height, width = _require_one_kind(chosen)
     _make_room(folder)
     fps = _frame_rate(data, chosen)
@@ -341,11 +343,6 @@ def write_lerobot(
             "features": features,
         },
     )
-
-
-def _in_splits(trials: Sequence[TrialInfo]) -> list[TrialInfo]:
-    splits = list(dict.fromkeys(info.split for info in trials))
-    return sorted(trials, key=lambda info: splits.index(info.split))
 
 
 def _ranges(splits: Sequence[str]) -> dict[str, str]:

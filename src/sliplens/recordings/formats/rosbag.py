@@ -225,10 +225,9 @@ def bag_messages(
 ) -> Iterator[tuple[str, int, Any]]:
     """Topic, time of arrival in nanoseconds and content of each message, in the order of recording.
 
-    Definitions that the bag brings along are not used, for `rosbags` turns them into code; those of the messages read
-    here are the same in all of ROS 2. Message data are views of the bytes read: a large header claims nothing. What is
-    compressed is expanded a chunk, message or file at a time, within the limits above. Where `kinds` tells the type of
-    a topic, messages of another are passed over: a second channel of the same topic could hold anything.
+    Definitions that the bag brings along are not used, for `rosbags` turns them into code. Message data are views of
+    the bytes read: a large header claims nothing. Where `kinds` tells the type of a topic, messages of another are
+    passed over: a second channel of the same topic could hold anything.
     """
     with open_bag(path) as bag:
         types, kinds = trial_types(), kinds or {}
@@ -291,10 +290,7 @@ def _require_whole_pages(file: Path) -> None:
 
 
 def read_trial_bag(path: Path, topics: dict[str, str]) -> Capture | None:
-    """Read a bag that `write_mcap` wrote; None where it is another one.
-
-    Frames, times, labels, reference frame and forces are those of the data set it came from, bit by bit.
-    """
+    """Read a bag that `write_mcap` wrote, bit by bit as its data set was; None where it is another one."""
     if topics.get(TRIAL) != TOPICS[TRIAL]:
         return None
     text = next((message.data for _, _, message in bag_messages(path, {TRIAL}, kinds=TOPICS)), "")
@@ -360,7 +356,7 @@ def _scan(
     for name, bag_ns, message in bag_messages(path, topics, kinds=kinds):
         topic = found[name]
         if name == images:
-            where = _where(len(topic.bag_ns), images, path)
+            where = f"frame {len(topic.bag_ns)} of {images} in {path}"
             before, size = size, image_size(message, where=where)
             if before is not None and before != size:
                 cure = "cut the bag there" if kinds is None else "export the trial again"
@@ -388,7 +384,7 @@ def _scan(
 
 def _read_frames(path: Path, images: str, *, kinds: Mapping[str, str] | None = None) -> Iterator[Frame]:
     for index, (_, _, message) in enumerate(bag_messages(path, {images}, kinds=kinds)):
-        yield image_pixels(message, where=_where(index, images, path))
+        yield image_pixels(message, where=f"frame {index} of {images} in {path}")
 
 
 def _require_whole(found: dict[str, _Topic], about: ExportedTrial, path: Path) -> None:
@@ -500,7 +496,3 @@ def _meet(clock: str, *topics: _Topic) -> bool:
 
 def _listed(topics: dict[str, str]) -> str:
     return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())) or "no topic"
-
-
-def _where(index: int, topic: str, path: Path) -> str:
-    return f"frame {index} of {topic} in {path}"

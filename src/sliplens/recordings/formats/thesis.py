@@ -2,7 +2,6 @@
 
 import os
 import re
-from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
@@ -35,53 +34,32 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
     return lines
 
 
-@dataclass(frozen=True, kw_only=True)
-class ListedFiles:
-    """Finds the files of lists by the paths they had elsewhere."""
+def _find(listed: str, *, where: str, folder: Path, root: Path) -> Path:
+    """File of a list: where its path says, else under the root by the last parts of its path, the most first.
 
-    folder: Path
-    """Of the lists: relative paths start here."""
-    root: Path
-    """Relative paths may not lead out of it; files that moved are looked for under it."""
-    _found: dict[Path, str] = field(default_factory=dict)
-
-    def find(self, listed: str, *, where: str) -> Path:
-        """Find a file: where its path says, else under the root by the last parts of its path, the most first."""
-        path = self._search(listed, where=where)
-        before = self._found.setdefault(path, listed)
-        if before != listed:
-            raise RecordingError(
-                f"{where}: {listed!r} and {before!r} both lead to {path}; give with --image-root a folder in which "
-                "they differ"
-            )
-        return path
-
-    def _search(self, listed: str, *, where: str) -> Path:
-        foreign = PureWindowsPath(listed.strip("\"'"))  # reads slashes and backslashes
-        own = Path(listed.strip("\"'"))
-        if own.is_absolute() and _is_file(own):
-            return own
-        parts = foreign.parts
-        if foreign.anchor:
-            parts = parts[1:]
-        else:
-            inside = Path(os.path.normpath(self.folder.absolute().joinpath(*parts)))
-            if inside.is_relative_to(os.path.normpath(self.root.absolute())):
-                if _is_file(inside):
-                    return inside
-            elif ".." in parts:
-                raise RecordingError(
-                    f"{where}: {listed!r} leads out of {self.root}; give the folder of all with --image-root"
-                )
-        parts = tuple(part for part in parts if part != "..")
-        for dropped in range(len(parts)):
-            moved = self.root.joinpath(*parts[dropped:])
-            if _is_file(moved):
-                return moved
-        raise RecordingError(
-            f"{where}: {listed[:200]!r} is not there, nor under {self.root}; give the folder of the images with "
-            "--image-root"
-        )
+    Relative paths start at the folder and may not lead out of the root.
+    """
+    foreign = PureWindowsPath(listed.strip("\"'"))  # reads slashes and backslashes
+    own = Path(listed.strip("\"'"))
+    if own.is_absolute() and _is_file(own):
+        return own
+    parts = foreign.parts
+    if foreign.anchor:
+        parts = parts[1:]
+    else:
+        inside = Path(os.path.normpath(folder.absolute().joinpath(*parts)))
+        if inside.is_relative_to(os.path.normpath(root.absolute())):
+            if _is_file(inside):
+                return inside
+        elif ".." in parts:
+            raise RecordingError(f"{where}: {listed!r} leads out of {root}; give the folder of all with --image-root")
+    parts = tuple(part for part in parts if part != "..")
+    moved = (root.joinpath(*parts[dropped:]) for dropped in range(len(parts)))
+    if found := next(filter(_is_file, moved), None):
+        return found
+    raise RecordingError(
+        f"{where}: {listed[:200]!r} is not there, nor under {root}; give the folder of the images with --image-root"
+    )
 
 
 def _is_file(path: Path) -> bool:
@@ -106,11 +84,6 @@ def read_thesis(
     columns (that called gamma, else the last), percent, backslashes, empty lines and comments. Their paths are those
     of the computer that recorded them; a path that does not exist here is looked for under `image_root` by its last
     parts, the most first.
-
-    Parameters
-    ----------
-    path
-        The list of frames, or the folder that holds just one.
     """
     rate = _FRAME_RATE_HZ if frame_rate is None else frame_rate
     how = "assumed" if frame_rate is None else "declared"
@@ -125,11 +98,23 @@ def read_thesis(
             f"{frames_list} has {len(frames)} frames, {lists[1].name} {len(references)} references and {lists[2].name} "
             f"{len(margins)} margins; give one of each a line"
         )
-    files = ListedFiles(folder=frames_list.parent, root=frames_list.parent if image_root is None else image_root)
+    root = frames_list.parent if image_root is None else image_root
+    listed: dict[Path, str] = {}
+
+    def find(text: str, where: str) -> Path:
+        path = _find(text, where=where, folder=frames_list.parent, root=root)
+        before = listed.setdefault(path, text)
+        if before != text:
+            raise RecordingError(
+                f"{where}: {text!r} and {before!r} both lead to {path}; give with --image-root a folder in which "
+                "they differ"
+            )
+        return path
+
     rows: dict[Path, list[tuple[Path, float]]] = {}
     for (number, frame), (at, reference), margin in zip(frames, references, margins.tolist(), strict=True):
-        untouched = files.find(reference, where=f"{lists[1]}, line {at}")
-        found = files.find(frame, where=f"{frames_list}, line {number}")
+        untouched = find(reference, f"{lists[1]}, line {at}")
+        found = find(frame, f"{frames_list}, line {number}")
         rows.setdefault(untouched, []).append((found, margin))
     base, digits = trial_name(stem or "thesis"), len(str(len(rows)))
     return [
