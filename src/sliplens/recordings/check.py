@@ -9,7 +9,7 @@ import numpy as np
 
 from sliplens.errors import SliplensError
 from sliplens.files import hash_file
-from sliplens.progress import OnProgress
+from sliplens.progress import OnProgress, counted
 from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_path
 from sliplens.recordings.store import forces_path, load_recording, read_header
 from sliplens.recordings.trial import SIGNALS, ContactState, Recording
@@ -36,16 +36,6 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
     contact, margin and forces agree, and contact states follow the margin. For the set: that no trial is listed twice,
     which would put its frames into two splits, and that no file is left over.
 
-    Parameters
-    ----------
-    data
-        Data set, or its folder.
-
-    Returns
-    -------
-    tuple of Finding
-        Empty when all is well.
-
     Raises
     ------
     SliplensError
@@ -64,10 +54,8 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
         for path in sorted([*(folder / "trials").glob("*"), *(folder / "forces").glob("*")])
         if path not in listed
     ]
-    for done, info in enumerate(data.trials, start=1):
+    for info in counted(data.trials, on_progress):
         findings += [Finding(where=info.trial, what=what) for what in _check_trial(folder, info)]
-        if on_progress is not None:
-            on_progress(done, len(data.trials))
     return tuple(findings)
 
 

@@ -127,8 +127,6 @@ def label_dataset(
 
     Parameters
     ----------
-    data
-        Data set, imported or simulated.
     out
         Folder to make. The data set's own gets the new labels once all of them are there.
     labelling
@@ -214,9 +212,8 @@ def _fingerprint(path: Path) -> list[object]:
 def _without_labels(capture: Capture) -> Capture:
     """A stored trial as if it came from where it was recorded, with what was noted then."""
     kept = capture.labels.labelling if capture.labels else None
-    if kept is None:
-        return replace(capture, labels=None)
-    return replace(capture, labels=None, source=kept.source, notes=kept.notes)
+    noted = {} if kept is None else {"source": kept.source, "notes": kept.notes}
+    return replace(capture, labels=None, **noted)
 
 
 def _write_trials(
@@ -261,12 +258,7 @@ def import_trial(
     """Write a recording as a trial of a data set, with the labels that came with it, or found; whole or not at all.
 
     The frames are read several times, never all at once: to see the image move, to find the untouched sensor, and to
-    write them.
-
-    Parameters
-    ----------
-    forces_file
-        Where to keep the samples of the force sensor, from which labels can be made anew; not kept if None.
+    write them. The samples of the force sensor, from which labels can be made anew, are kept in `forces_file`.
     """
     settings = settings or LabelSettings()
     if capture.labels is None and capture.forces is None:
@@ -285,7 +277,7 @@ def import_trial(
     # before the trial, whose file tells that all of it is there
     if forces_file is not None and capture.forces is not None:
         save_forces(capture.forces, forces_file)
-    images = _counted(encode_frames(_frames(capture)), len(capture), on_progress)
+    images = encode_frames(_frames(capture, on_progress))
     write_trial(path, images, facts=capture, time_s=capture.frame_time_s, labels=labels, reference=reference)
 
 
@@ -324,7 +316,7 @@ def _tell_source(capture: Capture, reference: ReferenceChoice) -> Labelling:
     )
 
 
-def _frames(capture: Capture) -> Iterator[Frame]:
+def _frames(capture: Capture, on_progress: OnProgress | None = None) -> Iterator[Frame]:
     """Frames of a capture, which must be as many as it promised and of one size."""
     read = 0
     for frame in capture.read_frames():
@@ -335,17 +327,9 @@ def _frames(capture: Capture) -> Iterator[Frame]:
             )
         read += 1
         yield frame
+        if on_progress is not None:
+            on_progress(read, len(capture))
     if read != len(capture):
         raise RecordingError(
             f"{capture.source} promised {len(capture)} frames but gave {read}; copy or export it again"
         )
-
-
-def _counted(chunks: Iterator[list[bytes]], total: int, on_progress: OnProgress | None) -> Iterator[list[bytes]]:
-    done = 0
-    for chunk in chunks:
-        done += len(chunk)
-        yield chunk
-        del chunk  # before the next is made
-        if on_progress is not None:
-            on_progress(done, total)

@@ -51,7 +51,6 @@ class ForceAxes:
     """Doubts, a sentence each."""
 
     def __post_init__(self) -> None:
-        """Check what can be declared wrongly."""
         if self.normal not in AXES:
             raise RecordingError(f"the normal axis is {self.normal!r}; name x, y or z")
         if self.sign not in (-1, 1):
@@ -90,7 +89,6 @@ class FrictionEstimate:
     """Motion of the image at the onset beyond that before it, in standard deviations; None where not measured."""
 
     def __post_init__(self) -> None:
-        """Check what can be given wrongly."""
         if not 0 < self.mu < np.inf:
             raise RecordingError(f"the coefficient of friction is {self.mu:.3g}; give a positive one")
         if not 0 <= self.low <= self.mu <= self.high < np.inf:
@@ -125,7 +123,6 @@ class Lag:
     """Why the lag cannot be told from this trial; empty where it can."""
 
     def __post_init__(self) -> None:
-        """Check what can be given wrongly."""
         if not (np.isfinite(self.lag_s) and self.sigma_s >= 0):
             raise RecordingError(
                 f"a lag of {self.lag_s:g} s with an uncertainty of {self.sigma_s:g} s cannot be; give it in seconds"

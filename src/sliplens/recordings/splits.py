@@ -9,9 +9,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from fnmatch import fnmatchcase
 from fractions import Fraction
+from functools import partial
 from glob import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import msgspec
 
@@ -24,7 +25,6 @@ from sliplens.recordings.trial import TrialFacts
 
 FACTS = ("trial", "day", "object", "condition", "sensor")
 """What is known of a trial before it is looked at: what rules ask for, and trials are grouped by."""
-_TEXTS = tuple(fact for fact in FACTS if fact != "day")
 _SPLIT_NAME = re.compile(r"[a-z][a-z0-9_-]*")
 # shares are written with few digits: thirds as 0.3333 are to be mended by the one who wrote them
 _SUM_TOLERANCE = 1e-6
@@ -58,7 +58,6 @@ class SplitRule:
     """Another seed deals the groups in another order."""
 
     def __post_init__(self) -> None:
-        """Check that the rule can be followed."""
         if (self.name is None) == (not self.share):
             said = "neither name nor share" if self.name is None else "both name and share"
             raise InputError(f"it has {said}; give the name of a split, or the share of each")
@@ -67,35 +66,27 @@ class SplitRule:
                 raise InputError(f"a split cannot be named {split!r}; use a lower-case word such as train or test")
         if not self.share and self.by is not None:
             raise InputError("by goes with share; leave it out, or give shares in place of the name")
-        if self.share:
-            self._check_shares()
-
-    def _check_shares(self) -> None:
-        if self.by not in FACTS:
+        if self.share and self.by not in FACTS:
             said = "share needs by" if self.by is None else f"trials cannot be grouped by {self.by!r}"
             raise InputError(f"{said}; choose {', '.join(FACTS[:-1])} or {FACTS[-1]}")
         for split, part in self.share.items():
             if not (math.isfinite(part) and part > 0):
                 raise InputError(f"the share of {split} is {part:g}; give more than 0, or leave {split} out")
         total = math.fsum(self.share.values())
-        if abs(total - 1) > _SUM_TOLERANCE:
+        if self.share and abs(total - 1) > _SUM_TOLERANCE:
             raise InputError(f"the shares sum to {total:.6g}; change them so that they sum to 1")
 
     def fits(self, trial: TrialFacts) -> bool:
         """Tell whether all that the rule asks for is so of a trial."""
-        if self.day and trial.day not in self.day:
-            return False
         return all(
-            any(_alike(getattr(trial, fact), pattern) for pattern in getattr(self, fact))
-            for fact in _TEXTS
-            if getattr(self, fact)
+            any(_alike(str(getattr(trial, fact)), str(pattern)) for pattern in asked)
+            for fact in FACTS
+            if (asked := getattr(self, fact))
         )
 
     def __str__(self) -> str:
         """Say what the rule asks for."""
-        asked = [
-            f"{fact} {' or '.join(str(one) for one in getattr(self, fact))}" for fact in FACTS if getattr(self, fact)
-        ]
+        asked = [f"{fact} {' or '.join(map(str, getattr(self, fact)))}" for fact in FACTS if getattr(self, fact)]
         return ", ".join(asked) or "any trial"
 
 
@@ -114,7 +105,6 @@ class SplitPlan:
     """The file or preset it comes from, for messages."""
 
     def __post_init__(self) -> None:
-        """Check that there is a rule."""
         if not self.rules:
             raise InputError(f"{self.source} has no rule; write one that begins with [[split]]")
 
@@ -155,37 +145,33 @@ def _alike(text: str, pattern: str) -> bool:
     return text == pattern or fnmatchcase(text, pattern)
 
 
-_TEXT, _PATTERNS = (str, "give one text in quotes"), (tuple[str, ...], "give a text in quotes, or a list of them")
-_KEYS: dict[str, tuple[Any, str]] = {
-    "trial": _PATTERNS,
-    "day": (tuple[int, ...], "give a whole number, or a list of them, without quotes"),
-    "object": _PATTERNS,
-    "condition": _PATTERNS,
-    "sensor": _PATTERNS,
-    "name": _TEXT,
-    "share": (dict[str, float], "write it like { train = 0.8, validation = 0.2 }"),
-    "by": _TEXT,
-    "seed": (int, "give a whole number"),
+_CURES = {
+    **dict.fromkeys(FACTS, "give a text in quotes, or a list of them"),
+    "day": "give a whole number, or a list of them, without quotes",
+    "name": "give one text in quotes",
+    "share": "write it like { train = 0.8, validation = 0.2 }",
+    "by": "give one text in quotes",
+    "seed": "give a whole number",
 }
-"""Types of what a rule may hold, and what to write in place of another."""
+"""What to write in place of what a rule cannot hold."""
 
 
 def _rule(row: Mapping[str, Any]) -> SplitRule:
-    unknown = [key for key in row if key not in _KEYS]
+    unknown = [key for key in row if key not in _CURES]
     if unknown:
-        *keys, last = _KEYS
+        *keys, last = _CURES
         raise InputError(f"{unknown[0]!r} is no key of a rule; use {', '.join(keys)} or {last}")
     if "seed" in row and "share" not in row:
         raise InputError("seed goes with share; leave it out")
-    values = {}
+    values, kinds = {}, get_type_hints(SplitRule)
     for key, value in row.items():
         if key in FACTS and value == []:
             raise InputError(f"{key} is an empty list, which fits no trial; name some, or leave {key} out")
-        kind, cure = _KEYS[key]
+        several = [value] if key in FACTS and not isinstance(value, list) else value
         try:
-            values[key] = msgspec.convert([value] if key in FACTS and not isinstance(value, list) else value, kind)
+            values[key] = msgspec.convert(several, kinds[key])
         except msgspec.ValidationError:
-            raise InputError(f"{key} is {value!r}; {cure}") from None
+            raise InputError(f"{key} is {value!r}; {_CURES[key]}") from None
     return SplitRule(**values)
 
 
@@ -197,17 +183,8 @@ def thesis_plan(trials: Sequence[TrialFacts]) -> SplitPlan:
 
     The first day trains and the last day tests. Of the dry trials of the days between a quarter validates, evenly
     spaced in the list of the first trial of each of these days, then the second of each, and so on; all others train.
-    Without such trials the first day gives up a quarter of its dry ones.
-
-    Parameters
-    ----------
-    trials
-        What is known of each trial; within a day their names tell their order, 2 before 10.
-
-    Raises
-    ------
-    InputError
-        If they are all of one day.
+    Without such trials the first day gives up a quarter of its dry ones. Within a day their names tell the order of the
+    trials, 2 before 10.
 
     References
     ----------
@@ -238,20 +215,18 @@ def _dry_of(trials: Sequence[TrialFacts], day: int) -> list[tuple[int, int, str]
     return [(place, day, name) for place, name in enumerate(sorted(names, key=lambda name: (natural_key(name), name)))]
 
 
-def _dealt(by: str, *, source: str) -> Callable[[Sequence[TrialFacts]], SplitPlan]:
+def _dealt_plan(trials: Sequence[TrialFacts], *, by: str) -> SplitPlan:  # noqa: ARG001 (as every preset takes them)
     share = {"train": 0.7, "validation": 0.15, "test": 0.15}
-    plan = SplitPlan(rules=(SplitRule(share=share, by=by),), source=source)
-    return lambda _: plan
+    return SplitPlan(rules=(SplitRule(share=share, by=by),), source=f"preset {by}s")
 
 
 PRESETS: dict[str, Callable[[Sequence[TrialFacts]], SplitPlan]] = {
     "thesis": thesis_plan,
-    "objects": _dealt("object", source="preset objects"),
-    "trials": _dealt("trial", source="preset trials"),
+    "objects": partial(_dealt_plan, by="object"),
+    "trials": partial(_dealt_plan, by="trial"),
 }
 """Plans worth a name, as functions of the trials there are. `objects` and `trials` deal 70 % to train and 15 % each to
 validation and test, by whole objects or by single trials."""
-
 
 __all__ = [
     "PRESETS",
@@ -262,8 +237,6 @@ __all__ = [
     "assign_splits",
     "read_splits",
     "split_dataset",
-    "thesis_plan",
-    "write_split_record",
 ]
 
 SPLITS_FILE = "splits.json"
@@ -291,11 +264,6 @@ def assign_splits(plan: SplitPlan, trials: Sequence[TrialFacts]) -> SplitResult:
     network is tested for is new objects or days, not more frames of them; and trials can be dealt before their frames
     are read. The groups are dealt in the order of the SHA-256 of `SEED:GROUP`: the order of the trials, how many there
     are in a group and the version of a library play no part, and a group that is added later moves few others.
-
-    Parameters
-    ----------
-    trials
-        What is known of each trial; no two have one name.
 
     Raises
     ------
@@ -347,7 +315,10 @@ def assign_splits(plan: SplitPlan, trials: Sequence[TrialFacts]) -> SplitResult:
             cause = "rules before it take every trial it fits" if any_fits else "no trial fits it; check its words"
             notes.append(f"{where} ({rule}) decides nothing: {cause}")
     told = tuple(splits[trial.trial] for trial in trials)
-    return SplitResult(splits=told, notes=(*notes, *_missing(told), *_shared(trials, told)))
+    missing = [split for split in _NEEDED if split not in told]
+    if missing:
+        notes.append(f"no trial is in {' or '.join(missing)}: to train takes train and validation, to evaluate test")
+    return SplitResult(splits=told, notes=(*notes, *_shared(trials, told)))
 
 
 def split_dataset(data: Dataset | Path | str, rules: SplitPlan | Path | str, *, dry_run: bool = False) -> SplitResult:
@@ -355,17 +326,10 @@ def split_dataset(data: Dataset | Path | str, rules: SplitPlan | Path | str, *, 
 
     Parameters
     ----------
-    data
-        Data set, or its folder.
     rules
         Rules, their file (TOML), or the name of a preset (`PRESETS`).
     dry_run
         Say what would be done and write nothing.
-
-    Returns
-    -------
-    SplitResult
-        The split of every trial, in the order of the data set, and what is odd about it.
 
     Raises
     ------
@@ -386,18 +350,16 @@ def split_dataset(data: Dataset | Path | str, rules: SplitPlan | Path | str, *, 
     return result
 
 
-def _as_table(rule: SplitRule) -> dict[str, Any]:
-    """Rule as its file would hold it, with what is left empty left out."""
-    unsaid = ("seed",) if rule.name is not None else ()
-    return {key: value for key, value in asdict(rule).items() if value not in ((), {}, None) and key not in unsaid}
-
-
 def write_split_record(folder: Path, plan: SplitPlan, trials: Sequence[TrialFacts], result: SplitResult) -> None:
-    """Write `splits.json`: the rules, where they come from, and what they made of which trial."""
+    """Write `splits.json`: the rules as their file would hold them, their source, and what they made of which trial."""
     splits = dict(zip((trial.trial for trial in trials), result.splits, strict=True))
+    unsaid = ((), {}, None)
     record = {
         "source": plan.source,
-        "rules": [_as_table(rule) for rule in plan.rules],
+        "rules": [
+            {key: value for key, value in asdict(rule).items() if value not in unsaid and (key != "seed" or rule.share)}
+            for rule in plan.rules
+        ],
         "splits": splits,
         "notes": result.notes,
         "sliplens": __version__,
@@ -444,13 +406,6 @@ def _apportion(count: int, share: Mapping[str, float]) -> dict[str, int]:
         dealt[giver] -= 1
         dealt[taker] += 1
     return dealt
-
-
-def _missing(splits: Sequence[str]) -> list[str]:
-    missing = [split for split in _NEEDED if split not in splits]
-    if not missing:
-        return []
-    return [f"no trial is in {' or '.join(missing)}: to train takes train and validation, to evaluate test"]
 
 
 def _shared(trials: Sequence[TrialFacts], splits: Sequence[str]) -> list[str]:

@@ -171,8 +171,9 @@ def estimate_friction(
     near &= forces.normal_n > contact_threshold_n
     time, ratio = forces.time_s[near], _ratio_along_pull(forces, near, rough)
     fit = fit_break(time, ratio, about_s=rough, rng=rng, draws=draws)
-    tare = _tare_share(forces, mu=fit.level, at=near)
-    low, high = np.quantile(fit.levels + rng.normal(0, tare, draws), _BAND)
+    # no resampling of the slip can show the uncertainty of the tare
+    tare = np.hypot(forces.tare_sigma_n.tangential, fit.level * forces.tare_sigma_n.normal)
+    low, high = np.quantile(fit.levels + rng.normal(0, float(tare / forces.normal_n[near].mean()), draws), _BAND)
     early, late = np.quantile(fit.times_s, _BAND)
     return FrictionEstimate(
         mu=fit.level,
@@ -227,12 +228,6 @@ def _ratio_along_pull(
     before = near & (forces.time_s <= rough)
     pull = forces.tangential_n[before].mean(axis=0)
     return forces.tangential_n[near] @ (pull / np.linalg.norm(pull)) / forces.normal_n[near]
-
-
-def _tare_share(forces: ContactForces, *, mu: float, at: Bool[np.ndarray, " samples"]) -> float:
-    """Uncertainty of the ratio from that of the tare, which no resampling of the slip can show."""
-    tare = forces.tare_sigma_n
-    return float(np.hypot(tare.tangential, mu * tare.normal) / forces.normal_n[at].mean())
 
 
 def _image_sigmas(image: ImageMotion | None, onset_s: float) -> float | None:

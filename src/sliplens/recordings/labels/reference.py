@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Frame
@@ -61,7 +61,8 @@ def choose_reference(
         chosen, how = int(before[0]) + _first_still(measure_motion(opening)), method
     ends = min(_ENDS, len(places) // 2)
     first, last = places[:ends].tolist(), places[len(places) - ends :].tolist()
-    compared = _spread(before)
+    # all of them, or so many evenly spread from the first to the last
+    compared = before[np.linspace(0, len(before) - 1, min(len(before), _COMPARED)).round().astype(int)].tolist()
     wanted = {*compared, *first, *last, *([] if chosen is None else [chosen])}
     # no further than to the last of them
     opening = islice(read_frames(), max(wanted) + 1)
@@ -76,13 +77,6 @@ def choose_reference(
         drift=_drift([soft[place] for place in first], [soft[place] for place in last]),
         drift_span=(int(places[0]), int(places[-1])) if len(places) else None,
     )
-
-
-def _spread(places: Int[np.ndarray, " untouched"]) -> list[int]:
-    """All of them, or so many as are compared, evenly spread from the first to the last."""
-    if len(places) <= _COMPARED:
-        return places.tolist()
-    return places[np.linspace(0, len(places) - 1, _COMPARED).round().astype(int)].tolist()
 
 
 def _first_still(motion: Float[np.ndarray, " frames"]) -> int:
