@@ -49,18 +49,15 @@ _FEW = 4  # charts in a row
 def plate_bins(results: Results) -> Plate:
     """Draw the MSE by bins of the margin, a chart a condition (thesis, Fig. 7)."""
     evaluations, conditions = results.evaluations, _conditions(results)
-    bins = {
-        condition: {
-            name: evaluations[name].conditions[condition].bins
-            for name in inputs_in_order(evaluations)
-            if condition in evaluations[name].conditions
-        }
-        for condition in conditions
-    }
+    bins = {condition: {} for condition in conditions}
+    for condition in conditions:
+        for name in inputs_in_order(evaluations):
+            if condition in evaluations[name].conditions:
+                bins[condition][name] = evaluations[name].conditions[condition].bins
     rows = [
         (condition, name, row.low, row.high, row.frames, row.mse)
-        for condition in conditions
-        for name, scores in bins[condition].items()
+        for condition, by_input in bins.items()
+        for name, scores in by_input.items()
         for row in scores
     ]
     # one scale for all conditions, or the eye compares bars that do not compare
@@ -71,12 +68,11 @@ def plate_bins(results: Results) -> Plate:
         for ax, condition in zip(axes, conditions, strict=True):
             plot_bins(bins[condition], ax=ax).set(ylim=(0, top))
             ax.set_title(f"{condition.capitalize()} objects", parse_math=False)
-    for condition in conditions:
-        known = [row for row in rows if row[0] == condition and row[5] is not None]
-        if known:
-            worst = max(known, key=lambda row: row[5] or 0.0)
-            place = f"{percent(worst[2])} to {percent(worst[3])}, {input_name(worst[1]).lower()}"
-            told.append(f"{condition}: {place}, MSE {worst[5]:.4f}")
+            known = [row for row in rows if row[0] == condition and row[5] is not None]
+            if known:
+                _, name, low, high, _, mse = max(known, key=lambda row: row[5] or 0.0)
+                place = f"{percent(low)} to {percent(high)}, {input_name(name).lower()}"
+                told.append(f"{condition}: {place}, MSE {mse:.4f}")
     return Plate(
         name="fig-07-mse-by-bin",
         figure=figure,
@@ -127,17 +123,14 @@ def plate_over_time(results: Results) -> Plate | None:
     rows = []
     with drawing_style():
         for ax, (condition, trial) in zip(axes, chosen.items(), strict=True):
-            own = {
-                name: one.predictions.where((one.predictions.trial == trial) & (one.predictions.condition == condition))
-                for name, one in results.evaluations.items()
-            }
-            shown = {name: frames for name, frames in own.items() if len(frames.trial)}
+            shown = {}
+            for name, one in results.evaluations.items():
+                of_trial = (one.predictions.trial == trial) & (one.predictions.condition == condition)
+                if of_trial.any():
+                    shown[name] = frames = one.predictions.where(of_trial)
+                    values = rows_of(frames.time_s, frames.safety_margin, frames.prediction)
+                    rows += [(name, trial, *own) for own in values]
             plot_margin_over_time(shown, ax=ax).set_title(condition.capitalize(), parse_math=False)
-            rows += [
-                (name, trial, *values)
-                for name, frames in shown.items()
-                for values in rows_of(frames.time_s, frames.safety_margin, frames.prediction)
-            ]
     told = ", ".join(f"{trial} ({condition})" for condition, trial in chosen.items())
     return Plate(
         name="over-time",
@@ -250,13 +243,10 @@ def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
         figure.legend(handles=handles, loc="outside upper left", ncols=3)
         figure.supxlabel("Removed (% of the image)", fontsize=9)
         figure.supylabel("Evidence lost (margin units)", fontsize=9)
-    numbers = [
-        (*key, *values)
-        for key, curve in faithful.curves.items()
-        for values in rows_of(
-            curve.areas, *(line.mean(axis=0) for line in (curve.most_first, curve.least_first, curve.random))
-        )
-    ]
+    numbers = []
+    for key, curve in faithful.curves.items():
+        lines = (line.mean(axis=0) for line in (curve.most_first, curve.least_first, curve.random))
+        numbers += [(*key, *values) for values in rows_of(curve.areas, *lines)]
     return Plate(
         name=f"sound-curves-{faithful.input}",
         figure=figure,
@@ -281,15 +271,10 @@ def plate_randomisation(results: Results) -> Plate:
         for ax, name in zip(axes, names, strict=True):
             for method in methods_in_order(found[name].methods):
                 one = found[name].methods[method]
-                ax.plot(
-                    one.layers,
-                    [np.nan if value is None else value for value in one.similarity],
-                    color=METHOD_COLOURS.get(method, PURPLE),
-                    linestyle=METHOD_LINES.get(method, "-"),
-                    marker="o",
-                    markersize=3.5,
-                    label=method_name(method),
-                )
+                colour, line = METHOD_COLOURS.get(method, PURPLE), METHOD_LINES.get(method, "-")
+                dots = {"marker": "o", "markersize": 3.5, "label": method_name(method)}
+                similarity = np.array(one.similarity, dtype=np.float64)
+                ax.plot(one.layers, similarity, color=colour, linestyle=line, **dots)
                 rows += [(name, method, layer, value) for layer, value in zip(one.layers, one.similarity, strict=True)]
                 last = one.similarity[-1] if one.similarity else None
                 if last is not None:
@@ -346,19 +331,13 @@ def _tell_order(scored: DeletionScores) -> str:
 
 def _deletion_numbers(scores: Mapping[str, DeletionScores]) -> dict[str, list]:
     names = ("input", "method", "pixels_removed", "share_removed", "mean", "quartile_low", "quartile_high", "sd")
-    rows = [
-        (name, method, *values)
-        for name, one in scores.items()
-        for method in methods_in_order(one.curves)
-        for curve in [one.curves[method]]
-        for values in rows_of(
-            curve.pixels_removed,
-            curve.pixels_removed / _pixels(one),
-            curve.scores.mean(axis=0),
-            *np.quantile(curve.scores, [0.25, 0.75], axis=0),
-            curve.scores.std(axis=0),
-        )
-    ]
+    rows = []
+    for name, one in scores.items():
+        for method in methods_in_order(one.curves):
+            curve = one.curves[method]
+            mean, quartiles = curve.scores.mean(axis=0), np.quantile(curve.scores, [0.25, 0.75], axis=0)
+            removed = (curve.pixels_removed, curve.pixels_removed / _pixels(one))
+            rows += [(name, method, *own) for own in rows_of(*removed, mean, *quartiles, curve.scores.std(axis=0))]
     return named_columns(names, rows)
 
 
@@ -374,11 +353,8 @@ def _plot_removal(curve: RemovalCurve, method: str, *, ax: Axes) -> None:
 
 def _tell_gains(faithful: RemovalScores, methods: list[str]) -> str:
     fill, unit = settings(faithful)[0]
-    gains = {
-        method: float(faithful.curves[fill, unit, method].srg.mean())
-        for method in methods
-        if (fill, unit, method) in faithful.curves
-    }
+    curves = {method: faithful.curves.get((fill, unit, method)) for method in methods}
+    gains = {method: float(curve.srg.mean()) for method, curve in curves.items() if curve is not None}
     ranked = sorted(gains, key=lambda one: -gains[one])
     told = ", ".join(f"{method_name(one)} {signed(gains[one], 3)}" for one in ranked)
     return f"Under {fill_name(fill, unit)} it is {told}."
