@@ -1,12 +1,19 @@
 """Displacements from a difference image alone: each marker shows twice, where it was and where it is."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from sliplens.errors import ImageError, InputError
 from sliplens.extras import import_cv2
+
+Pixels: TypeAlias = Float32[np.ndarray, "spots pixels"]
+Model: TypeAlias = Callable[[np.ndarray], np.ndarray]
+"""Doublets of a window, by the place and displacement of each."""
 
 _SWEEPS = 20
 
@@ -123,8 +130,9 @@ def fit_doublets(
         )
     half = int(np.ceil(radius_px * (1 + _LONGEST / 2) + 3 * edge_px))
     patches, weight, whole = _cut(signal, middle, half)
-    found = _search(signal, middle, half, radius_px, edge_px)
-    found, correlation, amplitude = _polish(patches, weight, found, half=half, radius_px=radius_px, edge_px=edge_px)
+    doublet = partial(_doublet, half=half, radius_px=radius_px, edge_px=edge_px)
+    found = _search(signal, middle, half, doublet, scale=radius_px / 6.5)
+    found, correlation, amplitude = _polish(patches, weight, found, doublet)
     place, way = middle + found[:, :2], found[:, 2:]
     keep = (
         (correlation > _LEAST_CORRELATION)
@@ -159,7 +167,7 @@ def _find_middles(signal: Float32[np.ndarray, "height width"], radius_px: float)
 
 def _cut(
     signal: Float32[np.ndarray, "height width"], middle: Float[np.ndarray, "spots 2"], half: int
-) -> tuple[Float32[np.ndarray, "spots pixels"], Float32[np.ndarray, "spots pixels"], Bool[np.ndarray, " spots"]]:
+) -> tuple[Pixels, Pixels, Bool[np.ndarray, " spots"]]:
     """Windows, where they lie inside the image, and which lie wholly inside but for their margin."""
     steps = np.arange(-half, half + 1)
     rows, columns = (middle[:, axis, None].astype(np.int64) + steps for axis in (1, 0))
@@ -186,18 +194,13 @@ def _doublet(found: np.ndarray, half: int, radius_px: float, edge_px: float) -> 
 
 
 def _search(
-    signal: Float32[np.ndarray, "height width"],
-    middle: Float[np.ndarray, "spots 2"],
-    half: int,
-    radius_px: float,
-    edge_px: float,
+    signal: np.ndarray, middle: Float[np.ndarray, "spots 2"], half: int, doublet: Model, *, scale: float
 ) -> Float[np.ndarray, "spots 4"]:
     """Best of a grid of doublets, by their correlation with the image."""
-    scale = radius_px / 6.5
     angle = np.arange(_ANGLES) * np.pi / _ANGLES
     ways = np.array(_LENGTHS)[:, None, None] * scale * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     tried = np.concatenate([np.zeros((ways.size // 2, 2)), ways.reshape(-1, 2)], axis=1)
-    models = _doublet(tried, half, radius_px, edge_px)
+    models = doublet(tried)
     models = models - models.mean(axis=1, keepdims=True)
     models = (models / np.linalg.norm(models, axis=1, keepdims=True)).T.astype(np.float32)
     best, found = np.full(len(middle), -np.inf), np.zeros((len(middle), 4))
@@ -214,18 +217,12 @@ def _search(
 
 
 def _polish(
-    patches: Float32[np.ndarray, "spots pixels"],
-    weight: Float32[np.ndarray, "spots pixels"],
-    found: Float[np.ndarray, "spots 4"],
-    *,
-    half: int,
-    radius_px: float,
-    edge_px: float,
+    patches: Pixels, weight: Pixels, found: Float[np.ndarray, "spots 4"], doublet: Model
 ) -> tuple[Float[np.ndarray, "spots 4"], Float[np.ndarray, " spots"], Float[np.ndarray, " spots"]]:
     """Least squares over place, displacement, amplitude and background; gives their correlation too."""
 
     def fit(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        model = _doublet(at, half, radius_px, edge_px)
+        model = doublet(at)
         total = weight.sum(axis=1)
         mean_model, mean_patch = (weight * model).sum(axis=1) / total, (weight * patches).sum(axis=1) / total
         free = (model - mean_model[:, None]) * weight

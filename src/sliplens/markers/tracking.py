@@ -192,15 +192,8 @@ def _tables(
             lost += bool((status == MarkerStatus.LOST).all())
             done += 1
             on_progress(done, total)
-        outcomes.append(
-            TrialTracking(
-                trial=trial.name,
-                frames=trial.frames,
-                markers=len(rest),
-                followed_share=followed / max(1, seen),
-                lost_frames=lost,
-            )
-        )
+        shown = {"trial": trial.name, "frames": trial.frames, "markers": len(rest)}
+        outcomes.append(TrialTracking(**shown, followed_share=followed / max(1, seen), lost_frames=lost))
     yield pa.concat_tables(waiting)
 
 

@@ -80,15 +80,9 @@ def stack_tracks(
     """Join the frames of a trial; markers that came later are unseen before."""
     count = max(len(frame.status) for frame in frames)
 
-    def padded(values: np.ndarray, fill: float | int) -> np.ndarray:
+    def padded(values: np.ndarray) -> np.ndarray:
         missing = [(0, count - len(values)), *((0, 0) for _ in values.shape[1:])]
-        return np.pad(values, missing, constant_values=fill)
+        return np.pad(values, missing, constant_values=np.nan if values.dtype.kind == "f" else MarkerStatus.UNSEEN)
 
-    return Tracks(
-        rest_px=padded(rest_px, np.nan),
-        rest_radius_px=padded(rest_radius_px, np.nan),
-        position_px=np.stack([padded(frame.position_px, np.nan) for frame in frames]),
-        radius_px=np.stack([padded(frame.radius_px, np.nan) for frame in frames]),
-        deviation_px=np.stack([padded(frame.deviation_px, np.nan) for frame in frames]),
-        status=np.stack([padded(frame.status, int(MarkerStatus.UNSEEN)) for frame in frames]),
-    )
+    joined = {name: np.stack([padded(getattr(frame, name)) for frame in frames]) for name in vars(frames[0])}
+    return Tracks(rest_px=padded(rest_px), rest_radius_px=padded(rest_radius_px), **joined)

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -143,33 +145,23 @@ def _study(study: Study, ax: Axes, index: int) -> None:
 def _predictions(predictions: Any, ax: Axes, index: int) -> None:
     # an evaluation's are columns
     table = predictions.table() if isinstance(predictions, Columns) else predictions.frame()
-    trials = np.array(table["trial"].to_pylist(), dtype=str)
-    names = list(dict.fromkeys(trials.tolist()))
-    shown = table.filter(trials == names[_of(len(names), index)])
-
-    def column(name: str) -> np.ndarray:
-        return np.array([np.nan if value is None else value for value in shown[name].to_pylist()], dtype=np.float64)
-
+    shown = _rows_of_trial(table, index)
     timed = "time_s" in shown.column_names and shown["time_s"].null_count == 0
-    across = column("time_s" if timed else "frame")
+    across = _column(shown, "time_s" if timed else "frame")
     if "low_90" in shown.column_names:
-        low, high = 100 * column("low_90"), 100 * column("high_90")
+        low, high = 100 * _column(shown, "low_90"), 100 * _column(shown, "high_90")
         ax.fill_between(across, low, high, color=BLUE, alpha=0.18, linewidth=0, label="90 % interval")
-    ax.plot(across, 100 * column("prediction"), color=BLUE, label="read")
+    ax.plot(across, 100 * _column(shown, "prediction"), color=BLUE, label="read")
     if "safety_margin" in shown.column_names:
-        ax.plot(across, 100 * column("safety_margin"), color=BLACK, linestyle="--", label="true")
+        ax.plot(across, 100 * _column(shown, "safety_margin"), color=BLACK, linestyle="--", label="true")
     ax.set(xlabel="Time (s)" if timed else "Frame", ylabel=MARGIN_LABEL)
-    ax.set_title(names[index], parse_math=False)
+    ax.set_title(shown["trial"][0].as_py(), parse_math=False)
     ax.legend()
 
 
 def _tracking(tracking: Any, ax: Axes, index: int) -> None:
-    table = tracking.frame()
-    names = [trial.trial for trial in tracking.trials]
-    rows = np.array(table["trial"].to_pylist(), dtype=str) == names[_of(len(names), index)]
-    frame, right, down = (
-        table[name].to_numpy(zero_copy_only=False).astype(np.float64)[rows] for name in ("frame", "dx_px", "dy_px")
-    )
+    shown = _rows_of_trial(tracking.frame(), index)
+    frame, right, down = (_column(shown, name) for name in ("frame", "dx_px", "dy_px"))
     frames, length = np.unique(frame), np.hypot(right, down)
     known = [length[(frame == one) & np.isfinite(length)] for one in frames]
     for values, name, colour in (
@@ -178,8 +170,17 @@ def _tracking(tracking: Any, ax: Axes, index: int) -> None:
     ):
         ax.plot(frames, values, color=colour, label=name)
     ax.set(xlabel="Frame", ylabel="Displacement (px)")
-    ax.set_title(names[index], parse_math=False)
+    ax.set_title(shown["trial"][0].as_py(), parse_math=False)
     ax.legend()
+
+
+def _rows_of_trial(table: pa.Table, index: int) -> pa.Table:
+    names = table["trial"].unique().to_pylist()
+    return table.filter(pc.field("trial") == names[_of(len(names), index)])
+
+
+def _column(table: pa.Table, name: str) -> np.ndarray:
+    return table[name].to_numpy().astype(np.float64)
 
 
 def _array(values: Any) -> np.ndarray:

@@ -32,29 +32,22 @@ def draw_strip(strip: Strip) -> Figure:
     limit = float(np.percentile(np.abs(points), _FULL_COLOUR_PERCENTILE)) or 1.0
     with drawing_style():
         figure = Figure(figsize=(_WIDTH_IN, height))
-        place_text(
-            figure, 0.1, 0.1, f"A {strip.condition} grip from stick to slip ({SOURCE_NAMES[strip.source]})",
-            fontsize=13, fontweight="bold",
-        )  # fmt: skip
+        head = f"A {strip.condition} grip from stick to slip ({SOURCE_NAMES[strip.source]})"
+        place_text(figure, 0.1, 0.1, head, fontsize=13, fontweight="bold")
         place_text(figure, 0.1, 0.36, _subtitle(strip), fontsize=9.5, color="#4B5563")
         for number, (frame, picture, relevance) in enumerate(zip(strip.shown, strip.pictures, points, strict=True)):
             ax = place_axes(figure, _MARGIN_IN + number * (cell + _GAP_IN), 1.05, cell, cell)
             ax.imshow(overlay_relevance(picture, relevance / limit))
             ax.set_axis_off()
-            ax.set_title(
-                f"{number + 1}: {_percent(strip.readings.prediction[frame])} read\n"
-                f"{_percent(strip.readings.safety_margin[frame])} true",
-                fontsize=9.5,
-                loc="center",
-                fontweight="normal",
-            )
+            read, true = _percent(strip.readings.prediction[frame]), _percent(strip.readings.safety_margin[frame])
+            words = f"{number + 1}: {read} read\n{true} true"
+            ax.set_title(words, fontsize=9.5, loc="center", fontweight="normal")
         bar = place_axes(figure, _WIDTH_IN - 0.9, 1.05, 0.13, cell)
         figure.colorbar(ScalarMappable(Normalize(-limit, limit), _COLOURS), cax=bar)
         bar.set_ylabel("points of margin\nper 1 % of the image", fontsize=8)
         bar.tick_params(labelsize=8)
-        plot_readings(
-            strip, ax=place_axes(figure, _MARGIN_IN, 1.05 + cell + 0.4, _WIDTH_IN - _MARGIN_IN - 1.0, _CHART_IN)
-        )
+        chart = place_axes(figure, _MARGIN_IN, 1.05 + cell + 0.4, _WIDTH_IN - _MARGIN_IN - 1.0, _CHART_IN)
+        plot_readings(strip, ax=chart)
     return figure
 
 
@@ -74,10 +67,8 @@ def plot_readings(strip: Strip, *, ax: Axes) -> Axes:
         ax.annotate(str(number), (time_s[frame], 106), ha="center", fontsize=9, annotation_clip=False)
     slipping = readings.contact_state == "full slip"
     if slipping.any():
-        first = float(time_s[slipping][0])
-        ax.axvspan(
-            first, float(time_s[-1]), color=VERMILLION, alpha=0.15, linewidth=0, label="from the first full slip"
-        )
+        ends = float(time_s[slipping][0]), float(time_s[-1])
+        ax.axvspan(*ends, color=VERMILLION, alpha=0.15, linewidth=0, label="from the first full slip")
     ax.set(xlabel="Time (s)", ylabel="Safety margin (%)", ylim=(-4, 104), xlim=(time_s[0], time_s[-1]))
     ax.legend(loc="lower left")
     return ax
