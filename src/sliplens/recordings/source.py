@@ -41,10 +41,8 @@ def open_source(
         Data set, folder of images, recording, or uint8 RGB frames (frames, height, width, 3).
     reference, reference_frame
         The sensor untouched, as an image or the number of the frame that shows it; what the source names if None.
-    split
-        Trials of a data set; all if None.
-    trial
-        Name of one trial; all if None.
+    split, trial
+        Trials of a data set, or the name of one; all if None.
     format
         Row of `FORMATS`; recognised if None.
     whole

@@ -407,6 +407,12 @@ def _capture(rows: Rows, trial: ExportedTrial) -> Capture:
         png = path.read_bytes()
     except OSError as error:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); copy the data set again") from None
+    forces = load_forces(kept_path(folder, "forces", index)) if trial.force_samples else None
+    if forces is not None and len(forces.time_s) != trial.force_samples:
+        raise RecordingError(
+            f"{kept_path(folder, 'forces', index)} has {len(forces.time_s)} samples of {trial.trial}, "
+            f"{trial.force_samples} were exported; copy the data set again"
+        )
     force = rows.vectors(FORCE)
     if force.shape[1] != len(FORCE_AXES):
         raise RecordingError(f"{FORCE} of {source} has {force.shape[1]} numbers, not 3; copy the data set again")
@@ -417,7 +423,7 @@ def _capture(rows: Rows, trial: ExportedTrial) -> Capture:
         frame_time_s=time,
         frame_size=size,
         read_frames=read_frames,
-        forces=_forces(kept_path(folder, "forces", index), trial) if trial.force_samples else None,
+        forces=forces,
         labels=trial.labels(
             {**numbers, "tangential_force_n": force[:, 0].copy(), "normal_force_n": force[:, 2].copy()},
             states=rows.words(STATE),
@@ -429,16 +435,6 @@ def _capture(rows: Rows, trial: ExportedTrial) -> Capture:
         split=trial.split,
         simulated=trial.simulated,
     )
-
-
-def _forces(path: Path, trial: ExportedTrial) -> Forces:
-    forces = load_forces(path)
-    if len(forces.time_s) != trial.force_samples:
-        raise RecordingError(
-            f"{path} has {len(forces.time_s)} samples of {trial.trial}, {trial.force_samples} were exported; "
-            "copy the data set again"
-        )
-    return forces
 
 
 _TACTILE = re.compile(r"tactile|touch|gel|digit|tactip|fingertip|skin", re.IGNORECASE)
@@ -454,15 +450,9 @@ def read_lerobot(
     Frames and forces are rows of one table: each force was taken with its frame, and both have its time, in seconds
     from the start of the episode. Frames of a video are those shown within half a frame of their row's time.
 
-    Trials that `write_lerobot` exported come back as they were, with their labels; where a feature is named, like those
-    of any data set.
-
-    Parameters
-    ----------
-    camera_key
-        Feature with the images; by default the only camera, or the only one named like a tactile sensor.
-    force_key
-        Feature of 3 or 6 numbers, the first three the force (x, y, z); by default the only one named like a force.
+    The camera is by default the only one, or the only one named like a tactile sensor; the force, 3 or 6 numbers that
+    begin with x, y, z, the only feature named like one. Trials that `write_lerobot` exported come back as they were,
+    with their labels; where a feature is named, like those of any data set.
     """
     layout = read_layout(folder)
     if camera_key is None and force_key is None and (kept := read_kept(layout)) is not None:

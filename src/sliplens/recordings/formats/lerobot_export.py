@@ -224,25 +224,21 @@ def frame_features(height: int, width: int) -> Features:
     return found | {name: {"dtype": "int64", "shape": [1], "names": None} for name in counts}
 
 
-def frame_columns(capture: Capture, *, fps: int | float, reasons: dict[str, int]) -> dict[str, np.ndarray]:
-    """Features of a labelled trial's frames, but for images and places; reasons not met before get a number."""
+def frame_columns(
+    capture: Capture, *, fps: int | float, reasons: dict[str, int], first: int, episode: int, task: int
+) -> dict[str, np.ndarray]:
+    """Features of a labelled trial's frames, but for images; reasons not met before get a number."""
     assert capture.labels is not None
-    labels, count = exported_labels(capture.labels), len(capture)
+    labels, numbers = exported_labels(capture.labels), np.arange(len(capture), dtype=np.int64)
+    force = labels["tangential_force_n"], np.zeros(len(capture)), labels["normal_force_n"]
     return {
         TIME: capture.frame_time_s,
-        FORCE: np.stack([labels["tangential_force_n"], np.zeros(count), labels["normal_force_n"]], axis=1),
+        FORCE: np.stack(force, axis=1),
         **{key: labels[name] for name, key in NUMBERS.items()},
         VALID: labels["valid"],
         STATE: np.array([_STATES.index(state) for state in labels["contact_state"]], dtype=np.int64),
         REASON: np.array([reasons.setdefault(reason, len(reasons)) for reason in labels["reason"]], dtype=np.int64),
-        "timestamp": (np.arange(count) / fps).astype(np.float32),
-    }
-
-
-def frame_places(frames: int, *, first: int, episode: int, task: int) -> dict[str, np.ndarray]:
-    """Features that place the frames of an episode in the data set."""
-    numbers = np.arange(frames, dtype=np.int64)
-    return {
+        "timestamp": (numbers / fps).astype(np.float32),
         "frame_index": numbers,
         "episode_index": np.full_like(numbers, episode),
         "index": first + numbers,
@@ -287,12 +283,11 @@ def write_lerobot(
     with DataFiles(folder, features) as files:
         for episode, info in enumerate(chosen):
             capture = read_stored_trial(data, info)
-            count = len(capture.frame_time_s)
+            count = len(capture)
             _keep(folder, episode, capture)
             task = f"touch {info.object or 'an object'} ({info.condition})"
-            columns = frame_columns(capture, fps=fps, reasons=reasons) | frame_places(
-                count, first=first, episode=episode, task=tasks.setdefault(task, len(tasks))
-            )
+            number = tasks.setdefault(task, len(tasks))
+            columns = frame_columns(capture, fps=fps, reasons=reasons, first=first, episode=episode, task=number)
             chunk, file = files.begin(count)
             shown, done = PixelCount(), 0
             for batch, pngs in encode_batches(capture.read_frames()):

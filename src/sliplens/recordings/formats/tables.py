@@ -354,15 +354,8 @@ class ForceTable:
     """What was declared or guessed, a sentence each, to be shown to the user."""
 
 
-def read_force_table(
-    path: Path,
-    *,
-    time_column: str | None = None,
-    force_columns: Sequence[str] | None = None,
-    time_unit: str | None = None,
-    force_unit: str | None = None,
-) -> ForceTable:
-    """Read times and forces from a text table with a header.
+def read_force_table(path: Path, **declared: Unpack[ForceColumns]) -> ForceTable:
+    """Read times and forces from a text table with a header; what is said of it goes before what is guessed.
 
     Columns are separated by commas, semicolons or tabs, decimals by points or (where columns are not separated by
     commas) commas; lines that begin with # or % are comments. What is not declared is guessed from the names of the
@@ -370,13 +363,14 @@ def read_force_table(
     also from its steps. Two force columns, normal and tangential, become z and x.
     """
     table = open_table(path)
+    time_column, force_columns = declared.get("time_column"), declared.get("force_columns")
     time_name = guess_time_column(table) if time_column is None else table.require(time_column, option="--time-column")
     names = _force_names(table, force_columns)
     values, lines, decimal_comma = read_numbers(table, [time_name, *names])
     time = values[:, 0]
     require_rising(time, lines, path=path, column=time_name)
-    unit, how = _time_unit(table, time_name, time_unit, time)
-    scales, units = _force_scales(table, names, force_unit)
+    unit, how = _time_unit(table, time_name, declared.get("time_unit"), time)
+    scales, units = _force_scales(table, names, declared.get("force_unit"))
     forces = values[:, 1:] * scales
     large = np.abs(forces).max(axis=1) > MOST_FORCE_N
     if large.any():
@@ -385,9 +379,9 @@ def read_force_table(
             f"{path}, line {lines[at]}: {np.abs(forces[at]).max():.4g} N is no force of a fingertip; "
             "declare the right one with --force-unit"
         )
-    declared = "declared" if time_column is not None else "by its name"
+    found = "declared" if time_column is not None else "by its name"
     notes = [
-        f"{path.name}: times are those of column {time_name!r} ({declared}), in {unit} ({how}).",
+        f"{path.name}: times are those of column {time_name!r} ({found}), in {unit} ({how}).",
         f"{path.name}: forces are those of {_listed(names, force_columns is not None)}, in {units}.",
     ]
     if decimal_comma:
