@@ -13,6 +13,8 @@ from sliplens.models.backbones import BACKBONES
 from sliplens.models.encodings import ENCODINGS
 from sliplens.models.engines import ENGINES
 from sliplens.recordings.formats import FORMATS
+from sliplens.training import RECIPES
+from sliplens.training.data import AUGMENTATIONS
 
 TABLES = {
     "sliplens.backbones": BACKBONES,
@@ -21,6 +23,8 @@ TABLES = {
     "sliplens.explainers": EXPLAINERS,
     "sliplens.fills": FILLS,
     "sliplens.formats": FORMATS,
+    "sliplens.augmentations": AUGMENTATIONS,
+    "sliplens.recipes": RECIPES,
 }
 
 

@@ -75,6 +75,18 @@ def quantiles(
     return edges[at] + part * (edges[at + 1] - edges[at])
 
 
+def raw_interval(
+    margin: Float[np.ndarray, " frames"],
+    probabilities: Float[np.ndarray, "frames bins"] | None,
+    edges: Float[np.ndarray, " edges"] | None,
+    level: float,
+) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]]:
+    """Interval of a level before it is widened: quantiles of each distribution, or the number itself, twice."""
+    if probabilities is None or edges is None:
+        return margin, margin
+    return quantiles(probabilities, edges, (1 - level) / 2), quantiles(probabilities, edges, (1 + level) / 2)
+
+
 def conformal_offset(
     low: Float[np.ndarray, " frames"],
     high: Float[np.ndarray, " frames"],

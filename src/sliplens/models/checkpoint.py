@@ -1,6 +1,6 @@
 """Trained networks: with their manifest, on disk, and those that come with the package."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
@@ -16,8 +16,8 @@ from sliplens.codec import load_record, load_result, save_record
 from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.extras import require_device
 from sliplens.files import hash_file, require_folder
-from sliplens.models.backbones import HistogramRegressor, bin_edges, build_model
-from sliplens.models.calibration import Calibration, quantiles
+from sliplens.models.backbones import Answers, bin_edges, build_model
+from sliplens.models.calibration import Calibration, raw_interval
 from sliplens.models.encodings import Encoding, get_encoding
 from sliplens.results.training import Training
 
@@ -74,15 +74,8 @@ class Run:
     ) -> Float[Tensor, "batch 3 size size"]:
         """Encode frames as the network was trained on them.
 
-        Parameters
-        ----------
-        reference
-            The sensor untouched; None for frames that were compared before, or that need not be.
-
-        Raises
-        ------
-        ImageError
-            If the frames are not of the size the network's sensor has.
+        `reference`: the sensor untouched; None for frames that were compared before, or that need not be. Frames of
+        another size than the network's sensor has raise `ImageError`.
         """
         self.require_frame_size(frames.shape[1:3])
         size = self.manifest.image_size
@@ -91,13 +84,7 @@ class Run:
         return self.encoding.encode(frames, reference, image_size=size)
 
     def require_frame_size(self, size: tuple[int, ...], *, what: str = "frames") -> None:
-        """Refuse frames of another sensor.
-
-        Raises
-        ------
-        ImageError
-            Naming both sizes.
-        """
+        """Refuse frames of another sensor."""
         if tuple(size) != tuple(self.manifest.frame_size):
             raise ImageError(
                 f"{what} are {size[0]} x {size[1]} pixels but the network was trained on "
@@ -105,20 +92,19 @@ class Run:
             )
 
     @torch.no_grad()
+    def answers(self, batches: Iterable[Float[Tensor, "batch 3 size size"]]) -> tuple[Tensor, ...]:
+        """What the network answers to encoded frames (`Answers`), on its device."""
+        network = Answers(self.model)
+        parts = [network(batch.to(self.device)) for batch in batches]
+        return tuple(torch.cat(answers) for answers in zip(*parts, strict=True))
+
     def predict(self, inputs: Float[Tensor, "batch 3 size size"], *, batch_size: int = 64) -> Float[Tensor, " batch"]:
         """Safety margin of encoded frames; not clipped, so that an answer outside [0, 1] shows as what it is."""
-        answers = [self.model(batch.to(self.device)).reshape(len(batch)) for batch in inputs.split(batch_size)]
-        return torch.cat(answers).cpu() if answers else torch.empty(0)
+        return self.answers(inputs.split(batch_size))[0].cpu()
 
-    @torch.no_grad()
     def estimate(self, inputs: Float[Tensor, "batch 3 size size"], *, batch_size: int = 64) -> "Estimate":
         """Safety margin of encoded frames, with how sure it is."""
-        if not isinstance(self.model, HistogramRegressor):
-            return self.to_estimate(self.predict(inputs, batch_size=batch_size))
-        parts = [self.model.probabilities(batch.to(self.device)) for batch in inputs.split(batch_size)]
-        bins = len(self.model.edges) - 1
-        probabilities = torch.cat(parts) if parts else torch.empty((0, bins), device=self.device)
-        return self.to_estimate(probabilities @ self.model.centres, probabilities)
+        return self.to_estimate(*self.answers(inputs.split(batch_size)))
 
     def to_estimate(
         self, margin: Float[Tensor, " batch"], probabilities: Float[Tensor, "batch bins"] | None = None
@@ -152,33 +138,13 @@ class Estimate:
         return np.sqrt((self.probabilities * spread).sum(axis=1))
 
     def interval(self, level: float) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]] | None:
-        """Margins between which each label lies with a level of confidence, within [0, 1]; None if not calibrated.
-
-        Raises
-        ------
-        ModelError
-            If the level is not one that was calibrated.
-        """
+        """Margins between which each label lies with a level of confidence, within [0, 1]; None if not calibrated."""
         if self.calibration is None:
             return None
         offset = self.calibration.offset(level)
-        low = high = self.margin
-        if self.probabilities is not None and self.edges is not None:
-            ends = (1 - level) / 2, (1 + level) / 2
-            low, high = (quantiles(self.probabilities, self.edges, share) for share in ends)
+        low, high = raw_interval(self.margin, self.probabilities, self.edges, level)
         # a label lies in [0, 1], so cutting there loses none
         return np.clip(low - offset, 0, 1), np.clip(high + offset, 0, 1)
-
-
-def join_estimates(parts: Sequence[Estimate]) -> Estimate:
-    """Join the estimates of one network, in their order; there must be one at least."""
-    told = [part.probabilities for part in parts if part.probabilities is not None]
-    return Estimate(
-        margin=np.concatenate([part.margin for part in parts]),
-        probabilities=np.concatenate(told) if told else None,
-        edges=parts[0].edges,
-        calibration=parts[0].calibration,
-    )
 
 
 def save_checkpoint(folder: Path, model: nn.Module, manifest: Manifest) -> None:
@@ -226,9 +192,13 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> Run:
     return Run(model=model, manifest=manifest, training=training)
 
 
+# the package is installed as files, never as an archive: its weights are mapped into memory from there
+_WEIGHTS = Path(str(files("sliplens"))) / "weights"
+
+
 def shipped_names() -> list[str]:
     """Names of the networks that come with the package."""
-    return sorted(folder.name for folder in _weights().iterdir() if (folder / MANIFEST_FILE).is_file())
+    return sorted(path.parent.name for path in _WEIGHTS.glob(f"*/{MANIFEST_FILE}"))
 
 
 def load(run: str | Path, *, device: str = "cpu") -> Run:
@@ -265,11 +235,6 @@ def find_run(run: Path) -> Path:
         return run
     names = shipped_names()
     if str(run) in names:
-        return _weights() / str(run)
+        return _WEIGHTS / run
     shipped = f", or name {' or '.join(names)}, which comes with sliplens" if names else ""
     raise InputError(f"the run {run} does not exist; check the path{shipped}")
-
-
-def _weights() -> Path:
-    # the package is installed as files, never as an archive: its weights are mapped into memory from there
-    return Path(str(files("sliplens"))) / "weights"

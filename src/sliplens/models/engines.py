@@ -75,16 +75,17 @@ class EngineJob:
 class EngineKind:
     """Way to run a network."""
 
-    words: str
-    """What it does, for people."""
     pays_after: int | None
     """Passes of a network from which it pays to prepare the engine; None for one that is taken by name alone."""
-    batch_size: Callable[[Float[Tensor, "batch 3 height width"]], int]
-    """Images in a batch that suit it."""
-    obstacle: Callable[[torch.device], str | None]
-    """Why it cannot be used on a device, with the cure; None if it can."""
     build: Callable[[nn.Module, EngineJob], RunBatches]
     """Called with a network in evaluation mode, one number an image."""
+    batch_size: Callable[[Float[Tensor, "batch 3 height width"]], int] = (
+        # a graphics card wants to be filled
+        lambda images: 64 if images.device.type == "cpu" else 256
+    )
+    """Images in a batch that suit it."""
+    obstacle: Callable[[torch.device], str | None] = lambda _: None
+    """Why it cannot be used on a device, with the cure; None if it can."""
 
 
 def prepare(
@@ -128,13 +129,9 @@ def prepare(
         If an engine that is asked for by name cannot run the network, or answers otherwise.
     """
     _PASSES[model] = known = _PASSES.get(model, 0) + passes
-    pay = [
-        name
-        for name, row in ENGINES.items()
-        if (row.pays_after is not None and known >= row.pays_after) or (onnx_file is not None and name in _CONVERTED)
-    ]
-    names = [engine] if engine != "auto" else [*reversed(pay)]
-    for name in names:
+    paying = [name for name, kind in ENGINES.items() if kind.pays_after is not None and known >= kind.pays_after]
+    paying = [name for name in ENGINES if name in paying or (onnx_file is not None and name in _CONVERTED)]
+    for name in [engine] if engine != "auto" else reversed(paying):
         kind = ENGINES.pick(name)
         obstacle = _obstacle(name, kind, model, images)
         if obstacle is not None:
@@ -278,10 +275,8 @@ _BUILT: WeakKeyDictionary[nn.Module, tuple[tuple[Any, ...], RunBatches]] = WeakK
 
 
 def _compiler_obstacle(device: torch.device) -> str | None:
-    if device.type != "cpu":  # Triton brings its own
-        return None
-    compilers = [name for name in (os.environ.get("CXX"), "g++", "clang++", "cl") if name]
-    if any(shutil.which(name) for name in compilers):
+    # Triton brings its own
+    if device.type != "cpu" or any(map(shutil.which, (os.environ.get("CXX", "g++"), "g++", "clang++", "cl"))):
         return None
     return "it needs a C++ compiler and there is none; install g++, or choose another engine"
 
@@ -296,15 +291,20 @@ def _needs(*packages: str, extra: str) -> Callable[[torch.device], str | None]:
     return obstacle
 
 
-def _run_torch(network: nn.Module, device: torch.device) -> RunBatches:
-    def run(batches: Iterable[Tensor]) -> Iterator[tuple[Tensor, ...]]:
-        for batch in batches:
-            with torch.no_grad():
-                # convolutions on a processor then need no reordering
-                answers = network(batch.to(device).contiguous(memory_format=torch.channels_last))
-            yield answers
+def _torch(change: Callable[[nn.Module], Callable[..., Any]]) -> Callable[[nn.Module, EngineJob], RunBatches]:
+    def build(model: nn.Module, job: EngineJob) -> RunBatches:
+        network, device = change(model), job.images.device
 
-    return run
+        def run(batches: Iterable[Tensor]) -> Iterator[tuple[Tensor, ...]]:
+            for batch in batches:
+                with torch.no_grad():
+                    # convolutions on a processor then need no reordering
+                    answers = network(batch.to(device).contiguous(memory_format=torch.channels_last))
+                yield answers
+
+        return run
+
+    return build
 
 
 def _run_in_streams(submit: Callable[[Tensor], Callable[[], tuple[Tensor, ...]]], streams: int) -> RunBatches:
@@ -383,10 +383,6 @@ def _openvino(model: nn.Module, job: EngineJob) -> RunBatches:
     return _run_in_streams(submit, job.streams)
 
 
-def _batch_of_torch(images: Tensor) -> int:
-    return 64 if images.device.type == "cpu" else 256  # a graphics card wants to be filled
-
-
 def _batch_in_cache(images: Tensor) -> int:
     # measured on two cores: 16 images of 112 px and 4 of 224 px are the fastest, more of them leave the caches
     return min(16, max(4, 16 * 112**2 // (images.shape[-2] * images.shape[-1])))
@@ -394,39 +390,22 @@ def _batch_in_cache(images: Tensor) -> int:
 
 _CONVERTED = ("onnxruntime", "openvino")
 _ROWS = {
-    "eager": EngineKind(
-        words="torch as it is",
-        pays_after=0,
-        batch_size=_batch_of_torch,
-        obstacle=lambda _: None,
-        build=lambda model, job: _run_torch(Answers(model), job.images.device),
-    ),
-    "folded": EngineKind(
-        words="torch, batch normalisation folded into the convolutions",
-        pays_after=100,  # it takes as long as 20 passes
-        batch_size=_batch_of_torch,
-        obstacle=lambda _: None,
-        build=lambda model, job: _run_torch(Answers(fold_batch_norm(model)), job.images.device),
-    ),
+    # torch as it is, its batch normalisation folded into the convolutions, and torch.compile of that
+    "eager": EngineKind(pays_after=0, build=_torch(Answers)),
+    # it takes as long as 20 passes
+    "folded": EngineKind(pays_after=100, build=_torch(lambda model: Answers(fold_batch_norm(model)))),
     "compiled": EngineKind(
-        words="torch.compile of the folded network",
         pays_after=None,  # it takes minutes
-        batch_size=_batch_of_torch,
         obstacle=_compiler_obstacle,
-        build=lambda model, job: _run_torch(
-            torch.compile(Answers(fold_batch_norm(model))),  # pyright: ignore[reportArgumentType]
-            job.images.device,
-        ),
+        build=_torch(lambda model: torch.compile(Answers(fold_batch_norm(model)))),
     ),
     "onnxruntime": EngineKind(
-        words="ONNX Runtime",
         pays_after=4000,  # it takes some 10 s, and saves 2 to 9 ms a pass
         batch_size=_batch_in_cache,
         obstacle=_needs(*ONNX_PACKAGES, extra="onnx"),
         build=_onnxruntime,
     ),
     "openvino": EngineKind(
-        words="OpenVINO",
         pays_after=1500,  # it takes as long as 1000 passes
         batch_size=_batch_in_cache,
         obstacle=_needs("openvino", extra="openvino"),

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 
 from sliplens.codec import keep_part
 from sliplens.errors import InputError, RecordingError
@@ -34,19 +34,12 @@ class BaselinePlan:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Followed:
-    """A `FieldTrial`, and how well its markers were followed."""
+class _Followed(FieldTrial):
+    """Displacements of a trial, and how well its markers were followed."""
 
-    rest_px: Float64[np.ndarray, "markers 2"]
-    displacement_px: Float64[np.ndarray, "frames markers 2"]
-    hold: int
     in_view: int
     """Markers of all frames that were in view."""
     followed: int
-
-    @property
-    def trial(self) -> FieldTrial:
-        return FieldTrial(rest_px=self.rest_px, displacement_px=self.displacement_px, hold=self.hold)
 
 
 def marker_kind(trials: Sequence[TrialInfo]) -> str:
@@ -98,11 +91,11 @@ def evaluate_baselines(
     mean = float(np.nanmean(np.concatenate(margins)))
     answers = {}
     for name, estimator in estimators.items():
-        estimator.fit([fields[info.trial].trial for info in fitted], margins)
+        estimator.fit([fields[info.trial] for info in fitted], margins)
         prediction = np.full(len(predictions), mean)
         for trial in tested & set(fields):
             rows = predictions.trial == trial
-            prediction[rows] = estimator.estimate(fields[trial].trial)[predictions.frame[rows]]
+            prediction[rows] = estimator.estimate(fields[trial])[predictions.frame[rows]]
         answers[name] = replace(predictions, prediction=prediction)
     scores = Baselines(
         markers=plan.markers,

@@ -5,21 +5,14 @@ from math import isfinite
 from typing import Literal
 
 from sliplens.errors import InputError
+from sliplens.extras import Table
 from sliplens.models.backbones import DEFAULT_BACKBONE, head_outputs
 from sliplens.training.data import get_augmentation
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """A training recipe.
-
-    Raises
-    ------
-    InputError
-        If a number cannot train a network.
-    ModelError
-        If there is no such head.
-    """
+    """A training recipe; `InputError` for a number that cannot train a network, `ModelError` for an unknown head."""
 
     recipe: str = "default"
     """Its name, kept in the manifest."""
@@ -61,7 +54,7 @@ class TrainConfig:
         get_augmentation(self.augmentation)
 
 
-RECIPES = {
+_RECIPES = {
     "default": TrainConfig(head="histogram"),
     "thesis": TrainConfig(
         recipe="thesis",
@@ -73,19 +66,12 @@ RECIPES = {
         untouched_share=0.0,
     ),
 }
+RECIPES = Table("recipe", "sliplens.recipes", _RECIPES)
 """`thesis` is that of Polak, section 4: ShuffleNetV2 x1.0 from scratch, one output, Ranger21 with its defaults, mean
 squared error, 25 epochs, batches of 124, 224 x 224 pixels, a learning rate of 8e-4, mixed precision, the best
 checkpoint on validation, rotation, noise and blur. `default` is ours; docs/networks.md tells why."""
 
 
 def get_recipe(name: str) -> TrainConfig:
-    """Look up a recipe by name.
-
-    Raises
-    ------
-    InputError
-        If there is none of that name; the message lists those there are.
-    """
-    if name not in RECIPES:
-        raise InputError(f"there is no recipe named {name!r}; choose one of {', '.join(RECIPES)}")
-    return RECIPES[name]
+    """Look up a recipe by name; `InputError` lists those there are."""
+    return RECIPES.pick(name)

@@ -5,7 +5,6 @@ import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,8 @@ from torch.utils.data import DataLoader, Sampler
 from torch.utils.data import Dataset as TorchDataset
 from torchvision.transforms.v2 import functional as transforms
 
-from sliplens.errors import InputError, RecordingError
+from sliplens.errors import RecordingError
+from sliplens.extras import Table
 from sliplens.models.encodings import Encoding
 from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset, TrialInfo
@@ -28,8 +28,6 @@ from sliplens.recordings import Dataset, TrialInfo
 class Augmentation:
     """Slight rotations and shifts, colour, Gaussian noise and Gaussian blur, drawn for each image.
 
-    References
-    ----------
     Polak, section 4 ("random image augmentations": rotation, noise and blur; shift and colour are ours).
     """
 
@@ -76,19 +74,14 @@ class Augmentation:
         return images.add_(noise.mul_(uniform(batch, 1, 1, 1) * self.noise_sd)).clamp_(0, 1)
 
 
-AUGMENTATIONS = {
-    "none": None,
-    "thesis": Augmentation(shift=0.0, colour=0.0),
-    "default": Augmentation(),
-}
+_AUGMENTATIONS = {"none": None, "thesis": Augmentation(shift=0.0, colour=0.0), "default": Augmentation()}
+AUGMENTATIONS = Table("augmentation", "sliplens.augmentations", _AUGMENTATIONS)
 """What a recipe may ask for; `thesis` has rotation, noise and blur alone, in amounts of ours, for it gives none."""
 
 
 def get_augmentation(name: str, *, neutral: float = 0.0) -> Augmentation | None:
     """Look up an augmentation by name, for inputs with a neutral level; None for none."""
-    if name not in AUGMENTATIONS:
-        raise InputError(f"there is no augmentation named {name!r}; choose one of {', '.join(AUGMENTATIONS)}")
-    augmentation = AUGMENTATIONS[name]
+    augmentation = AUGMENTATIONS.pick(name)
     return None if augmentation is None else replace(augmentation, neutral=neutral)
 
 
@@ -121,10 +114,17 @@ class FrameSet(TorchDataset):
         images, labels = self.__getitems__([index])
         return images[0], labels[0]
 
-    def __getitems__(self, indices: Sequence[int]) -> tuple[Tensor, Tensor]:
+    def __getitems__(self, indices: Sequence[int] | Tensor) -> tuple[Tensor, Tensor]:
         """Return a batch of inputs and their labels; torch's loader asks for it by this name."""
         rows = torch.as_tensor(indices)
         return self.encoding.normalise(self.images[rows]), self.safety_margin[rows]
+
+    def batches(self, size: int, on_progress: OnProgress | None = None) -> Iterator[Tensor]:
+        """Inputs of all frames, in their order."""
+        for rows in torch.arange(len(self)).split(size):
+            yield self.__getitems__(rows)[0]
+            if on_progress is not None:
+                on_progress(int(rows[-1]) + 1, len(self))
 
 
 def load_frames(
@@ -137,25 +137,22 @@ def load_frames(
     scratch: Path | None = None,
     on_progress: OnProgress | None = None,
 ) -> FrameSet:
-    """Read trials, encode them, and keep the frames that have a label.
-
-    Frames without contact have no safety margin and are left out, as in the thesis.
+    """Read trials, encode them, and keep the frames that have a label; those without contact have none.
 
     Frames that would take more than half of the free memory go into a file in the folder `scratch`, if there is one,
     which is read as needed and gone when the frames are.
 
-    Parameters
-    ----------
-    untouched_share
-        For training: add the untouched sensor itself, with the label 1, this often for each labelled frame and at least
-        once a trial. Without a pull the safety margin is 1 however light the touch, so 1 is its limit; and a network
-        that was shown the untouched sensor gives explanations a reference that means something: "why 20 % rather than
-        100 %?". Never for an evaluation.
+    `untouched_share`, for training alone, adds the untouched sensor itself, with the label 1, this often for each
+    labelled frame and at least once a trial. Without a pull the safety margin is 1 however light the touch, so 1 is its
+    limit; and a network that was shown the untouched sensor gives explanations a reference that means something.
     """
     sizes = {(info.height, info.width) for info in trials}
     if len(sizes) > 1:
         raise RecordingError(f"{data.folder} mixes frames of {sorted(sizes)} pixels; use one sensor at a time")
-    copies_of = partial(_untouched_copies, share=untouched_share)
+
+    def copies_of(labelled: int) -> int:
+        return max(1, round(untouched_share * labelled)) if untouched_share > 0 else 0
+
     counts = [int(data.read_labels(info).labelled.sum()) for info in trials]
     if not sum(counts):
         raise RecordingError(f"{data.folder}: no frame of the {len(trials)} trials has a label; label them first")
@@ -189,10 +186,6 @@ def load_frames(
         day=day,
         time_s=np.concatenate(times),
     )
-
-
-def _untouched_copies(labelled: int, *, share: float) -> int:
-    return max(1, round(share * labelled)) if share > 0 else 0
 
 
 def _allocate(shape: tuple[int, int, int, int], scratch: Path | None) -> UInt8[Tensor, "frames 3 size size"]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError, RecordingError
@@ -16,11 +16,11 @@ from sliplens.files import output_folder, scratch_folder
 from sliplens.markers.detect import get_kind
 from sliplens.markers.estimators import ESTIMATORS, get_estimator
 from sliplens.models import Run
-from sliplens.models.checkpoint import Estimate, join_estimates, load
+from sliplens.models.checkpoint import load
 from sliplens.progress import OnProgress, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset
-from sliplens.results.evaluation import Evaluation, Predictions, Reliability
+from sliplens.results.evaluation import Evaluation, Predictions, RegressionScores, Reliability
 from sliplens.training.baselines import BaselinePlan, choose_training, evaluate_baselines, marker_kind
 from sliplens.training.data import FrameSet, load_frames
 from sliplens.training.metrics import auroc, coverage, find_lead_times, score_predictions
@@ -111,11 +111,10 @@ def _evaluate(
     evaluation = replace(evaluation, known_trials=_count_known(trials, run))
     if plan is None:
         return evaluation
+    fields = folder / "fields"
     with stage(on_progress, "Following markers") as count:
-        scores, answers = evaluate_baselines(
-            plan, data, evaluation.predictions, folder=folder / "fields", on_progress=count
-        )
-    shutil.rmtree(folder / "fields")  # kept until here for whoever is interrupted
+        scores, answers = evaluate_baselines(plan, data, evaluation.predictions, folder=fields, on_progress=count)
+    shutil.rmtree(fields)  # kept until here for whoever is interrupted
     known = _count_known(plan.training, run)
     return replace(evaluation, baselines=replace(scores, known_trials=known), baseline_predictions=answers)
 
@@ -151,32 +150,18 @@ def evaluate_frames(
     batch_size: int = 64,
     on_progress: OnProgress | None = None,
 ) -> Evaluation:
-    """Predict every frame and score each condition, day and trial by itself.
+    """Predict frames, which must be in the network's encoding and size, and score each condition, day and trial.
 
-    Parameters
-    ----------
-    run
-        The network; `frames` must be in its encoding and size.
-    split
-        What the frames are called in the result.
-
-    Raises
-    ------
-    RecordingError
-        If there is no frame.
+    `split` is what they are called in the result; `RecordingError` if there is none.
     """
     count = len(frames)
     if not count:
         raise RecordingError("there is no labelled frame to evaluate; check the split and the condition")
-    parts = []
-    for start in range(0, count, batch_size):
-        rows = range(start, min(start + batch_size, count))
-        parts.append(run.estimate(frames.__getitems__(rows)[0], batch_size=batch_size))
-        if on_progress is not None:
-            on_progress(rows.stop, count)
-    estimate = join_estimates(parts)
-    unknown = np.full(count, np.nan)
-    sigma, interval = estimate.sigma, estimate.interval(0.9) or (unknown, unknown)
+    estimate = run.to_estimate(*run.answers(frames.batches(batch_size, on_progress)))
+    levels = estimate.calibration.offsets if estimate.calibration else ()
+    intervals = {level: ends for level in levels if (ends := estimate.interval(float(level)))}
+    unknown, sigma = np.full(count, np.nan), estimate.sigma
+    low_90, high_90 = intervals.get("0.9", (unknown, unknown))
     predictions = Predictions(
         trial=np.array(frames.trial),
         condition=np.array(frames.condition),
@@ -186,8 +171,8 @@ def evaluate_frames(
         safety_margin=frames.safety_margin.numpy().astype(np.float64),
         prediction=estimate.margin,
         sigma=unknown if sigma is None else sigma,
-        low_90=interval[0],
-        high_90=interval[1],
+        low_90=low_90,
+        high_90=high_90,
     )
     conditions = {name: predictions.condition == name for name in sorted(set(frames.condition))}
     days = {
@@ -197,17 +182,24 @@ def evaluate_frames(
     }
     trials = {name: predictions.trial == name for name in dict.fromkeys(frames.trial)}
     wet, dry = conditions.get("wet"), conditions.get("dry")
+
+    def score(rows: Bool[np.ndarray, " frames"]) -> RegressionScores:
+        return score_predictions(predictions.where(rows))
+
     return Evaluation(
         input=run.manifest.input,
         split=split,
         known_trials=0,
-        conditions={name: score_predictions(predictions.where(rows)) for name, rows in conditions.items()},
-        days={name: score_predictions(predictions.where(rows)) for name, rows in days.items()},
-        trials={name: score_predictions(predictions.where(rows)) for name, rows in trials.items()},
+        conditions={name: score(rows) for name, rows in conditions.items()},
+        days={name: score(rows) for name, rows in days.items()},
+        trials={name: score(rows) for name, rows in trials.items()},
         reliability={
             name: Reliability(
-                coverage=_coverages(estimate, predictions.safety_margin, rows),
-                mean_width_90=_finite((predictions.high_90 - predictions.low_90)[rows].mean()),
+                coverage={
+                    level: coverage(low[rows], high[rows], predictions.safety_margin[rows])
+                    for level, (low, high) in intervals.items()
+                },
+                mean_width_90=float((high_90 - low_90)[rows].mean()) if intervals else None,
             )
             for name, rows in conditions.items()
         },
@@ -215,20 +207,3 @@ def evaluate_frames(
         lead_times={name: find_lead_times(predictions.where(rows)) for name, rows in conditions.items()},
         predictions=predictions,
     )
-
-
-def _coverages(
-    estimate: Estimate, labels: Float[np.ndarray, " frames"], rows: Bool[np.ndarray, " frames"]
-) -> dict[str, float]:
-    """Coverage of the intervals of every calibrated level on some of the frames."""
-    levels = () if estimate.calibration is None else estimate.calibration.offsets
-    intervals = {level: estimate.interval(float(level)) for level in levels}
-    return {
-        level: coverage(interval[0][rows], interval[1][rows], labels[rows])
-        for level, interval in intervals.items()
-        if interval is not None
-    }
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -4,7 +4,7 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,10 +19,10 @@ from sliplens.codec import save_result
 from sliplens.errors import InputError, ModelError, RecordingError
 from sliplens.files import output_folder, partial_folder, scratch_folder, versions
 from sliplens.models import Manifest, Run, build_model, load_checkpoint, save_checkpoint
-from sliplens.models.backbones import HistogramRegressor, histogram_targets
-from sliplens.models.calibration import LEVELS, Calibration, conformal_offset, fit_temperature, quantiles
+from sliplens.models.backbones import HistogramRegressor, bin_edges, histogram_targets
+from sliplens.models.calibration import LEVELS, Calibration, conformal_offset, fit_temperature, raw_interval
 from sliplens.models.checkpoint import load
-from sliplens.models.encodings import Encoding, get_encoding
+from sliplens.models.encodings import get_encoding
 from sliplens.progress import OnProgress, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset
@@ -94,110 +94,75 @@ def train(
     if start is not None:
         require_same_kind(start, config, input)
     data = data if isinstance(data, Dataset) else load_dataset(data)
-    job = _Job(
-        config=config,
-        encoding=get_encoding(input),
-        data=data,
-        condition=condition,
-        start=start,
-        trainer=trainer,
-        trials=_choose_trials(data, condition),
-    )
+    encoding, trials = get_encoding(input), _choose_trials(data, condition)
+    # what shapes the result besides the recipe
+    origin = {"input": encoding.name, "condition": condition, "data_hash": data.hash}
+    if start is not None:
+        origin["started_from"] = start.manifest.weights_sha256
+
+    def run(
+        folder: Path, *, scratch: Path, logger: Logger | None = None, on_progress: OnProgress | None = None
+    ) -> Training:
+        """Read the frames and fit: what every process does alike."""
+        frames = []
+        for what, some, share in zip(("training", "validation"), trials, (config.untouched_share, 0.0), strict=True):
+            with stage(on_progress, f"Reading {what} trials ({encoding.name})") as count:
+                frames.append(
+                    load_frames(
+                        data,
+                        some,
+                        encoding=encoding,
+                        image_size=config.image_size,
+                        untouched_share=share,
+                        scratch=scratch,
+                        on_progress=count,
+                    )
+                )
+        info = trials[0][0]
+        training = fit(
+            config,
+            frames[0],
+            frames[1],
+            folder,
+            frame_size=(info.height, info.width),
+            sensor=info.sensor,
+            data_hash=data.hash,
+            trained_on=[trial.sha256[:12] for some in trials for trial in some],
+            start=start,
+            trainer=trainer,
+            logger=logger,
+            on_progress=on_progress,
+        )
+        return replace(training, condition=condition)
+
     if out is None:
         if trainer.world_size > 1:
             raise InputError("several processes need a folder that all can see; name one with out")
         with scratch_folder() as folder:
-            training = job.run(folder, scratch=folder, on_progress=on_progress)
+            training = run(folder, scratch=folder, on_progress=on_progress)
             return replace(load_checkpoint(folder), training=training)
     out = Path(out)
     if not trainer.is_global_zero:
         # the target appears when a training is over, which no process leaves before the others: all see the same here,
         # and where it is there the first process has nothing to do, or refuses
         if overwrite or not out.exists():
-            job.assist(partial_folder(out))
+            # in silence, for the first one says what there is to say; the output folder is its to write, and on a
+            # cluster this disk is nearer
+            with suppress(KeyboardInterrupt, DivergedError):
+                run(partial_folder(out), scratch=Path(tempfile.gettempdir()))
         raise SystemExit(0)  # what comes after a training is for one process
-    with output_folder(out, stage="train", config=job.recipe, overwrite=overwrite) as output:
+    with output_folder(out, stage="train", config={**origin, "training": config}, overwrite=overwrite) as output:
         if not output.complete:
-            settings = {**asdict(config), **job.origin}
-            with open_logger(logger, output.folder, run_name=out.name, recipe=settings) as opened:
-                training = job.run(output.folder, scratch=output.folder, logger=opened, on_progress=on_progress)
+            with open_logger(logger, output.folder, run_name=out.name, recipe={**asdict(config), **origin}) as opened:
+                training = run(output.folder, scratch=output.folder, logger=opened, on_progress=on_progress)
             save_result(training, output.folder)
-    run = load_checkpoint(out)
-    assert run.training is not None
-    wrote(
-        on_progress,
-        out,
-        f"{run.training.epochs:.1f} epochs in {run.training.minutes:.1f} min, "
-        f"validation MSE {run.training.best_validation_mse:.4f}",
-        kept=output.complete,
-    )
-    return run
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Job:
-    """What every process of a training does alike."""
-
-    config: TrainConfig
-    encoding: Encoding
-    data: Dataset
-    condition: str | None
-    start: Run | None
-    trainer: lightning.Trainer
-    trials: tuple[tuple[TrialInfo, ...], tuple[TrialInfo, ...]]
-    """To train and to validate on."""
-
-    @property
-    def origin(self) -> dict[str, str | None]:
-        """What shapes the result besides the recipe."""
-        origin = {"input": self.encoding.name, "condition": self.condition, "data_hash": self.data.hash}
-        return origin if self.start is None else {**origin, "started_from": self.start.manifest.weights_sha256}
-
-    @property
-    def recipe(self) -> dict[str, Any]:
-        return {**self.origin, "training": self.config}
-
-    def run(
-        self, folder: Path, *, scratch: Path, logger: Logger | None = None, on_progress: OnProgress | None = None
-    ) -> Training:
-        """Read the frames and fit."""
-        frames = []
-        shares = (self.config.untouched_share, 0.0)
-        for what, trials, share in zip(("training", "validation"), self.trials, shares, strict=True):
-            with stage(on_progress, f"Reading {what} trials ({self.encoding.name})") as count:
-                frames.append(
-                    load_frames(
-                        self.data,
-                        trials,
-                        encoding=self.encoding,
-                        image_size=self.config.image_size,
-                        untouched_share=share,
-                        scratch=scratch,
-                        on_progress=count,
-                    )
-                )
-        info = self.trials[0][0]
-        training = fit(
-            self.config,
-            frames[0],
-            frames[1],
-            folder,
-            frame_size=(info.height, info.width),
-            sensor=info.sensor,
-            data_hash=self.data.hash,
-            trained_on=[trial.sha256[:12] for trials in self.trials for trial in trials],
-            start=self.start,
-            trainer=self.trainer,
-            logger=logger,
-            on_progress=on_progress,
-        )
-        return replace(training, condition=self.condition)
-
-    def assist(self, folder: Path) -> None:
-        """Help the first process, in silence: it says what there is to say."""
-        with suppress(KeyboardInterrupt, DivergedError):
-            # the output folder is the first one's to write, and on a cluster this disk is nearer
-            self.run(folder, scratch=Path(tempfile.gettempdir()))
+    trained = load_checkpoint(out)
+    training = trained.training
+    assert training is not None
+    best = f"validation MSE {training.best_validation_mse:.4f}"
+    done = f"{training.epochs:.1f} epochs in {training.minutes:.1f} min, {best}"
+    wrote(on_progress, out, done, kept=output.complete)
+    return trained
 
 
 def _choose_trials(data: Dataset, condition: str | None) -> tuple[tuple[TrialInfo, ...], tuple[TrialInfo, ...]]:
@@ -219,32 +184,20 @@ def calibrate(model: nn.Module, validation: FrameSet, *, batch_size: int) -> Cal
     was_training, device = model.training, next(model.parameters()).device
     model.eval()
     network = model.backbone if isinstance(model, HistogramRegressor) else model
-    answers = []
-    for start in range(0, len(validation), batch_size):
-        rows = range(start, min(start + batch_size, len(validation)))
-        answers.append(network(validation.__getitems__(rows)[0].to(device)).float().cpu())
+    outputs = torch.cat([network(inputs.to(device)).float().cpu() for inputs in validation.batches(batch_size)])
     model.train(was_training)
-    outputs, labels = torch.cat(answers), validation.safety_margin
-    margins = labels.double().numpy()
+    labels, margins = validation.safety_margin, validation.safety_margin.double().numpy()
     if isinstance(model, HistogramRegressor):
-        edges = model.edges.cpu()
-        temperature = fit_temperature(outputs, histogram_targets(labels, edges))
+        temperature = fit_temperature(outputs, histogram_targets(labels, model.edges.cpu()))
         model.temperature.fill_(temperature)
         probabilities = torch.softmax(outputs / temperature, dim=-1).double().numpy()
         predictions = probabilities @ model.centres.double().cpu().numpy()
-        tails = {level: ((1 - level) / 2, (1 + level) / 2) for level in LEVELS}
-        bounds = {
-            level: tuple(np.asarray(quantiles(probabilities, edges.double().numpy(), share)) for share in shares)
-            for level, shares in tails.items()
-        }
     else:
-        temperature, predictions = 1.0, outputs.reshape(-1).double().numpy()
-        bounds = dict.fromkeys(LEVELS, (predictions, predictions))
+        temperature, predictions, probabilities = 1.0, outputs.reshape(-1).double().numpy(), None
+    ends = {level: raw_interval(predictions, probabilities, bin_edges(model), level) for level in LEVELS}
     return Calibration(
         temperature=temperature,
-        offsets={
-            str(level): conformal_offset(low, high, margins, level=level) for level, (low, high) in bounds.items()
-        },
+        offsets={str(level): conformal_offset(*ends[level], margins, level=level) for level in LEVELS},
         frames=len(margins),
         mse=float(np.mean((predictions - margins) ** 2)),
     )
@@ -408,13 +361,12 @@ def _check_frames(config: TrainConfig, train: FrameSet, validation: FrameSet, pr
 
 def require_same_kind(start: Run, config: TrainConfig, encoding: str) -> None:
     """Refuse to start from a network whose weights would mean something else."""
-    kept = start.manifest
-    asked = {"input": encoding, "backbone": config.backbone, "head": config.head}
-    for name, value in asked.items():
-        if getattr(kept, name) != value:
+    for name, value in (("input", encoding), ("backbone", config.backbone), ("head", config.head)):
+        kept = getattr(start.manifest, name)
+        if kept != value:
             raise ModelError(
-                f"the network to start from has the {name} {getattr(kept, name)}, and {value} is to be trained; "
-                f"train {getattr(kept, name)}, or start from another network"
+                f"the network to start from has the {name} {kept}, and {value} is to be trained; "
+                f"train {kept}, or start from another network"
             )
 
 

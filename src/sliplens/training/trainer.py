@@ -41,7 +41,7 @@ def make_trainer(
     InputError
         If this machine has not the devices, or torchrun or a cluster started another number of processes.
     """
-    on_gpu = accelerator != "cpu" and torch.cuda.is_available()
+    half = config.mixed_precision and accelerator != "cpu" and torch.cuda.is_available()
     shared = devices * num_nodes > 1 or TorchElasticEnvironment.detect()
     try:
         with quiet_lightning():
@@ -61,7 +61,7 @@ def make_trainer(
                 use_distributed_sampler=False,
                 # Ranger21 clips by itself, adaptively
                 gradient_clip_val=1.0 if config.optimizer == "adamw" else None,
-                precision="16-mixed" if config.mixed_precision and on_gpu else "32-true",
+                precision="16-mixed" if half else "32-true",
             )
         environment = getattr(trainer.strategy, "cluster_environment", None)
         if environment is not None:
@@ -143,7 +143,9 @@ def run_trainer(
             raise ModelError("the memory of the GPU is full; lower --batch-size or --image-size") from None
         except RuntimeError as error:
             _end_others(trainer)
-            if trainer.world_size > 1 and _is_lost_connection(error):
+            lost = ("gloo", "connection closed", "connection reset", "broken pipe")
+            known = isinstance(error, torch.distributed.DistError) or any(word in str(error).lower() for word in lost)
+            if trainer.world_size > 1 and known:
                 raise ModelError(
                     "another process of this training was lost; give the same command again, it goes on after the last "
                     "whole epoch"
@@ -152,13 +154,6 @@ def run_trainer(
         except BaseException:
             _end_others(trainer)
             raise
-
-
-def _is_lost_connection(error: RuntimeError) -> bool:
-    words = str(error).lower()
-    return isinstance(error, torch.distributed.DistError) or any(
-        word in words for word in ("gloo", "connection closed", "connection reset", "broken pipe")
-    )
 
 
 def _end_others(trainer: lightning.Trainer) -> None:
@@ -172,28 +167,23 @@ def _end_others(trainer: lightning.Trainer) -> None:
 def quiet_lightning() -> Iterator[None]:
     """Keep Lightning's notes on hardware, loggers and its own deprecations from the user's terminal."""
     names = ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero", "lightning.fabric")
-    levels = {name: logging.getLogger(name).level for name in names}
-    for name in names:
-        logging.getLogger(name).setLevel(logging.WARNING)
+    loggers = {logger: logger.level for logger in map(logging.getLogger, names)}
+    for logger in loggers:
+        logger.setLevel(logging.WARNING)
     try:
         with warnings.catch_warnings():
-            for message, category in _EXPECTED:
-                warnings.filterwarnings("ignore", message=message, category=category)
+            for message in _EXPECTED:
+                warnings.filterwarnings("ignore", message=message)
             yield
     finally:
-        for name, level in levels.items():
-            logging.getLogger(name).setLevel(level)
+        for logger, level in loggers.items():
+            logger.setLevel(level)
 
 
-_EXPECTED: tuple[tuple[str, Any], ...] = (
-    # the frames lie in memory: worker processes would only copy them
-    (".*does not have many workers.*", Warning),
-    # going on in a folder that holds a checkpoint is what resuming means
-    (".*Checkpoint directory.*exists and is not empty.*", Warning),
-    # Lightning 2.6 calls what torch 2.13 deprecates
-    (".*LeafSpec.*", FutureWarning),
-    # channels last, which is worth more than this costs
-    (".*Grad strides do not match bucket view strides.*", UserWarning),
-    # who asks for --accelerator cpu has a reason
-    (".*GPU available but not used.*", Warning),
+_EXPECTED = (
+    ".*does not have many workers.*",  # the frames lie in memory: worker processes would only copy them
+    ".*Checkpoint directory.*exists and is not empty.*",  # resuming means to go on in such a folder
+    ".*LeafSpec.*",  # Lightning 2.6 calls what torch 2.13 deprecates
+    ".*Grad strides do not match bucket view strides.*",  # channels last, which is worth more than this costs
+    ".*GPU available but not used.*",  # who asks for --accelerator cpu has a reason
 )
