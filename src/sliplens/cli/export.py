@@ -34,52 +34,38 @@ class Export(Command):
 
     def run(self) -> None:
         """Export."""
+        from sliplens.recordings.dataset import DATASET_FILE
+
         kinds = [name for name in ("onnx", "lerobot", "mcap") if getattr(self, name)]
         if len(kinds) != 1:
             said = " and ".join(f"--{name}" for name in kinds) or "none"
             raise InputError(f"say what to write with one of --onnx, --lerobot and --mcap, got {said}")
-        if kinds[0] == "onnx":
+        is_run, is_data = ((self.source / name).is_file() for name in ("manifest.json", DATASET_FILE))
+        if self.onnx:
+            if is_data and not is_run:
+                raise InputError(
+                    f"{self.source} is a data set, and --onnx writes a network; name the folder of a run, "
+                    "or choose --lerobot or --mcap"
+                )
             self._export_network()
         else:
-            self._export_data(kinds[0])
+            if is_run and not is_data:
+                raise InputError(
+                    f"{self.source} is a run, and --{kinds[0]} writes a data set; name a data set, or choose --onnx"
+                )
+            from sliplens.recordings.exporting import export_lerobot, export_mcap
+
+            self.call(export_mcap if self.mcap else export_lerobot, data=self.source, out=self.output)
 
     def _export_network(self) -> None:
         from sliplens.models.checkpoint import load
         from sliplens.models.onnx import export_onnx
 
-        if _is_data(self.source) and not _is_run(self.source):
-            raise InputError(
-                f"{self.source} is a data set, and --onnx writes a network; name the folder of a run, "
-                "or choose --lerobot or --mcap"
-            )
         if self.trials:
             raise InputError("--trials chooses trials of a data set; leave it out with --onnx")
         trained = load(self.source)
         with OUT.status("Exporting and comparing"):
             export_onnx(trained, self.output, overwrite=self.overwrite)
-        manifest = trained.manifest
-        wrote(
-            self.output,
-            f"{manifest.backbone}, {manifest.head} head, {manifest.image_size} px, {manifest.input} images; "
-            "answers as the network does in ONNX Runtime",
-        )
-
-    def _export_data(self, kind: str) -> None:
-        from sliplens.recordings.exporting import export_lerobot, export_mcap
-
-        if _is_run(self.source) and not _is_data(self.source):
-            raise InputError(
-                f"{self.source} is a run, and --{kind} writes a data set; name a data set, or choose --onnx"
-            )
-        export = export_mcap if kind == "mcap" else export_lerobot
-        self.call(export, data=self.source, out=self.output)
-
-
-def _is_run(source: Path) -> bool:
-    return (source / "manifest.json").is_file()
-
-
-def _is_data(source: Path) -> bool:
-    from sliplens.recordings.dataset import DATASET_FILE
-
-    return (source / DATASET_FILE).is_file()
+        kept = trained.manifest
+        about = f"{kept.backbone}, {kept.head} head, {kept.image_size} px, {kept.input} images"
+        wrote(self.output, f"{about}; answers as the network does in ONNX Runtime")

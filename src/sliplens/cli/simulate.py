@@ -1,6 +1,6 @@
 """`sliplens simulate`."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -71,21 +71,17 @@ class Simulate(Command):
         self._require_pictures()
         require_device(self.device)
         own = {"output", "preset", "device", "preview", "video", "overwrite"}
-        changes = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in own}
+        changes = {name: value for name, value in vars(self).items() if name not in own}
         recipe, terminal = make_recipe(self.preset, **changes), Terminal()
         if self.preview is not None:
             self._draw_preview(self.preview, recipe, terminal)
         if self.video is not None:
             self._draw_video(self.video, recipe, terminal)
         if self.output is not None:
-            shown = {"device": self.device, "overwrite": self.overwrite, "on_progress": terminal}
-            data = simulate(self.output, preset=self.preset, **shown, **changes)
-            rows = describe_simulation(data).by_split.items()
-            print_table(
-                "Simulated",
-                ("split", "trials", "frames"),
-                [(name, str(row.trials), f"{row.frames:,}") for name, row in rows],
-            )
+            data = self.call(simulate, out=self.output, on_progress=terminal, **changes)
+            splits = describe_simulation(data).by_split.items()
+            rows = [(name, str(row.trials), f"{row.frames:,}") for name, row in splits]
+            print_table("Simulated", ("split", "trials", "frames"), rows)
 
     def _require_pictures(self) -> None:
         """Refuse a wrong suffix before anything is simulated."""

@@ -1,5 +1,6 @@
 """`sliplens split`."""
 
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -61,7 +62,8 @@ class Split:
 
 def _show_splits(trials: "Sequence[TrialInfo]", splits: Sequence[str]) -> None:
     rows = []
-    for name in _in_order(splits):
+    usual = ("train", "validation", "test")
+    for name in sorted(set(splits), key=lambda name: (usual.index(name) if name in usual else len(usual), name)):
         infos = [info for info, split in zip(trials, splits, strict=True) if split == name]
         rows.append(
             (
@@ -80,18 +82,11 @@ def _show_moves(moved: "Sequence[tuple[TrialInfo, str]]") -> None:
     if not moved:
         say("every trial is in its split already")
         return
-    names: dict[tuple[str, str], list[str]] = {}
+    names = defaultdict(list)
     for info, to in moved:
-        names.setdefault((info.split, to), []).append(info.trial)
+        names[info.split, to].append(info.trial)
     rows = [(escape(old), to, str(len(those)), _some(those)) for (old, to), those in sorted(names.items())]
     print_table("Moves", ("from", "to", "trials", "which"), rows)
-
-
-def _in_order(splits: Iterable[str]) -> list[str]:
-    """Splits as one speaks of them, others after them."""
-    usual = ["train", "validation", "test"]
-    present = set(splits)
-    return [name for name in usual if name in present] + sorted(present - set(usual))
 
 
 def _some(names: Iterable[str]) -> str:

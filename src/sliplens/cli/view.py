@@ -8,7 +8,7 @@ import tyro
 
 from sliplens.cli.command import Command, Data
 from sliplens.cli.console import Terminal, say, wrote
-from sliplens.errors import InputError
+from sliplens.files import require_new_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,8 +33,7 @@ class View(Command):
         require_rerun()
         if self.output is not None:
             require_rrd_path(self.output)
-            if self.output.exists() and not self.overwrite:
-                raise InputError(f"{self.output} exists; choose another file or pass --overwrite")
+            require_new_file(self.output, overwrite=self.overwrite)
         data = load_dataset(self.data)
         info = data.trials[0] if self.trial is None else data.find(self.trial)
         with Terminal().stage(f"Reading {info.trial}") as bar:

@@ -92,8 +92,8 @@ class Run:
             )
 
     @torch.no_grad()
-    def answers(self, batches: Iterable[Float[Tensor, "batch 3 size size"]]) -> tuple[Tensor, ...]:
-        """What the network answers to encoded frames (`Answers`), on its device."""
+    def answers(self, batches: Iterable[Tensor]) -> tuple[Tensor, ...]:
+        """What the network answers (`Answers`) to batches of encoded frames, (batch, 3, size, size), on its device."""
         network = Answers(self.model)
         parts = [network(batch.to(self.device)) for batch in batches]
         return tuple(torch.cat(answers) for answers in zip(*parts, strict=True))

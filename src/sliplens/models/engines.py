@@ -45,15 +45,7 @@ class Engine:
         return (margins for margins, *_ in self.answers(batches))
 
     def estimate(self, trained: Run, inputs: Float[Tensor, "batch 3 size size"]) -> Estimate:
-        """Safety margins of encoded images, with how sure the network is.
-
-        Parameters
-        ----------
-        trained
-            The network that the engine was made of.
-        inputs
-            As `Run.encode` makes them.
-        """
+        """Safety margins of images that the network of the engine has encoded, with how sure it is."""
         answers = zip(*self.answers(inputs.split(self.batch_size)), strict=True)
         return trained.to_estimate(*(torch.cat(parts) for parts in answers))
 
@@ -116,8 +108,8 @@ def prepare(
         Images in a batch; None for what suits the engine.
     streams
         Batches that are worked on at once, by one thread each; None for one a thread, which is fastest for many
-        passes: threads that share a batch wait for each other in every layer, and long where another program takes
-        one of their cores. With 1 all threads work on one batch, which answers soonest.
+        passes: threads that share a batch wait for each other in every layer. With 1 all threads work on one batch,
+        which answers soonest.
     onnx_file
         The network as `export_onnx` wrote it, for `onnxruntime` and `openvino`; converted here if None.
 

@@ -272,14 +272,14 @@ def fit(
 
     def batch_rows(epoch: int, batch: int) -> list[str]:
         order = EpochShuffle(len(train), seed=config.seed).order(epoch)[rank::processes]
-        return [_name(train, row) for row in order[batch * share : (batch + 1) * share]]
+        rows = [(train.frame[row], train.trial[row]) for row in order[batch * share : (batch + 1) * share]]
+        return [f"{'the reference frame' if frame < 0 else f'frame {frame}'} of {trial}" for frame, trial in rows]
 
     module = Regressor(
         model,
         config=config,
         augmentation=get_augmentation(config.augmentation, neutral=train.encoding.neutral),
-        steps=clock.steps,
-        fraction_done=clock.fraction,
+        clock=clock,
         batch_rows=batch_rows,
     )
     checkpoints = folder / "checkpoints"
@@ -334,7 +334,7 @@ def fit(
 
     try:
         title = f"Training ({train.encoding.name})"
-        with torch.random.fork_rng(devices=[]), stage(on_progress if first else None, title) as clock.count:
+        with torch.random.fork_rng(devices=[]), stage(on_progress if first else None, title) as clock.on_progress:
             run_trainer(trainer, module, loaders, checkpoints / "last.ckpt")
     except DivergedError as error:
         if not first or not best.best_model_path:
@@ -368,8 +368,3 @@ def require_same_kind(start: Run, config: TrainConfig, encoding: str) -> None:
                 f"the network to start from has the {name} {kept}, and {value} is to be trained; "
                 f"train {kept}, or start from another network"
             )
-
-
-def _name(frames: FrameSet, row: int) -> str:
-    frame = frames.frame[row]
-    return f"the reference frame of {frames.trial[row]}" if frame < 0 else f"frame {frame} of {frames.trial[row]}"

@@ -5,6 +5,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -45,16 +46,14 @@ class Regressor(lightning.LightningModule):
         *,
         config: TrainConfig,
         augmentation: Augmentation | None,
-        steps: int,
-        fraction_done: Callable[[], float],
+        clock: "Clock",
         batch_rows: Callable[[int, int], Sequence[str]],
     ) -> None:
         super().__init__()
         self.model = model
         self.config = config
         self.augmentation = augmentation
-        self.steps = steps
-        self.fraction_done = fraction_done
+        self.clock = clock
         self.batch_rows = batch_rows
         # sums and counts, added up over the processes: exact however the frames are shared
         self.train_mse = MeanSquaredError()
@@ -87,9 +86,8 @@ class Regressor(lightning.LightningModule):
     def _refuse(self, loss: float, batch_idx: int, *, finite: bool) -> None:
         """Stop, and say which frames of which process brought a loss that is not finite."""
         mine: tuple[float, Sequence[str]] = (loss, () if finite else self.batch_rows(self.current_epoch, batch_idx))
-        losses = [mine]
+        losses = [mine] * self.trainer.world_size
         if self.trainer.world_size > 1:
-            losses = [mine] * self.trainer.world_size
             distributed.all_gather_object(losses, mine)
         value, rows = next(shared for shared in losses if shared[1])
         more = f" and {len(rows) - _NAMED_ROWS} more" if len(rows) > _NAMED_ROWS else ""
@@ -108,7 +106,7 @@ class Regressor(lightning.LightningModule):
         """Set the learning rate for the share of the training that is done; Ranger21 sets its own."""
         if self.config.optimizer != "adamw":
             return
-        warm_up, done = 0.1, self.fraction_done()
+        warm_up, done = 0.1, self.clock.fraction()
         descent = 0.5 * (1 + math.cos(math.pi * min(1.0, max(0.0, (done - warm_up) / (1 - warm_up)))))
         factor = max(done / warm_up, 0.02) if done < warm_up else max(descent, 0.005)
         for optimizer in self.trainer.optimizers:
@@ -118,16 +116,14 @@ class Regressor(lightning.LightningModule):
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """AdamW, without weight decay on biases and normalisation; or Ranger21 with its defaults."""
         if self.config.optimizer == "ranger21":
-            return Ranger21(self.parameters(), num_iterations=self.steps, lr=self.config.learning_rate)
+            return Ranger21(self.parameters(), num_iterations=self.clock.steps, lr=self.config.learning_rate)
         decayed = [value for value in self.parameters() if value.ndim > 1]
         others = [value for value in self.parameters() if value.ndim <= 1]
-        groups = [
-            {"params": decayed, "weight_decay": self.config.weight_decay},
-            {"params": others, "weight_decay": 0.0},
-        ]
-        return torch.optim.AdamW(groups, lr=self.config.learning_rate)
+        groups = [{"params": decayed}, {"params": others, "weight_decay": 0.0}]
+        return torch.optim.AdamW(groups, lr=self.config.learning_rate, weight_decay=self.config.weight_decay)
 
 
+@dataclass(kw_only=True, eq=False)
 class Clock(Callback):
     """Stops when the epochs or the minutes are used up, and writes a table row after each epoch.
 
@@ -135,24 +131,16 @@ class Clock(Callback):
     time limit all processes go by the clock of the first: the learning rate follows it too.
     """
 
-    def __init__(
-        self,
-        *,
-        steps: int,
-        max_minutes: float | None,
-        metrics_file: Path | None,
-        on_progress: OnProgress | None,
-    ) -> None:
-        self.steps = steps
-        self.max_seconds = None if max_minutes is None else 60 * max_minutes
-        self.metrics_file = metrics_file
-        self.count = on_progress
-        self.seconds_before = 0.0
-        self.step = 0
-        self.rows: list[list[float]] = []
-        self.stopped_by = "epochs"
-        self._started = time.perf_counter()
-        self._time_share = 0.0
+    steps: int
+    max_minutes: float | None
+    metrics_file: Path | None
+    on_progress: OnProgress | None
+    seconds_before: float = 0.0
+    step: int = 0
+    rows: list[list[float]] = field(default_factory=list)
+    stopped_by: str = "epochs"
+    _started: float = field(default_factory=time.perf_counter)
+    _time_share: float = 0.0
 
     @property
     def seconds(self) -> float:
@@ -189,27 +177,22 @@ class Clock(Callback):
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, batch: Any, batch_idx: int
     ) -> None:
         """Look at the clock, which the module's learning rate follows."""
-        if self.max_seconds is not None:
-            self._time_share = trainer.strategy.broadcast(self.seconds) / self.max_seconds
+        if self.max_minutes is not None:
+            self._time_share = trainer.strategy.broadcast(self.seconds) / (60 * self.max_minutes)
 
     def on_train_batch_end(
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Stop when the time is up."""
         self.step = trainer.global_step
-        if self.max_seconds is not None and self.step < self.steps:
-            late = self.seconds >= self.max_seconds
+        if self.max_minutes is not None and self.step < self.steps:
+            late = self.seconds >= 60 * self.max_minutes
             # one that stopped alone would leave the others waiting
             if trainer.strategy.reduce_boolean_decision(late, all=False):
                 self.stopped_by, self._time_share = "time limit", 1.0
                 trainer.should_stop = True
-        if self.count is not None:
-            self.count(round(self.fraction() * self.steps), self.steps)
+        if self.on_progress is not None:
+            self.on_progress(round(self.fraction() * self.steps), self.steps)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Write the epoch's row; the validation has run by now."""
