@@ -159,12 +159,8 @@ def save_checkpoint(folder: Path, model: nn.Module, manifest: Manifest) -> None:
 def load_checkpoint(folder: Path, *, device: str = "cpu") -> Run:
     """Load a checkpoint written by `save_checkpoint`.
 
-    Raises
-    ------
-    InputError
-        If the folder or its manifest is missing.
-    CheckpointError
-        If the manifest is of another schema, the weights were changed or damaged, or they do not fit the backbone.
+    `InputError` if the folder or its manifest is missing; `CheckpointError` if the manifest is of another schema, the
+    weights were changed or damaged, or they do not fit the backbone.
     """
     require_folder(folder, what="the run")
     path, weights = folder / MANIFEST_FILE, folder / WEIGHTS_FILE

@@ -51,7 +51,7 @@ class Predictions:
     rows: pa.Table | None
     """The rows; None where they are in the file."""
     notes: tuple[str, ...] = ()
-    """What was assumed, a sentence each, for people."""
+    """What was assumed, a sentence each."""
 
     def frame(self) -> pa.Table:
         """Arrow table; `.to_pandas()` where pandas is installed.
@@ -196,7 +196,7 @@ def _tables(
         estimate = trained.to_estimate(*answers)
         for name, values in _columns(estimate, trial, first).items():
             if name in waiting:
-                waiting[name].extend(values.to_pylist())
+                waiting[name].extend(values)
         if len(waiting["frame"]) >= _ROW_GROUP:
             yield pa.Table.from_pydict(waiting, schema)
             waiting = {name: [] for name in schema.names}
@@ -219,23 +219,17 @@ def _encode(
             yield trained.encode(np.stack(batch), reference)
 
 
-def _columns(estimate: Estimate, trial: Capture, first: int) -> dict[str, pa.Array]:
+def _columns(estimate: Estimate, trial: Capture, first: int) -> dict[str, list]:
     count = len(estimate.margin)
-    here = slice(first, first + count)
+    here, unknown = slice(first, first + count), [None] * count
     low, high = estimate.interval(LEVEL) or (None, None)
+    times, margins = (None if values is None else values[here] for values in (trial.time_s, trial.safety_margin))
+    numbers = {"time_s": times, "safety_margin": margins, "sigma": estimate.sigma, "low_90": low, "high_90": high}
     return {
-        "trial": pa.array([trial.name] * count),
-        "frame": pa.array(np.arange(first, first + count)),
-        "file": pa.array(trial.files[here]) if trial.files else pa.nulls(count, pa.string()),
-        "time_s": _numbers(trial.time_s, here, count),
-        "safety_margin": _numbers(trial.safety_margin, here, count),
-        "prediction": pa.array(estimate.margin),
-        "sigma": _numbers(estimate.sigma, slice(None), count),
-        "low_90": _numbers(low, slice(None), count),
-        "high_90": _numbers(high, slice(None), count),
+        "trial": [trial.name] * count,
+        "frame": list(range(first, first + count)),
+        "file": list(trial.files[here]) if trial.files else unknown,
+        "prediction": estimate.margin.tolist(),
+        # NaN as null: nothing is known
+        **{name: unknown if v is None else pa.array(v, from_pandas=True).to_pylist() for name, v in numbers.items()},
     }
-
-
-def _numbers(values: np.ndarray | None, rows: slice, count: int) -> pa.Array:
-    """As Arrow keeps them, NaN as null: nothing is known."""
-    return pa.nulls(count, pa.float64()) if values is None else pa.array(values[rows], from_pandas=True)

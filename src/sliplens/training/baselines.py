@@ -57,12 +57,7 @@ def choose_training(trials: Sequence[TrialInfo], count: int) -> tuple[TrialInfo,
 
 
 def evaluate_baselines(
-    plan: BaselinePlan,
-    data: Dataset,
-    predictions: Predictions,
-    *,
-    folder: Path,
-    on_progress: OnProgress | None = None,
+    plan: BaselinePlan, data: Dataset, predictions: Predictions, *, folder: Path, on_progress: OnProgress | None = None
 ) -> tuple[Baselines, BaselinePredictions]:
     """Follow markers, fit estimators on training trials, and score them on the very frames a network was scored on.
 
@@ -105,8 +100,7 @@ def evaluate_baselines(
         known_trials=0,
         shared_trials=sum(info.trial in tested for info in plan.training),
         training_frames=sum(int(np.isfinite(margin).sum()) for margin in margins),
-        followed=sum(field.followed for field in fields.values())
-        / max(1, sum(field.in_view for field in fields.values())),
+        followed=sum(one.followed for one in fields.values()) / max(1, sum(one.in_view for one in fields.values())),
         failed=failed,
         estimators={name: _score(answer) for name, answer in answers.items()},
     )
@@ -137,7 +131,7 @@ def _margins(data: Dataset, info: TrialInfo) -> Float[np.ndarray, " frames"]:
 
 
 def _score(answers: Predictions) -> BaselineScores:
-    conditions = {name: answers.where(answers.condition == name) for name in sorted(set(answers.condition.tolist()))}
+    conditions = {name: rows for (name,), rows in sorted(answers.groups("condition").items())}
     return BaselineScores(
         conditions={name: score_predictions(rows) for name, rows in conditions.items()},
         lead_times={name: find_lead_times(rows) for name, rows in conditions.items()},

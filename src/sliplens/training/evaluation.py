@@ -48,11 +48,9 @@ def evaluate(
         Folder to write, with `result.json` and `predictions.parquet`; nothing is written if None.
     split
         Which trials of the data set.
-    baselines
-        Estimators to put beside the network, rows of `markers.estimators.ESTIMATORS` or `all`: they read the motion
-        of the markers, fitted on training trials.
-    baseline_trials
-        How many training trials they are fitted on, spread evenly over those of the data set.
+    baselines, baseline_trials
+        Estimators to put beside the network, rows of `markers.estimators.ESTIMATORS` or `all`, and how many training
+        trials they are fitted on, spread evenly over those of the data set.
     markers
         What markers look like, a row of `markers.KINDS`; by the sensor's name if None.
 
@@ -74,12 +72,9 @@ def evaluate(
     if out is None:
         with scratch_folder() as folder:
             return _evaluate(run, data, trials, plan, folder, split=split, on_progress=on_progress)
-    recipe: dict[str, Any] = {
-        "weights_sha256": run.manifest.weights_sha256,
-        "data_hash": data.hash,
-        "input": run.manifest.input,
-        "split": split,
-    }
+    kept = run.manifest
+    recipe: dict[str, Any] = {"weights_sha256": kept.weights_sha256, "data_hash": data.hash, "input": kept.input}
+    recipe["split"] = split
     if plan is not None:
         trained_on = [trial.trial for trial in plan.training]
         recipe["baselines"] = {"estimators": plan.estimators, "markers": plan.markers, "trials": trained_on}

@@ -70,8 +70,7 @@ def train(
     condition
         Train and validate on the trials of one condition alone, such as dry.
     accelerator, devices, num_nodes
-        As Lightning takes them: devices of each node, a process each, which Lightning, torchrun or SLURM starts. They
-        and the logger are no part of what makes the result. All processes but the first end here.
+        As Lightning takes them: devices of each node, a process each. All processes but the first end here.
     logger
         Where the numbers go besides `metrics.csv`: `csv` for nowhere, or a row of `LOGGERS`.
     changes
@@ -228,19 +227,17 @@ def fit(
     train, validation
         Encoded frames, of trials that do not overlap.
     folder
-        Gets `model.safetensors`, `manifest.json` and `metrics.csv`. While training runs it also holds checkpoints, from
-        which a call with the same folder goes on. All processes must see it.
+        Gets `model.safetensors`, `manifest.json` and `metrics.csv`; while training runs also checkpoints, from which a
+        call with the same folder goes on. All processes must see it.
     frame_size, sensor, data_hash, trained_on
-        Kept in the manifest: height and width of the sensor's frames, its name, the data set's hash, and those of the
-        trials.
+        Kept in the manifest: height and width of the sensor's frames, its name, hashes of the data set and the trials.
     start
-        Network whose weights it starts from, instead of random ones: to go on at another image size, or to teach a
-        network a sensor that is like the one it knows. It is left as it is.
+        Network whose weights it starts from, instead of random ones; it is left as it is.
     trainer
         As `make_trainer` makes it, used once; one device, a GPU if there is one, if None.
     on_progress
-        Called after every step with the steps done and the steps in all, in the first process; under a time limit the
-        share of the time counts where it is further.
+        Called after every step in the first process; under a time limit the share of the time counts where it is
+        further.
 
     Raises
     ------

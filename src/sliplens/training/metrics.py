@@ -19,14 +19,8 @@ def coverage(
 def auroc(positive: Float[np.ndarray, " _"], negative: Float[np.ndarray, " _"]) -> float | None:
     """Area under the receiver operating characteristic: how often a positive scores above a negative; ties count half.
 
-    Returns
-    -------
-    float or None
-        0.5 where the scores tell nothing apart; None where a class is empty.
-
-    References
-    ----------
-    Hanley & McNeil, *Radiology* 143 (1982) 29: the area is the Mann-Whitney statistic over the number of pairs.
+    Hanley & McNeil, *Radiology* 143 (1982) 29: the Mann-Whitney statistic over the number of pairs. None where a class
+    is empty.
     """
     if not (len(positive) and len(negative)):
         return None
@@ -56,10 +50,8 @@ def lead_times(
 
     Parameters
     ----------
-    trial
-        Name of each frame's trial; the frames of a trial follow each other in time.
-    time_s, labels, predictions
-        Time in seconds, true and predicted margin of each frame in margin units.
+    trial, time_s, labels, predictions
+        Name of each frame's trial, time in seconds, true and predicted margin in margin units.
     threshold
         A prediction below it is an alarm; in margin units.
     """
@@ -104,16 +96,9 @@ _BINS = 10
 def regression_scores(
     labels: Float[np.ndarray, " frames"], predictions: Float[np.ndarray, " frames"], *, trials: int = 1
 ) -> RegressionScores:
-    """MSE, R2, MAE and the MSE in ten bins of the safety margin.
+    """MSE, R2, MAE and the MSE in ten bins of the safety margin (Polak, Table 1 and Fig. 7).
 
-    Raises
-    ------
-    RecordingError
-        If there is no frame, or a label lies outside [0, 1].
-
-    References
-    ----------
-    Polak, Table 1 and Fig. 7.
+    `RecordingError` if there is no frame, or a label lies outside [0, 1].
     """
     if len(labels) == 0:
         raise RecordingError("there is no labelled frame to evaluate; check the split and the condition")
@@ -132,12 +117,9 @@ def regression_scores(
         mae=float(np.abs(predictions - labels).mean()),
         bins=tuple(
             BinScore(
-                low=index / _BINS,
-                high=(index + 1) / _BINS,
-                frames=len(inside),
-                mse=float(inside.mean()) if len(inside) else None,
+                low=at / _BINS, high=(at + 1) / _BINS, frames=len(one), mse=float(one.mean()) if len(one) else None
             )
-            for index, inside in enumerate(errors)
+            for at, one in enumerate(errors)
         ),
     )
 

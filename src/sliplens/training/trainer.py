@@ -31,15 +31,8 @@ def make_trainer(
 ) -> lightning.Trainer:
     """Trainer of this process, which knows its number among all (`global_rank`); nothing runs yet.
 
-    Parameters
-    ----------
-    accelerator, devices, num_nodes
-        Lightning's own: devices of each node, a process each.
-
-    Raises
-    ------
-    InputError
-        If this machine has not the devices, or torchrun or a cluster started another number of processes.
+    `accelerator`, `devices` and `num_nodes` are Lightning's own: devices of each node, a process each. `InputError` if
+    this machine has not the devices, or torchrun or a cluster started another number of processes.
     """
     half = config.mixed_precision and accelerator != "cpu" and torch.cuda.is_available()
     shared = devices * num_nodes > 1 or TorchElasticEnvironment.detect()
