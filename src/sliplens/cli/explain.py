@@ -73,8 +73,6 @@ class Explain(Command):
 def _print_methods() -> None:
     from sliplens.explainers import EXPLAINERS
 
-    rows = []
-    for name, explainer in EXPLAINERS.items():
-        summary = (type(explainer).__doc__ or "").strip().splitlines()[0].rstrip(".")
-        rows.append((name, summary))
+    said = {name: (type(explainer).__doc__ or "").strip() for name, explainer in EXPLAINERS.items()}
+    rows = [(name, text.splitlines()[0].rstrip(".")) for name, text in said.items()]
     print_table("Explainers", ("method", "what it does"), rows)

@@ -133,22 +133,14 @@ entry point `sliplens.backbones`."""
 def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point") -> nn.Module:
     """Build a classifier from scratch, its last layer replaced by one output: the safety margin.
 
+    It takes (batch, 3, height, width) and returns (batch, 1), untrained, drawn from torch's current random state.
+
     Parameters
     ----------
     backbone
-        Row of `BACKBONES`.
+        Row of `BACKBONES`; `ModelError` if there is none of that name.
     head
         `point` for one number, `histogram` for the mean of a distribution (`HistogramRegressor`).
-
-    Returns
-    -------
-    Module
-        Takes (batch, 3, height, width) and returns (batch, 1), untrained, drawn from torch's current random state.
-
-    Raises
-    ------
-    ModelError
-        If there is no backbone or head of that name.
 
     References
     ----------

@@ -44,18 +44,11 @@ _COMPARED = {
 
 
 def export_onnx(run: Run | Path | str, out: Path | str, *, overwrite: bool = False) -> Path:
-    """Write a network as an ONNX file; it appears when ONNX Runtime gives the same answers, or not at all.
+    """Write a network, or that of a folder or name, as NAME.onnx; it appears when ONNX Runtime gives the same answers.
 
     Input `image` is float32 (batch, 3, size, size), encoded and normalised; outputs are `margin` (batch,) and, for a
     histogram, `probabilities` (batch, bins). The batch may be of any size. Properties of the model, as JSON:
     `sliplens.manifest`, `sliplens.input` (how frames become an input) and `sliplens.output` (edges of the bins).
-
-    Parameters
-    ----------
-    run
-        Network, its folder, or the name of one that comes with sliplens.
-    out
-        File to write, NAME.onnx.
 
     Raises
     ------

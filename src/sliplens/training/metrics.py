@@ -109,6 +109,7 @@ def regression_scores(
     # times ten, rounded: 0.3 * 10 must fall in bin 3 although 0.3 is not exact in binary
     bins = np.minimum(np.floor(np.round(labels * _BINS, 9)), _BINS - 1)
     errors = [squared[bins == index] for index in range(_BINS)]
+    means = [float(inside.mean()) if len(inside) else None for inside in errors]
     return RegressionScores(
         frames=len(labels),
         trials=trials,
@@ -116,10 +117,8 @@ def regression_scores(
         r2=float(1 - squared.sum() / spread) if spread > 0 else None,
         mae=float(np.abs(predictions - labels).mean()),
         bins=tuple(
-            BinScore(
-                low=at / _BINS, high=(at + 1) / _BINS, frames=len(one), mse=float(one.mean()) if len(one) else None
-            )
-            for at, one in enumerate(errors)
+            BinScore(low=index / _BINS, high=(index + 1) / _BINS, frames=len(errors[index]), mse=means[index])
+            for index in range(_BINS)
         ),
     )
 
