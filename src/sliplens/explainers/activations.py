@@ -77,15 +77,11 @@ def find_layers(
 ) -> tuple[Layer, ...]:
     """Find the layers to explain, in the order in which they run: fine to coarse in the usual network.
 
-    The network is run once and its main path followed: the modules that the network itself calls, looking into
-    plain `Sequential` containers, wrappers whose output is no map, and blocks that shrink the map by more than two,
-    but not into blocks and their branches. Neighbours on the path whose maps have the same channels, height and width
-    are one layer, represented by the last; a layer without parameters (pooling) only repeats the one before and is
-    left out, as are 1 x 1 maps. So each resolution and width gives its last map, whether the pooling that follows is a
-    module or a function. For TorchVision's ShuffleNetV2 these are conv1, stage2, stage3, stage4 and conv5, for its
-    ResNet-18 relu and layer1 to layer4.
-
-    The network is `frozen` for the pass, for which one image is enough.
+    The network is run once, with one image, and its main path followed: the modules that the network itself calls,
+    looking into plain `Sequential` containers, wrappers whose output is no map, and blocks that shrink the map by more
+    than two, but not into blocks and their branches. Each resolution and width gives its last map; a layer without
+    parameters (pooling) is left out, as are 1 x 1 maps. For TorchVision's ShuffleNetV2 these are conv1, stage2, stage3,
+    stage4 and conv5, for its ResNet-18 relu and layer1 to layer4.
 
     Parameters
     ----------
@@ -204,7 +200,8 @@ def _distinct(steps: list[_Call]) -> tuple[Layer, ...]:
     layers = []
     for shape, group in groupby(steps, key=lambda step: step.output_shape):
         members = list(group)
-        if _is_spatial(shape) and any(next(step.module.parameters(), None) is not None for step in members):
+        has_parameters = any(next(step.module.parameters(), None) is not None for step in members)
+        if shape is not None and _is_spatial(shape) and has_parameters:
             layers.append(Layer(members[-1].name, shape))
     return tuple(layers)
 

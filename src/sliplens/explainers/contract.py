@@ -86,8 +86,8 @@ class FrozenModel:
                 raise ModelError(
                     f"the model predicts {float(values[index])} for {what} {index}; train or load it again"
                 )
-        both = {"prediction": prediction, "reference_prediction": reference_prediction.expand_as(prediction)}
-        return Comparison(**vars(self) | both)
+        known: dict[str, Any] = vars(self) | {"prediction": prediction}
+        return Comparison(**known | {"reference_prediction": reference_prediction.expand_as(prediction)})
 
 
 @dataclass(frozen=True, kw_only=True)

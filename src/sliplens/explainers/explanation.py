@@ -78,10 +78,8 @@ class Explanation:
     def saliency(self) -> Float[Tensor, "batch height width"]:
         """The supporting evidence in [0, 1], for viewing: 1 at the strongest pixel of each image.
 
-        A regressor has no winning class, so "supporting" is read off the difference that is explained: with
-        s = sign(f(x) - f(reference)) the map is relu(s * relevance) over its largest value. Where the margin falls
-        below the reference's (s = -1) the pixels that lower it are shown, which a plain ReLU would hide. A map
-        without supporting evidence stays zero, and so does every map where f(x) = f(reference).
+        The map is relu(sign(f(x) - f(reference)) relevance) over its largest value: where the margin falls below the
+        reference's, the pixels that lower it. A map without supporting evidence stays zero.
         """
         supporting = torch.relu(self.influence)
         peak = supporting.amax(dim=(1, 2), keepdim=True)
@@ -159,12 +157,7 @@ def check_approximations(approximations: Sequence[Approximation]) -> Iterator[st
 
 
 def check_slopes(sizes: Sequence[float], *, change: Sequence[float]) -> Iterator[str]:
-    """Where the gradients at an image are next to nothing, though there is something to explain.
-
-    Where the network is linear, the sizes of gradient times contrast add up to |f(x) - f(reference)| at least. Where
-    they make less than a tenth of it even if all pulled one way, the network is saturated at the image, and its slope
-    there has little to do with how the prediction came about.
-    """
+    """Where the gradients at an image, were they all of one sign, make next to nothing of what there is to explain."""
     for index, (size, difference) in enumerate(zip(sizes, change, strict=True)):
         if abs(difference) >= CLOSE and size < FLAT * abs(difference):
             yield (

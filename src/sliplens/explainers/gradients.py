@@ -1,7 +1,7 @@
 """Integrated Gradients along the line from the reference, Expected Gradients, SmoothGrad."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from captum import attr
@@ -17,12 +17,10 @@ _NODES = 4  # of a piece; the slope along the path has kinks, on which more node
 _ROUNDING = 1e-6  # of |f|: a gap that float32 predictions cannot resolve is no gap
 
 
-@dataclass(frozen=True, kw_only=True)
-class Line:
+class Line(NamedTuple):
     """Integral of the gradients from a reference to an image."""
 
     relevance: Float[Tensor, "height width"]
-    """Relevance in margin units."""
     slope: float
     """Sum of the sizes of the relevance, were the last piece of the line, next to the image, the whole of it."""
 
@@ -34,11 +32,9 @@ class IntegratedGradients(Method):
     Relevance is (x - b) times the integral over t in [0, 1] of df/dx at b + t (x - b), summed over the channels; it
     adds up to f(x) - f(b) when the integral is exact.
 
-    The line is cut into pieces. Each has a completeness gap of its own, between its part of the integral and the change
-    of f from its start to its end, which two forward passes tell. While the gaps add up to more than `tolerance` the
-    pieces with the largest are halved: nodes spread over the whole line miss the sum of a trained network by percents.
-
-    Each image is refined on its own, so a batch gives what its images alone would give.
+    The line is cut into pieces, each with a completeness gap of its own, between its part of the integral and the
+    change of f from its start to its end. While the gaps add up to more than `tolerance` the pieces with the largest
+    are halved: nodes spread over the whole line miss the sum of a trained network by percents.
 
     Parameters
     ----------
@@ -85,16 +81,13 @@ class IntegratedGradients(Method):
             raise InputError(f"integrated gradients' tolerance is {self.tolerance}; give a share above 0")
 
     def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
-        comparison = frozen.compare()
-        slopes = []
+        comparison, slopes = frozen.compare(), []
+        pairs = (comparison.images, comparison.reference, comparison.prediction, comparison.reference_prediction)
 
         def integral(index: int) -> Tensor:
-            images = comparison.images[index], comparison.reference[index]
-            line = self.integrate(
-                comparison, *images, comparison.prediction[index], comparison.reference_prediction[index]
-            )
-            slopes.append(line.slope)
-            return line.relevance
+            relevance, slope = self.integrate(comparison, *(values[index] for values in pairs))
+            slopes.append(slope)
+            return relevance
 
         return comparison.explanation(
             comparison.map_each(integral, on_progress=on_progress),
@@ -117,7 +110,7 @@ class IntegratedGradients(Method):
         allowed = max(self.tolerance * abs(change), _ROUNDING * max(abs(float(end)) for end in ends))
         fixed = self.steps == self.max_steps
         pieces, nodes = (1, self.steps) if fixed else (max(1, self.steps // _NODES), min(self.steps, _NODES))
-        path = _Path(frozen, image=image, reference=reference, nodes=nodes, batch_size=self.batch_size)
+        path = _Path(frozen=frozen, image=image, reference=reference, nodes=nodes, batch_size=self.batch_size)
         edges = torch.linspace(0, 1, pieces + 1, dtype=torch.float64, device=image.device)
         heights = torch.cat([ends[0][None], path.predict(edges[1:-1]), ends[1][None]]).double()
         starts, stops, rises = edges[:-1], edges[1:], heights.diff()
@@ -142,34 +135,35 @@ class IntegratedGradients(Method):
             used += 2 * nodes * count
 
 
+@dataclass(frozen=True, kw_only=True)
 class _Path:
     """The straight line from a reference to an image."""
 
-    def __init__(self, frozen: FrozenModel, *, image: Tensor, reference: Tensor, nodes: int, batch_size: int) -> None:
-        self._frozen, self._image, self._reference = frozen, image, reference
-        self._nodes, self._batch_size = nodes, batch_size
-        self._captum = attr.IntegratedGradients(frozen.predict)
+    frozen: FrozenModel
+    image: Tensor
+    reference: Tensor
+    nodes: int
+    batch_size: int
 
     def _at(self, times: Tensor) -> Tensor:
-        shares = times.to(self._image.dtype)[:, None, None, None]
-        return self._reference + shares * (self._image - self._reference)
+        return self.reference + times.to(self.image.dtype)[:, None, None, None] * (self.image - self.reference)
 
     @torch.no_grad()
     def predict(self, times: Tensor) -> Tensor:
         """Predictions at some points, 0 the reference and 1 the image."""
-        parts = [self._frozen.predict(self._at(part)) for part in times.split(self._batch_size) if len(part)]
-        return torch.cat(parts) if parts else self._image.new_zeros(0)
+        parts = [self.frozen.predict(self._at(part)) for part in times.split(self.batch_size) if len(part)]
+        return torch.cat(parts) if parts else self.image.new_zeros(0)
 
     def integrate(self, starts: Tensor, stops: Tensor) -> Tensor:
         """Relevance (pieces, height, width) of each piece of the line."""
-        together = max(1, self._batch_size // self._nodes)
+        together, captum = max(1, self.batch_size // self.nodes), attr.IntegratedGradients(self.frozen.predict)
         pieces = []
         for start, stop in zip(starts.split(together), stops.split(together), strict=True):
-            contributions = self._captum.attribute(
+            contributions = captum.attribute(
                 self._at(stop),
                 baselines=self._at(start),
-                n_steps=self._nodes,
-                internal_batch_size=max(len(start), min(self._batch_size, len(start) * self._nodes)),
+                n_steps=self.nodes,
+                internal_batch_size=max(len(start), min(self.batch_size, len(start) * self.nodes)),
             )
             pieces.append(contributions.detach().sum(dim=1))
         return torch.cat(pieces)
@@ -179,10 +173,9 @@ class _Path:
 class ExpectedGradients(Method):
     """Expected Gradients: the mean of Integrated Gradients over a background of references.
 
-    "Why this margin rather than that of frames without slip?": no single frame has to stand for no slip. The relevance
-    adds up to f(x) less the mean of f over the background. The published method draws references and points of the
-    line at random; here the background is gone through and each line integrated until it is complete, which gives the
-    same in the limit, without noise and without a seed.
+    The relevance adds up to f(x) less the mean of f over the background. The published method draws references and
+    points of the line at random; here the background is gone through and each line integrated until it is complete,
+    which gives the same in the limit, without noise and without a seed.
 
     Parameters
     ----------
@@ -216,7 +209,7 @@ class ExpectedGradients(Method):
             image, prediction = comparison.images[index], comparison.prediction[index]
             pairs = zip(frames[index], heights[index], strict=True)
             lines = [self.integrated.integrate(comparison, image, frame, prediction, height) for frame, height in pairs]
-            return torch.stack([line.relevance for line in lines]).mean(dim=0)
+            return torch.stack([relevance for relevance, _ in lines]).mean(dim=0)
 
         only = ("no background was given, so the reference alone stands for it, as in integrated gradients",)
         return comparison.explanation(
@@ -233,9 +226,8 @@ class SmoothGrad(Method):
     """SmoothGrad times what the image adds to the reference, signed, in margin units.
 
     Relevance is (x - b) times the mean of df/dx over x plus normal noise, summed over the channels. The gradient alone,
-    which was published, has another unit than the other maps and lights up where the image equals the reference. The
-    relevance is what the linear model through x says; for a linear network it adds up to f(x) - f(b), for any other to
-    nothing in particular, so it has no completeness gap.
+    which was published, has another unit than the other maps and lights up where the image equals the reference. Only
+    for a linear network it adds up to f(x) - f(b), so it has no completeness gap.
 
     Parameters
     ----------

@@ -27,8 +27,7 @@ class Lrp(Method):
     the reference only decides what `saliency` shows.
 
     Works on a copy whose batch normalisation is folded into the convolutions, and whose means over space and sums of
-    branches, functions in TorchVision's networks, are made modules: zennit knows rules for modules only, and would
-    hand relevance back from a mean in equal parts, and twice from a sum.
+    branches, functions in TorchVision's networks, are made modules: zennit knows rules for modules only.
 
     References
     ----------
@@ -45,12 +44,11 @@ class Lrp(Method):
         for module in copy.modules():
             if isinstance(module, fx.GraphModule):
                 _name_functions(module)
-        parts, done = [], 0
+        parts = []
         for part in comparison.images.split(self.batch_size):
             parts.append(_propagate(copy, part))
-            done += len(part)
             if on_progress is not None:
-                on_progress(done, len(comparison.images))
+                on_progress(sum(map(len, parts)), len(comparison.images))
         relevance = torch.cat(parts)
         shares = (relevance.sum(dim=(1, 2)) / comparison.prediction).tolist()
         return comparison.explanation(
@@ -77,18 +75,6 @@ class _Sum(nn.Module):
         return self.inner(torch.stack(torch.broadcast_tensors(left, right), dim=-1))
 
 
-class _Mean(nn.Module):
-    """A mean over space, by the module that zennit has a rule for."""
-
-    def __init__(self, *, keepdim: bool) -> None:
-        super().__init__()
-        self.inner, self.keepdim = nn.AdaptiveAvgPool2d(1), keepdim
-
-    def forward(self, images: Tensor) -> Tensor:
-        pooled = self.inner(images)
-        return pooled if self.keepdim else pooled.flatten(1)
-
-
 def _name_functions(module: fx.GraphModule) -> None:
     """Replace sums of two branches and means over space by modules."""
     from zennit.layer import Sum  # noqa: PLC0415  # pyright: ignore[reportMissingImports] (an extra)
@@ -98,7 +84,8 @@ def _name_functions(module: fx.GraphModule) -> None:
         if node.op == "call_function" and node.target in {operator.add, operator.iadd, torch.add}:
             replacement = _Sum(Sum()) if len(branches) == 2 else None
         elif node.op == "call_method" and node.target == "mean" and _over_space(node):
-            replacement = _Mean(keepdim=bool(node.kwargs.get("keepdim", False)))
+            pool = nn.AdaptiveAvgPool2d(1)
+            replacement = pool if node.kwargs.get("keepdim", False) else nn.Sequential(pool, nn.Flatten())
         else:
             replacement = None
         if replacement is not None:

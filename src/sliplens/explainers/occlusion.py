@@ -21,12 +21,7 @@ from sliplens.recordings import Recording
 def find_markers(
     image: Float[Tensor, "3 height width"], reference: Float[Tensor, "3 height width"]
 ) -> Float[Tensor, "markers 2"]:
-    """Places (x, y) of the markers that an image shows, in pixels.
-
-    Parameters
-    ----------
-    image, reference
-        As a network takes them, in [0, 1]; the reference tells whether the markers show at all.
+    """Places (x, y) of the markers that an image shows, in pixels; the reference tells whether they show at all.
 
     Raises
     ------
@@ -46,15 +41,12 @@ def find_markers(
 
 
 def markers_in_frame(frame: UInt8[np.ndarray, "height width 3"], *, image_size: int) -> Float[Tensor, "markers 2"]:
-    """Places (x, y) of the markers of a camera frame, in the network's image; errors as `find_markers`."""
+    """Places (x, y) of the markers of a camera frame, in the network's image."""
     return _scaled(detect_markers(frame).centre_px, frame.shape[:2], image_size)
 
 
 def markers_in_recording(recording: Recording, row: int, *, image_size: int) -> Float[Tensor, "markers 2"]:
-    """Places (x, y) of the markers in one frame of a trial, in pixels of the network's square image.
-
-    The simulator's own where the trial has a truth, else found in the frame, with the errors of `find_markers`.
-    """
+    """Places (x, y) of the markers of a trial's frame in the network's image: the simulator's, where it has any."""
     if recording.truth is None:
         return markers_in_frame(recording.frames[row], image_size=image_size)
     return _scaled(recording.truth.marker_px[row], recording.frames.shape[1:3], image_size)
@@ -88,10 +80,9 @@ def tile_regions(size: tuple[int, int], *, tile_px: int) -> Int[Tensor, "height 
 def marker_regions(
     size: tuple[int, int], centres_px: Float[Tensor, "markers 2"], *, radius_px: float | None = None
 ) -> Int[Tensor, "height width"]:
-    """Number of the marker that each pixel belongs to, and one number more for the pixels between the markers.
+    """Number of the nearest marker of each pixel, and one number more for the pixels that none reaches.
 
-    Places are x and y in the image that the network sees; pixel centres lie at whole numbers. A marker reaches, by
-    default, half of the median distance between neighbours; a pixel within reach of two belongs to the nearer.
+    A marker reaches, by default, half of the median distance between neighbours; pixel centres lie at whole numbers.
     """
     rows, columns = (torch.arange(length, dtype=torch.float64) for length in size)
     pixels = torch.stack(torch.broadcast_tensors(columns, rows[:, None]), dim=-1).reshape(-1, 2)
@@ -107,10 +98,9 @@ def marker_regions(
 class Occlusion(Method):
     """Occlusion by tile, or by marker where the markers' places are given, signed, in margin units.
 
-    The relevance of a region is f(x) - f(x with the region as in the reference), spread evenly over its pixels. Nothing
-    is assumed of the network, and nothing outside its data is shown to it as far as the reference is one of them. For a
-    linear network the regions add up to f(x) - f(b); where they work together, or stand in for each other, they do not,
-    so there is no completeness gap.
+    The relevance of a region is f(x) - f(x with the region as in the reference), spread evenly over its pixels. Where
+    regions work together, or stand in for each other, they do not add up to f(x) - f(b), so there is no completeness
+    gap.
 
     Parameters
     ----------

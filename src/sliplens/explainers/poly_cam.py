@@ -14,7 +14,7 @@ from sliplens.explainers.activations import Layer, capture, find_layers, find_pu
 from sliplens.explainers.contract import Comparison, FrozenModel, Method
 from sliplens.explainers.explanation import Approximation, Explanation, Level, check_approximations, check_weights
 from sliplens.explainers.maps import combine, local_change, resize, scale_to, to_masks
-from sliplens.explainers.poly_cam_budget import ChannelSearch, Likeness, mask_kernel
+from sliplens.explainers.poly_cam_budget import ChannelSearch, GaussianProcess, Likeness, mask_kernel
 from sliplens.models.engines import Engine
 from sliplens.progress import OnProgress
 
@@ -136,9 +136,9 @@ class PolyCam(Method):
     and their mean is "+/-": 0 for the empty mask, f(x) - f(b) for the full one. A channel's weight is
     relu(effect / (f(x) - f(b))), the part that supports the change.
 
-    The layers' maps are refined from the coarsest to the finest (`combine`). The finest, times how much the image
-    differs from the reference thereabouts (`local_change`), is the saliency; the relevance is that scaled to add up to
-    f(x) - f(b), which is a convention: it says nothing about how much one pixel contributes.
+    The layers' maps are refined from the coarsest to the finest. The finest, times how much the image differs from the
+    reference thereabouts, is the saliency; the relevance is that scaled to add up to f(x) - f(b), a convention that
+    says nothing about how much one pixel contributes.
 
     Parameters
     ----------
@@ -150,15 +150,13 @@ class PolyCam(Method):
     layers
         Names of the layers; by default those that belong to the score.
     level
-        Which level's map is the relevance, counted from the finest, 0. The thesis displayed the finest of its ten, and
-        scored the fifth from the coarsest, `level=5`. Layers finer than that have no part in it, and cost no pass.
+        Which level's map is the relevance, counted from the finest, 0; the thesis scored `level=5`. Layers finer than
+        that have no part in it, and cost no pass.
     budget
-        Share of the channels to measure at first, in (0, 1]; 1 for the exact map. Below 1 the other channels' weights
-        are estimated, and `Explanation.approximations` says how many were measured and what the map is expected to have
-        in common with the exact one.
+        Share of the channels to measure at first, in (0, 1]; 1 for the exact map. The other channels' weights are
+        estimated, and `Explanation.approximations` says what the map is expected to have in common with the exact one.
     likeness
-        What that should be: more channels are measured until it is expected, all of them if need be. None to stop at
-        the budget, whatever the map is like.
+        What that should be: channels are measured until it is expected. None to stop at the budget.
     batch_size
         Masked images in one pass; None for what suits the engine.
     levels
@@ -299,9 +297,10 @@ class PolyCam(Method):
         active = regions.active()
         count(sum(sizes) - len(active))
         if self.budget < 1 and len(active):
+            contrast = (regions.image - regions.empty).abs().mean(dim=0)
             search = ChannelSearch(
-                activations,
-                mask_kernel((regions.image - regions.empty).abs().mean(dim=0), regions.masks, active),
+                activations=activations,
+                process=GaussianProcess(mask_kernel(contrast, regions.masks, active)),
                 active=active,
                 at_empty=supports(at_empty)[0],
                 measure=lambda channels: supports(measure(channels)),

@@ -133,6 +133,7 @@ class Likeness:
                 raise InputError(f"the likeness asks for a {name} of {getattr(self, name)}; give a number from 0 to 1")
 
 
+@dataclass(frozen=True, kw_only=True)
 class ChannelSearch:
     """Channels measured where they matter to the map, the supports of the others estimated from them.
 
@@ -146,29 +147,20 @@ class ChannelSearch:
     `measure` gives supports of channels in rising order (`Score.support`), `to_map` the map that weights make.
     """
 
-    def __init__(
-        self,
-        activations: Sequence[Float[Tensor, "_channels _rows _columns"]],
-        kernel: Float[Tensor, "some some"],
-        *,
-        active: Int[Tensor, " some"],
-        at_empty: Float[Tensor, ""],
-        measure: Callable[[Int[Tensor, " part"]], Float[Tensor, " part"]],
-        to_map: Callable[[list[Tensor]], Float[Tensor, "height width"]],
-        seed: int,
-    ) -> None:
-        self._activations, self._active, self._at_empty = activations, active, at_empty
-        self._measure, self._to_map, self._seed = measure, to_map, seed
-        self._process = GaussianProcess(kernel)
-        self._norms = [activation.flatten(1).norm(dim=1) for activation in activations]
-        self._dtype = kernel.dtype
+    activations: Sequence[Float[Tensor, "_channels _rows _columns"]]
+    process: GaussianProcess
+    active: Int[Tensor, " some"]
+    at_empty: Float[Tensor, ""]
+    measure: Callable[[Int[Tensor, " part"]], Float[Tensor, " part"]]
+    to_map: Callable[[list[Tensor]], Float[Tensor, "height width"]]
+    seed: int
 
     def run(self, *, budget: float, likeness: Likeness | None) -> tuple[list[Tensor], Approximation]:
         """Weights >= 0 of each layer's channels, and what their map should have in common with the exact one.
 
         A share of the channels (`budget`, in (0, 1)) is measured at first, more until the likeness is reached.
         """
-        count = min(len(self._active), max(1, math.ceil(budget * len(self._active))))
+        count = min(len(self.active), max(1, math.ceil(budget * len(self.active))))
         first = math.ceil(_FIRST * count)
         rounds = min(_ROUNDS, max(1, count - first))
         self._explore(first)
@@ -176,51 +168,49 @@ class ChannelSearch:
             self._explore(first + (count - first) * step // rounds)
         while True:
             approximation = self._judge()
-            if likeness is None or count == len(self._active) or _reached(approximation, likeness):
-                return self._weights(self._process.estimate()[0]), approximation
+            if likeness is None or count == len(self.active) or _reached(approximation, likeness):
+                return self._weights(self.process.estimate()[0]), approximation
             wanted = math.ceil(_GROWTH * count)
-            count = len(self._active) if wanted > _NEARLY_ALL * len(self._active) else wanted
+            count = len(self.active) if wanted > _NEARLY_ALL * len(self.active) else wanted
             self._explore(count)
 
     def _explore(self, until: int) -> None:
         """Measure channels until there are so many."""
-        count = until - len(self._process.chosen)
+        count = until - len(self.process.chosen)
         if count < 1:
             return
-        chosen = self._process.choose(count, importance=self._importance().to(self._dtype))
+        chosen = self.process.choose(count, importance=self._importance().double())
         order = chosen.argsort()
-        supports = torch.empty(len(chosen), dtype=self._dtype, device=chosen.device)
-        supports[order] = self._measure(self._active[chosen[order]]).to(supports)
-        self._process.learn(supports)
+        self.process.learn(self.measure(self.active[chosen[order]])[order.argsort()])
 
     def _judge(self) -> Approximation:
         """What the map is expected to have in common with the exact one."""
-        estimate, _ = self._process.estimate()
-        result = self._to_map(self._weights(estimate))
-        generator = torch.Generator().manual_seed(self._seed)
-        drawn = [self._to_map(self._weights(supports)) for supports in self._process.draws(_DRAWS, generator=generator)]
+        estimate, _ = self.process.estimate()
+        result = self.to_map(self._weights(estimate))
+        generator = torch.Generator().manual_seed(self.seed)
+        drawn = [self.to_map(self._weights(supports)) for supports in self.process.draws(_DRAWS, generator=generator)]
         return Approximation(
-            measured=len(self._process.chosen),
-            channels=len(self._active),
+            measured=len(self.process.chosen),
+            channels=len(self.active),
             pearson_r=fmean(pearson_r(result, other) for other in drawn),
             top_overlap=fmean(top_overlap(result, other) for other in drawn),
         )
 
     def _importance(self) -> Tensor:
         """What an error of each support costs the map."""
-        if not self._process.chosen:
-            return torch.cat([norm / norm.norm().clamp_min(FLOOR) for norm in self._norms])[self._active]
-        estimate, deviation = self._process.estimate()
-        layers = zip(self._norms, self._activations, self._weights(estimate), strict=True)
+        norms = [maps.flatten(1).norm(dim=1) for maps in self.activations]
+        if not self.process.chosen:
+            return torch.cat([norm / norm.norm().clamp_min(FLOOR) for norm in norms])[self.active]
+        estimate, deviation = self.process.estimate()
+        layers = zip(norms, self.activations, self._weights(estimate), strict=True)
         shares = [norm / layer_map(maps, weights).norm().clamp_min(FLOOR) for norm, maps, weights in layers]
-        strength = torch.cat(shares)[self._active]
-        odds = estimate / deviation.clamp_min(FLOOR)
-        return strength.clamp_max(1 / FLOOR) * torch.special.ndtr(odds)
+        odds = torch.special.ndtr(estimate / deviation.clamp_min(FLOOR))
+        return torch.cat(shares)[self.active].clamp_max(1 / FLOOR) * odds
 
     def _weights(self, supports: Tensor) -> list[Tensor]:
-        every = self._at_empty.to(supports).repeat(sum(map(len, self._activations)))
-        every[self._active] = supports
-        return list(torch.relu(every).to(self._at_empty.dtype).split([len(norm) for norm in self._norms]))
+        every = self.at_empty.to(supports).repeat(sum(map(len, self.activations)))
+        every[self.active] = supports
+        return list(torch.relu(every).to(self.at_empty.dtype).split([len(maps) for maps in self.activations]))
 
 
 def _reached(approximation: Approximation, likeness: Likeness) -> bool:

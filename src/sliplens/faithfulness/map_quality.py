@@ -12,9 +12,7 @@ _SAMPLES = 33
 
 
 def total_variation(saliency: Float[np.ndarray, "height width"]) -> float:
-    """Mean absolute step between neighbouring pixels, over the range of the map; 0 for a constant one.
-
-    A map of independent even noise has 1/3, a smooth one a few percent.
+    """Mean absolute step between neighbouring pixels, over the range of the map: 1/3 for independent even noise.
 
     Examples
     --------
@@ -53,10 +51,9 @@ def gini(saliency: Float[np.ndarray, "height width"]) -> float:
 
 
 def resolution(saliency: Float[np.ndarray, "height width"], markers_px: Float[np.ndarray, "markers 2"]) -> float:
-    """How far neighbouring markers can be told apart: depth of the valley between them over the lower of their peaks.
+    """Depth of the valley between neighbouring markers (x, y) over the lower of their peaks, from 0 to 1.
 
-    1 where the map falls to nothing between any two neighbours, 0 where it does not fall at all. Pairs of which one has
-    no relevance are left out; NaN if there is no other. The map lies in [0, 1], markers are given as x, y.
+    Pairs of which one has no relevance are left out; NaN if there is no other.
     """
     if len(markers_px) < 2:
         raise InputError("resolution needs two markers or more")
@@ -77,10 +74,7 @@ def resolution(saliency: Float[np.ndarray, "height width"], markers_px: Float[np
 def stability(
     maps: Float[np.ndarray, "images height width"], others: Float[np.ndarray, "images height width"]
 ) -> Float[np.ndarray, " images"]:
-    """Pearson's correlation of each map with its like: of the same frame with other noise, or of the next frame.
-
-    NaN where a map is constant.
-    """
+    """Pearson's correlation of each map with its like, such as the next frame's; NaN where a map is constant."""
     first, second = (values.reshape(len(values), -1) for values in (maps, others))
     first, second = (values - values.mean(axis=1, keepdims=True) for values in (first, second))
     size = np.sqrt((first**2).sum(axis=1) * (second**2).sum(axis=1))
@@ -90,8 +84,6 @@ def stability(
 
 def relevance_mass(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "height width"]) -> float:
     """Share of a map's sum that lies inside the truth; NaN for a map that is zero.
-
-    A map that knows nothing has the share of the image that the truth covers.
 
     References
     ----------

@@ -37,15 +37,7 @@ RANDOM_ORDERS = 20
 
 
 def tile_units(shape: tuple[int, int], *, size: int) -> Units:
-    """Square tiles, of 1 for single pixels; those at the right and lower border may be smaller.
-
-    Examples
-    --------
-    >>> from sliplens.faithfulness.removal import tile_units
-    >>> tile_units((2, 4), size=2)
-    array([[0, 0, 1, 1],
-           [0, 0, 1, 1]])
-    """
+    """Square tiles, of 1 for single pixels; those at the right and lower border may be smaller."""
     if size < 1:
         raise InputError(f"tiles of {size} pixels are impossible; choose 1 or more")
     return tile_regions(shape, tile_px=size).numpy()
@@ -93,10 +85,7 @@ def random_unit_order(units: Units, *, rng: np.random.Generator) -> Int[np.ndarr
 
 
 def influence_orders(influence: Float[np.ndarray, "images markers"]) -> Int[np.ndarray, "2 images markers"]:
-    """Orders of the markers from the most influential on, and from the least.
-
-    Ties fall alike in both: a map that tells nothing has one order, and gains nothing.
-    """
+    """Orders of the markers from the most influential on, and from the least, in which ties fall alike."""
     return np.stack([np.argsort(sign * influence, axis=-1, kind="stable") for sign in (-1, 1)])
 
 
