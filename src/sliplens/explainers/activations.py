@@ -26,8 +26,8 @@ def capture(model: nn.Module, names: Sequence[str], *, differentiable: bool = Fa
     names
         Modules, by their names in `model.named_modules()`. Of a module called twice the last output is kept.
     differentiable
-        Start the graph anew at each kept output, so that the gradient of the prediction with respect to it can be
-        taken and the backward pass stops there. With several modules only the last one's gradient is whole.
+        Start the graph anew at each kept output, so that the gradient of the prediction in it can be taken. With
+        several modules only the last one's gradient is whole.
     """
     outputs: dict[str, Tensor] = {}
     modules = dict(model.named_modules())

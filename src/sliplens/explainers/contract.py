@@ -86,8 +86,9 @@ class FrozenModel:
                 raise ModelError(
                     f"the model predicts {float(values[index])} for {what} {index}; train or load it again"
                 )
-        known: dict[str, Any] = vars(self) | {"prediction": prediction}
-        return Comparison(**known | {"reference_prediction": reference_prediction.expand_as(prediction)})
+        known: dict[str, Any] = {**vars(self), "prediction": prediction}
+        known["reference_prediction"] = reference_prediction.expand_as(prediction)
+        return Comparison(**known)
 
 
 @dataclass(frozen=True, kw_only=True)

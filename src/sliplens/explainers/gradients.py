@@ -232,9 +232,7 @@ class SmoothGrad(Method):
     Parameters
     ----------
     noise
-        Standard deviation of the noise, in units of the input's range [0, 1].
-    seed
-        Of the noise, the same for each image.
+        Standard deviation of the noise, in units of the input's range [0, 1]; the same draws for each image.
 
     References
     ----------

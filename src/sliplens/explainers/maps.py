@@ -142,16 +142,7 @@ def pearson_r(first: Float[Tensor, "height width"], second: Float[Tensor, "heigh
 def top_overlap(
     one: Float[Tensor, "height width"], other: Float[Tensor, "height width"], *, share: float = 0.1
 ) -> float:
-    """Share of the strongest pixels of one map, such as a tenth of all, that are among the strongest of another.
-
-    Examples
-    --------
-    >>> import torch
-    >>> from sliplens.explainers.maps import top_overlap
-    >>> one, other = torch.tensor([[3.0, 2.0], [1.0, 0.0]]), torch.tensor([[3.0, 0.0], [1.0, 2.0]])
-    >>> top_overlap(one, other, share=0.5)
-    0.5
-    """
+    """Share of the strongest pixels of one map, such as a tenth of all, that are among the strongest of another."""
     count = max(1, round(share * one.numel()))
     strongest = torch.zeros(one.numel(), dtype=torch.bool, device=one.device)
     strongest[one.flatten().topk(count).indices] = True

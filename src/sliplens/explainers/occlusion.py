@@ -64,15 +64,7 @@ FindPlaces: TypeAlias = Callable[[Float[Tensor, "3 height width"], Float[Tensor,
 
 
 def tile_regions(size: tuple[int, int], *, tile_px: int) -> Int[Tensor, "height width"]:
-    """Number of the square tile in which each pixel lies; tiles at the right and lower border may be smaller.
-
-    Examples
-    --------
-    >>> from sliplens.explainers.occlusion import tile_regions
-    >>> tile_regions((2, 3), tile_px=2)
-    tensor([[0, 0, 1],
-            [0, 0, 1]])
-    """
+    """Number of the square tile in which each pixel lies; tiles at the right and lower border may be smaller."""
     rows, columns = (torch.arange(length) // tile_px for length in size)
     return rows[:, None] * (int(columns.max()) + 1) + columns
 

@@ -99,14 +99,7 @@ def open_run(run: Run | Path | str, *, device: str = "cpu") -> Run:
 
 
 def get_explainer(method: str, **options: Any) -> Explainer:
-    """Look up an explainer by name, with other options than its row of the table has.
-
-    Parameters
-    ----------
-    method
-        Row of `EXPLAINERS`.
-    options
-        Fields of its class.
+    """Look up a row of `EXPLAINERS`, with other options than it has: the fields of its class.
 
     Raises
     ------

@@ -16,8 +16,6 @@ Images = Float[Tensor, "images 3 height width"]
 ControlMaps = Float[Tensor, "images height width"]
 Maps = Float[np.ndarray, "images height width"]
 _BATCH_NORMS = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm)
-_CENTRE_SD = 0.25
-"""Standard deviation of the centred Gaussian, in widths of the image."""
 
 
 def edges(images: Images) -> ControlMaps:
@@ -35,10 +33,10 @@ def brightness(images: Images) -> ControlMaps:
 
 
 def centre(images: Images) -> ControlMaps:
-    """A Gaussian about the middle: a camera looks at what matters."""
+    """A Gaussian about the middle, of a quarter of the image's side: a camera looks at what matters."""
     height, width = images.shape[-2:]
     down, across = (torch.linspace(-0.5, 0.5, side, device=images.device) for side in (height, width))
-    bump = torch.exp(-(down[:, None].square() + across.square()) / (2 * _CENTRE_SD**2))
+    bump = torch.exp(-(down[:, None].square() + across.square()) / (2 * 0.25**2))
     return bump.to(images.dtype).expand(len(images), height, width)
 
 

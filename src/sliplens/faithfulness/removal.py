@@ -187,10 +187,7 @@ class Faithfulness:
     def interval(self, *, trials: np.ndarray | None = None, seed: int = 0) -> Difference:
         """Mean symmetric gain over the images in margin units, with its 95 % interval.
 
-        Parameters
-        ----------
-        trials
-            Trial of each image: whole trials are resampled, since frames of one resemble one another.
+        Where the trial of each image is given, whole trials are resampled: frames of one resemble one another.
         """
         nothing = np.zeros_like(self.symmetric_gain)
         return paired_difference(self.symmetric_gain, nothing, trials=trials, rng=np.random.default_rng(seed))
@@ -271,8 +268,6 @@ def removal_curves(
 
     Parameters
     ----------
-    predict
-        From inputs (batch, 3, height, width) to answers (batch,), in margin units; or an engine made ready.
     images, references
         Inputs in [0, 1], and those of the untouched sensor where the fill needs them.
     orders

@@ -49,9 +49,9 @@ def score(
 ) -> Faithfulness:
     """Score maps by removing what they call influential first, and last, against random orders and controls.
 
-    The score is the symmetric gain: how much further the answer moves away from what it is, towards that on the
-    untouched sensor, with the most influential parts removed first rather than the least. Controls are maps that know
-    nothing of the network; a map that gains no more than they do has shown nothing.
+    The score is the symmetric gain, in margin units: how much further the answer moves towards that on the untouched
+    sensor with the most influential parts removed first rather than the least. A map that gains no more than the
+    controls, which know nothing of the network, has shown nothing.
 
     Parameters
     ----------
@@ -67,12 +67,6 @@ def score(
         What is removed at once: pixels, or square tiles of a fourteenth of the image.
     random_orders
         How many random orders are removed beside.
-
-    Returns
-    -------
-    Faithfulness
-        Scores and curves of the maps in margin units, those of the controls, and alarms; `interval()` tells how sure
-        the gain is.
 
     Raises
     ------
@@ -127,7 +121,7 @@ def score_by_deletion(
     seed: int = 0,
     on_progress: OnProgress | None = None,
 ) -> DeletionCurves:
-    """Score maps as the thesis does: remove the most salient pixels step by step and watch the answer.
+    """Score maps as the thesis does: remove the most salient pixels step by step, beside a random order (`control`).
 
     Kept to compare with published figures; `score` is the one to rely on (docs/deletion.md).
 
@@ -139,11 +133,6 @@ def score_by_deletion(
         What removed pixels become, a row of `FILLS`.
     steps
         Steps until every pixel is gone; the image's height if None, as in the thesis.
-
-    Returns
-    -------
-    DeletionCurves
-        Answers in margin units and scores D of each frame and step, with a random order as `control`.
 
     References
     ----------
