@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 
 from sliplens.intervals import Difference, bootstrap_difference, paired_difference
 from sliplens.plots.style import CONTROL, FILL_NAMES, UNIT_NAMES, fill_name, in_order, signed
@@ -78,16 +78,15 @@ def share_of_strongest(effects: MarkerEffects, *, count: int, rng: np.random.Gen
 
     None where no marker has any effect.
     """
-    ids, first, member = np.unique(effects.frame_id, return_index=True, return_inverse=True)
-    shares, kept = [], []
-    for frame in range(len(ids)):
-        sizes = np.sort(np.abs(effects.network[member == frame]))[::-1]
+    shares, trials = [], []
+    for frame in effects.groups("frame_id").values():
+        sizes = np.sort(np.abs(frame.network))[::-1]
         if sizes.sum() > 0:
             shares.append(sizes[:count].sum() / sizes.sum())
-            kept.append(effects.trial[first[frame]])
+            trials.append(frame.trial[0])
     if not shares:
         return None
-    return paired_difference(np.array(shares), np.zeros(len(shares)), trials=np.array(kept), rng=rng)
+    return paired_difference(np.array(shares), np.zeros(len(shares)), trials=np.array(trials), rng=rng)
 
 
 def settings(faithful: RemovalScores) -> list[tuple[str, str]]:
@@ -118,10 +117,9 @@ def mean_at(curve: RemovalCurve, area: float) -> tuple[float, float]:
     return most, chance
 
 
-def tell_interval(gap: Difference, *, digits: int = 3, scale: float = 1.0) -> str:
+def tell_interval(gap: Difference, *, digits: int = 3) -> str:
     """Write an estimate with its 95 % interval."""
-    values: Float[np.ndarray, 3] = scale * np.array([gap.estimate, gap.low, gap.high])
-    return f"{signed(values[0], digits)} ({signed(values[1], digits)} to {signed(values[2], digits)})"
+    return f"{signed(gap.estimate, digits)} ({tell_bounds(gap, digits=digits)})"
 
 
 def tell_bounds(gap: Difference, *, digits: int = 3) -> str:
