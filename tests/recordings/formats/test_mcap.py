@@ -18,6 +18,7 @@ from sliplens.codec import to_builtins
 from sliplens.errors import InputError, RecordingError
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_info, trial_path, write_dataset_table
+from sliplens.recordings.exporting import export_mcap
 from sliplens.recordings.formats.rosbag import read_rosbag
 from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.importing import import_trial
@@ -532,11 +533,9 @@ def test_a_folder_that_is_missing_or_not_empty_is_refused(data, tmp_path):
 @pytest.mark.parametrize(("start_s", "said"), [(3e9, "goes from 3e"), (-3e9, "goes from -3e")])
 def test_times_beyond_the_stamps_of_ros_are_refused_and_nothing_is_left(tmp_path, rng, start_s, said):
     data = store([make_capture("late", rng, start_s=start_s, full=False, forces=False)], tmp_path / "data")
-    folder = tmp_path / "out"
-    folder.mkdir()
     with pytest.raises(RecordingError, match=rf"trial late {said}.*; import it with times in seconds"):
-        write_mcap(data, folder)
-    assert not list(folder.iterdir())
+        export_mcap(data, tmp_path / "out")
+    assert [file.name for file in tmp_path.iterdir()] == ["data"]
 
 
 def test_a_trial_that_cannot_name_a_file_is_refused(data, tmp_path):

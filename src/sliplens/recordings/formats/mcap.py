@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -98,40 +98,28 @@ def write_mcap(
     written, total = 0, sum(info.frames for info in chosen)
     for info in chosen:
         require_trial_name(info.trial)
-        with _Bag(folder / f"{info.trial}.mcap") as bag:
+        with (folder / f"{info.trial}.mcap").open("wb") as stream:
+            bag = _Bag(stream)
             for _ in _write_trial(bag, read_stored_trial(data, info)):
                 written += 1
                 if on_progress is not None:
                     on_progress(written, total)
+            bag.writer.finish()
 
 
 class _Bag:
-    """An MCAP file that takes messages by topic and field; it appears when complete."""
+    """An MCAP file that takes messages by topic and field."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, stream: BinaryIO) -> None:
         require_packages("mcap", "rosbags", extra="ros", purpose="an MCAP file")
         from mcap.writer import Writer  # noqa: PLC0415 (an extra)
 
         self.types = trial_types()
-        self.path, self.part = path, path.with_name(path.name + ".part")
-        self.stream = self.part.open("wb")
         # chunks under Zstandard, with indexes and checksums
-        self.writer = Writer(self.stream)
+        self.writer = Writer(stream)
         self.writer.start(profile="ros2", library=f"sliplens {__version__}")
         self.schemas: dict[str, int] = {}
         self.channels: dict[str, int] = {}
-
-    def __enter__(self) -> "_Bag":
-        return self
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        if kind is None:
-            self.writer.finish()
-        self.stream.close()
-        if kind is None:
-            self.part.replace(self.path)
-        else:
-            self.part.unlink()
 
     def make(self, kind: str, **fields: Any) -> Any:
         """A message, or part of one."""

@@ -32,10 +32,10 @@ _WAKES = 1.015  # a camera that adapts its exposure when it is started grows bri
 def stale_frames(frames: Iterable[Frame]) -> int:
     """Count the frames at the start that belong to another scene.
 
-    A camera that was just started hands out dark frames, and then what lay in its buffers: frozen frames of an earlier
-    moment. The last of them is unlike every frame that follows it. An object that slides from frame to frame is not
-    stale: there, all frames leap, or none does. (Where the camera ran already, an object that is pressed all at once
-    within the first 13 frames and never let go cannot be told from a frozen start; do not ask there.)
+    A camera that was just started hands out dark frames, then what lay in its buffers: frozen frames of an earlier
+    moment, the last of them unlike every frame that follows. Of an object that slides all frames leap, or none does.
+    (Where the camera ran already, an object that is pressed all at once within the first 13 frames and never let go
+    cannot be told from a frozen start; do not ask there.)
     """
     return count_stale(small_copies(frames))
 
