@@ -12,7 +12,7 @@ import numpy as np
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import output_folder
 from sliplens.progress import OnProgress, note, stage, wrote
-from sliplens.recordings.capture import Capture, Forces, Frame
+from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import Dataset, load_dataset, trial_info, trial_path, write_dataset_table
 from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.labelling import Labelling, ReferenceChoice
@@ -265,13 +265,8 @@ def import_trial(
         raise RecordingError(
             f"{capture.source} has no forces, and without them there is no label; give the table of the force sensor"
         )
-    index = capture.reference_index if settings.reference_frame is None else settings.reference_frame
     try:
-        if capture.labels is not None:
-            reference, labels = _given_labels(capture, capture.labels, index)
-        else:
-            assert capture.forces is not None
-            reference, labels = _find_labels(capture, capture.forces, settings, rng, index)
+        reference, labels = _label(capture, settings, rng)
     except RecordingError as error:
         raise RecordingError(f"{capture.source}: {error}") from None
     # before the trial, whose file tells that all of it is there
@@ -281,39 +276,36 @@ def import_trial(
     write_trial(path, images, facts=capture, time_s=capture.frame_time_s, labels=labels, reference=reference)
 
 
-def _find_labels(
-    capture: Capture, forces: Forces, settings: LabelSettings, rng: np.random.Generator, index: int | None
-) -> tuple[Frame, Labels]:
-    labels = label_trial(capture.frame_time_s, measure_motion(_frames(capture)), forces, settings=settings, rng=rng)
-    if capture.reference is not None and index is None:
-        image, choice = capture.reference, ReferenceChoice(method="recorded apart from the frames")
-    else:
-        untouched = np.array([reason is Reason.NO_CONTACT for reason in labels.reason])
+def _label(capture: Capture, settings: LabelSettings, rng: np.random.Generator) -> tuple[Frame, Labels]:
+    """Image of the untouched sensor, and the labels that came with the recording, or are found."""
+    index = capture.reference_index if settings.reference_frame is None else settings.reference_frame
+    labels, found, image = capture.labels, None, capture.reference
+    if labels is None:
+        assert capture.forces is not None
+        motion = measure_motion(_frames(capture))
+        labels = found = label_trial(capture.frame_time_s, motion, capture.forces, settings=settings, rng=rng)
+    if image is not None and index is None:
+        choice = ReferenceChoice(method="recorded apart from the frames" if found else "came with the recording")
+    elif found is not None:
+        untouched = np.array([reason is Reason.NO_CONTACT for reason in found.reason])
         choice = choose_reference(capture.read_frames, untouched, index=index, method=settings.reference)
-        image = next(islice(capture.read_frames(), choice.index, None))
-    return image, replace(labels, labelling=replace(_tell_source(capture, choice), basis=labels.basis))
-
-
-def _given_labels(capture: Capture, labels: Labels, index: int | None) -> tuple[Frame, Labels]:
-    if index is not None:
-        if not 0 <= index < len(capture):
-            raise RecordingError(f"the reference is frame {index} of {len(capture)}; name one from 0 on that is there")
-        image, choice = next(islice(capture.read_frames(), index, None)), ReferenceChoice(index=index, method="named")
-    elif capture.reference is not None:
-        image, choice = capture.reference, ReferenceChoice(method="came with the recording")
-    else:
+    elif index is None:
         raise RecordingError("no frame is known to be untouched; name one with --reference-frame")
-    return image, replace(labels, labelling=labels.labelling or _tell_source(capture, choice))
-
-
-def _tell_source(capture: Capture, reference: ReferenceChoice) -> Labelling:
-    return Labelling(
+    elif not 0 <= index < len(capture):
+        raise RecordingError(f"the reference is frame {index} of {len(capture)}; name one from 0 on that is there")
+    else:
+        choice = ReferenceChoice(index=index, method="named")
+    if image is None or index is not None:
+        image = next(islice(capture.read_frames(), choice.index, None))
+    labelling = labels.labelling or Labelling(
         source=capture.source,
         forces=capture.forces.source if capture.forces else None,
         notes=capture.notes,
-        reference=reference,
+        reference=choice,
         clip=capture.clip,
+        basis=found.basis if found else None,
     )
+    return image, replace(labels, labelling=labelling)
 
 
 def _frames(capture: Capture, on_progress: OnProgress | None = None) -> Iterator[Frame]:

@@ -241,7 +241,6 @@ __all__ = [
 
 SPLITS_FILE = "splits.json"
 """Keeps, in the folder of a data set, the rules that its splits come from."""
-_NEEDED = ("train", "validation", "test")
 _NAMED = 5  # so many names are told before the rest is counted
 
 
@@ -315,7 +314,7 @@ def assign_splits(plan: SplitPlan, trials: Sequence[TrialFacts]) -> SplitResult:
             cause = "rules before it take every trial it fits" if any_fits else "no trial fits it; check its words"
             notes.append(f"{where} ({rule}) decides nothing: {cause}")
     told = tuple(splits[trial.trial] for trial in trials)
-    missing = [split for split in _NEEDED if split not in told]
+    missing = [split for split in ("train", "validation", "test") if split not in told]
     if missing:
         notes.append(f"no trial is in {' or '.join(missing)}: to train takes train and validation, to evaluate test")
     return SplitResult(splits=told, notes=(*notes, *_shared(trials, told)))

@@ -96,12 +96,8 @@ class Labels:
     def count(self) -> dict[str, int]:
         """Number of frames by the reason why they have no valid label; those that have one as 'valid'."""
         reasons = self.reason or [""] * len(self.safety_margin)
-        return dict(
-            Counter(
-                "valid" if fine else reason or "no label"
-                for fine, reason in zip(self.labelled.tolist(), reasons, strict=True)
-            )
-        )
+        pairs = zip(self.labelled.tolist(), reasons, strict=True)
+        return dict(Counter("valid" if fine else reason or "no label" for fine, reason in pairs))
 
 
 OPTIONAL_LABELS = ("safety_margin_sigma", "valid", "reason", "force_time_s")
@@ -109,14 +105,9 @@ OPTIONAL_LABELS = ("safety_margin_sigma", "valid", "reason", "force_time_s")
 
 
 def labels_of_margins(safety_margin: Float[np.ndarray, " frames"]) -> Labels:
-    """Labels where no force is known, but the margin, or not even that.
+    """Labels where no force is known, but the margin in [0, 1], or not even that (NaN).
 
     Full slip is where the margin is 0, contact where it is 1; the stick ratio is that of a sphere, as everywhere.
-
-    Parameters
-    ----------
-    safety_margin
-        In [0, 1]; NaN where it is not known.
 
     Examples
     --------

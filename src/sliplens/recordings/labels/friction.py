@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.labelling import Found, FrictionEstimate
@@ -169,8 +169,10 @@ def estimate_friction(
     rough = (seen or candidates)[0]
     near = (forces.time_s >= rough - _BEFORE_S) & (forces.time_s <= rough + _AFTER_S)
     near &= forces.normal_n > contact_threshold_n
-    time, ratio = forces.time_s[near], _ratio_along_pull(forces, near, rough)
-    fit = fit_break(time, ratio, about_s=rough, rng=rng, draws=draws)
+    pull = forces.tangential_n[near & (forces.time_s <= rough)].mean(axis=0)
+    # along the direction of the pull: a projection is not biased by noise
+    ratio = forces.tangential_n[near] @ (pull / np.linalg.norm(pull)) / forces.normal_n[near]
+    fit = fit_break(forces.time_s[near], ratio, about_s=rough, rng=rng, draws=draws)
     # no resampling of the slip can show the uncertainty of the tare
     tare = np.hypot(forces.tare_sigma_n.tangential, fit.level * forces.tare_sigma_n.normal)
     low, high = np.quantile(fit.levels + rng.normal(0, float(tare / forces.normal_n[near].mean()), draws), _BAND)
@@ -219,15 +221,6 @@ def _find_falls(forces: ContactForces, *, window_s: float, contact_threshold_n: 
     # a stretch begins before its fall by the time that a fall may take, and may end as it begins
     tops = [start + int(np.argmax(steep[start : end + count + 1])) for start, end in zip(starts, ends, strict=True)]
     return sorted({float(time[top]) for top in tops}), highest
-
-
-def _ratio_along_pull(
-    forces: ContactForces, near: Bool[np.ndarray, " all_samples"], rough: float
-) -> Float[np.ndarray, " samples"]:
-    """F_t / F_n of single samples, along the direction of the pull: a projection is not biased by noise."""
-    before = near & (forces.time_s <= rough)
-    pull = forces.tangential_n[before].mean(axis=0)
-    return forces.tangential_n[near] @ (pull / np.linalg.norm(pull)) / forces.normal_n[near]
 
 
 def _image_sigmas(image: ImageMotion | None, onset_s: float) -> float | None:

@@ -1,7 +1,6 @@
 """The lag between camera and force sensor, from what both feel: the image moves when the force changes."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -103,7 +102,7 @@ def estimate_lag(
     if release is not None:
         # the same weights for every lag: a share that depends on the lag would prefer some
         top = int(np.argmax(_correlations(weights[:1], motion, changes=changes, covered=covered)[0]))
-        weights *= release.balance(frame_time_s[1:] - lags[top], changes[top])
+        weights *= _balance(frame_time_s[1:] - lags[top], changes[top], release)
     curves = _correlations(weights, motion, changes=changes, covered=covered)
     peaks = np.array([_peak(lags, curve) for curve in curves])
     low, high = np.quantile(peaks[1:], (0.16, 0.84))
@@ -111,28 +110,21 @@ def estimate_lag(
     return Lag(lag_s=lag, sigma_s=sigma, correlation=correlation, doubt=_doubt(lag, sigma, correlation, lags))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Release:
-    """A press, and a release that ends at nothing."""
+def _balance(
+    time_s: Float[np.ndarray, " intervals"], changes: Float[np.ndarray, " intervals"], release: tuple[float, float]
+) -> Float[np.ndarray, " intervals"]:
+    """Weights that give press and release the same pull on the lag.
 
-    pressed_s: float
-    let_go_s: float
-
-    def balance(
-        self, time_s: Float[np.ndarray, " intervals"], changes: Float[np.ndarray, " intervals"]
-    ) -> Float[np.ndarray, " intervals"]:
-        """Weights that give press and release the same pull on the lag.
-
-        Of two like peaks, the one of a rate r has a curvature as r^2 / T and errs as T, where T is how long it takes
-        and r T is the load of both: so each pulls as r^2.
-        """
-        released = time_s > self.let_go_s
-        press, fall = (float(changes[part].max(initial=0)) for part in (time_s <= self.pressed_s, released))
-        return np.where(released, min(1.0, (press / max(fall, 1e-9)) ** 2), 1.0)
+    Of two like peaks, the one of a rate r has a curvature as r^2 / T and errs as T, where T is how long it takes and
+    r T is the load of both: so each pulls as r^2.
+    """
+    pressed_s, let_go_s = release
+    press, fall = (float(changes[part].max(initial=0)) for part in (time_s <= pressed_s, time_s > let_go_s))
+    return np.where(time_s > let_go_s, min(1.0, (press / max(fall, 1e-9)) ** 2), 1.0)
 
 
-def _find_release(forces: Forces, *, sudden_s: float) -> _Release | None:
-    """When a load that ends at nothing begins to fall; None where it holds to the end or falls suddenly."""
+def _find_release(forces: Forces, *, sudden_s: float) -> tuple[float, float] | None:
+    """When a load that ends at nothing is pressed and begins to fall; None where it holds or falls suddenly."""
     # the tare alone is asked for: neither axis nor sign matters to a length
     loose = forces.force_n - infer_axes(forces, normal="x", sign=1).tare_n
     time = forces.time_s
@@ -143,7 +135,7 @@ def _find_release(forces: Forces, *, sudden_s: float) -> _Release | None:
     if light[-1] == time[-1] or fall_s <= sudden_s:
         return None
     # the quarter of the load before is let go in about the time of the half between
-    return _Release(pressed_s=float(heavy[0]), let_go_s=float(heavy[-1]) - fall_s)
+    return float(heavy[0]), float(heavy[-1]) - fall_s
 
 
 def _force_changes(time_s: Float[np.ndarray, " frames"], forces: Forces) -> Float[np.ndarray, " intervals"]:

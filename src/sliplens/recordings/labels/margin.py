@@ -1,7 +1,10 @@
 """The label of every frame: its forces, its safety margin with uncertainty, its contact state, and its validity."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -157,10 +160,8 @@ def label_frames(
         threshold = contact_threshold(forces, window_s=window)
     onset = np.inf if friction.onset_s is None else friction.onset_s
 
-    def forces_at(time_s: Float[np.ndarray, " frames"]) -> FrameForces:
-        limits = {"window_s": window, "gap_s": gap, "until_s": onset, "force_range_n": settings.force_range}
-        return interpolate_forces(forces, time_s, **limits)
-
+    limits = {"window_s": window, "gap_s": gap, "until_s": onset, "force_range_n": settings.force_range}
+    forces_at = partial(interpolate_forces, forces, **limits)
     shift = lag.lag_s if lag is not None and apply_lag else 0.0
     unsure = 0.0 if lag is None else lag.sigma_s if apply_lag else float(np.hypot(lag.lag_s, lag.sigma_s))
     time = frame_time_s - shift
@@ -193,9 +194,10 @@ def label_frames(
         safety_margin=margin,
         safety_margin_sigma=np.where(valid, sigma, np.nan),
         stick_ratio=stick_ratio(margin),
-        contact_state=_states(contact, slipped=slipped, stuck=used < _STUCK_SIGMAS * sigma),
+        contact_state=_first_of(_STATES, ~contact, slipped, used < _STUCK_SIGMAS * sigma),
         valid=valid,
-        reason=_reasons(at, contact, slipped),
+        # a frame without samples cannot be known to touch
+        reason=_first_of(_REASONS, at.missing, at.out_of_range, ~contact, slipped),
         basis=LabelBasis(
             axes=forces.axes,
             friction=friction,
@@ -236,20 +238,14 @@ def _remaining(
     return np.clip((end - time_s) / max(end - touch, 1e-9), 0, 1)
 
 
-def _states(
-    contact: Bool[np.ndarray, " frames"], *, slipped: Bool[np.ndarray, " frames"], stuck: Bool[np.ndarray, " frames"]
-) -> tuple[ContactState, ...]:
-    names = (ContactState.NO_CONTACT, ContactState.FULL_SLIP, ContactState.CONTACT, ContactState.INCIPIENT_SLIP)
-    return tuple(names[index] for index in np.select([~contact, slipped, stuck], [0, 1, 2], default=3))
+_STATES = (ContactState.NO_CONTACT, ContactState.FULL_SLIP, ContactState.CONTACT, ContactState.INCIPIENT_SLIP)
+_REASONS = (Reason.MISSING_SAMPLES, Reason.OUT_OF_RANGE, Reason.NO_CONTACT, Reason.AFTER_GROSS_SLIP, Reason.NONE)
+_Word = TypeVar("_Word", ContactState, Reason)
 
 
-def _reasons(
-    at: FrameForces, contact: Bool[np.ndarray, " frames"], slipped: Bool[np.ndarray, " frames"]
-) -> tuple[Reason, ...]:
-    """The first reason that holds; a frame without samples cannot be known to touch."""
-    names = (Reason.MISSING_SAMPLES, Reason.OUT_OF_RANGE, Reason.NO_CONTACT, Reason.AFTER_GROSS_SLIP, Reason.NONE)
-    flags = [at.missing, at.out_of_range, ~contact, slipped]
-    return tuple(names[index] for index in np.select(flags, [0, 1, 2, 3], default=4))
+def _first_of(words: Sequence[_Word], *flags: Bool[np.ndarray, " frames"]) -> tuple[_Word, ...]:
+    """Word of the first flag that holds for a frame; the last where none does."""
+    return tuple(words[index] for index in np.select(flags, list(range(len(flags))), default=len(flags)))
 
 
 def label_trial(

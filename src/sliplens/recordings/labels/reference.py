@@ -1,6 +1,6 @@
 """The reference frame of a trial, the sensor untouched: named, or chosen; and how it drifts."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from itertools import islice
 
 import numpy as np
@@ -70,11 +70,15 @@ def choose_reference(
     middle = np.median(np.stack([soft[place] for place in compared or sorted(wanted)]), axis=0)
     if chosen is None:
         chosen, how = min(compared, key=lambda place: _energy(soft[place] - middle)), method
+    drift = None
+    if ends:
+        start, end = (np.median([soft[place] for place in some], axis=0) for some in (first, last))
+        drift = float(np.mean(np.abs(end - start)))
     return ReferenceChoice(
         index=chosen,
         method=how,
         contact_energy=_energy(soft[chosen] - middle),
-        drift=_drift([soft[place] for place in first], [soft[place] for place in last]),
+        drift=drift,
         drift_span=(int(places[0]), int(places[-1])) if len(places) else None,
     )
 
@@ -87,15 +91,6 @@ def _first_still(motion: Float[np.ndarray, " frames"]) -> int:
     limit = _STILL_TIMES * np.quantile(steps, 0.25)
     moves = np.maximum(np.append(steps, steps[-1]), np.insert(steps, 0, steps[0]))
     return int(np.argmax(moves <= limit)) if np.any(moves <= limit) else int(np.argmin(moves))
-
-
-def _drift(
-    first: Sequence[Float[np.ndarray, "rows columns 3"]], last: Sequence[Float[np.ndarray, "rows columns 3"]]
-) -> float | None:
-    """Mean absolute difference of their medians; None without any."""
-    if not first:
-        return None
-    return float(np.mean(np.abs(np.median(last, axis=0) - np.median(first, axis=0))))
 
 
 def _energy(difference: Float[np.ndarray, "rows columns 3"]) -> float:
