@@ -63,7 +63,10 @@ def open_source(
     if isinstance(source, Path) and format in {None, "sliplens"} and (source / DATASET_FILE).is_file():
         source = load_dataset(source)
     if isinstance(source, Dataset):
-        _require_nothing_given(source, reference, reference_frame, options)
+        if reference is not None or reference_frame is not None:
+            raise InputError(f"the trials of {source.folder} bring their reference frames; leave out --reference")
+        if given := options.given():
+            raise InputError(f"{source.folder} is a data set of sliplens, which does not take {spoken(given)}")
         infos = source.select(split=split)
         names = [info.trial for info in infos]
         opened = [
@@ -85,15 +88,6 @@ def _open(source: Path | Frames, format: str | None, options: ReadOptions, *, wh
     if not whole and set(options.given()) <= {"frame_rate"} and (format or recognise(source)) == "images":
         return [_images(source, options.frame_rate)]
     return open_captures(source, format=format, options=options)
-
-
-def _require_nothing_given(
-    data: Dataset, reference: Path | str | Frame | None, reference_frame: int | None, options: ReadOptions
-) -> None:
-    if reference is not None or reference_frame is not None:
-        raise InputError(f"the trials of {data.folder} bring their reference frames; leave out --reference")
-    if options.given():
-        raise InputError(f"{data.folder} is a data set of sliplens, which does not take {spoken(options.given())}")
 
 
 def _chosen(trials: Sequence[Any], names: list[str], trial: str | None, source: Path | Frames) -> Sequence[Any]:
