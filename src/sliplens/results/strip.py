@@ -26,23 +26,7 @@ class StripReadings(Columns):
 
 @dataclass(frozen=True, kw_only=True)
 class Strip:
-    """One trial from stick to slip: true margin, read margin, and the map of a few frames.
-
-    Attributes
-    ----------
-    trial, condition, source
-        Trial that is shown, its condition, and `simulated` or `real`.
-    input, method
-        Input of the network that reads it, and explainer of the maps.
-    readings
-        Margins of every frame.
-    shown
-        Numbers of the frames that have pictures.
-    pictures
-        What the camera saw in them.
-    relevance
-        Signed contribution of each pixel to f(x) - f(untouched sensor), in margin units.
-    """
+    """One trial from stick to slip: true margin, read margin, and the map of a few frames."""
 
     trial: str
     condition: str
@@ -51,5 +35,7 @@ class Strip:
     method: str
     readings: StripReadings
     shown: tuple[int, ...]
+    """Numbers of the frames that have pictures and maps."""
     pictures: UInt8[np.ndarray, "shown height width 3"]
     relevance: Float32[np.ndarray, "shown rows columns"]
+    """Signed contribution of each pixel to f(x) - f(untouched sensor), in margin units."""

@@ -1,11 +1,6 @@
 """The experiment: pick frames, explain them, score the explanations, keep what was found."""
 
-from sliplens.study.explaining import (
-    ChosenFrames,
-    explain_frames,
-    frames_from_dataset,
-    frames_from_folder,
-)
+from sliplens.study.explaining import ChosenFrames, explain_frames, frames_from_dataset, frames_from_folder
 from sliplens.study.run import run_study
 from sliplens.study.scoring import score_explanations
 from sliplens.study.workspace import explain_source, explain_trial, score_explained

@@ -162,17 +162,7 @@ Maps = Float[np.ndarray, "frames height width"]
 def randomise_weights(
     material: Material, *, frames: int = 2, seed: int = 0, on_progress: OnProgress | None = None
 ) -> Randomisation:
-    """Explain networks whose weights are drawn anew from the output on, to see how far the maps change.
-
-    Parameters
-    ----------
-    frames
-        How many of the frames, from the first on.
-
-    References
-    ----------
-    See `sliplens.faithfulness.controls`.
-    """
+    """Explain networks with weights drawn anew from the output on, to see how far the maps of a few frames change."""
     inputs, references = material.inputs[:frames], material.references[:frames]
     methods, alarms = {}, []
     for name, whole in counted(material.explainers.items(), on_progress):
@@ -240,12 +230,10 @@ def explain_untrained(
 ) -> UntrainedMaps:
     """Explain the network with all weights drawn anew: a control that every map has to beat."""
     model = _untrained(material.trained.model, material.inputs, seed=seed)
-    maps = []
-    for index in counted(range(len(material.inputs)), on_progress):
-        frame = slice(index, index + 1)
-        maps.append(_influence(explainer(model, material.inputs[frame], reference=material.references[frame]))[0])
+    frames = list(zip(material.inputs.split(1), material.references.split(1), strict=True))
+    maps = [_influence(explainer(model, one, reference=empty)) for one, empty in counted(frames, on_progress)]
     return UntrainedMaps(
-        input=material.explained.input, source=material.explained.source, maps=np.stack(maps).astype(np.float64)
+        input=material.explained.input, source=material.explained.source, maps=np.concatenate(maps).astype(np.float64)
     )
 
 

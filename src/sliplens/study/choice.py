@@ -145,17 +145,16 @@ def show_states(choice: Choice, data: Dataset, *, on_progress: OnProgress | None
     in which they cannot be followed has none, and the result says why.
     """
     infos = {info.trial: info for info in data.trials}
-    tables: list[MarkerTable] = [_NO_MARKERS]
+    # so that the table of a study without markers has its columns
+    tables = [_table("", np.empty((0, 2)), np.empty((0, 2)))]
     shown, raw, difference, untracked = [], [], [], []
-    done, simulated = 0, True
-    for trial, group in groupby(choice.frames, key=lambda frame: frame.trial):
-        chosen = list(group)
+    simulated = True
+    groups = [(trial, list(own)) for trial, own in groupby(choice.frames, key=lambda frame: frame.trial)]
+    for trial, chosen in counted(groups, on_progress):
         recording = data.load(infos[trial])
         simulated = simulated and recording.truth is not None
         try:
-            tables += [
-                _table(frame.id, marked) for frame, marked in zip(chosen, _markers(recording, chosen), strict=True)
-            ]
+            tables += _markers(recording, chosen)
         except (ImageError, InputError) as error:
             untracked.append(f"{trial}: {error}")
         for frame in chosen:
@@ -170,9 +169,6 @@ def show_states(choice: Choice, data: Dataset, *, on_progress: OnProgress | None
                 )
                 raw.append(recording.frames[frame.frame])
                 difference.append(absolute_difference(raw[-1][None], recording.reference)[0])
-            done += 1
-            if on_progress is not None:
-                on_progress(done, len(choice.frames))
     return States(
         trial=next(frame.trial for frame in choice.frames if frame.shown),
         markers_from="simulation" if simulated else "tracking",
@@ -184,33 +180,20 @@ def show_states(choice: Choice, data: Dataset, *, on_progress: OnProgress | None
     )
 
 
-def _markers(recording: Recording, chosen: Sequence[ChosenFrame]) -> list[MarkedFrame]:
-    rows = [frame.frame for frame in chosen]
-    if recording.truth is not None:
-        truth = recording.truth
-        return [
-            MarkedFrame(rest_px=truth.marker_rest_px.astype(np.float64), now_px=truth.marker_px[row].astype(np.float64))
-            for row in rows
-        ]
-    tracks = track_markers(recording.frames[: max(rows) + 1], recording.reference)
-    followed = np.where(tracks.followed[..., None], tracks.position_px, np.nan)
-    return [MarkedFrame(rest_px=tracks.rest_px, now_px=followed[row]) for row in rows]
+def _markers(recording: Recording, chosen: Sequence[ChosenFrame]) -> list[MarkerTable]:
+    rows, truth = [frame.frame for frame in chosen], recording.truth
+    if truth is not None:
+        rest, places = truth.marker_rest_px.astype(np.float64), truth.marker_px.astype(np.float64)
+    else:
+        tracks = track_markers(recording.frames[: max(rows) + 1], recording.reference)
+        rest, places = tracks.rest_px, np.where(tracks.followed[..., None], tracks.position_px, np.nan)
+    return [_table(frame.id, rest, places[frame.frame]) for frame in chosen]
 
 
-def _table(frame_id: str, marked: MarkedFrame) -> MarkerTable:
-    count = len(marked.rest_px)
-    return MarkerTable(
-        frame_id=np.repeat(frame_id, count),
-        marker=np.arange(count),
-        rest_x_px=marked.rest_px[:, 0],
-        rest_y_px=marked.rest_px[:, 1],
-        x_px=marked.now_px[:, 0],
-        y_px=marked.now_px[:, 1],
-    )
-
-
-# so that the table of a study without markers has its columns
-_NO_MARKERS = _table("", MarkedFrame(rest_px=np.empty((0, 2)), now_px=np.empty((0, 2))))
+def _table(frame_id: str, rest: Float[np.ndarray, "markers 2"], now: Float[np.ndarray, "markers 2"]) -> MarkerTable:
+    names, marker = np.repeat(frame_id, len(rest)), np.arange(len(rest))
+    (rest_x, rest_y), (x, y) = rest.T, now.T
+    return MarkerTable(frame_id=names, marker=marker, rest_x_px=rest_x, rest_y_px=rest_y, x_px=x, y_px=y)
 
 
 def network_places(

@@ -2,8 +2,8 @@
 
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import product
+from dataclasses import dataclass, replace
+from itertools import islice, product
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from sliplens.explainers.table import network_images
 from sliplens.models import Run
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
-from sliplens.recordings.source import open_source
+from sliplens.recordings.source import TrialFrames, open_source
 from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
 
 DEFAULT_LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
@@ -53,15 +53,10 @@ def frames_from_dataset(
     trials: int = 1,
     levels: Sequence[float] = DEFAULT_LEVELS,
 ) -> ChosenFrames:
-    """Frames of the first trials of a split, at given safety margins.
+    """Frames of the first trials of a split, in the order of the data set's table, at given safety margins.
 
     For each trial and level the frame whose label is nearest is taken; at a level of 0 the first frame of full slip, at
     1 the last frame that is still fully stuck, so that each is next to the change.
-
-    Parameters
-    ----------
-    split, condition, trials
-        Which trials, and how many of them, in the order of the data set's table.
 
     Raises
     ------
@@ -74,38 +69,30 @@ def frames_from_dataset(
         raise InputError(f"levels must lie in [0, 1], got {', '.join(f'{level:g}' for level in levels)}")
     rows: dict[str, list[int]] = {}
     for info in data.select(split=split, condition=condition)[:trials]:
-        recording = data.load(info, truth=False)
-        margin = np.where(recording.labelled, recording.safety_margin, np.nan)
-        if not np.isfinite(margin).any():
-            raise RecordingError(f"trial {recording.trial} has no labelled frame; label it first")
-        rows[info.trial] = [nearest_frame(margin, level) for level in levels]
+        (opened,) = open_source(data, trial=info.trial)
+        rows[info.trial] = [nearest_frame(known_margin(opened), level) for level in levels]
     return frames_at(trained, data, rows)
+
+
+def known_margin(opened: TrialFrames) -> Float[np.ndarray, " frames"]:
+    """Labels of a trial, NaN where there is none."""
+    margin = opened.safety_margin
+    if margin is None or not np.isfinite(margin).any():
+        raise RecordingError(f"trial {opened.name} has no labelled frame; label it first")
+    return margin
 
 
 def frames_at(trained: Run, data: Dataset, rows: Mapping[str, Sequence[int]]) -> ChosenFrames:
     """Frames of a data set by trial and number."""
-    infos = {info.trial: info for info in data.trials}
-    images, references, labels, names = [], [], [], []
-    for trial, frames in rows.items():
-        if trial not in infos:
+    conditions = {info.trial: info.condition for info in data.trials}
+    parts = []
+    for trial, numbers in rows.items():
+        if trial not in conditions:
             raise RecordingError(f"{data.folder} has no trial {trial}; use the data set that the frames came from")
-        recording = data.load(infos[trial], truth=False)
-        chosen = list(frames)
-        inputs, empty = network_images(trained, recording.frames[chosen], recording.reference)
-        images.append(inputs)
-        references.append(empty.expand(len(chosen), -1, -1, -1))
-        labels.append(np.where(recording.labelled, recording.safety_margin, np.nan)[chosen])
-        names += [(f"{trial}-f{row:04d}", trial, recording.condition) for row in chosen]
-    ids, trials, conditions = zip(*names, strict=True)
-    return ChosenFrames(
-        ids=ids,
-        trial=trials,
-        condition=conditions,
-        safety_margin=np.concatenate(labels).astype(np.float32),
-        images=torch.cat(images),
-        references=torch.cat(references),
-        source=data.source,
-    )
+        (opened,) = open_source(data, trial=trial)
+        part = _take(trained, opened, numbers, trial=trial, source=data.source, condition=conditions[trial])
+        parts.append(part)
+    return _join(parts)
 
 
 def nearest_frame(margin: Float[np.ndarray, " frames"], level: float) -> int:
@@ -137,26 +124,35 @@ def frames_from_folder(
         If an image cannot be read, or has another size or kind of pixels.
     """
     parts = []
-    for trial in open_source(folder, reference=reference):
-        names = trial.files or [f"{trial.name}-f{number:04d}" for number in range(trial.frames)]
-        trained.require_frame_size(trial.frame_size, what=f"frames such as {names[0]}")
-        untouched = None if trial.read_reference is None else trial.read_reference()
-        images, empty = network_images(trained, np.stack(list(trial.read_frames())), untouched)
-        labels = np.full(trial.frames, np.nan) if trial.safety_margin is None else trial.safety_margin
+    for opened in open_source(folder, reference=reference):
+        name = folder.name if opened.files else opened.name
+        part = _take(trained, opened, range(opened.frames), trial=name, source="real", condition="unknown")
         if labels_in_names:
-            labels = np.array([_label(folder / name) for name in names])
-        parts.append(
-            ChosenFrames(
-                ids=tuple(Path(name).stem for name in names),
-                trial=(folder.name if trial.files else trial.name,) * trial.frames,
-                condition=("unknown",) * trial.frames,
-                safety_margin=labels.astype(np.float32),
-                images=images,
-                references=empty.expand(trial.frames, -1, -1, -1).clone(),
-                source="real",
-            )
-        )
+            margin = np.array([_label(folder / name) for name in opened.files or part.ids], dtype=np.float32)
+            part = replace(part, safety_margin=margin)
+        parts.append(part)
     return _join(parts)
+
+
+def _take(
+    trained: Run, opened: TrialFrames, numbers: Sequence[int], *, trial: str, source: str, condition: str
+) -> ChosenFrames:
+    names = opened.files or [f"{opened.name}-f{number:04d}" for number in range(opened.frames)]
+    trained.require_frame_size(opened.frame_size, what=f"frames such as {names[numbers[0]]}")
+    untouched = None if opened.read_reference is None else opened.read_reference()
+    first = islice(opened.read_frames(), max(numbers) + 1)
+    frames = {number: frame for number, frame in enumerate(first) if number in numbers}
+    images, empty = network_images(trained, np.stack([frames[number] for number in numbers]), untouched)
+    margin = np.full(opened.frames, np.nan) if opened.safety_margin is None else opened.safety_margin
+    return ChosenFrames(
+        ids=tuple(Path(names[number]).stem if opened.files else names[number] for number in numbers),
+        trial=(trial,) * len(numbers),
+        condition=(condition,) * len(numbers),
+        safety_margin=margin[list(numbers)].astype(np.float32),
+        images=images,
+        references=empty.expand(len(numbers), -1, -1, -1),
+        source=source,
+    )
 
 
 def _join(parts: Sequence[ChosenFrames]) -> ChosenFrames:
@@ -210,15 +206,8 @@ def explain_frames(
 ) -> Explained:
     """Explain frames with several methods.
 
-    Parameters
-    ----------
-    methods
-        Names in the table of explainers.
-    explainers
-        The table, where their options are not the default ones; a method whose options differ from frame to frame has
-        one explainer for each.
-    parts
-        Folder that keeps each map as soon as it is there, so that an interrupted run loses at most one.
+    A method whose options differ from frame to frame has one explainer for each. `parts` is a folder that keeps each
+    map as soon as it is there, so that an interrupted run loses at most one.
 
     Raises
     ------

@@ -390,12 +390,7 @@ class _Stages:
         return True
 
     def _run(
-        self,
-        name: tuple[str, ...],
-        kind: type[_Result],
-        config: Mapping[str, Any],
-        title: str,
-        work: _Work[_Result],
+        self, name: tuple[str, ...], kind: type[_Result], config: Mapping[str, Any], title: str, work: _Work[_Result]
     ) -> _Result:
         """Make a stage (of an input) that is not there yet, or read it."""
         target, what = self.folder / "-".join(name), title[0].lower() + title[1:]

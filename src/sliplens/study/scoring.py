@@ -1,33 +1,20 @@
 """Deletion score of the thesis, and the remedies that the thesis proposes for it."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from sliplens.errors import CheckpointError
-from sliplens.faithfulness import (
-    DeletionCurves,
-    deletion_curves,
-    deletion_score,
-    get_fill,
-    random_order,
-)
+from sliplens.faithfulness import DeletionCurves, deletion_curves, deletion_score, get_fill, random_order
 from sliplens.faithfulness.alarms import fill_decides, flat_maps, follows_last_step, saturated
 from sliplens.faithfulness.deletion import deletion_steps, saliency_orders
 from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.models import Run
 from sliplens.progress import OnProgress, continued
 from sliplens.results.explanation import Explained, ExplainedFrame
-from sliplens.results.faithfulness import (
-    DeletionScores,
-    DeletionTable,
-    MethodScore,
-    Remedies,
-    Variant,
-    VariantTable,
-)
+from sliplens.results.faithfulness import DeletionScores, DeletionTable, MethodScore, Remedies, Variant, VariantTable
 from sliplens.study.explaining import network_inputs
 from sliplens.study.material import Material
 
@@ -60,14 +47,7 @@ def score_explanations(
     seed: int = 0,
     on_progress: OnProgress | None = None,
 ) -> DeletionScores:
-    """Delete the most salient pixels step by step, for every method and for a random order.
-
-    Parameters
-    ----------
-    explained
-        Explanations of it.
-    fill, steps
-        What removed pixels become, and in how many steps (the image's height if None).
+    """Delete the most salient pixels for every method and a random order, in so many steps or the image's height.
 
     Raises
     ------
@@ -119,7 +99,7 @@ def score_remedies(
 ) -> Remedies:
     """Score maps by deletion that stops at half of the saliency, by deletion to the background, and by insertion.
 
-    The same frames scored by deletion to grey, as the thesis does, are given: stopping early needs no pass of its own.
+    Stopping early needs no pass of its own: the same frames, scored by deletion to grey, are given.
 
     References
     ----------
@@ -146,39 +126,32 @@ def score_remedies(
             name: _inserted(delete(name, "grey", order[:, ::-1].copy()), explained) for name, order in orders.items()
         },
     }
+    grey_deletion: dict[str, Any] = {"fill": "grey", "mode": "deletion", "stop": None, "better": "lower"}
     about = {
-        "stop-at-half": Variant(
-            summary="Grey fill; ends once every pixel with a saliency above 0.5 is gone, so that frames and methods "
+        "stop-at-half": grey_deletion
+        | {
+            "summary": "Grey fill; ends once every pixel with a saliency above 0.5 is gone, so that frames and methods "
             "end at different areas. Random orders end at the median area of the methods.",
-            fill="grey",
-            mode="deletion",
-            stop=_STOP,
-            better="lower",
-            methods={name: _score(own) for name, own in curves["stop-at-half"].items()},
-        ),
-        "background": Variant(
-            summary=f"Removed pixels become {background}, and all of them go.",
-            fill=background,
-            mode="deletion",
-            stop=None,
-            better="lower",
-            methods={name: _score(own) for name, own in curves["background"].items()},
-        ),
-        "insertion": Variant(
-            summary="From an image of nothing but grey, the most salient pixels come first; D against the answer on "
+            "stop": _STOP,
+        },
+        "background": grey_deletion
+        | {"summary": f"Removed pixels become {background}, and all of them go.", "fill": background},
+        "insertion": grey_deletion
+        | {
+            "summary": "From an image of nothing but grey, the most salient pixels come first; D against the answer on "
             "the whole image, so that a faithful map rises early.",
-            fill="grey",
-            mode="insertion",
-            stop=None,
-            better="higher",
-            methods={name: _score(own) for name, own in curves["insertion"].items()},
-        ),
+            "mode": "insertion",
+            "better": "higher",
+        },
     }
     return Remedies(
         input=explained.input,
         source=explained.source,
         steps=steps,
-        variants=about,
+        variants={
+            name: Variant(**about[name], methods={method: _score(one) for method, one in own.items()})
+            for name, own in curves.items()
+        },
         alarms=tuple(
             f"{name}: {alarm}" for name in ("stop-at-half", "background") for alarm in _method_alarms(curves[name])
         ),
@@ -200,27 +173,20 @@ def _orders(explained: Explained, *, seed: int) -> dict[str, Int[np.ndarray, "fr
     return orders | {CONTROL: np.stack([random_order(shape, rng=rng) for _ in explained.frames])}
 
 
-def _curve(
-    method: str,
-    frame: ExplainedFrame,
-    removed: Int[np.ndarray, " steps"],
-    answers: Float[np.ndarray, " steps"],
-    scores: Float[np.ndarray, " steps"],
-) -> DeletionTable:
-    steps = len(scores)
+def _curve(method: str, frame: ExplainedFrame, removed: np.ndarray, answers: np.ndarray, base: float) -> DeletionTable:
     return DeletionTable(
-        method=np.repeat(method, steps),
-        frame_id=np.repeat(frame.id, steps),
-        step=np.arange(steps),
+        method=np.repeat(method, len(answers)),
+        frame_id=np.repeat(frame.id, len(answers)),
+        step=np.arange(len(answers)),
         pixels_removed=removed,
         prediction=answers,
-        score=scores,
+        score=deletion_score(np.float64(base), answers),
     )
 
 
 def _split(method: str, curves: DeletionCurves, explained: Explained) -> list[DeletionTable]:
-    rows = zip(explained.frames, curves.predictions, curves.scores, strict=True)
-    return [_curve(method, frame, curves.pixels_removed, answers, scores) for frame, answers, scores in rows]
+    rows = zip(explained.frames, curves.predictions, curves.base, strict=True)
+    return [_curve(method, frame, curves.pixels_removed, answers, base) for frame, answers, base in rows]
 
 
 def _score(curves: Sequence[DeletionTable]) -> MethodScore:
@@ -240,8 +206,7 @@ def _stopped(grey: DeletionScores, explained: Explained) -> _Curves:
         for frame, pixels in zip(explained.frames, counts.get(name, median), strict=True):
             answers = curve.predictions[curve.frame_ids.index(frame.id)]
             end = int(np.searchsorted(curve.pixels_removed, int(pixels))) + 1
-            scores = deletion_score(np.full(len(answers), frame.prediction), answers)[:end]
-            stopped[name].append(_curve(name, frame, curve.pixels_removed[:end], answers[:end], scores))
+            stopped[name].append(_curve(name, frame, curve.pixels_removed[:end], answers[:end], frame.prediction))
     return stopped
 
 
@@ -251,8 +216,7 @@ def _inserted(curves: Sequence[DeletionTable], explained: Explained) -> list[Del
     for curve, frame in zip(curves, explained.frames, strict=True):
         removed = np.concatenate([[0], curve.pixels_removed[:-1]])[::-1]
         answers = np.concatenate([[frame.prediction], curve.prediction[:-1]])[::-1]
-        scores = deletion_score(np.full(len(answers), frame.prediction), answers)
-        turned.append(replace(curve, pixels_removed=removed.copy(), prediction=answers.copy(), score=scores))
+        turned.append(_curve(str(curve.method[0]), frame, removed.copy(), answers.copy(), frame.prediction))
     return turned
 
 

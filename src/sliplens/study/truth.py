@@ -97,6 +97,7 @@ def stage_frames(
     trained: Run, explained: Explained, data: Dataset, *, recipe: SimulationRecipe | None = None
 ) -> tuple[StagedFrame, ...]:
     """Make frames of a study ready to be drawn anew; the data set's folder has the recipe where none is given."""
+    require_same_network(trained, explained)
     if not data.simulated or explained.source != "simulated":
         raise InputError(f"{data.folder} was recorded: what each marker does is known of simulated frames alone")
     infos = {info.trial: info for info in data.trials}
@@ -111,7 +112,10 @@ def stage_frames(
         scene = rebuild_trial(data.folder, recording, recipe=recipe)
         for row in some:
             name = explained.frames[row].id
-            number = _number(name, trial, frames=len(recording.frames))
+            digits = name.removeprefix(f"{trial}-f")
+            if digits == name or not digits.isdecimal() or int(digits) >= len(recording.frames):
+                raise InputError(f"{name} does not name a frame of trial {trial}; explain frames of a data set")
+            number = int(digits)
             compared = trained.encoding.compare(recording.frames[number : number + 1], recording.reference)
             image = trained.encoding.resize(compared, image_size=trained.manifest.image_size)[0].numpy()
             if np.abs(image.astype(np.int16) - explained.images[row].astype(np.int16)).max() > _ROUNDING:
@@ -129,13 +133,6 @@ def stage_frames(
                 markers=visible_markers(scene.film.sensor),
             )
     return tuple(staged[row] for row in range(len(explained.frames)))
-
-
-def _number(name: str, trial: str, *, frames: int) -> int:
-    number = name.removeprefix(f"{trial}-f")
-    if number == name or not number.isdecimal() or int(number) >= frames:
-        raise InputError(f"{name} does not name a frame of trial {trial}; explain frames of a data set")
-    return int(number)
 
 
 def redrawing(trained: Run, frames: Sequence[StagedFrame]) -> Redraw:
@@ -221,9 +218,8 @@ def shuffle_half(values: Float[np.ndarray, " markers"], *, rng: np.random.Genera
 
 def _gains(curves: RemovalCurves, towards: float) -> Float[np.ndarray, "2 2"]:
     """Symmetric gains of two maps, each removed both ways, by the size of the changes and by their part `towards`."""
-    means = np.empty((2, len(curves.answers)))
-    means[0] = curves.mean_changes[:, 0]
-    means[1] = np.trapezoid(towards * (curves.answers[:, 0, :1] - curves.answers[:, 0]), curves.areas, axis=-1)
+    lost = np.trapezoid(curves.lost(np.array([towards]))[:, 0], curves.areas, axis=-1)
+    means = np.stack([curves.mean_changes[:, 0], lost])
     return means[:, ::2] - means[:, 1::2]
 
 
@@ -258,8 +254,8 @@ def mean_interval(values: Float[np.ndarray, " frames"], trials: np.ndarray, *, s
     known = np.isfinite(values)
     if not known.any():
         return None
-    none = np.zeros(int(known.sum()))
-    return paired_difference(values[known], none, trials=trials[known], rng=np.random.default_rng(seed))
+    values = values[known]
+    return paired_difference(values, 0 * values, trials=trials[known], rng=np.random.default_rng(seed))
 
 
 def meta_test(effects: Sequence[FrameEffects], trials: np.ndarray, *, seed: int) -> tuple[MetaTest, ...]:
@@ -322,21 +318,13 @@ def judge_by_truth(
     sign. Marker by marker it is the size of a map's mean that is compared with the size of the effect: a marker that
     works against the answer matters as much as one that works for it, and maps that know no sign can be compared too.
 
-    Parameters
-    ----------
-    maps
-        Influence by method, controls included: signed relevance times the sign of the answer's change from the
-        untouched sensor.
-    fills
-        Those under which a map that knows the effects is held against one that knows half of them.
-    recipe
-        What simulated the data set; read from its folder if None.
-    parts
-        Folder that keeps what is found of each frame, so that an interrupted run goes on after the last.
+    `maps` are influences by method, controls included; `fills` those under which a map that knows the effects is held
+    against one that knows half of them. The recipe of the simulation is read from the data set's folder if None.
     """
     for fill in fills:
         get_fill(fill)
-    frames, places = _stage(trained, explained, data, recipe=recipe)
+    frames = stage_frames(trained, explained, data, recipe=recipe)
+    places = [find_places(frame, image_size=trained.manifest.image_size) for frame in frames]
     effects = _find_effects(
         trained, explained, frames, places, fills=fills, seed=seed, parts=parts, on_progress=on_progress
     )
@@ -416,7 +404,8 @@ def true_curves(
     on_progress: OnProgress | None = None,
 ) -> dict[str, Faithfulness]:
     """Removal curves under the true fill: markers put back, most or least influential first, or in random orders."""
-    frames, places = _stage(trained, explained, data, recipe=recipe)
+    frames = stage_frames(trained, explained, data, recipe=recipe)
+    places = [find_places(frame, image_size=trained.manifest.image_size) for frame in frames]
     inputs = network_inputs(trained, explained)
     passes = len(frames) * (2 * len(maps) + random_orders) * (len(SHARES) - 2)
     return score_maps_by_marker(
@@ -428,14 +417,6 @@ def true_curves(
         random_orders=random_orders,
         on_progress=on_progress,
     )
-
-
-def _stage(
-    trained: Run, explained: Explained, data: Dataset, *, recipe: SimulationRecipe | None
-) -> tuple[tuple[StagedFrame, ...], list[Places]]:
-    require_same_network(trained, explained)
-    frames = stage_frames(trained, explained, data, recipe=recipe)
-    return frames, [find_places(frame, image_size=trained.manifest.image_size) for frame in frames]
 
 
 def _paint(places: Sequence[Places], values: Sequence[Float[np.ndarray, " markers"]]) -> Maps:
@@ -493,9 +474,7 @@ def _find_effects(
             gains={name: _gains(own, towards) for name, own in curves.items()},
         )
 
-    def part(index: int) -> Path | None:
-        return None if parts is None else parts / f"{index:05d}"
-
     return [
-        keep_part(part(index), FrameEffects, partial(find, index)) for index in counted(range(len(frames)), on_progress)
+        keep_part(parts and parts / f"{index:05d}", FrameEffects, partial(find, index))
+        for index in counted(range(len(frames)), on_progress)
     ]

@@ -130,8 +130,10 @@ def explain_source(
             shutil.rmtree(output.folder / "parts")
             draw_explained(explained, output.folder, colours=colours)
             save_result(explained, output.folder)
-            for warning, names in _warned(explained).items():
-                note(on_progress, f"{', '.join(names)}: {warning}")
+            warnings = dict.fromkeys(warning for notes in explained.methods.values() for warning in notes.warnings)
+            for warning in warnings:
+                warned = [method for method, notes in explained.methods.items() if warning in notes.warnings]
+                note(on_progress, f"{', '.join(warned)}: {warning}")
     wrote(on_progress, out, what, kept=output.complete)
     return load_explained(out)
 
@@ -150,20 +152,8 @@ def score_explained(
 ) -> DeletionScores:
     """Score explanations by deletion, as the thesis does, beside a random order.
 
-    Parameters
-    ----------
-    run
-        The network that was explained, its folder, or the name of one that comes with sliplens.
-    explanations
-        What `explain_source` gave, or its folder.
-    fill
-        What removed pixels become, a row of `FILLS`.
-    steps
-        Steps until every pixel is gone; the image's height if None, as in the thesis.
-    device
-        Where a network that is loaded here runs.
-    out
-        Folder to write: curves and scores; nowhere if None.
+    `run` is the network that was explained, `fill` a row of `FILLS`; as in the thesis every pixel is gone after as many
+    steps as the image is high if `steps` is None. Curves and scores are written to the folder `out`, if it is named.
 
     Raises
     ------
@@ -177,9 +167,10 @@ def score_explained(
     explained = explanations if isinstance(explanations, Explained) else load_explained(explanations)
     require_same_network(trained, explained)
     title = f"Deleting pixels ({explained.input}, {explained.source})"
+    score = partial(score_explanations, trained, explained, fill=fill, steps=steps, seed=seed)
     if out is None:
         with stage(on_progress, title) as count:
-            return score_explanations(trained, explained, fill=fill, steps=steps, seed=seed, on_progress=count)
+            return score(on_progress=count)
     recipe = {
         "weights_sha256": trained.manifest.weights_sha256,
         "maps_sha256": hashlib.sha256(b"".join(maps.tobytes() for maps in explained.saliency.values())).hexdigest(),
@@ -192,19 +183,14 @@ def score_explained(
     with output_folder(out, stage="score", config=recipe, overwrite=overwrite) as output:
         if not output.complete:
             with stage(on_progress, title) as count:
-                scores = score_explanations(trained, explained, fill=fill, steps=steps, seed=seed, on_progress=count)
-            save_result(scores, output.folder)
+                save_result(score(on_progress=count), output.folder)
     wrote(on_progress, out, "curves and scores", kept=output.complete)
     return load_result(out, DeletionScores, command="sliplens score")
 
 
 def draw_explained(explained: Explained, folder: Path, *, colours: Literal["inferno", "jet"]) -> None:
     """Write an overlay of every map (`overlays/METHOD/FRAME.png`), and all of them side by side (`panel.png`)."""
-    lay = (
-        overlay_jet
-        if colours == "jet"
-        else lambda picture, saliency: overlay_saliency(picture, stretch_saliency(saliency))
-    )
+    lay = overlay_jet if colours == "jet" else lambda picture, map_: overlay_saliency(picture, stretch_saliency(map_))
     rows = {"Input": list(explained.pictures)}
     for method, maps in explained.saliency.items():
         (overlays := folder / "overlays" / method).mkdir(parents=True, exist_ok=True)
@@ -222,15 +208,6 @@ def draw_explained(explained: Explained, folder: Path, *, colours: Literal["infe
     ]
     with drawing_style():
         draw_panel(rows, titles=titles).savefig(folder / "panel.png")
-
-
-def _warned(explained: Explained) -> dict[str, list[str]]:
-    """Methods by what they warned of."""
-    warned: dict[str, list[str]] = {}
-    for method, notes in explained.methods.items():
-        for warning in notes.warnings:
-            warned.setdefault(warning, []).append(method)
-    return warned
 
 
 def _choose_explainers(
@@ -276,7 +253,6 @@ def _occlude_markers(
     return [Occlusion(markers_px=centres) for centres in places]
 
 
-_LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 _CONFIDENCE = 0.9
 
 
@@ -287,21 +263,13 @@ def explain_trial(
     source: str,
     method: str = "poly-cam",
     budget: float = 1.0,
-    levels: Sequence[float] = _LEVELS,
+    levels: Sequence[float] = DEFAULT_LEVELS,
     on_progress: OnProgress | None = None,
 ) -> Strip:
     """Read every frame of a trial, and explain those nearest to a few safety margins.
 
-    Parameters
-    ----------
-    source
-        `simulated` or `real`.
-    method
-        Explainer of the maps (`study_explainers`).
-    budget
-        Share of the channels that `poly-cam` measures at first.
-    levels
-        Safety margins whose frames are explained, in [0, 1]; a frame that is nearest to two is shown once.
+    The frames are those nearest to `levels` in [0, 1], each shown once; `source` is `simulated` or `real`, and `budget`
+    the share of the channels that `poly-cam` measures at first.
     """
     margin = np.where(recording.labelled, recording.safety_margin, np.nan)
     if not np.isfinite(margin).any():
