@@ -30,10 +30,7 @@ def choice(network: Run, fine_dataset: Dataset) -> Choice:
 def material(network: Run, fine_dataset: Dataset, choice: Choice) -> Material:
     """Six scored frames of two trials, their maps, and a grid of markers that does not move."""
     explainers = study_explainers(METHODS)
-    rows: dict[str, list[int]] = {}
-    for frame in choice.frames:
-        rows.setdefault(frame.trial, []).append(frame.frame)
-    chosen = frames_at(network, fine_dataset, rows)
+    chosen = frames_at(network, fine_dataset, [(frame.trial, frame.frame) for frame in choice.frames])
     x, y = np.meshgrid(np.arange(6, 48, 9.0), np.arange(6, 48, 9.0))
     grid = np.stack([x.ravel(), y.ravel()], axis=1)
     return gather(

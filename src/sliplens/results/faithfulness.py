@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Float64, Int, Int64, Shaped
@@ -11,6 +11,7 @@ from jaxtyping import Float64, Int, Int64, Shaped
 from sliplens.codec import Columns
 from sliplens.intervals import Difference
 
+_Rows = TypeVar("_Rows", "DeletionTable", "RemovalTable")
 Key = tuple[str, str, str]
 """Fill, unit and method."""
 
@@ -212,46 +213,37 @@ class RemovalScores:
     @cached_property
     def curves(self) -> dict[Key, RemovalCurve]:
         """Curves by fill, unit and method, frames sorted by their ids."""
-        return {
-            (fill, unit, method): _removal_curve(rows, f"{fill} / {unit} / {method}")
-            for (fill, unit, method), rows in self.table.groups("fill", "unit", "method").items()
-        }
+        by_key = self.table.groups("fill", "unit", "method")
+        return {(key[0], key[1], key[2]): _removal_curve(rows, " / ".join(key)) for key, rows in by_key.items()}
 
 
 def _deletion_curve(rows: DeletionTable, name: str) -> DeletionCurve:
-    ids, _, order = _sort_by_frame(rows.frame_id, rows.step, f"lacks steps of some frames under {name!r}")
-    ordered, shape = rows.where(order), (len(ids), -1)
-    return DeletionCurve(
-        frame_ids=ids,
-        pixels_removed=ordered.pixels_removed.reshape(shape)[0],
-        scores=ordered.score.reshape(shape),
-        predictions=ordered.prediction.reshape(shape),
+    ids, ordered = _sort_by_frame(rows, rows.step, f"lacks steps of some frames under {name!r}")
+    pixels, scores, predictions = (
+        values.reshape(len(ids), -1) for values in (ordered.pixels_removed, ordered.score, ordered.prediction)
     )
+    return DeletionCurve(frame_ids=ids, pixels_removed=pixels[0], scores=scores, predictions=predictions)
 
 
 def _removal_curve(rows: RemovalTable, name: str) -> RemovalCurve:
-    ids, areas, order = _sort_by_frame(rows.frame_id, rows.area, f"lacks areas of some frames under {name}")
-    ordered, shape = rows.where(order), (len(ids), -1)
+    ids, ordered = _sort_by_frame(rows, rows.area, f"lacks areas of some frames under {name}")
+    trials, areas, most, least, random = (
+        values.reshape(len(ids), -1)
+        for values in (ordered.trial, ordered.area, ordered.most_first, ordered.least_first, ordered.random)
+    )
     return RemovalCurve(
-        frame_ids=ids,
-        trials=ordered.trial.reshape(shape)[:, 0],
-        areas=areas,
-        most_first=ordered.most_first.reshape(shape),
-        least_first=ordered.least_first.reshape(shape),
-        random=ordered.random.reshape(shape),
+        frame_ids=ids, trials=trials[:, 0], areas=areas[0], most_first=most, least_first=least, random=random
     )
 
 
-def _sort_by_frame(
-    frame_id: np.ndarray, step: np.ndarray, complaint: str
-) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """Frames, steps, and the rows sorted by both, each pair of which must be there once."""
-    ids, frame_at = np.unique(frame_id, return_inverse=True)
+def _sort_by_frame(rows: _Rows, step: np.ndarray, complaint: str) -> tuple[tuple[str, ...], _Rows]:
+    """Frames, and the rows sorted by frame and step, each pair of which must be there once."""
+    ids, frame_at = np.unique(rows.frame_id, return_inverse=True)
     steps, step_at = np.unique(step, return_inverse=True)
     cells = frame_at * len(steps) + step_at
-    if len(cells) != len(ids) * len(steps) or len(np.unique(cells)) != len(cells):
+    if not np.array_equal(np.sort(cells), np.arange(len(ids) * len(steps))):
         raise ValueError(complaint)
-    return tuple(ids.tolist()), steps, np.argsort(cells)
+    return tuple(ids.tolist()), rows.where(np.argsort(cells))
 
 
 def _require_curves(names: Iterable[str | Key], curves: Mapping[Any, object]) -> None:

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice, product
+from itertools import groupby, islice, product
 from pathlib import Path
 
 import numpy as np
@@ -67,31 +67,31 @@ def frames_from_dataset(
     """
     if any(not 0 <= level <= 1 for level in levels):
         raise InputError(f"levels must lie in [0, 1], got {', '.join(f'{level:g}' for level in levels)}")
-    rows: dict[str, list[int]] = {}
+    rows: list[tuple[str, int]] = []
     for info in data.select(split=split, condition=condition)[:trials]:
         (opened,) = open_source(data, trial=info.trial)
-        rows[info.trial] = [nearest_frame(known_margin(opened), level) for level in levels]
+        margin = known_margin(opened.name, opened.safety_margin)
+        rows += [(info.trial, nearest_frame(margin, level)) for level in levels]
     return frames_at(trained, data, rows)
 
 
-def known_margin(opened: TrialFrames) -> Float[np.ndarray, " frames"]:
-    """Labels of a trial, NaN where there is none."""
-    margin = opened.safety_margin
+def known_margin(trial: str, margin: Float[np.ndarray, " frames"] | None) -> Float[np.ndarray, " frames"]:
+    """Labels of a trial, of which one at least is known."""
     if margin is None or not np.isfinite(margin).any():
-        raise RecordingError(f"trial {opened.name} has no labelled frame; label it first")
+        raise RecordingError(f"trial {trial} has no labelled frame; label it first")
     return margin
 
 
-def frames_at(trained: Run, data: Dataset, rows: Mapping[str, Sequence[int]]) -> ChosenFrames:
-    """Frames of a data set by trial and number."""
+def frames_at(trained: Run, data: Dataset, frames: Sequence[tuple[str, int]]) -> ChosenFrames:
+    """Frames of a data set by trial and number, those of a trial one after another."""
     conditions = {info.trial: info.condition for info in data.trials}
     parts = []
-    for trial, numbers in rows.items():
+    for trial, own in groupby(frames, key=lambda frame: frame[0]):
         if trial not in conditions:
             raise RecordingError(f"{data.folder} has no trial {trial}; use the data set that the frames came from")
         (opened,) = open_source(data, trial=trial)
-        part = _take(trained, opened, numbers, trial=trial, source=data.source, condition=conditions[trial])
-        parts.append(part)
+        numbers = [number for _, number in own]
+        parts.append(_take(trained, opened, numbers, trial=trial, source=data.source, condition=conditions[trial]))
     return _join(parts)
 
 

@@ -1,8 +1,8 @@
 """What the scores of one network work on: its explanations, what was explained, and the fastest way to ask it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any
+from dataclasses import dataclass, is_dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -51,15 +51,18 @@ def as_the_thesis_ran(explainers: Mapping[str, Explainer]) -> dict[str, Explaine
     }
 
 
-def method_options(explainers: Mapping[str, Explainer]) -> dict[str, dict[str, Any]]:
+Option: TypeAlias = bool | int | float | str | Likeness | Tensor | None
+"""Value of a field of an explainer."""
+
+
+def method_options(explainers: Mapping[str, Explainer]) -> dict[str, dict[str, Option]]:
     """Options of each explainer by name: what a map depends on beside the network and the frame."""
     return {
         name: {
-            one.name: getattr(explainer, one.name)
-            # a row that an installed package added may be any callable
-            for one in (fields(explainer) if is_dataclass(explainer) else ())
-            # what finds markers is code, not an option
-            if not callable(getattr(explainer, one.name))
+            option: value
+            # a row that an installed package added may be any callable; what finds markers is code, not an option
+            for option, value in (vars(explainer) if is_dataclass(explainer) else {}).items()
+            if not callable(value)
         }
         for name, explainer in explainers.items()
     }
@@ -128,16 +131,12 @@ def gather(
     """Gather what the scores need of the chosen frames, each of which is explained."""
     places = {frame.id: at for at, frame in enumerate(explained.frames)}
     counted = explained.take([places[frame.id] for frame in chosen])
-    by_trial: dict[str, list[int]] = {}
-    for frame in chosen:
-        by_trial.setdefault(frame.trial, []).append(frame.frame)
-    frames = frames_at(trained, data, by_trial)
-    rows = [frames.ids.index(frame.id) for frame in chosen]
+    frames = frames_at(trained, data, [(frame.trial, frame.frame) for frame in chosen])
     return Material(
         trained=trained,
         explained=counted,
         inputs=network_inputs(trained, counted),
-        references=frames.references[rows].to(trained.device),
+        references=frames.references.to(trained.device),
         chosen=chosen,
         markers=markers,
         explainers=explainers,

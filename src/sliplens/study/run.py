@@ -234,9 +234,6 @@ class _Stages:
     def judge(self, name: str) -> None:
         """Explain the frames with one network's methods, and judge the explanations in every way but by the clock."""
         run, found, seed, chosen = self.networks[name], self.found[name], self.seed, self._choice.frames
-        rows: dict[str, list[int]] = {}
-        for frame in chosen:
-            rows.setdefault(frame.trial, []).append(frame.frame)
         found["explain"] = self._run(
             ("explain", name),
             Explained,
@@ -244,7 +241,7 @@ class _Stages:
             f"Explaining {len(chosen)} frames ({name})",
             lambda parts, count: explain_frames(
                 run,
-                frames_at(run, self.data, rows),
+                frames_at(run, self.data, [(frame.trial, frame.frame) for frame in chosen]),
                 methods=list(self.explainers),
                 explainers=self.explainers,
                 parts=parts,

@@ -180,7 +180,7 @@ def _curve(method: str, frame: ExplainedFrame, removed: np.ndarray, answers: np.
         step=np.arange(len(answers)),
         pixels_removed=removed,
         prediction=answers,
-        score=deletion_score(np.float64(base), answers),
+        score=deletion_score(np.full(len(answers), base), answers),
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from sliplens.codec import load_result, save_result
-from sliplens.errors import InputError, RecordingError
+from sliplens.errors import InputError
 from sliplens.explainers import EXPLAINERS, ExpectedGradients, Explainer, Occlusion, get_explainer
 from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
 from sliplens.explainers.table import open_run
@@ -34,6 +34,7 @@ from sliplens.study.explaining import (
     explain_frames,
     frames_from_dataset,
     frames_from_folder,
+    known_margin,
     nearest_frame,
     require_methods,
 )
@@ -67,23 +68,15 @@ def explain_source(
 
     Parameters
     ----------
-    run
-        The network, its folder, or the name of one that comes with sliplens.
-    source
-        A data set; or a folder of images, or a recording: camera frames if a reference is given or the recording
-        brings one, else absolute difference images.
-    reference
-        Image of the untouched sensor, for camera frames that bring none.
+    source, reference
+        A data set; or a folder of images, or a recording: camera frames if an image of the untouched sensor is given
+        or the recording brings one, else absolute difference images.
     labels_in_names
         Read the safety margin in percent from names of images such as `image_433_20.png`.
-    methods
-        Rows of `EXPLAINERS`.
-    budget
-        Share of the channels that `poly-cam` measures at first.
+    methods, budget
+        Rows of `EXPLAINERS`, and the share of the channels that `poly-cam` measures at first.
     split, condition, trials, levels
         Which trials of a data set and how many, and the safety margins at which frames are taken.
-    device
-        Where a network that is loaded here runs: cpu, cuda or cuda:1.
     out
         Folder to write: maps, overlays of every map, all of them side by side; nowhere if None. A folder that was
         interrupted goes on after its last map.
@@ -271,9 +264,7 @@ def explain_trial(
     The frames are those nearest to `levels` in [0, 1], each shown once; `source` is `simulated` or `real`, and `budget`
     the share of the channels that `poly-cam` measures at first.
     """
-    margin = np.where(recording.labelled, recording.safety_margin, np.nan)
-    if not np.isfinite(margin).any():
-        raise RecordingError(f"trial {recording.trial} has no labelled frame; label it first")
+    margin = known_margin(recording.trial, np.where(recording.labelled, recording.safety_margin, np.nan))
     shown = tuple(sorted({nearest_frame(margin, level) for level in levels}))
     inputs = run.encode(recording.frames, recording.reference)
     estimate = run.estimate(inputs)
