@@ -13,7 +13,7 @@ from sliplens.models.checkpoint import load
 from sliplens.progress import OnProgress, stage, wrote
 from sliplens.recordings import Dataset
 from sliplens.report import write_report
-from sliplens.results.strip import Strip
+from sliplens.results.explanation import Strip
 from sliplens.simulation.trials import simulate
 from sliplens.study import explain_source, explain_trial, run_study, score_explained
 from sliplens.study.curves import Setting

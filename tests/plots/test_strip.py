@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sliplens.plots.strip import draw_strip
-from sliplens.results.strip import Strip, StripReadings
+from sliplens.results.explanation import Strip, StripReadings
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import pytest
 from sliplens.codec import load_result, save_result
 from sliplens.errors import RecordingError
 from sliplens.models import load_checkpoint
-from sliplens.results.strip import Strip
+from sliplens.results.explanation import Strip
 from sliplens.study.workspace import explain_trial
 
 from ..conftest import make_recording

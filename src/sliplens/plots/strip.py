@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from sliplens.plots.layout import place_axes, place_text
 from sliplens.plots.style import BLACK, BLUE, INPUT_NAMES, SOURCE_NAMES, VERMILLION, drawing_style, method_name
-from sliplens.results.strip import Strip
+from sliplens.results.explanation import Strip
 
 _WIDTH_IN, _MARGIN_IN, _GAP_IN, _CHART_IN = 10.0, 0.75, 0.08, 2.2
 _COLOURS = "RdBu"

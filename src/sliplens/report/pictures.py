@@ -53,9 +53,8 @@ from sliplens.report.plates import (
 )
 from sliplens.report.results import Results
 from sliplens.report.verdict import rank_methods
-from sliplens.results.explanation import Explained
+from sliplens.results.explanation import Explained, Strip
 from sliplens.results.faithfulness import DeletionCurve, DeletionScores
-from sliplens.results.strip import Strip
 from sliplens.results.study import StateFrame, States, Truth
 
 SHARES = (0.01, 0.05, 0.1, 0.2, 0.5, 1.0)

@@ -9,12 +9,10 @@ from sliplens.errors import InputError
 from sliplens.files import RUN_FILE, Provenance, require_folder
 from sliplens.recordings.dataset import load_dataset
 from sliplens.results.evaluation import Evaluation
-from sliplens.results.explanation import Explained, load_explained
+from sliplens.results.explanation import Explained, Strip, load_explained
 from sliplens.results.faithfulness import DeletionScores, Remedies, RemovalScores
-from sliplens.results.simulation import Simulation, describe_simulation
-from sliplens.results.strip import Strip
 from sliplens.results.study import TABLES, Choice, MapQuality, Randomisation, States, Study, Timing, Truth
-from sliplens.results.training import Training
+from sliplens.results.training import Simulation, Training, describe_simulation
 
 _OF_A_COMMAND: dict[str, type] = {"train": Training, "evaluate": Evaluation, "score": DeletionScores, "strip": Strip}
 _OF_A_STUDY: dict[str, type] = {

@@ -13,9 +13,8 @@ from sliplens.results.evaluation import (
 )
 from sliplens.results.explanation import Explained, ExplainedFrame, load_explained
 from sliplens.results.faithfulness import DeletionCurve, DeletionScores, Remedies, RemovalCurve, RemovalScores
-from sliplens.results.simulation import Simulation, SplitCount, describe_simulation
 from sliplens.results.study import Choice, MapQuality, Randomisation, States, Study, Timing, Truth
-from sliplens.results.training import LearningCurve, Training
+from sliplens.results.training import LearningCurve, Simulation, SplitCount, Training, describe_simulation
 
 __all__ = [
     "BaselinePredictions",

@@ -125,8 +125,7 @@ def score_removal(
             areas = next(iter(scored.values())).areas
             return _SettingCurves(areas=areas, curves={name: own.curves for name, own in scored.items()})
 
-        part = None if parts is None else parts / f"{setting.fill}-{setting.unit}"
-        kept = keep_part(part, _SettingCurves, find)
+        kept = keep_part(parts and parts / f"{setting.fill}-{setting.unit}", _SettingCurves, find)
         curves[setting] = {name: Faithfulness(areas=kept.areas, curves=own) for name, own in kept.curves.items()}
     whole = answer_whole(predict, inputs, batch_size=64)
     blank = {setting.fill: _answer_blank(predict, material, setting.fill, seed) for setting in known}
@@ -227,26 +226,25 @@ def ranking_alarms(curves: Curves) -> list[str]:
 
 
 def _table(curves: Curves, explained: Explained) -> RemovalTable:
-    margins = [np.nan if frame.safety_margin is None else frame.safety_margin for frame in explained.frames]
-    tables = []
+    frames, tables = explained.frames, []
+    margins = np.array([np.nan if frame.safety_margin is None else frame.safety_margin for frame in frames])
     for setting, own in curves.items():
         for name, curve in own.items():
-            frames, steps = curve.curves.shape[1:]
-            if frames != len(explained.frames):
-                raise InputError(f"{frames} curves of {name} for {len(explained.frames)} frames; make the study again")
-            rows = frames * steps
-            tables.append(
-                RemovalTable(
-                    fill=np.repeat(setting.fill, rows),
-                    unit=np.repeat(setting.unit, rows),
-                    method=np.repeat(name, rows),
-                    frame_id=np.repeat([frame.id for frame in explained.frames], steps),
-                    trial=np.repeat([frame.trial for frame in explained.frames], steps),
-                    safety_margin=np.repeat(np.array(margins, dtype=np.float64), steps),
-                    area=np.tile(curve.areas, frames),
-                    most_first=curve.curves[0].ravel(),
-                    least_first=curve.curves[1].ravel(),
-                    random=curve.curves[2].ravel(),
-                )
+            count, steps = curve.curves.shape[1:]
+            if count != len(frames):
+                raise InputError(f"{count} curves of {name} for {len(frames)} frames; make the study again")
+            most_first, least_first, random = curve.curves.reshape(3, -1)
+            table = RemovalTable(
+                fill=np.repeat(setting.fill, count * steps),
+                unit=np.repeat(setting.unit, count * steps),
+                method=np.repeat(name, count * steps),
+                frame_id=np.repeat([frame.id for frame in frames], steps),
+                trial=np.repeat([frame.trial for frame in frames], steps),
+                safety_margin=np.repeat(margins, steps),
+                area=np.tile(curve.areas, count),
+                most_first=most_first,
+                least_first=least_first,
+                random=random,
             )
+            tables.append(table)
     return RemovalTable.joined(tables)

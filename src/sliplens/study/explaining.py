@@ -3,6 +3,7 @@
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import groupby, islice, product
 from pathlib import Path
 
@@ -231,8 +232,8 @@ def explain_frames(
 
     maps: dict[str, list[_Map]] = {method: [] for method in methods}
     for method, index in counted(list(product(methods, range(len(inputs)))), on_progress):
-        part = None if parts is None else parts / f"{method}-{index:05d}"
-        maps[method].append(keep_part(part, _Map, lambda method=method, index=index: explain(method, index)))
+        part = parts and parts / f"{method}-{index:05d}"
+        maps[method].append(keep_part(part, _Map, partial(explain, method, index)))
     # the same answers for every method: asked once, on all frames
     predictions, untouched = trained.predict(inputs).tolist(), trained.predict(chosen.references).tolist()
     return Explained(

@@ -37,7 +37,6 @@ from sliplens.recordings import Dataset
 from sliplens.recordings.trial import SLIPS
 from sliplens.results.explanation import Explained
 from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTest, OracleTest, Truth
-from sliplens.simulation import SimulationRecipe
 from sliplens.simulation.information import visible_markers
 from sliplens.simulation.intervention import (
     FilmedTrial,
@@ -93,10 +92,8 @@ class Places:
         return np.append(values, 0.0)[self.units]
 
 
-def stage_frames(
-    trained: Run, explained: Explained, data: Dataset, *, recipe: SimulationRecipe | None = None
-) -> tuple[StagedFrame, ...]:
-    """Make frames of a study ready to be drawn anew; the data set's folder has the recipe where none is given."""
+def stage_frames(trained: Run, explained: Explained, data: Dataset) -> tuple[StagedFrame, ...]:
+    """Make frames of a study ready to be drawn anew."""
     require_same_network(trained, explained)
     if not data.simulated or explained.source != "simulated":
         raise InputError(f"{data.folder} was recorded: what each marker does is known of simulated frames alone")
@@ -109,7 +106,7 @@ def stage_frames(
     staged: dict[int, StagedFrame] = {}
     for trial, some in rows.items():
         recording = data.load(infos[trial])
-        scene = rebuild_trial(data.folder, recording, recipe=recipe)
+        scene = rebuild_trial(data.folder, recording)
         for row in some:
             name = explained.frames[row].id
             digits = name.removeprefix(f"{trial}-f")
@@ -307,7 +304,6 @@ def judge_by_truth(
     *,
     maps: Mapping[str, Maps],
     fills: Sequence[str] = TRUTH_FILLS,
-    recipe: SimulationRecipe | None = None,
     seed: int = 0,
     parts: Path | None = None,
     on_progress: OnProgress | None = None,
@@ -319,11 +315,11 @@ def judge_by_truth(
     works against the answer matters as much as one that works for it, and maps that know no sign can be compared too.
 
     `maps` are influences by method, controls included; `fills` those under which a map that knows the effects is held
-    against one that knows half of them. The recipe of the simulation is read from the data set's folder if None.
+    against one that knows half of them.
     """
     for fill in fills:
         get_fill(fill)
-    frames = stage_frames(trained, explained, data, recipe=recipe)
+    frames = stage_frames(trained, explained, data)
     places = [find_places(frame, image_size=trained.manifest.image_size) for frame in frames]
     effects = _find_effects(
         trained, explained, frames, places, fills=fills, seed=seed, parts=parts, on_progress=on_progress
@@ -398,13 +394,12 @@ def true_curves(
     data: Dataset,
     *,
     maps: Mapping[str, Maps],
-    recipe: SimulationRecipe | None = None,
     random_orders: int = RANDOM_ORDERS,
     seed: int = 0,
     on_progress: OnProgress | None = None,
 ) -> dict[str, Faithfulness]:
     """Removal curves under the true fill: markers put back, most or least influential first, or in random orders."""
-    frames = stage_frames(trained, explained, data, recipe=recipe)
+    frames = stage_frames(trained, explained, data)
     places = [find_places(frame, image_size=trained.manifest.image_size) for frame in frames]
     inputs = network_inputs(trained, explained)
     passes = len(frames) * (2 * len(maps) + random_orders) * (len(SHARES) - 2)

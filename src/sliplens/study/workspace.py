@@ -24,9 +24,8 @@ from sliplens.plots.style import drawing_style, method_name, percent
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.source import open_source
-from sliplens.results.explanation import Explained, load_explained
+from sliplens.results.explanation import Explained, Strip, StripReadings, load_explained
 from sliplens.results.faithfulness import DeletionScores
-from sliplens.results.strip import Strip, StripReadings
 from sliplens.study.explaining import (
     DEFAULT_LEVELS,
     DEFAULT_METHODS,
