@@ -30,6 +30,11 @@ class ChosenTrial:
     worst_error: dict[str, float]
     """Largest error over the chosen frames in margin units, by input."""
 
+    @property
+    def worst(self) -> float:
+        """Largest error of any network."""
+        return max(self.worst_error.values())
+
 
 @dataclass(frozen=True, kw_only=True)
 class ChosenFrame:
@@ -140,13 +145,10 @@ class States:
     @cached_property
     def markers(self) -> dict[str, MarkedFrame]:
         """Markers by frame, in the order of their numbers; frames in which none could be followed are absent."""
+        rows = self.table.where(np.argsort(self.table.marker, kind="stable"))
         return {
-            frame: MarkedFrame(
-                rest_px=np.stack([rows.rest_x_px, rows.rest_y_px], axis=1),
-                now_px=np.stack([rows.x_px, rows.y_px], axis=1),
-            )
-            for (frame,), unsorted in self.table.groups("frame_id").items()
-            for rows in [unsorted.where(np.argsort(unsorted.marker, kind="stable"))]
+            frame: MarkedFrame(rest_px=np.c_[own.rest_x_px, own.rest_y_px], now_px=np.c_[own.x_px, own.y_px])
+            for (frame,), own in rows.groups("frame_id").items()
         }
 
 

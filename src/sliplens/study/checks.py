@@ -77,12 +77,8 @@ def measure_maps(
         methods=methods,
         # stability was tried on few frames: no interval would mean anything
         comparisons=tuple(
-            Roughness(
-                first=first,
-                second=second,
-                gap=paired_difference(roughness[first], roughness[second], trials=material.trials, rng=rng),
-            )
-            for first, second in combinations(roughness, 2)
+            Roughness(first=first, second=second, gap=paired_difference(one, other, trials=material.trials, rng=rng))
+            for (first, one), (second, other) in combinations(roughness.items(), 2)
         ),
     )
 

@@ -14,7 +14,7 @@ from sliplens.models import Run
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset, Recording
 from sliplens.results.study import Choice, ChosenFrame, ChosenTrial, MarkedFrame, MarkerTable, ShownFrame, States
-from sliplens.study.explaining import DEFAULT_LEVELS, nearest_frame
+from sliplens.study.explaining import DEFAULT_LEVELS, nearest_frame, require_levels
 
 SCORED_LEVELS = (0.4, 0.2, 0.0)
 """Margins at which the thesis scores: near slip, where there is much to explain."""
@@ -52,14 +52,9 @@ def choose_frames(
         raise InputError(f"a study of {trials} trials is impossible; ask for 1 or more")
     if not 0 <= tolerance <= 1:
         raise InputError(f"the tolerance is {tolerance:g}; give a share of the margin between 0 and 1")
-    if any(not 0 <= level <= 1 for level in levels):
-        raise InputError(f"levels must lie in [0, 1], got {', '.join(f'{level:g}' for level in levels)}")
-    absent = [level for level in scored_levels if level not in levels]
-    if absent or not scored_levels:
-        raise InputError(
-            f"scored levels must be some of the levels {', '.join(f'{level:g}' for level in levels)}, got "
-            f"{', '.join(f'{level:g}' for level in scored_levels) or 'none'}"
-        )
+    known, scored = (", ".join(f"{level:g}" for level in some) for some in (require_levels(levels), scored_levels))
+    if not scored_levels or not set(scored_levels) <= set(levels):
+        raise InputError(f"scored levels must be some of the levels {known}, got {scored or 'none'}")
     infos = data.select(split=split, condition=condition)
     candidates: list[tuple[ChosenTrial, list[tuple[int, float]]]] = []
     for info in counted(infos, on_progress):
@@ -80,11 +75,8 @@ def choose_frames(
             f"of each of {', '.join(f'{level:.0%}' for level in levels)}; choose other levels or another split"
         )
     # sorting is stable: those that qualify keep the data set's order, so that none is picked for its looks
-    taken = sorted(candidates, key=lambda item: 0.0 if item[0].qualified else max(item[0].worst_error.values()))[
-        :trials
-    ]
-    best_read = sorted(taken, key=lambda item: max(item[0].worst_error.values()))[:shown_trials]
-    shown = {trial.trial for trial, _ in best_read}
+    taken = sorted(candidates, key=lambda item: 0.0 if item[0].qualified else item[0].worst)[:trials]
+    shown = {trial.trial for trial, _ in sorted(taken, key=lambda item: item[0].worst)[:shown_trials]}
     frames = tuple(
         ChosenFrame(
             id=f"{trial.trial}-f{row:04d}",
@@ -99,12 +91,11 @@ def choose_frames(
         for level, (row, label) in zip(levels, rows, strict=True)
         if level in scored_levels or trial.trial in shown
     )
-    qualified = sum(trial.qualified for trial, _ in candidates)
     choice = Choice(
         trials_wanted=trials,
         tolerance=tolerance,
         considered=len(candidates),
-        qualified=qualified,
+        qualified=sum(trial.qualified for trial, _ in candidates),
         summary="",
         source=data.source,
         condition=condition,
@@ -126,7 +117,7 @@ def _summarise(choice: Choice, trials: int) -> str:
     )
     others = [trial for trial in taken if not trial.qualified]
     if others:
-        worst = max(max(trial.worst_error.values()) for trial in others)
+        worst = max(trial.worst for trial in others)
         summary += (
             f" {wanted} were wanted, so the {len(others)} read best among the others were taken too; the worst of "
             f"their answers is off by {worst:.0%}."

@@ -17,6 +17,7 @@ from sliplens.faithfulness import get_fill
 from sliplens.faithfulness.alarms import controls_win, fill_decides, flat_maps, rankings_disagree, saturated
 from sliplens.faithfulness.controls import CONTROLS
 from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness, Predict, answer_whole, score_maps
+from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.intervals import paired_difference
 from sliplens.progress import OnProgress, continued
 from sliplens.results.explanation import Explained
@@ -95,7 +96,7 @@ def score_removal(
     units = material.units()
     known = [setting for setting in settings if setting.unit in units]
     orders = 2 * len(maps) + random_orders
-    predict = material.fast(len(known) * len(inputs) * orders * (len(STUDY_AREAS) - 2))
+    predict = prepare_passes(material.trained, inputs, len(known) * len(inputs) * orders * (len(STUDY_AREAS) - 2))
 
     works: dict[Setting, Scoring] = {
         setting: partial(

@@ -19,7 +19,8 @@ from sliplens.explainers.table import network_images
 from sliplens.models import Run
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
-from sliplens.recordings.source import TrialFrames, open_source
+from sliplens.recordings.capture import Capture
+from sliplens.recordings.source import open_source
 from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
 
 DEFAULT_LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
@@ -66,14 +67,19 @@ def frames_from_dataset(
     InputError
         If a level is outside [0, 1].
     """
-    if any(not 0 <= level <= 1 for level in levels):
-        raise InputError(f"levels must lie in [0, 1], got {', '.join(f'{level:g}' for level in levels)}")
     rows: list[tuple[str, int]] = []
     for info in data.select(split=split, condition=condition)[:trials]:
         (opened,) = open_source(data, trial=info.trial)
         margin = known_margin(opened.name, opened.safety_margin)
-        rows += [(info.trial, nearest_frame(margin, level)) for level in levels]
+        rows += [(info.trial, nearest_frame(margin, level)) for level in require_levels(levels)]
     return frames_at(trained, data, rows)
+
+
+def require_levels(levels: Sequence[float]) -> Sequence[float]:
+    """Safety margins that are looked for, each of which must lie in [0, 1]."""
+    if any(not 0 <= level <= 1 for level in levels):
+        raise InputError(f"levels must lie in [0, 1], got {', '.join(f'{level:g}' for level in levels)}")
+    return levels
 
 
 def known_margin(trial: str, margin: Float[np.ndarray, " frames"] | None) -> Float[np.ndarray, " frames"]:
@@ -108,13 +114,9 @@ def frames_from_folder(
 ) -> ChosenFrames:
     """Images of a folder, in natural order, or the frames of whatever recording `open_source` opens.
 
-    Parameters
-    ----------
-    folder
-        Frames of the size the network's sensor has: camera frames if `reference` is given or the source brings one,
-        otherwise absolute difference images |T_n - T_0|.
-    labels_in_names
-        Read the safety margin in percent from names that end in `_GG`, as in `image_433_20.png`.
+    They have the size of the network's sensor: camera frames if `reference` is given or the source brings one, else
+    absolute difference images |T_n - T_0|. `labels_in_names` reads the safety margin in percent from names that end in
+    `_GG`, as in `image_433_20.png`.
 
     Raises
     ------
@@ -136,7 +138,7 @@ def frames_from_folder(
 
 
 def _take(
-    trained: Run, opened: TrialFrames, numbers: Sequence[int], *, trial: str, source: str, condition: str
+    trained: Run, opened: Capture, numbers: Sequence[int], *, trial: str, source: str, condition: str
 ) -> ChosenFrames:
     names = opened.files or [f"{opened.name}-f{number:04d}" for number in range(opened.frames)]
     trained.require_frame_size(opened.frame_size, what=f"frames such as {names[numbers[0]]}")

@@ -10,9 +10,7 @@ from torch import Tensor
 
 from sliplens.explainers import EXPLAINERS, Explainer, Likeness, PolyCam
 from sliplens.faithfulness.removal import Units, marker_units, tile_units
-from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.models import Run
-from sliplens.models.engines import Engine
 from sliplens.recordings import Dataset
 from sliplens.results.explanation import Explained
 from sliplens.results.study import ChosenFrame, MarkedFrame
@@ -29,11 +27,7 @@ _AS_PUBLISHED = Likeness(pearson_r=0.999, top_overlap=0.97)
 
 
 def study_explainers(methods: Sequence[str] = STUDY_METHODS, *, budget: float = STUDY_BUDGET) -> dict[str, Explainer]:
-    """Explainers of a study by name, with a budget for Poly-CAM.
-
-    Besides rows of `EXPLAINERS` there is `poly-cam-thesis`: the public code's score, layers, and the map that the
-    thesis scored.
-    """
+    """Explainers of a study: rows of `EXPLAINERS`, and `poly-cam-thesis` with the public code's score and layers."""
     table = {
         **EXPLAINERS,
         "poly-cam": PolyCam(budget=budget),
@@ -95,10 +89,6 @@ class Material:
     def towards_target(self, method: str) -> Float[np.ndarray, "frames size size"]:
         """The part of a method's relevance that works towards each frame's target."""
         return self.explained.relevance[method] * self.explained.towards[:, None, None]
-
-    def fast(self, passes: int) -> Engine:
-        """Make an engine ready for so many passes of the network."""
-        return prepare_passes(self.trained, self.inputs, passes)
 
     def units(self) -> dict[str, list[Units]]:
         """What can be removed at once, for each frame: pixels, tiles, and markers where they are known in every one."""

@@ -95,20 +95,14 @@ def run_study(
         with sliplens; None to leave it out.
     out
         Folder of the study, a subfolder a stage; a temporary one that lives as long as the result if None.
-    methods
-        Explainers to compare (`study_explainers`).
-    trials
-        How many trials to look at.
-    tolerance
-        Largest error of an answer in them, in margin units; where too few qualify, the next best are taken.
-    tests, settings
-        What to judge explanations by, some of `TESTS`, and what is removed and put there by the removal curves.
-    budget
-        Share of the channels that Poly-CAM measures at first, 1 for all.
-    random_orders
-        Random orders that every method has to beat.
-    device
-        Where networks that are loaded here run: cpu, cuda or cuda:1.
+    methods, budget
+        Explainers to compare (`study_explainers`), and the share of the channels that Poly-CAM measures at first.
+    trials, tolerance
+        How many trials to look at, and the largest error of an answer in them, in margin units; where too few qualify,
+        the next best are taken.
+    tests, settings, random_orders
+        What to judge explanations by, some of `TESTS`; what is removed and put there by the removal curves, and how
+        many random orders every method has to beat.
     jobs
         Networks to judge at the same time, each by a process with its share of the cores. More than one needs a script
         that starts its work under `if __name__ == "__main__":`, as all that starts processes does.
@@ -157,8 +151,7 @@ def run_study(
         evaluation = evaluate(run, stages.data, folder, overwrite=overwrite, on_progress=on_progress)
         stages.found[name] = {"evaluate": evaluation}
     choice, states = stages.choose(split=split, condition=condition, trials=trials, tolerance=tolerance)
-    cores = torch.get_num_threads()
-    judging = stages
+    cores, judging = torch.get_num_threads(), stages
     if min(jobs, len(networks), cores) > 1:
         # they leave their stages in folders, and what is here reads them
         work = pickle.dumps(replace(stages, on_progress=None, found={name: {} for name in networks}))
@@ -356,7 +349,7 @@ class _Stages:
 
     @property
     def _frames(self) -> dict[str, Any]:
-        return {"data_hash": self.data.hash, "choice": hash_json(to_builtins(self._choice))}
+        return {"data_hash": self.data.hash, "choice": hash_json(self._choice)}
 
     def _about(self, name: str) -> dict[str, Any]:
         weights = self.networks[name].manifest.weights_sha256

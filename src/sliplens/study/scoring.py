@@ -109,7 +109,7 @@ def score_remedies(
     orders = _orders(explained, seed=seed)
     background = BACKGROUND.get(explained.input, "background")
     total, done = 2 * len(orders) * len(inputs), 0
-    predict = material.fast(total * steps)
+    predict = prepare_passes(material.trained, inputs, total * steps)
 
     def delete(name: str, fill: str, order: Int[np.ndarray, "frames pixels"]) -> list[DeletionTable]:
         nonlocal done
