@@ -21,16 +21,7 @@ from sliplens.errors import RecordingError
 from sliplens.images import decode_png, encode_png
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling
-from sliplens.recordings.trial import (
-    LABEL_SIGNALS,
-    OPTIONAL_LABELS,
-    SIGNALS,
-    ContactState,
-    GroundTruth,
-    Labels,
-    Recording,
-    TrialFacts,
-)
+from sliplens.recordings.trial import OPTIONAL_LABELS, SIGNALS, ContactState, GroundTruth, Labels, Recording, TrialFacts
 
 SCHEMA_VERSION = 2
 CODEC = "rows+zstd"
@@ -183,7 +174,7 @@ def write_trial(
 ) -> None:
     """Write the Parquet file of a trial, its encoded images a row group at a time; it appears when complete."""
     columns: dict[str, Any] = {"time_s": time_s, "contact_state": labels.contact_state}
-    columns |= {name: getattr(labels, name) for name in (*LABEL_SIGNALS, *OPTIONAL_LABELS)}
+    columns |= {name: getattr(labels, name) for name in (*SIGNALS[1:], *OPTIONAL_LABELS)}
     columns = {name: values for name, values in columns.items() if values is not None}
     kept = None
     if truth is not None:

@@ -153,13 +153,12 @@ def estimate_friction(
     RecordingError
         If the trial never slips: its friction is then unknown, only that it is larger than all that was seen.
     """
-    candidates: list[float] = []
     highest = 0.0
     for window_s in _WINDOWS_S:
         candidates, highest = _find_falls(forces, window_s=window_s, contact_threshold_n=contact_threshold_n)
         if candidates:
             break
-    if not candidates:
+    else:
         raise RecordingError(
             f"the trial never slips (F_t / F_n reaches {highest:.2f} without breaking off), so its friction is "
             "unknown; give the coefficient of friction by hand"

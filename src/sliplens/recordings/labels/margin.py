@@ -36,6 +36,7 @@ class FrameForces:
     missing: Bool[np.ndarray, " frames"]
     """Whether the neighbouring samples are too far apart, or there are none on one side."""
     out_of_range: Bool[np.ndarray, " frames"]
+    """Whether any sample that a frame's force rests on reaches the end of the sensor's range."""
 
 
 def interpolate_forces(
@@ -63,25 +64,17 @@ def interpolate_forces(
     # the neighbours of a time on a sample are both that sample
     before = samples[np.maximum(np.searchsorted(samples, time_s, side="right") - 1, 0)]
     after = samples[np.minimum(np.searchsorted(samples, time_s), len(samples) - 1)]
+    # with the tare; the slip's onset hides no sample here: a window more is a frame less, a window less a wrong label
+    limit = np.inf if force_range_n is None else force_range_n
+    full = np.any(np.abs(forces.recorded.force_n) >= limit, axis=1, keepdims=True).astype(np.float64)
     return FrameForces(
         normal_n=normal,
         tangential_n=magnitude(tangential, sigma_n=tangential_noise),
         normal_sigma_n=np.hypot(normal_noise, tare.normal),
         tangential_sigma_n=np.hypot(tangential_noise, tare.tangential),
         missing=(time_s < samples[0]) | (time_s > samples[-1]) | (after - before > gap_s),
-        out_of_range=_out_of_range(forces, time_s, window_s=window_s, range_n=force_range_n),
+        out_of_range=mean_force(samples, full, time_s, window_s=window_s)[:, 0] > _NO_FLAG,
     )
-
-
-def _out_of_range(
-    forces: ContactForces, time_s: Float[np.ndarray, " frames"], *, window_s: float, range_n: float | None
-) -> Bool[np.ndarray, " frames"]:
-    """Whether any sample that a frame's force rests on reaches the end of the sensor's range, tare included."""
-    if range_n is None:
-        return np.zeros(len(time_s), dtype=bool)
-    full = np.any(np.abs(forces.recorded.force_n) >= range_n, axis=1, keepdims=True).astype(np.float64)
-    # the slip's onset hides no sample here: a window more is a frame less, a window less a wrong label
-    return mean_force(forces.time_s, full, time_s, window_s=window_s)[:, 0] > _NO_FLAG
 
 
 _CONTACT_SIGMAS = 8.0  # least normal force of a contact, in standard deviations of its noise
