@@ -214,9 +214,8 @@ def _find_falls(forces: ContactForces, *, window_s: float, contact_threshold_n: 
     starts = np.flatnonzero(falls & ~np.concatenate(([False], falls[:-1])))
     ends = np.flatnonzero(falls & ~np.concatenate((falls[1:], [False])))
     # of each stretch the moment at which the ratio falls most steeply
-    steep = mean_force(time, ratio, time - _STEP_S / 2, window_s=_STEP_S) - mean_force(
-        time, ratio, time + _STEP_S, window_s=_STEP_S
-    )
+    earlier, later = (mean_force(time, ratio, at, window_s=_STEP_S) for at in (time - _STEP_S / 2, time + _STEP_S))
+    steep = earlier - later
     # a stretch begins before its fall by the time that a fall may take, and may end as it begins
     tops = [start + int(np.argmax(steep[start : end + count + 1])) for start, end in zip(starts, ends, strict=True)]
     return sorted({float(time[top]) for top in tops}), highest

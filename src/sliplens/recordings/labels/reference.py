@@ -94,15 +94,11 @@ def _first_still(motion: Float[np.ndarray, " frames"]) -> int:
 
 
 def _energy(difference: Float[np.ndarray, "rows columns 3"]) -> float:
-    return float(np.mean(np.abs(_high_pass(difference))))
-
-
-def _high_pass(image: Float[np.ndarray, "rows columns 3"]) -> Float[np.ndarray, "rows columns 3"]:
-    """Take the mean of a square about each block off."""
+    """Mean absolute value, the mean of a square about each block taken off."""
     half = _SMOOTH // 2
-    slow = image.astype(np.float64)
+    slow = difference.astype(np.float64)
     for axis in (0, 1):
         pads = [(half, half) if axis == side else (0, 0) for side in range(3)]
         padded = np.pad(slow, pads, mode="reflect" if slow.shape[axis] > half else "edge")
         slow = np.mean(np.lib.stride_tricks.sliding_window_view(padded, _SMOOTH, axis=axis), axis=-1)
-    return image - slow
+    return float(np.mean(np.abs(difference - slow)))
