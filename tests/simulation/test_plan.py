@@ -79,6 +79,20 @@ def test_another_seed_gives_other_trials():
     assert not {plan.seed for plan in one} & {plan.seed for plan in other}
 
 
+def test_presets_share_no_trial_no_sensor_and_no_day():
+    plans = {
+        (preset, seed): plan_trials(replace(recipe, seed=seed)) for preset, recipe in PRESETS.items() for seed in (0, 1)
+    }
+    seen = [{plan.seed for plan in own} | {plan.unit_seed for plan in own} for own in plans.values()]
+    days = [{plan.day_draw for plan in own} for own in plans.values()]
+    for groups in (seen, days):
+        assert len(set().union(*groups)) == sum(map(len, groups))
+
+
+def test_the_thesis_had_one_sensor():
+    assert len({plan.unit_seed for plan in plan_trials(PRESETS["thesis"])}) == 1
+
+
 def test_friction_does_not_depend_on_the_normal_force():
     plans = plan_trials(SimulationRecipe(dry_trials=3, wet_trials=1500))
     grasps = [

@@ -1,5 +1,6 @@
 """Which trials are simulated, on which day, and what they are for."""
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -61,6 +62,8 @@ class SimulationRecipe:
     sensors: int = 2
     """Number of sensors built: their markers differ a little."""
     seed: int = 0
+    series: str = ""
+    """Name that is drawn into every seed: recipes of two series share no day, no sensor and no trial."""
     nuisances: Nuisances = field(default_factory=Nuisances)
 
     def __post_init__(self) -> None:
@@ -231,9 +234,9 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
                         condition=condition,
                         split=split,
                         frames=recipe.frames_per_trial,
-                        seed=_seed(recipe.seed, _TRIALS, day, condition == "wet", number),
+                        seed=_seed(recipe, _TRIALS, day, condition == "wet", number),
                         unit=unit,
-                        unit_seed=_seed(recipe.seed, _UNITS, unit),
+                        unit_seed=_seed(recipe, _UNITS, unit),
                         day_draw=days[day],
                         recipe=recipe,
                         recipe_hash=recipe_hash,
@@ -276,25 +279,26 @@ def _spread(trials: int, *, days: int, tested: range) -> dict[int, int]:
 
 def _draw_days(recipe: SimulationRecipe) -> dict[int, Day]:
     """Draw the days, their dry friction spread over its range: four independent draws may all be alike."""
-    spread = np.random.default_rng(_seed(recipe.seed, _DAYS))
+    spread = np.random.default_rng(_seed(recipe, _DAYS))
     strata = spread.permutation(recipe.days)
     return {
         day: draw_day(
             recipe.nuisances,
             quantile=float((strata[day - 1] + spread.uniform()) / recipe.days),
-            rng=np.random.default_rng(_seed(recipe.seed, _DAYS, day)),
+            rng=np.random.default_rng(_seed(recipe, _DAYS, day)),
         )
         for day in range(1, recipe.days + 1)
     }
 
 
-def _seed(seed: int, *branch: int) -> int:
-    state = np.random.SeedSequence(seed, spawn_key=tuple(int(step) for step in branch)).generate_state(2, np.uint64)
-    return int(state[0])
+def _seed(recipe: SimulationRecipe, *branch: int) -> int:
+    series = zlib.crc32(recipe.series.encode())
+    key = (*([series] if recipe.series else []), *map(int, branch))
+    return int(np.random.SeedSequence(recipe.seed, spawn_key=key).generate_state(2, np.uint64)[0])
 
 
 PRESETS = {
-    "small": SimulationRecipe(dry_trials=96, wet_trials=8, frames_per_trial=48, days=12),
+    "small": SimulationRecipe(dry_trials=96, wet_trials=8, frames_per_trial=48, days=12, series="small"),
     "thesis": SimulationRecipe(
         # 160 training, 20 validation and 21 test trials of about 800 frames
         dry_trials=(100, 40, 40, 11),
@@ -302,6 +306,8 @@ PRESETS = {
         frames_per_trial=800,
         frame_totals=FrameTotals(train=128_043, validation=15_839, test=16_875),
         days=4,
+        sensors=1,
+        series="thesis",
     ),
     "varied": SimulationRecipe(
         # many short trials, each day with three: of long ones a network learns the trials by heart
@@ -318,4 +324,4 @@ PRESETS = {
 """`small` fits a laptop and shows many days; `thesis` has the days, splits and number of frames of the thesis: Polak,
 *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning*. It does not say how many trials it
 had, nor how dry and wet shared the test day: that is assumed, from about 800 frames a trial. `varied` is for networks
-that are to meet other days, sensors and objects."""
+that are to meet other days, sensors and objects; it has no series, since the networks of the package learned it so."""
