@@ -41,6 +41,7 @@ from sliplens.recordings.store import save_forces
 
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
+Place = dict[str, int | float | list[str]]
 Stats = dict[str, Any]
 """min, max, mean, std, count and quantiles, as JSON holds them."""
 
@@ -176,7 +177,7 @@ def write_tasks(folder: Path, tasks: Sequence[str]) -> None:
     pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(index)}), folder / "meta" / "tasks.parquet")
 
 
-def write_episodes(folder: Path, places: Sequence[dict[str, Any]], stats: Sequence[dict[str, Stats]]) -> None:
+def write_episodes(folder: Path, places: Sequence[Place], stats: Sequence[dict[str, Stats]]) -> None:
     """Write `meta/episodes`: where each episode lies, and its statistics."""
     rows = []
     for place, features in zip(places, stats, strict=True):
@@ -277,7 +278,7 @@ def write_lerobot(
     fps = _frame_rate(data, chosen)
     features, reasons = frame_features(height, width), {"": 0}
     tasks: dict[str, int] = {}
-    places: list[dict[str, Any]] = []
+    places: list[Place] = []
     stats: list[dict[str, Stats]] = []
     pixels, first, total = PixelCount(), 0, sum(info.frames for info in chosen)
     with DataFiles(folder, features) as files:

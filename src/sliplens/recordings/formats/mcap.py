@@ -158,7 +158,7 @@ def _write_trial(bag: _Bag, capture: Capture) -> Iterator[None]:
     bag.write(REFERENCE, start_ns, **_image(bag, encode_png(capture.reference), start_ns))
     label = {"time_s": capture.frame_time_s, **exported_labels(labels)}
     label["invalid_reason"] = label.pop("reason")
-    fields = {name: np.asarray(values).tolist() for name, values in label.items()}
+    fields = {name: values.tolist() for name, values in label.items()}
     sampled = 0
     pngs = (png for _, batch in encode_batches(capture.read_frames()) for png in batch)
     for index, png in enumerate(pngs):

@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -73,13 +72,14 @@ _BATCH = 16  # frames that are encoded side by side
 _LONGEST = 2**24  # characters of a text that is parsed; those of a trial are some thousands
 
 
-def exported_labels(labels: Labels) -> dict[str, Any]:
+def exported_labels(labels: Labels) -> dict[str, np.ndarray]:
     """A value a frame of each label; those that a trial lacks follow from what it has, or are not known."""
     known = np.isfinite(labels.safety_margin)
     missing = {"safety_margin_sigma": np.full(len(known), np.nan), "valid": known, "reason": ("",) * len(known)}
     found = {name: getattr(labels, name) for name in (*LABEL_SIGNALS, *EXPORTED_OPTIONAL)}
+    states = [str(state) for state in labels.contact_state]
     found = {name: missing[name] if values is None else values for name, values in found.items()}
-    return {**found, "contact_state": [str(state) for state in labels.contact_state]}
+    return {name: np.asarray(values) for name, values in {**found, "contact_state": states}.items()}
 
 
 def encode_batches(frames: Iterator[Frame]) -> Iterator[tuple[list[Frame], Iterator[bytes]]]:
