@@ -87,41 +87,58 @@ def marker_regions(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Occlusion(Method):
+class RegionMethod(Method):
+    """A method that takes an image apart into tiles, or into markers where their places are given."""
+
+    tile_px: int = 16
+    """Side of a tile, in pixels."""
+    markers_px: Places | FindPlaces | None = None
+    """x and y of the markers in the image that the network sees, (markers, 2), or what finds them in each image, such
+    as `find_markers`; they are then the regions, and what lies between them is one more."""
+    radius_px: float | None = None
+    """How far a marker reaches; see `marker_regions`."""
+    batch_size: int = 32
+
+    def __post_init__(self) -> None:
+        require_at_least_one(self._name, batch_size=self.batch_size)
+        if self.tile_px < 1:
+            raise InputError(f"{self._name}'s tile_px is {self.tile_px}; give at least 1 pixel")
+        if isinstance(self.markers_px, Tensor):
+            self._require_reach(self.markers_px)
+        if self.radius_px is not None and not self.radius_px > 0:
+            raise InputError(f"{self._name}'s radius_px is {self.radius_px}; give a radius above 0 pixels")
+
+    @property
+    def _name(self) -> str:
+        return type(self).__name__.lower()
+
+    def _regions(self, image: Tensor, empty: Tensor) -> Tensor:
+        size = image.shape[-2], image.shape[-1]
+        if self.markers_px is None:
+            return tile_regions(size, tile_px=self.tile_px)
+        places = self.markers_px if isinstance(self.markers_px, Tensor) else self.markers_px(image, empty)
+        self._require_reach(places)
+        return marker_regions(size, places, radius_px=self.radius_px)
+
+    def _require_reach(self, places: Places) -> None:
+        if not len(places) or (self.radius_px is None and len(places) < 2):
+            raise InputError(
+                f"{self._name} has {len(places)} marker(s) and no radius_px; a single one's reach must be given"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Occlusion(RegionMethod):
     """Occlusion by tile, or by marker where the markers' places are given, signed, in margin units.
 
     The relevance of a region is f(x) - f(x with the region as in the reference), spread evenly over its pixels. Where
     regions work together, or stand in for each other, they do not add up to f(x) - f(b), so there is no completeness
     gap.
 
-    Parameters
-    ----------
-    tile_px
-        Side of a tile in pixels.
-    markers_px
-        x and y of the markers in the image that the network sees, (markers, 2), or what finds them in each image, such
-        as `find_markers`; they are then the regions, and what lies between them is one more.
-    radius_px
-        How far a marker reaches; see `marker_regions`.
-
     References
     ----------
     Zeiler and Fergus, *Visualizing and understanding convolutional networks*, ECCV 2014, section 4.2; by Captum.
     """
-
-    tile_px: int = 16
-    markers_px: Places | FindPlaces | None = None
-    radius_px: float | None = None
-    batch_size: int = 32
-
-    def __post_init__(self) -> None:
-        require_at_least_one("occlusion", batch_size=self.batch_size)
-        if self.tile_px < 1:
-            raise InputError(f"occlusion's tile_px is {self.tile_px}; give at least 1 pixel")
-        if isinstance(self.markers_px, Tensor):
-            self._require_reach(self.markers_px)
-        if self.radius_px is not None and not self.radius_px > 0:
-            raise InputError(f"occlusion's radius_px is {self.radius_px}; give a radius above 0 pixels")
 
     @torch.no_grad()
     def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
@@ -155,17 +172,3 @@ class Occlusion(Method):
             + (f"tiles of {self.tile_px} px" if by_tile else "markers"),
             engine=engine.name,
         )
-
-    def _regions(self, image: Tensor, empty: Tensor) -> Tensor:
-        size = image.shape[-2], image.shape[-1]
-        if self.markers_px is None:
-            return tile_regions(size, tile_px=self.tile_px)
-        places = self.markers_px if isinstance(self.markers_px, Tensor) else self.markers_px(image, empty)
-        self._require_reach(places)
-        return marker_regions(size, places, radius_px=self.radius_px)
-
-    def _require_reach(self, places: Places) -> None:
-        if not len(places) or (self.radius_px is None and len(places) < 2):
-            raise InputError(
-                f"occlusion has {len(places)} marker(s) and no radius_px; a single one's reach must be given"
-            )

@@ -17,6 +17,7 @@ from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients
 from sliplens.explainers.lrp import Lrp
 from sliplens.explainers.occlusion import Occlusion, find_markers
 from sliplens.explainers.poly_cam import PolyCam
+from sliplens.explainers.shapley import Shapley
 from sliplens.extras import Table
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
@@ -32,6 +33,8 @@ _ROWS: dict[str, Explainer] = {
     "smooth-grad": SmoothGrad(),
     "occlusion": Occlusion(),
     "occlusion-marker": Occlusion(markers_px=find_markers),
+    "shapley": Shapley(),
+    "shapley-marker": Shapley(markers_px=find_markers),
     "lrp": Lrp(),
 }
 EXPLAINERS = Table("method", "sliplens.explainers", _ROWS)

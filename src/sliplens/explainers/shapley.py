@@ -1,0 +1,185 @@
+"""Shapley values: what each marker or tile adds to the answer, averaged over all the company it may keep."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64
+from scipy.special import comb
+from torch import Tensor
+
+from sliplens.errors import InputError
+from sliplens.explainers.contract import FrozenModel
+from sliplens.explainers.explanation import Explanation
+from sliplens.explainers.occlusion import RegionMethod
+from sliplens.progress import OnProgress
+
+_FEW = 20
+"""Players of which all coalitions can be counted."""
+Value = Callable[[Bool[np.ndarray, "coalitions players"]], Float64[np.ndarray, " coalitions"]]
+"""What each coalition is worth; True for players that take part."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapleyValues:
+    """Contribution of each player, in the unit of the game; together they are the whole game's worth."""
+
+    values: Float64[np.ndarray, " players"]
+    standard_errors: Float64[np.ndarray, " players"]
+    """Of the values, as far as the sampled coalitions tell; 0 where all coalitions were asked."""
+
+
+def shapley_values(value: Value, players: int, *, pairs: int, rng: np.random.Generator) -> ShapleyValues:
+    """Estimate the Shapley values of a game from pairs of coalitions, each with its complement.
+
+    Values are those of the weighted least squares whose solution over all coalitions is the Shapley value, on sampled
+    ones. With its complement, each coalition tells of the odd part of the game alone, on which the values depend: games
+    of pairs that help or hinder each other are told exactly. Errors are the sandwich estimate from the residuals.
+
+    Parameters
+    ----------
+    value
+        Worth of coalitions, (coalitions, players) to (coalitions,); asked once for the whole and the empty one, and
+        once for all others.
+    pairs
+        Pairs of coalitions to ask; all of them, exactly, where the players have no more. At least twice the players.
+
+    Raises
+    ------
+    InputError
+        If there are too few pairs for the players.
+
+    References
+    ----------
+    Lundberg and Lee, *A Unified Approach to Interpreting Model Predictions* (2017), Theorem 2; Covert and Lee,
+    *Improving KernelSHAP: Practical Shapley Value Estimation via Linear Regression* (2021), section 4.2, pairs.
+
+    Examples
+    --------
+    Two players who only gain together share alike:
+
+    >>> import numpy as np
+    >>> from sliplens.explainers.shapley import shapley_values
+    >>> together = lambda members: members.all(axis=1).astype(float)
+    >>> shapley_values(together, 2, pairs=4, rng=np.random.default_rng(0)).values
+    array([0.5, 0.5])
+    """
+    whole, empty = value(np.array([[True] * players, [False] * players])).tolist()
+    if players == 1:
+        return ShapleyValues(values=np.array([whole - empty]), standard_errors=np.zeros(1))
+    exact = players <= _FEW and 2 ** (players - 1) - 1 <= pairs
+    if not exact and pairs < 2 * players:
+        raise InputError(f"{pairs} pairs of coalitions cannot tell {players} players apart; ask for {2 * players}")
+    members, weights = _all_pairs(players) if exact else _sample(players, pairs, rng)
+    worth = value(np.concatenate([members, ~members])).reshape(2, -1)
+    odd = (worth[0] - worth[1]) / 2
+    # even shares first, so that the values add up to the worth of the whole; the members tell how they differ from that
+    share = members.mean(axis=1)
+    left = odd - (share - 0.5) * (whole - empty)
+    # the last column takes what the mere number of players does, a cubic that vanishes at both ends: its own Shapley
+    # values are 0, and where an answer tips between few and many it is most of the noise
+    number = (2 * share - 1) ** 3 - (2 * share - 1)
+    columns = np.column_stack([members - share[:, None], number])
+    solve = np.linalg.pinv(np.sqrt(weights)[:, None] * columns) * np.sqrt(weights)
+    solution = solve @ left
+    spread = (solve * (left - columns @ solution)) ** 2 * len(odd) / max(len(odd) - players, 1)
+    return ShapleyValues(
+        values=solution[:players] + (whole - empty) / players,
+        standard_errors=np.zeros(players) if exact else np.sqrt(spread.sum(axis=1)[:players]),
+    )
+
+
+def _all_pairs(players: int) -> tuple[Bool[np.ndarray, "pairs players"], Float64[np.ndarray, " pairs"]]:
+    """One coalition of each pair, those without the last player, and Shapley's kernel of each."""
+    members = (np.arange(1, 2 ** (players - 1))[:, None] >> np.arange(players) & 1).astype(bool)
+    sizes = members.sum(axis=1)
+    return members, 1 / (comb(players, sizes) * sizes * (players - sizes))
+
+
+def _sample(
+    players: int, pairs: int, rng: np.random.Generator
+) -> tuple[Bool[np.ndarray, "pairs players"], Float64[np.ndarray, " pairs"]]:
+    """Coalitions of sizes drawn by the root of Shapley's kernel, each weighted by the same root.
+
+    Drawn by the kernel itself, half of the coalitions are nearly empty or nearly whole, where the answer hardly varies.
+    """
+    sizes = np.arange(1, players)
+    root = 1 / np.sqrt(sizes * (players - sizes))
+    chance = np.cumsum(root) / root.sum()
+    drawn = np.searchsorted(chance, (np.arange(pairs) + rng.uniform()) / pairs)
+    members = rng.permuted(np.broadcast_to(np.arange(players), (pairs, players)), axis=1) < sizes[drawn, None]
+    return members, root[drawn] / root.mean()
+
+
+_UNSURE = 0.5
+"""Standard error over the spread of the contributions, above which their order means little."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shapley(RegionMethod):
+    """Shapley values of tiles, or of markers where their places are given, signed and complete, in margin units.
+
+    A region that does not take part is as in the reference. The relevance of a region is its Shapley value, spread
+    evenly over its pixels, so that a map adds up to f(x) - f(b). Where the contributions are hardly surer than they
+    differ, a warning says so; more `pairs` help.
+
+    References
+    ----------
+    Shapley, *A Value for n-Person Games* (1953); Lundberg and Lee, *A Unified Approach to Interpreting Model
+    Predictions* (2017). Estimated by `shapley_values`.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from sliplens.explainers.shapley import Shapley
+    >>> mean_of_left = lambda images: images[:, :, :, :2].mean(dim=(1, 2, 3))
+    >>> model = torch.nn.Identity()
+    ... model.forward = mean_of_left
+    >>> explanation = Shapley(tile_px=2)(model, torch.ones(1, 3, 2, 4))
+    >>> explanation.relevance[0]
+    tensor([[0.2500, 0.2500, 0.0000, 0.0000],
+            [0.2500, 0.2500, 0.0000, 0.0000]])
+    """
+
+    tile_px: int = 28
+    pairs: int = 400
+    """Pairs of coalitions that are asked for each image, two passes of the network each."""
+    seed: int = 0
+
+    @torch.no_grad()
+    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
+        comparison = frozen.compare()
+        engine = comparison.prepare(2 * self.pairs * len(comparison.images), batch_size=self.batch_size)
+        unsure = []
+
+        def contribute(index: int) -> Float[Tensor, "height width"]:
+            image, empty = comparison.images[index], comparison.reference[index]
+            regions = self._regions(image, empty).to(image.device)
+            # a number that no pixel has, such as that of what lies between markers which cover the image, is no player
+            numbers, players = regions.unique(return_inverse=True)
+
+            def worth(members: Bool[np.ndarray, "coalitions players"]) -> Float64[np.ndarray, " coalitions"]:
+                taking_part = torch.from_numpy(members).to(image.device).split(engine.batch_size)
+                batches = (torch.where(part[:, players][:, None], image, empty) for part in taking_part)
+                return torch.cat(list(engine.run(batches))).double().cpu().numpy()
+
+            rng = np.random.default_rng((self.seed, index))
+            found = shapley_values(worth, len(numbers), pairs=max(self.pairs, 2 * len(numbers)), rng=rng)
+            unsure.append(float(np.sqrt((found.standard_errors**2).mean())) > _UNSURE * float(found.values.std()))
+            shares = torch.from_numpy(found.values).to(image) / players.flatten().bincount()
+            return shares[players]
+
+        relevance = comparison.map_each(contribute, on_progress=on_progress)
+        warning = (
+            f"contributions hardly surer than they differ in {sum(unsure)} of {len(unsure)} frames; ask for more pairs"
+        )
+        by_tile = self.markers_px is None
+        return comparison.explanation(
+            relevance,
+            method="shapley" if by_tile else "shapley-marker",
+            complete=True,
+            target="f(x) - f(reference), shared out among " + (f"tiles of {self.tile_px} px" if by_tile else "markers"),
+            warnings=[warning] if any(unsure) else [],
+            engine=engine.name,
+        )
