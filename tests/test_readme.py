@@ -53,7 +53,8 @@ def folder(
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             save_checkpoint(run, build_model(head="histogram").eval(), manifest)
-    monkeypatch.setitem(RECIPES, "default", replace(RECIPES["default"], image_size=IMAGE_SIZE, batch_size=16))
+    small = replace(RECIPES["default"], image_size=IMAGE_SIZE, batch_size=16)
+    monkeypatch.setitem(RECIPES._rows, "default", small)
     for option in ("random_orders", "trials"):
         monkeypatch.setitem(inspect.unwrap(run_study).__kwdefaults__, option, 1)
     monkeypatch.chdir(tmp_path)
