@@ -174,7 +174,7 @@ def summarise(cases: Sequence[tuple[Case, dict[str, dict[str, float]]]], *, seed
             "frames": len(known),
             "means": {name: float(one.mean()) for name, one in values.items()},
             "ours_less": {
-                name: asdict(paired_difference(values[OURS], one, trials=trials, rng=np.random.default_rng(seed)))
+                name: asdict(paired_difference(values[OURS], one, clusters=[trials], rng=np.random.default_rng(seed)))
                 for name, one in values.items()
                 if name != OURS
             },

@@ -1,82 +1,142 @@
-"""Paired differences with their uncertainty."""
+"""Paired differences with their uncertainty over networks, days and trials."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Int, Shaped
+from scipy.special import stdtrit
 
-__all__ = ["FEWEST_UNITS", "Difference", "bootstrap_difference", "paired_difference"]
+__all__ = ["FEWEST_UNITS", "Difference", "paired_difference"]
 
 FEWEST_UNITS = 5
-"""Resampling fewer trials or frames says little."""
+"""Fewer trials say little."""
+_FEWEST_DRAWN = 8
+"""From so many clusters on the distribution of t is drawn from them; that of fewer is Student's."""
 _RESAMPLES = 2000
+_ENDS = np.array([0.025, 0.975])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """Mean of the first minus mean of the second, with a 95 % interval over `units` resampled trials or frames."""
+    """Mean of the first minus mean of the second, with a 95 % interval, and over what it was taken."""
 
     estimate: float
     low: float
     high: float
     units: int
+    """Trials."""
+    days: int = 1
+    networks: int = 1
+    """Of a single day or network the interval holds for that one alone: how far others differ is not in it."""
 
     @property
     def sure(self) -> bool:
-        """Whether the interval leaves zero out, and rests on enough units."""
+        """Whether the interval leaves zero out, and rests on enough trials."""
         return self.units >= FEWEST_UNITS and (self.low > 0 or self.high < 0)
 
-
-def bootstrap_difference(
-    first: Float[np.ndarray, " units"],
-    second: Float[np.ndarray, " units"],
-    counts: Float[np.ndarray, " units"],
-    *,
-    rng: np.random.Generator,
-) -> Difference:
-    """Difference of two means over the same units, resampled together.
-
-    Given are each unit's sums, such as the squared errors of a trial's frames or one frame's score, and the number of
-    terms in them.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from sliplens.intervals import bootstrap_difference
-    >>> squared_errors, of_another = np.array([4.0, 6, 5, 5, 4, 6]), np.array([1.0, 3, 2, 2, 1, 3])
-    >>> gap = bootstrap_difference(squared_errors, of_another, np.full(6, 10.0), rng=np.random.default_rng(0))
-    >>> round(gap.estimate, 6), gap.sure
-    (0.3, True)
-    """
-    gap = first - second
-    rows = rng.integers(0, len(gap), size=(_RESAMPLES, len(gap)))
-    means = gap[rows].sum(axis=1) / counts[rows].sum(axis=1)
-    low, high = np.quantile(means, [0.025, 0.975])
-    return Difference(estimate=float(gap.sum() / counts.sum()), low=float(low), high=float(high), units=len(gap))
+    @property
+    def over(self) -> str:
+        """What the interval was taken over, in words: "14 trials, one day, one network"."""
+        named = {"trial": self.units, "day": self.days, "network": self.networks}
+        return ", ".join(f"one {name}" if count == 1 else f"{count} {name}s" for name, count in named.items())
 
 
 def paired_difference(
     first: Float[np.ndarray, " images"],
     second: Float[np.ndarray, " images"],
     *,
-    trials: Shaped[np.ndarray, " images"] | None = None,
+    clusters: Iterable[Shaped[np.ndarray, " images"]],
     rng: np.random.Generator,
 ) -> Difference:
-    """Difference of two scores of the same images; whole trials are resampled where each image's trial is named.
+    """Difference of two scores of the same images, with an interval that holds for other networks, days and trials.
 
-    Frames of one trial resemble one another: resampled one by one they would feign more evidence than there is.
+    Frames of one trial resemble one another, and so do trials of one day and answers of one network. The interval is
+    that of a mean over the outermost clusters of which there are several: the trials of a single day; else the days,
+    whose spread has that of their trials in it. The ends come from the distribution of t among resampled clusters, or
+    from Student's where clusters are fewer than eight. Of a single trial nothing is known but the estimate.
+
+    Parameters
+    ----------
+    clusters
+        Labels of each image, outermost first: `[networks, days, trials]`, the last of them, or none where images are
+        trials of their own. Equal labels are the same cluster: days that several networks saw count beside them.
+
+    References
+    ----------
+    Efron and Tibshirani, *An Introduction to the Bootstrap* (1993), section 12.5: the bootstrap-t interval. Cameron,
+    Gelbach and Miller, *Robust Inference with Multiway Clustering* (2011): networks that see the same days.
 
     Examples
     --------
-    Eight frames, each 0.1 better than its partner, but of four trials only:
+    Sixteen frames, each about 0.1 better than its partner, but of four trials only:
 
     >>> import numpy as np
     >>> from sliplens.intervals import paired_difference
-    >>> worse = np.linspace(0.2, 0.9, 8)
-    >>> gap = paired_difference(worse, worse - 0.1, trials=np.repeat(np.arange(4), 2), rng=np.random.default_rng(0))
-    >>> round(gap.estimate, 6), gap.units, gap.sure  # four trials are too few to be sure
-    (0.1, 4, False)
+    >>> rng, trials = np.random.default_rng(0), np.repeat(np.arange(4), 4)
+    >>> worse = rng.random(16)
+    >>> gap = paired_difference(worse, worse - 0.1 + 0.01 * rng.random(16), clusters=[trials], rng=rng)
+    >>> round(gap.estimate, 2), gap.over, gap.sure  # four trials are too few to be sure
+    (0.09, '4 trials, one day, one network', False)
     """
-    _, member = np.unique(np.arange(len(first)) if trials is None else trials, return_inverse=True)
-    ones = np.ones(len(first))
-    return bootstrap_difference(*(np.bincount(member, weights=values) for values in (first, second, ones)), rng=rng)
+    gap = first - second
+    levels = [np.unique(labels, return_inverse=True)[1] for labels in clusters] or [np.arange(len(gap))]
+    counts = [int(level.max()) + 1 for level in levels]
+    free: list[Int[np.ndarray, " images"]] = []
+    for level in levels:
+        if level.max() and not any(_within(level, outer) for outer in free):
+            free.append(level)
+    over = dict(zip(("units", "days", "networks"), counts[::-1], strict=False))
+    estimate = float(gap.mean())
+    ends = _drawn_ends(gap, free[0], rng) if len(free) == 1 else _student_ends(gap, free)
+    low, high = (estimate + ends).tolist()
+    return Difference(estimate=estimate, low=low, high=high, **over)
+
+
+def _within(inner: Int[np.ndarray, " images"], outer: Int[np.ndarray, " images"]) -> bool:
+    """Whether each inner cluster lies in a single outer one, so that the spread of these has its own in it."""
+    return len(np.unique(inner * (outer.max() + 1) + outer)) == int(inner.max()) + 1
+
+
+def _drawn_ends(
+    gap: Float[np.ndarray, " images"], level: Int[np.ndarray, " images"], rng: np.random.Generator
+) -> Float[np.ndarray, " 2"]:
+    """Ends of the interval less the estimate; clusters are drawn again where there are enough."""
+    sums, counts = np.bincount(level, weights=gap), np.bincount(level)
+    if len(sums) < _FEWEST_DRAWN:
+        return _student_ends(gap, [level])
+    # the clusters as they are, then drawn again
+    rows = np.concatenate([np.arange(len(sums))[None], rng.integers(0, len(sums), size=(_RESAMPLES, len(sums)))])
+    sizes = counts[rows].sum(axis=1)
+    means = sums[rows].sum(axis=1) / sizes
+    rest = sums[rows] - means[:, None] * counts[rows]
+    errors = np.sqrt(len(sums) / (len(sums) - 1) * (rest**2).sum(axis=1)) / sizes
+    known = errors > 0  # the same cluster in every place has no spread
+    if not known[0]:
+        return np.zeros(2)
+    return -errors[0] * np.quantile((means - means[0])[known] / errors[known], _ENDS)[::-1]
+
+
+def _student_ends(
+    gap: Float[np.ndarray, " images"], levels: Sequence[Int[np.ndarray, " images"]]
+) -> Float[np.ndarray, " 2"]:
+    """Ends of the interval less the estimate, by Student's t; clusters of several levels cross one another."""
+    if not levels:
+        return np.zeros(2)
+    rest = gap - gap.mean()
+    parts, freedom, cells = [], [], np.zeros(len(gap), dtype=np.int64)
+    alone = rest.copy()
+    for level in levels:
+        sums, counts = np.bincount(level, weights=rest), np.bincount(level)
+        parts.append(len(sums) / (len(sums) - 1) * (sums**2).sum() / len(gap) ** 2)
+        freedom.append(len(sums) - 1)
+        alone -= (sums / counts)[level]
+        cells = cells * len(sums) + level
+    # what is left in each cell is in the spread of every level: it counts once
+    own = (np.bincount(cells, weights=alone) ** 2).sum() / len(gap) ** 2
+    shared = own * np.prod([1 + 1 / one for one in freedom])
+    variance = max(sum(parts) - (len(parts) - 1) * shared, *parts, 0.0)
+    if variance == 0:
+        return np.zeros(2)
+    degrees = variance**2 / sum(part**2 / one for part, one in zip(parts, freedom, strict=True))  # Satterthwaite's
+    return np.sqrt(variance) * stdtrit(degrees, _ENDS)

@@ -269,6 +269,8 @@ def deletion_table(curves: dict[str, list[tuple[str, np.ndarray, np.ndarray, np.
             DeletionTable(
                 method=np.repeat(method, len(removed)),
                 frame_id=np.repeat(frame, len(removed)),
+                day=np.ones(len(removed), dtype=np.int64),
+                trial=np.repeat(frame.rpartition("-")[0] or frame, len(removed)),
                 step=np.arange(len(removed)),
                 pixels_removed=np.asarray(removed, dtype=np.int64),
                 prediction=answers,

@@ -329,6 +329,7 @@ def write_faithfulness(workspace: Path, name: str, made: Made, *, rng: np.random
                     unit=np.repeat(unit, most.size),
                     method=np.repeat(method, most.size),
                     frame_id=np.repeat([row.id for row in rows], len(areas)),
+                    day=np.ones(most.size, dtype=np.int64),
                     trial=np.repeat(trials, len(areas)),
                     safety_margin=np.repeat([row.safety_margin for row in rows], len(areas)),
                     area=np.tile(areas, len(rows)),
@@ -344,8 +345,8 @@ def write_faithfulness(workspace: Path, name: str, made: Made, *, rng: np.random
                     unit=unit,
                     method=method,
                     control=method in CONTROLS,
-                    srg=paired_difference(gains[method], zero, trials=trials, rng=rng),
-                    gain_over_random=paired_difference(gains[method] / 2, zero, trials=trials, rng=rng),
+                    srg=paired_difference(gains[method], zero, clusters=[trials], rng=rng),
+                    gain_over_random=paired_difference(gains[method] / 2, zero, clusters=[trials], rng=rng),
                     most_first=float(np.trapezoid(most, areas).mean()),
                     least_first=float(np.trapezoid(least, areas).mean()),
                     random=0.2,
@@ -360,7 +361,7 @@ def write_faithfulness(workspace: Path, name: str, made: Made, *, rng: np.random
                 unit=unit,
                 first=first,
                 second=second,
-                gap=paired_difference(gains[first], gains[second], trials=trials, rng=rng),
+                gap=paired_difference(gains[first], gains[second], clusters=[trials], rng=rng),
             )
             for first, second in pairs
         ]
@@ -463,6 +464,7 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
         tables.append(
             MarkerEffects(
                 frame_id=np.repeat(row.id, len(x)),
+                day=np.ones(len(x), dtype=np.int64),
                 trial=np.repeat(row.trial, len(x)),
                 safety_margin=np.full(len(x), row.safety_margin),
                 marker=np.arange(len(x)),

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from sliplens.intervals import bootstrap_difference
 from sliplens.report.comparisons import compare_deletion, compare_errors
 from sliplens.results.evaluation import Predictions
 from sliplens.results.faithfulness import DeletionCurve
@@ -48,25 +47,27 @@ def test_other_frames_are_not_compared(rng):
     assert compare_errors(predictions(error), predictions(error[:7]), rng=rng) is None
 
 
-def test_interval_has_the_width_of_the_standard_error(rng):
-    gap = rng.normal(0.3, 1.0, size=400)
-
-    found = bootstrap_difference(gap, np.zeros(400), np.ones(400), rng=rng)
-
-    assert found.high - found.low == pytest.approx(2 * 1.96 * gap.std() / 20, rel=0.1)
-    assert found.sure
-
-
-def test_few_units_are_never_sure(rng):
-    assert not bootstrap_difference(np.ones(3), np.zeros(3), np.ones(3), rng=rng).sure
+def curve(ids: str, scores: np.ndarray, trials: str) -> DeletionCurve:
+    return DeletionCurve(
+        frame_ids=tuple(ids),
+        clusters=np.array([["1"] * len(ids), list(trials)]),
+        pixels_removed=np.array([1, 2]),
+        scores=np.repeat(scores[:, None], 2, axis=1),
+        predictions=np.ones((len(ids), 2)),
+    )
 
 
 def test_curves_of_other_frames_are_not_compared(rng):
-    one, other = (
-        DeletionCurve(
-            frame_ids=(name,), pixels_removed=np.array([1, 2]), scores=np.ones((1, 2)), predictions=np.ones((1, 2))
-        )
-        for name in "ab"
-    )
+    one, other = (curve(name, np.ones(1), "t") for name in "ab")
 
     assert compare_deletion(one, other, rng=rng) is None
+
+
+def test_deletion_is_compared_over_trials_not_frames(rng):
+    scores = rng.random(12)
+    one, other = (curve("abcdefghijkl", values, "sstttuuuvvww") for values in (scores, 0 * scores))
+
+    gap = compare_deletion(one, other, rng=rng)
+
+    assert gap is not None
+    assert gap.units == 5

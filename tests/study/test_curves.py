@@ -137,7 +137,7 @@ def test_a_method_is_better_only_when_the_interval_leaves_zero_out():
         curves=np.stack([value[:, None] * np.array([0.0, 1.0, 1.0]) for value in (level, np.zeros(8), np.zeros(8))]),
     )
     found = {PIXELS: {"poly-cam": noisy, "grad-cam": straight(0.1, 0.0), "occlusion": noisy, "edges": straight(0, 0)}}
-    _, comparisons = judge_curves(found, trials=np.arange(8), seed=0)
+    _, comparisons = judge_curves(found, clusters=np.stack([np.ones(8), np.arange(8)]), seed=0)
     by_pair = {(one.first, one.second): one.gap for one in comparisons}
     assert by_pair["poly-cam", "grad-cam"].sure
     assert by_pair["poly-cam", "grad-cam"].estimate == pytest.approx(0.75 * (level.mean() - 0.1))
@@ -149,9 +149,10 @@ def test_a_method_is_better_only_when_the_interval_leaves_zero_out():
 def test_intervals_resample_trials_not_frames():
     values = np.array([0.1, 0.1, 0.9, 0.9])
     rng = np.random.default_rng(1)
-    one = paired_difference(values, np.zeros(4), trials=np.array(["a", "a", "b", "b"]), rng=rng)
-    # of two trials with the means 0.1 and 0.9 a resample draws one of them twice half of the time
-    assert (one.low, one.high, one.units) == (0.1, 0.9, 2)
+    one = paired_difference(values, np.zeros(4), clusters=[np.array(["a", "a", "b", "b"])], rng=rng)
+    # t of one degree of freedom is tan: 12.7 standard errors of two means that lie 0.4 from theirs
+    half = 0.4 * np.tan(0.475 * np.pi)
+    assert (one.low, one.high, one.units) == (pytest.approx(0.5 - half), pytest.approx(0.5 + half), 2)
     assert not one.sure
 
 

@@ -184,13 +184,13 @@ class Faithfulness:
         """Most influential first less random orders."""
         return self.most_first - self.random
 
-    def interval(self, *, trials: np.ndarray | None = None, seed: int = 0) -> Difference:
+    def interval(self, *, clusters: Sequence[np.ndarray] = (), seed: int = 0) -> Difference:
         """Mean symmetric gain over the images in margin units, with its 95 % interval.
 
-        Where the trial of each image is given, whole trials are resampled: frames of one resemble one another.
+        `clusters` are labels of the images, such as `[days, trials]`: frames of one trial resemble one another.
         """
         nothing = np.zeros_like(self.symmetric_gain)
-        return paired_difference(self.symmetric_gain, nothing, trials=trials, rng=np.random.default_rng(seed))
+        return paired_difference(self.symmetric_gain, nothing, clusters=clusters, rng=np.random.default_rng(seed))
 
     def frame(self) -> pa.Table:
         """Arrow table of the curves, a row for each image and share of it removed, in margin units."""

@@ -22,8 +22,8 @@ from sliplens.plots.style import (
     percent,
 )
 from sliplens.report.comparisons import (
+    compare_deletion,
     compare_gain,
-    compare_thesis_score,
     controls,
     gap_from,
     mean_at,
@@ -200,18 +200,13 @@ def _judged(where: str, gaps: Mapping[str, Difference | None]) -> list[Finding]:
 
 
 def _by_thesis_score(
-    pairs: Mapping[str, tuple[DeletionCurve, DeletionCurve]], faithful: RemovalScores, *, rng: np.random.Generator
+    pairs: Mapping[str, tuple[DeletionCurve, DeletionCurve]], *, rng: np.random.Generator
 ) -> list[Finding]:
-    trials = {
-        frame: str(trial)
-        for curve in faithful.curves.values()
-        for frame, trial in zip(curve.frame_ids, curve.trials, strict=True)
-    }
     return [
         Finding(
             where="score of the thesis",
             compared=f"{compared} (below zero = more faithful)",
-            gap=compare_thesis_score(*pair, trials, rng=rng),
+            gap=compare_deletion(*pair, rng=rng),
         )
         for compared, pair in pairs.items()
     ]
@@ -236,7 +231,7 @@ def _beats_rivals(faithful: RemovalScores, method: str, results: Results, *, rng
     scored = next((one.curves for (own, _), one in results.scores.items() if own == faithful.input), {})
     rivals = [one for one in _RIVALS if {one, method} <= set(scored)]
     pairs = {f"D, {name} less {method_name(one)}": (scored[method], scored[one]) for one in rivals}
-    findings += _by_thesis_score(pairs, faithful, rng=rng)
+    findings += _by_thesis_score(pairs, rng=rng)
     return _over_settings(subject if len(_poly_cams(faithful)) == 1 else f"{subject}, {name}", by_setting, findings)
 
 
@@ -263,7 +258,7 @@ def _compare_inputs(results: Results, *, rng: np.random.Generator) -> Answer:
     )
     methods = [one for one in (*_RIVALS, THESIS_POLY_CAM, POLY_CAM) if one in first and one in second]
     pairs = {f"D of {method_name(one)}, difference less raw": (first[one], second[one]) for one in methods}
-    return _over_settings(subject, by_setting, [*findings, *_by_thesis_score(pairs, difference, rng=rng)])
+    return _over_settings(subject, by_setting, [*findings, *_by_thesis_score(pairs, rng=rng)])
 
 
 def _no_better(faithful: RemovalScores, *, rng: np.random.Generator) -> Answer:
@@ -272,7 +267,7 @@ def _no_better(faithful: RemovalScores, *, rng: np.random.Generator) -> Answer:
         own = curves.get(GRAD_CAM)
         if own is None:
             continue
-        nothing = paired_difference(own.srg, np.zeros(len(own.srg)), trials=own.trials, rng=rng)
+        nothing = paired_difference(own.srg, np.zeros(len(own.srg)), clusters=own.clusters, rng=rng)
         gaps: dict[str, Difference] = {"chance": nothing}
         known = [one for one in sorted(controls(faithful)) if one in curves]
         best = max(known, key=lambda one: float(curves[one].srg.mean()), default=None)

@@ -1,11 +1,11 @@
-"""Comparisons that the report makes: errors, deletion scores, gains, and their intervals."""
+"""Comparisons that the report makes: errors, deletion scores, gains, and their intervals over days and trials."""
 
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
 
-from sliplens.intervals import Difference, bootstrap_difference, paired_difference
+from sliplens.intervals import Difference, paired_difference
 from sliplens.plots.style import CONTROL, FILL_NAMES, UNIT_NAMES, fill_name, in_order, signed
 from sliplens.results.evaluation import Predictions
 from sliplens.results.faithfulness import Comparison, DeletionCurve, DeletionScores, RemovalCurve, RemovalScores
@@ -13,22 +13,23 @@ from sliplens.results.study import MarkerEffects, Roughness
 
 
 def compare_errors(first: Predictions, second: Predictions, *, rng: np.random.Generator) -> Difference | None:
-    """Difference in MSE of two networks, resampling trials; None unless both answered the very same frames."""
+    """Difference in MSE of two networks, over days and trials; None unless both answered the very same frames."""
     one, other = (own.where(np.lexsort((own.frame, own.trial))) for own in (first, second))
     if not len(one.trial) or any(
         not np.array_equal(getattr(one, key), getattr(other, key)) for key in ("trial", "frame")
     ):
         return None
     errors = [(own.prediction - own.safety_margin) ** 2 for own in (one, other)]
-    return paired_difference(errors[0], errors[1], trials=one.trial, rng=rng)
+    return paired_difference(errors[0], errors[1], clusters=[one.day, one.trial], rng=rng)
 
 
 def compare_deletion(first: DeletionCurve, second: DeletionCurve, *, rng: np.random.Generator) -> Difference | None:
-    """Difference in D_AUC of two deletion orders, resampling frames; None unless both hold the same frames."""
-    if first.frame_ids != second.frame_ids or not first.frame_ids:
+    """Difference in D_AUC of two deletion orders, over the frames that both hold; None without any."""
+    ids, here, there = np.intersect1d(first.frame_ids, second.frame_ids, return_indices=True)
+    if not len(ids):
         return None
-    auc = [curve.scores.mean(axis=1) for curve in (first, second)]
-    return bootstrap_difference(auc[0], auc[1], np.ones(len(auc[0])), rng=rng)
+    auc = [curve.scores.mean(axis=1)[rows] for curve, rows in ((first, here), (second, there))]
+    return paired_difference(auc[0], auc[1], clusters=first.clusters[:, here], rng=rng)
 
 
 def against_control(scored: DeletionScores, method: str, *, rng: np.random.Generator) -> Difference | None:
@@ -50,8 +51,8 @@ def compare_gain(*pairs: tuple[RemovalCurve, RemovalCurve], rng: np.random.Gener
         np.mean([curve.srg[np.searchsorted(curve.frame_ids, shared)] for curve in curves], axis=0)
         for curves in zip(*pairs, strict=True)
     )
-    trials = pairs[0][0].trials[np.searchsorted(pairs[0][0].frame_ids, shared)]
-    return paired_difference(first, second, trials=trials, rng=rng)
+    clusters = pairs[0][0].clusters[:, np.searchsorted(pairs[0][0].frame_ids, shared)]
+    return paired_difference(first, second, clusters=clusters, rng=rng)
 
 
 def gap_from(compared: Comparison | Roughness, method: str) -> Difference:
@@ -60,33 +61,20 @@ def gap_from(compared: Comparison | Roughness, method: str) -> Difference:
     return gap if compared.first == method else replace(gap, estimate=-gap.estimate, low=-gap.high, high=-gap.low)
 
 
-def compare_thesis_score(
-    first: DeletionCurve, second: DeletionCurve, trials: dict[str, str], *, rng: np.random.Generator
-) -> Difference | None:
-    """Deletion score of the first less that of the second, over the frames whose trial is known; None without any."""
-    ids, here, there = np.intersect1d(first.frame_ids, second.frame_ids, return_indices=True)
-    known = np.array([name in trials for name in ids], dtype=bool)
-    if not known.any():
-        return None
-    means = [one.scores.mean(axis=1)[rows[known]] for one, rows in ((first, here), (second, there))]
-    names = np.array([trials[name] for name in ids[known]])
-    return paired_difference(means[0], means[1], trials=names, rng=rng)
-
-
 def share_of_strongest(effects: MarkerEffects, *, count: int, rng: np.random.Generator) -> Difference | None:
-    """Share of a network's effects, in size, that its strongest markers hold; trials are resampled.
+    """Share of a network's effects, in size, that its strongest markers hold; over days and trials.
 
     None where no marker has any effect.
     """
-    shares, trials = [], []
+    shares, clusters = [], []
     for frame in effects.groups("frame_id").values():
         sizes = np.sort(np.abs(frame.network))[::-1]
         if sizes.sum() > 0:
             shares.append(sizes[:count].sum() / sizes.sum())
-            trials.append(frame.trial[0])
+            clusters.append((str(frame.day[0]), frame.trial[0]))
     if not shares:
         return None
-    return paired_difference(np.array(shares), np.zeros(len(shares)), trials=np.array(trials), rng=rng)
+    return paired_difference(np.array(shares), np.zeros(len(shares)), clusters=np.array(clusters).T, rng=rng)
 
 
 def settings(faithful: RemovalScores) -> list[tuple[str, str]]:

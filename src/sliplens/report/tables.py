@@ -134,7 +134,7 @@ def table_deletion(scores: Mapping[str, DeletionScores], *, rng: np.random.Gener
     return make_table(
         f"Deletion score D on {sources}, averaged over all steps, mean ± standard deviation over frames; lower = more "
         "faithful, and the lowest of each input is bold. “Against random”: mean difference from the random control "
-        "with a 95 % interval (frames resampled); below zero = better than chance. “Last step”: D once every pixel is "
+        "with a 95 % interval over days and trials; below zero = better than chance. “Last step”: D once every pixel is "
         f"filled, which no map has a part in. Grey column: the {MARK}.",
         ("Input", "Method", "Score D", "Against random", "Last step", "Score D, thesis", "Frames"),
         rows,
@@ -400,7 +400,7 @@ def table_localisation(truth: Truth) -> Table:
     return make_table(
         f"{input_name(truth.input)}, {truth.frames} simulated frames: share of the relevance, and of the strongest "
         "pixels, in three regions; and Spearman's correlation of the map's mean on each marker with what putting that "
-        "marker back does to the network's answer and to the best reading of the margin (95 % interval over trials).",
+        "marker back does to the network's answer and to the best reading of the margin (95 % interval over days and trials).",
         ("Method", *heads, "With the answer", "With the best reading"),
         [
             *(

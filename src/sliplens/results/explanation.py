@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float32, Float64, Shaped, UInt8
 
 from sliplens.arrays import require_saliency
 from sliplens.codec import Columns, load_result
@@ -23,6 +23,7 @@ class ExplainedFrame:
     safety_margin: float | None
     prediction: float
     reference_prediction: float
+    day: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +72,11 @@ class Explained:
     def towards(self) -> Float64[np.ndarray, " frames"]:
         """Sign of each answer's change from that on the untouched sensor, which the maps explain."""
         return np.array([np.sign(frame.prediction - frame.reference_prediction) for frame in self.frames])
+
+    @property
+    def clusters(self) -> Shaped[np.ndarray, "2 frames"]:
+        """Day and trial of each frame, which an interval resamples."""
+        return np.array([[str(frame.day) for frame in self.frames], [frame.trial for frame in self.frames]])
 
     def take(self, rows: Sequence[int]) -> "Explained":
         """Explanations of some of the frames, by their numbers."""

@@ -32,6 +32,8 @@ class DeletionTable(Columns):
 
     method: Shaped[np.ndarray, " rows"]
     frame_id: Shaped[np.ndarray, " rows"]
+    day: Int64[np.ndarray, " rows"]
+    trial: Shaped[np.ndarray, " rows"]
     step: Int64[np.ndarray, " rows"]
     pixels_removed: Int64[np.ndarray, " rows"]
     prediction: Float64[np.ndarray, " rows"]
@@ -43,6 +45,8 @@ class DeletionCurve:
     """Deletion score D of each frame while pixels are removed, and the answers it comes from, in margin units."""
 
     frame_ids: tuple[str, ...]
+    clusters: Shaped[np.ndarray, "2 frames"]
+    """Day and trial of each."""
     pixels_removed: Int[np.ndarray, " steps"]
     scores: Float64[np.ndarray, "frames steps"]
     predictions: Float64[np.ndarray, "frames steps"]
@@ -160,7 +164,8 @@ class RemovalCurve:
     """Changes of the answers of one method under one fill and unit, in margin units."""
 
     frame_ids: tuple[str, ...]
-    trials: Shaped[np.ndarray, " frames"]
+    clusters: Shaped[np.ndarray, "2 frames"]
+    """Day and trial of each."""
     areas: Float64[np.ndarray, " areas"]
     most_first: Float64[np.ndarray, "frames areas"]
     least_first: Float64[np.ndarray, "frames areas"]
@@ -180,6 +185,7 @@ class RemovalTable(Columns):
     unit: Shaped[np.ndarray, " rows"]
     method: Shaped[np.ndarray, " rows"]
     frame_id: Shaped[np.ndarray, " rows"]
+    day: Int64[np.ndarray, " rows"]
     trial: Shaped[np.ndarray, " rows"]
     safety_margin: Float64[np.ndarray, " rows"]
     area: Float64[np.ndarray, " rows"]
@@ -222,18 +228,33 @@ def _deletion_curve(rows: DeletionTable, name: str) -> DeletionCurve:
     pixels, scores, predictions = (
         values.reshape(len(ids), -1) for values in (ordered.pixels_removed, ordered.score, ordered.prediction)
     )
-    return DeletionCurve(frame_ids=ids, pixels_removed=pixels[0], scores=scores, predictions=predictions)
+    return DeletionCurve(
+        frame_ids=ids,
+        clusters=_clusters(ordered, len(ids)),
+        pixels_removed=pixels[0],
+        scores=scores,
+        predictions=predictions,
+    )
 
 
 def _removal_curve(rows: RemovalTable, name: str) -> RemovalCurve:
     ids, ordered = _sort_by_frame(rows, rows.area, f"lacks areas of some frames under {name}")
-    trials, areas, most, least, random = (
+    areas, most, least, random = (
         values.reshape(len(ids), -1)
-        for values in (ordered.trial, ordered.area, ordered.most_first, ordered.least_first, ordered.random)
+        for values in (ordered.area, ordered.most_first, ordered.least_first, ordered.random)
     )
     return RemovalCurve(
-        frame_ids=ids, trials=trials[:, 0], areas=areas[0], most_first=most, least_first=least, random=random
+        frame_ids=ids,
+        clusters=_clusters(ordered, len(ids)),
+        areas=areas[0],
+        most_first=most,
+        least_first=least,
+        random=random,
     )
+
+
+def _clusters(ordered: DeletionTable | RemovalTable, frames: int) -> Shaped[np.ndarray, "2 frames"]:
+    return np.stack([values.reshape(frames, -1)[:, 0].astype(str) for values in (ordered.day, ordered.trial)])
 
 
 def _sort_by_frame(rows: _Rows, step: np.ndarray, complaint: str) -> tuple[tuple[str, ...], _Rows]:

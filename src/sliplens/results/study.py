@@ -49,6 +49,7 @@ class ChosenFrame:
     """Whether it counts in the scores."""
     shown: bool
     """Whether the panels show it."""
+    day: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -293,6 +294,7 @@ class MarkerEffects(Columns):
     """What putting one marker back does to the network's answer and to the true margin, a row a marker and frame."""
 
     frame_id: Shaped[np.ndarray, " rows"]
+    day: Int64[np.ndarray, " rows"]
     trial: Shaped[np.ndarray, " rows"]
     safety_margin: Float64[np.ndarray, " rows"]
     marker: Int64[np.ndarray, " rows"]

@@ -47,7 +47,7 @@ def measure_maps(
     explained, rng = material.explained, np.random.default_rng(seed)
     noisy, following, noise_sd = _once_more(material.trained, data, material.chosen[:repeated], rng=rng)
     references = material.references[:repeated]
-    methods, roughness = {}, {}
+    methods, roughness, clusters = {}, {}, explained.clusters
     for name, explainer in counted(material.explainers.items(), on_progress):
 
         def again(images: Tensor, explainer: Explainer = explainer) -> Float[np.ndarray, "repeated height width"]:
@@ -77,7 +77,7 @@ def measure_maps(
         methods=methods,
         # stability was tried on few frames: no interval would mean anything
         comparisons=tuple(
-            Roughness(first=first, second=second, gap=paired_difference(one, other, trials=material.trials, rng=rng))
+            Roughness(first=first, second=second, gap=paired_difference(one, other, clusters=clusters, rng=rng))
             for (first, one), (second, other) in combinations(roughness.items(), 2)
         ),
     )

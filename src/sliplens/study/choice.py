@@ -74,6 +74,7 @@ def choose_frames(
             f"none of the {len(infos)} {condition} trials of split {split!r} has a labelled frame within {_REACH:.0%} "
             f"of each of {', '.join(f'{level:.0%}' for level in levels)}; choose other levels or another split"
         )
+    days = {info.trial: info.day for info in infos}
     # sorting is stable: those that qualify keep the data set's order, so that none is picked for its looks
     taken = sorted(candidates, key=lambda item: 0.0 if item[0].qualified else item[0].worst)[:trials]
     shown = {trial.trial for trial, _ in sorted(taken, key=lambda item: item[0].worst)[:shown_trials]}
@@ -81,6 +82,7 @@ def choose_frames(
         ChosenFrame(
             id=f"{trial.trial}-f{row:04d}",
             trial=trial.trial,
+            day=days[trial.trial],
             frame=row,
             level=float(level),
             safety_margin=label,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Shaped
 from scipy.stats import kendalltau
 
 from sliplens.codec import keep_part
@@ -130,12 +130,12 @@ def score_removal(
         curves[setting] = {name: Faithfulness(areas=kept.areas, curves=own) for name, own in kept.curves.items()}
     whole = answer_whole(predict, inputs, batch_size=64)
     blank = {setting.fill: _answer_blank(predict, material, setting.fill, seed) for setting in known}
-    scores, comparisons = judge_curves(curves, trials=material.trials, seed=seed)
+    scores, comparisons = judge_curves(curves, clusters=material.clusters, seed=seed)
     return RemovalScores(
         input=explained.input,
         source=explained.source,
         frames=len(inputs),
-        trials=len(set(material.trials.tolist())),
+        trials=len(set(material.clusters[1].tolist())),
         random_orders=random_orders,
         fills=tuple(dict.fromkeys(setting.fill for setting in curves)),
         units=tuple(dict.fromkeys(setting.unit for setting in curves)),
@@ -163,11 +163,11 @@ def _answer_blank(predict: Predict, material: Material, fill: str, seed: int) ->
 
 
 def judge_curves(
-    curves: Curves, *, trials: np.ndarray, seed: int
+    curves: Curves, *, clusters: Shaped[np.ndarray, "2 frames"], seed: int
 ) -> tuple[tuple[RemovalScore, ...], tuple[Comparison, ...]]:
     """Scores with intervals, and methods compared with each other and with the best control.
 
-    The curves are those of controls too; whole trials are resampled.
+    The curves are those of controls too; days and trials are resampled.
     """
     rng = np.random.default_rng(seed)
     scores, comparisons = [], []
@@ -180,8 +180,8 @@ def judge_curves(
                     unit=setting.unit,
                     method=name,
                     control=is_control(name),
-                    srg=paired_difference(curve.symmetric_gain, none, trials=trials, rng=rng),
-                    gain_over_random=paired_difference(curve.gain_over_random, none, trials=trials, rng=rng),
+                    srg=paired_difference(curve.symmetric_gain, none, clusters=clusters, rng=rng),
+                    gain_over_random=paired_difference(curve.gain_over_random, none, clusters=clusters, rng=rng),
                     most_first=float(curve.most_first.mean()),
                     least_first=float(curve.least_first.mean()),
                     random=float(curve.random.mean()),
@@ -192,7 +192,7 @@ def judge_curves(
         best = max(controls, key=lambda name: float(own[name].symmetric_gain.mean()), default=None)
         pairs = [*combinations(methods, 2), *((name, best) for name in methods if best is not None)]
         for first, second in pairs:
-            gap = paired_difference(own[first].symmetric_gain, own[second].symmetric_gain, trials=trials, rng=rng)
+            gap = paired_difference(own[first].symmetric_gain, own[second].symmetric_gain, clusters=clusters, rng=rng)
             comparisons.append(Comparison(fill=setting.fill, unit=setting.unit, first=first, second=second, gap=gap))
     return tuple(scores), tuple(comparisons)
 
@@ -240,6 +240,7 @@ def _table(curves: Curves, explained: Explained) -> RemovalTable:
                 unit=np.repeat(setting.unit, count * steps),
                 method=np.repeat(name, count * steps),
                 frame_id=np.repeat([frame.id for frame in frames], steps),
+                day=np.repeat([frame.day for frame in frames], steps),
                 trial=np.repeat([frame.trial for frame in frames], steps),
                 safety_margin=np.repeat(margins, steps),
                 area=np.tile(curve.areas, count),

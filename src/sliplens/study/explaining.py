@@ -34,6 +34,7 @@ class ChosenFrames:
     """Frames to explain, compared and resized but still in 8 bits, so that they can be stored exactly."""
 
     ids: tuple[str, ...]
+    day: tuple[int, ...]
     trial: tuple[str, ...]
     condition: tuple[str, ...]
     safety_margin: Float32[np.ndarray, " frames"]
@@ -91,14 +92,17 @@ def known_margin(trial: str, margin: Float[np.ndarray, " frames"] | None) -> Flo
 
 def frames_at(trained: Run, data: Dataset, frames: Sequence[tuple[str, int]]) -> ChosenFrames:
     """Frames of a data set by trial and number, those of a trial one after another."""
-    conditions = {info.trial: info.condition for info in data.trials}
+    infos = {info.trial: info for info in data.trials}
     parts = []
     for trial, own in groupby(frames, key=lambda frame: frame[0]):
-        if trial not in conditions:
+        if trial not in infos:
             raise RecordingError(f"{data.folder} has no trial {trial}; use the data set that the frames came from")
         (opened,) = open_source(data, trial=trial)
         numbers = [number for _, number in own]
-        parts.append(_take(trained, opened, numbers, trial=trial, source=data.source, condition=conditions[trial]))
+        info = infos[trial]
+        parts.append(
+            _take(trained, opened, numbers, trial=trial, day=info.day, source=data.source, condition=info.condition)
+        )
     return _join(parts)
 
 
@@ -129,7 +133,7 @@ def frames_from_folder(
     parts = []
     for opened in open_source(folder, reference=reference):
         name = folder.name if opened.files else opened.name
-        part = _take(trained, opened, range(opened.frames), trial=name, source="real", condition="unknown")
+        part = _take(trained, opened, range(opened.frames), trial=name, day=1, source="real", condition="unknown")
         if labels_in_names:
             margin = np.array([_label(folder / name) for name in opened.files or part.ids], dtype=np.float32)
             part = replace(part, safety_margin=margin)
@@ -138,7 +142,7 @@ def frames_from_folder(
 
 
 def _take(
-    trained: Run, opened: Capture, numbers: Sequence[int], *, trial: str, source: str, condition: str
+    trained: Run, opened: Capture, numbers: Sequence[int], *, trial: str, day: int, source: str, condition: str
 ) -> ChosenFrames:
     names = opened.files or [f"{opened.name}-f{number:04d}" for number in range(opened.frames)]
     trained.require_frame_size(opened.frame_size, what=f"frames such as {names[numbers[0]]}")
@@ -149,6 +153,7 @@ def _take(
     margin = np.full(opened.frames, np.nan) if opened.safety_margin is None else opened.safety_margin
     return ChosenFrames(
         ids=tuple(Path(names[number]).stem if opened.files else names[number] for number in numbers),
+        day=(day,) * len(numbers),
         trial=(trial,) * len(numbers),
         condition=(condition,) * len(numbers),
         safety_margin=margin[list(numbers)].astype(np.float32),
@@ -161,6 +166,7 @@ def _take(
 def _join(parts: Sequence[ChosenFrames]) -> ChosenFrames:
     return ChosenFrames(
         ids=sum((part.ids for part in parts), ()),
+        day=sum((part.day for part in parts), ()),
         trial=sum((part.trial for part in parts), ()),
         condition=sum((part.condition for part in parts), ()),
         safety_margin=np.concatenate([part.safety_margin for part in parts]),
@@ -246,6 +252,7 @@ def explain_frames(
             ExplainedFrame(
                 id=chosen.ids[index],
                 trial=chosen.trial[index],
+                day=chosen.day[index],
                 condition=chosen.condition[index],
                 safety_margin=float(margin) if np.isfinite(margin) else None,
                 prediction=predictions[index],

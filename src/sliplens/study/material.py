@@ -5,7 +5,7 @@ from dataclasses import dataclass, is_dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from sliplens.explainers import EXPLAINERS, Explainer, Likeness, PolyCam
@@ -82,9 +82,9 @@ class Material:
     """By name, with the options that made the maps."""
 
     @property
-    def trials(self) -> np.ndarray:
-        """Trial of each frame."""
-        return np.array([frame.trial for frame in self.explained.frames])
+    def clusters(self) -> Shaped[np.ndarray, "2 frames"]:
+        """Day and trial of each frame."""
+        return self.explained.clusters
 
     def towards_target(self, method: str) -> Float[np.ndarray, "frames size size"]:
         """The part of a method's relevance that works towards each frame's target."""

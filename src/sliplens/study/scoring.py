@@ -177,6 +177,8 @@ def _curve(method: str, frame: ExplainedFrame, removed: np.ndarray, answers: np.
     return DeletionTable(
         method=np.repeat(method, len(answers)),
         frame_id=np.repeat(frame.id, len(answers)),
+        day=np.repeat(frame.day, len(answers)),
+        trial=np.repeat(frame.trial, len(answers)),
         step=np.arange(len(answers)),
         pixels_removed=removed,
         prediction=answers,

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int, UInt8
+from jaxtyping import Bool, Float, Float64, Int, Shaped, UInt8
 from scipy.stats import spearmanr
 from torch import Tensor
 
@@ -59,6 +59,7 @@ class StagedFrame:
     """A frame of a study with all that drew it."""
 
     id: str
+    day: int
     trial: str
     number: int
     """In its trial."""
@@ -121,6 +122,7 @@ def stage_frames(trained: Run, explained: Explained, data: Dataset) -> tuple[Sta
             assert truth is not None  # what was rebuilt has its truth
             staged[row] = StagedFrame(
                 id=name,
+                day=infos[trial].day,
                 trial=trial,
                 number=number,
                 safety_margin=float(recording.safety_margin[number]),
@@ -246,16 +248,20 @@ def rank_correlation(first: Float[np.ndarray, " markers"], second: Float[np.ndar
     return float(np.asarray(spearmanr(first, second))[0])
 
 
-def mean_interval(values: Float[np.ndarray, " frames"], trials: np.ndarray, *, seed: int) -> Difference | None:
-    """Mean over the frames in which it is defined, with a 95 % interval over resampled trials; None if in none."""
+def mean_interval(
+    values: Float[np.ndarray, " frames"], clusters: Shaped[np.ndarray, "2 frames"], *, seed: int
+) -> Difference | None:
+    """Mean over the frames in which it is defined, with a 95 % interval over days and trials; None if in none."""
     known = np.isfinite(values)
     if not known.any():
         return None
     values = values[known]
-    return paired_difference(values, 0 * values, trials=trials[known], rng=np.random.default_rng(seed))
+    return paired_difference(values, 0 * values, clusters=clusters[:, known], rng=np.random.default_rng(seed))
 
 
-def meta_test(effects: Sequence[FrameEffects], trials: np.ndarray, *, seed: int) -> tuple[MetaTest, ...]:
+def meta_test(
+    effects: Sequence[FrameEffects], clusters: Shaped[np.ndarray, "2 frames"], *, seed: int
+) -> tuple[MetaTest, ...]:
     """Whether each fill ranks the map that knows the effects above the one that knows half, and that above chance.
 
     A gain counts changes of the answer towards the target, as `score_maps` does when it is told; `by_size` counts how
@@ -264,12 +270,14 @@ def meta_test(effects: Sequence[FrameEffects], trials: np.ndarray, *, seed: int)
     tests = []
     for fill in effects[0].gains:
         gains = np.stack([own.gains[fill] for own in effects])
-        signed, by_size = (_test_oracle(gains[:, row], trials, seed=seed) for row in (1, 0))
+        signed, by_size = (_test_oracle(gains[:, row], clusters, seed=seed) for row in (1, 0))
         tests.append(MetaTest(fill=fill, by_size=by_size, **vars(signed)))
     return tuple(tests)
 
 
-def _test_oracle(gains: Float[np.ndarray, "frames 2"], trials: np.ndarray, *, seed: int) -> OracleTest:
+def _test_oracle(
+    gains: Float[np.ndarray, "frames 2"], clusters: Shaped[np.ndarray, "2 frames"], *, seed: int
+) -> OracleTest:
     oracle, degraded = gains.mean(axis=0).tolist()
     return OracleTest(
         holds=oracle > degraded > 0,
@@ -277,7 +285,7 @@ def _test_oracle(gains: Float[np.ndarray, "frames 2"], trials: np.ndarray, *, se
         degraded=degraded,
         # a random order turned round is a random order: its symmetric gain is 0 on average
         random=0.0,
-        gap=mean_interval(gains[:, 0] - gains[:, 1], trials, seed=seed),
+        gap=mean_interval(gains[:, 0] - gains[:, 1], clusters, seed=seed),
     )
 
 
@@ -330,16 +338,16 @@ def judge_by_truth(
         ORACLE: _paint(places, [sign * own.network for sign, own in zip(towards, effects, strict=True)]),
         DEGRADED: _paint(places, [sign * own.shuffled for sign, own in zip(towards, effects, strict=True)]),
     }
-    trials = np.array([frame.trial for frame in frames])
+    clusters = explained.clusters
     own = np.array([rank_correlation(one.network, one.margin) for one in effects])
-    meta, agreement = meta_test(effects, trials, seed=seed), mean_interval(own, trials, seed=seed)
+    meta, agreement = meta_test(effects, clusters, seed=seed), mean_interval(own, clusters, seed=seed)
     return Truth(
         input=explained.input,
         source=explained.source,
         frames=len(frames),
         # the mass of a map of chance
         areas=_by_region(places, lambda _, region: float(region.mean())),
-        methods={name: _judge(values, places, effects, trials, seed=seed) for name, values in judged.items()},
+        methods={name: _judge(values, places, effects, clusters, seed=seed) for name, values in judged.items()},
         network_against_margin=agreement,
         meta=meta,
         summary=_summarise(meta, agreement),
@@ -350,7 +358,12 @@ def judge_by_truth(
 
 
 def _judge(
-    maps: Maps, places: Sequence[Places], effects: Sequence[FrameEffects], trials: np.ndarray, *, seed: int
+    maps: Maps,
+    places: Sequence[Places],
+    effects: Sequence[FrameEffects],
+    clusters: Shaped[np.ndarray, "2 frames"],
+    *,
+    seed: int,
 ) -> Localisation:
     means, positive = marker_means(maps, places), np.clip(maps.astype(np.float64), 0, None)
     edges = [relevance_mass(own, place.edges) - place.edges.mean() for own, place in zip(positive, places, strict=True)]
@@ -363,9 +376,9 @@ def _judge(
         rank=_by_region(places, lambda frame, region: relevance_rank(positive[frame], region)),
         spearman_network=mean_of_known(network),
         spearman_margin=mean_of_known(margin),
-        network=mean_interval(network, trials, seed=seed),
-        margin=mean_interval(margin, trials, seed=seed),
-        edges=mean_interval(np.array(edges), trials, seed=seed),
+        network=mean_interval(network, clusters, seed=seed),
+        margin=mean_interval(margin, clusters, seed=seed),
+        edges=mean_interval(np.array(edges), clusters, seed=seed),
     )
 
 
@@ -374,6 +387,7 @@ def _table(frames: Sequence[StagedFrame], places: Sequence[Places], effects: Seq
         [
             MarkerEffects(
                 frame_id=np.repeat(frame.id, len(frame.markers)),
+                day=np.repeat(frame.day, len(frame.markers)),
                 trial=np.repeat(frame.trial, len(frame.markers)),
                 safety_margin=np.full(len(frame.markers), frame.safety_margin),
                 marker=frame.markers.astype(np.int64),
