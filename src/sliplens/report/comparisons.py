@@ -1,5 +1,6 @@
 """Comparisons that the report makes: errors, deletion scores, gains, and their intervals over days and trials."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -103,6 +104,11 @@ def mean_at(curve: RemovalCurve, area: float) -> tuple[float, float]:
     places: Float64[np.ndarray, " areas"] = curve.areas
     most, chance = (float(np.interp(area, places, values.mean(axis=0))) for values in (curve.most_first, curve.random))
     return most, chance
+
+
+def tell_over(gaps: Iterable[Difference | None]) -> str:
+    """Write what intervals of a table were taken over: "14 trials, one day, one network"."""
+    return next((gap.over for gap in gaps if gap is not None), "trials")
 
 
 def tell_interval(gap: Difference, *, digits: int = 3) -> str:

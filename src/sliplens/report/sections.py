@@ -202,8 +202,8 @@ SECTIONS: tuple[Section, ...] = (
         title="The claims of the thesis, tested here",
         short_title="Claims",
         intro="Each claim holds, does not hold, or stays undecided. A fill is what removed parts become; intervals (95 "
-        "%) resample whole trials, of which fewer than five decide nothing. A claim holds for a network where it holds "
-        "under more than half of the fills and the opposite is sure under none.",
+        "%) are over days and trials; fewer than five trials decide nothing. A claim holds for a network where it "
+        "holds under more than half of the fills and the opposite is sure under none.",
         command="study",
         build=lambda results, rng: judge_claims(results, rng=rng) if results.study else (),
     ),

@@ -26,7 +26,7 @@ from sliplens.plots.style import (
     signed,
     source_name,
 )
-from sliplens.report.comparisons import against_control, mean_at, settings, tell_bounds, tell_interval
+from sliplens.report.comparisons import against_control, mean_at, settings, tell_bounds, tell_interval, tell_over
 from sliplens.report.results import Results
 from sliplens.report.thesis import ACCURACY, DELETION, MARK, NETWORK_PIXELS, SECONDS, thesis_row
 from sliplens.results.explanation import Explained
@@ -122,11 +122,12 @@ def table_accuracy(results: Results) -> Table:
 
 def table_deletion(scores: Mapping[str, DeletionScores], *, rng: np.random.Generator) -> Table:
     """Tabulate the deletion score by input and method, with the random control (thesis, Table 2)."""
-    rows = []
+    rows, gaps = [], []
     for name, method, score in _each_method(scores):
         scored = scores[name]
         lowest = min((own.mean for other, own in scored.methods.items() if other != CONTROL), default=None)
-        against = _interval(against_control(scored, method, rng=rng), digits=3)
+        gaps.append(against_control(scored, method, rng=rng))
+        against = _interval(gaps[-1], digits=3)
         last, thesis = decimals(score.last_step_mean, 3), _thesis_score(name, method, scored.methods)
         cells = (_score_cell(score, lowest), against, last, thesis, str(score.frames))
         rows.append((input_name(name), method_name(method), *cells))
@@ -134,8 +135,8 @@ def table_deletion(scores: Mapping[str, DeletionScores], *, rng: np.random.Gener
     return make_table(
         f"Deletion score D on {sources}, averaged over all steps, mean ± standard deviation over frames; lower = more "
         "faithful, and the lowest of each input is bold. “Against random”: mean difference from the random control "
-        "with a 95 % interval over days and trials; below zero = better than chance. “Last step”: D once every pixel is "
-        f"filled, which no map has a part in. Grey column: the {MARK}.",
+        f"with a 95 % interval over {tell_over(gaps)}; below zero = better than chance. “Last step”: D once every "
+        f"pixel is filled, which no map has a part in. Grey column: the {MARK}.",
         ("Input", "Method", "Score D", "Against random", "Last step", "Score D, thesis", "Frames"),
         rows,
         names=2,
@@ -219,7 +220,7 @@ def table_scores(faithful: RemovalScores, scored: DeletionScores | None) -> Tabl
         f"{input_name(faithful.input)}: the deletion score D of the thesis{fill} (mean ± standard deviation over "
         "frames; lower = more faithful) beside the symmetric relevance gain, SRG: the mean change of the answer with "
         "the most supporting parts gone first, less that with the least supporting first, in margin units; 0 = a map "
-        f"that tells nothing. 95 % intervals over {faithful.trials} trials ({faithful.frames} frames); * = the "
+        f"that tells nothing. 95 % intervals over {tell_over(one.srg for one in faithful.scores)}; * = the "
         f"interval leaves zero out. Bold: best of its column, controls left out. Grey column: the {MARK}.",
         ("Method", "Score D", "Score D, thesis", *(f"SRG, {fill_name(*one)}" for one in fills)),
         [
@@ -400,7 +401,8 @@ def table_localisation(truth: Truth) -> Table:
     return make_table(
         f"{input_name(truth.input)}, {truth.frames} simulated frames: share of the relevance, and of the strongest "
         "pixels, in three regions; and Spearman's correlation of the map's mean on each marker with what putting that "
-        "marker back does to the network's answer and to the best reading of the margin (95 % interval over days and trials).",
+        "marker back does to the network's answer and to the best reading of the margin (95 % interval over "
+        f"{tell_over(one.network for one in truth.methods.values())}).",
         ("Method", *heads, "With the answer", "With the best reading"),
         [
             *(
