@@ -487,7 +487,7 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
         "degraded-oracle": 0.8,
     }
     mass: dict[str, float | None] = {"markers": 0.5, "slip_annulus": 0.4, "edges": made.edge_mass}
-    held = {"holds": True, "oracle": 0.3, "degraded": 0.2, "random": 0.0, "gap": None}
+    held = {"holds": True, "oracle": 0.3, "degraded": 0.2, "random": 0.0, "gap": interval(0.1, made.trials)}
     return write_run(
         workspace / f"truth-{name}",
         "truth",

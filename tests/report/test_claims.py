@@ -268,7 +268,10 @@ def test_a_fill_that_cannot_tell_the_truth_has_no_vote(judged, tmp_path, rng):
     judged(Made(gains=GAINS | {"integrated-gradients": 0.4}))
     study = load_results(tmp_path).study
     (meta,) = study.truth["difference"].meta
-    truth = replace(study.truth["difference"], meta=(meta, replace(meta, fill="grey", holds=False)))
+    assert meta.gap is not None
+    # ahead by its mean, but not for sure
+    unsure = replace(meta, fill="grey", gap=replace(meta.gap, low=-0.01))
+    truth = replace(study.truth["difference"], meta=(meta, unsure))
 
     best = rank_methods(study.faithfulness["difference"], truth)[0]
 
@@ -290,6 +293,28 @@ def test_a_fill_counts_once_whatever_the_units(judged, tmp_path):
 
     # the untouched frame was tried by pixel and by marker
     assert best.tested == (("reference", "pixel"), ("grey", "pixel"), ("blur", "pixel"), ("true", "marker"))
+
+
+def test_a_claim_counts_a_fill_once_too(judged, tmp_path, rng):
+    judged(Made())
+    results = load_results(tmp_path)
+    faithful = results.study.faithfulness["difference"]
+    table = faithful.table
+    turned = (table.fill == "reference") & (table.unit == "marker") & (table.method == "poly-cam")
+    first, last = (
+        np.where(turned, *pair)
+        for pair in ((table.least_first, table.most_first), (table.most_first, table.least_first))
+    )
+    changed = replace(faithful, table=replace(table, most_first=first, least_first=last))
+    study = replace(results.study, faithfulness=results.study.faithfulness | {"difference": changed})
+
+    answer = judge_claims(replace(results, study=study), rng=rng)[0].answers[0]
+
+    # by markers the untouched frame says the opposite, but by pixels it has voted
+    assert answer.outcome == "holds"
+    opposite = [one for one in answer.findings if one.where == "untouched frame (markers)"]
+    assert opposite
+    assert all(one.outcome is None and one.gap is not None and one.gap.high < 0 for one in opposite)
 
 
 def test_without_scores_nothing_is_believed(tmp_path, rng):

@@ -64,7 +64,7 @@ def test_rows_may_stand_in_any_order(study):
     assert set(after) == set(before)
     for key, curve in after.items():
         assert curve.frame_ids == before[key].frame_ids
-        np.testing.assert_array_equal(curve.trials, before[key].trials)
+        np.testing.assert_array_equal(curve.clusters, before[key].clusters)
         np.testing.assert_array_equal(curve.least_first, before[key].least_first)
 
 

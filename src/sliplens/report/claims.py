@@ -15,6 +15,7 @@ from sliplens.intervals import Difference, paired_difference
 from sliplens.plots.style import (
     CONTROLS,
     decimals,
+    fill_name,
     input_name,
     inputs_in_order,
     listed,
@@ -30,6 +31,7 @@ from sliplens.report.comparisons import (
     removal_by_setting,
     share_of_strongest,
     tell_interval,
+    voting_settings,
 )
 from sliplens.report.results import Results
 from sliplens.report.thesis import THESIS_POLY_CAM
@@ -180,8 +182,13 @@ def _untested(subject: str, why: str) -> Answer:
     return Answer(subject=subject, outcome="undecided", text=f"Not tested: {why}.")
 
 
-def _over_settings(subject: str, by_setting: dict[str, Outcome], findings: list[Finding]) -> Answer:
-    """Answer by what holds under most settings, with the intervals of the first."""
+def _over_fills(
+    subject: str, by_setting: dict[str, Outcome], findings: list[Finding], faithful: RemovalScores
+) -> Answer:
+    """Answer by what holds under most fills, each of which votes once, with the intervals of the first."""
+    voting = [fill_name(*one) for one in voting_settings(faithful)]
+    findings = [replace(one, outcome=one.outcome if one.where in voting else None) for one in findings]
+    by_setting = {name: own for name, own in by_setting.items() if name in voting}
     names = {found: [name for name, own in by_setting.items() if own == found] for found in (*_OPPOSITE, "undecided")}
     text = _sentence("; ".join(f"{outcome} under {listed(where)}" for outcome, where in names.items() if where))
     first = findings[0].where
@@ -232,7 +239,9 @@ def _beats_rivals(faithful: RemovalScores, method: str, results: Results, *, rng
     rivals = [one for one in _RIVALS if {one, method} <= set(scored)]
     pairs = {f"D, {name} less {method_name(one)}": (scored[method], scored[one]) for one in rivals}
     findings += _by_thesis_score(pairs, rng=rng)
-    return _over_settings(subject if len(_poly_cams(faithful)) == 1 else f"{subject}, {name}", by_setting, findings)
+    return _over_fills(
+        subject if len(_poly_cams(faithful)) == 1 else f"{subject}, {name}", by_setting, findings, faithful
+    )
 
 
 def _compare_inputs(results: Results, *, rng: np.random.Generator) -> Answer:
@@ -258,7 +267,7 @@ def _compare_inputs(results: Results, *, rng: np.random.Generator) -> Answer:
     )
     methods = [one for one in (*_RIVALS, THESIS_POLY_CAM, POLY_CAM) if one in first and one in second]
     pairs = {f"D of {method_name(one)}, difference less raw": (first[one], second[one]) for one in methods}
-    return _over_settings(subject, by_setting, [*findings, *_by_thesis_score(pairs, rng=rng)])
+    return _over_fills(subject, by_setting, [*findings, *_by_thesis_score(pairs, rng=rng)], difference)
 
 
 def _no_better(faithful: RemovalScores, *, rng: np.random.Generator) -> Answer:
@@ -279,7 +288,9 @@ def _no_better(faithful: RemovalScores, *, rng: np.random.Generator) -> Answer:
         most, chance = mean_at(own, _SMALL_AREA)
         compared = f"change once {percent(_SMALL_AREA)} of the image is gone, against random order"
         findings.append(Finding(where=where, compared=compared, value=f"{most:.3f} against {chance:.3f}"))
-    return _over_settings(subject, by_setting, findings) if by_setting else _untested(subject, f"{name} was not scored")
+    if not by_setting:
+        return _untested(subject, f"{name} was not scored")
+    return _over_fills(subject, by_setting, findings, faithful)
 
 
 def _noisiest(looks: MapQuality) -> Answer:

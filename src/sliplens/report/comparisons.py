@@ -86,6 +86,12 @@ def settings(faithful: RemovalScores) -> list[tuple[str, str]]:
     return [(fill, unit) for unit in units for fill in fills if (fill, unit) in found]
 
 
+def voting_settings(faithful: RemovalScores) -> list[tuple[str, str]]:
+    """One setting of each fill, or a fill tried with several units would vote as often: that by pixels where it is."""
+    units = {fill: (fill, unit) for fill, unit in reversed(settings(faithful))}
+    return [one for one in settings(faithful) if units[one[0]] == one]
+
+
 def controls(faithful: RemovalScores) -> set[str]:
     """Names of the maps that know nothing of the network."""
     return {score.method for score in faithful.scores if score.control}

@@ -427,14 +427,16 @@ def table_meta(truth: Truth) -> Table | None:
         return None
     return make_table(
         f"{input_name(truth.input)}: the score put to the test. A map made from the truth must gain more than that map "
-        "damaged, and that more than chance; a fill where this fails cannot judge methods, and the verdict leaves it "
+        "damaged, beyond the 95 % interval; a fill where this fails cannot judge methods, and the verdict leaves it "
         "out.",
-        ("Fill", "Holds", "SRG of the truth", "SRG, damaged", "SRG, random"),
+        ("Fill", "Holds", "SRG of the truth", "SRG, damaged", "Truth less damaged", "SRG, random"),
         [
             (
                 FILL_NAMES.get(one.fill, one.fill),
-                "yes" if one.holds else "no",
-                *(decimals(value, 3) for value in (one.oracle, one.degraded, one.random)),
+                "yes" if one.fit else "no",
+                *(decimals(value, 3) for value in (one.oracle, one.degraded)),
+                _interval(one.gap, digits=3),
+                decimals(one.random, 3),
             )
             for one in truth.meta
         ],

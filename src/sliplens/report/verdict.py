@@ -32,8 +32,8 @@ from sliplens.report.comparisons import (
     compare_errors,
     controls,
     gap_from,
-    settings,
     tell_interval,
+    voting_settings,
 )
 from sliplens.report.results import Results
 from sliplens.report.thesis import NETWORK_PIXELS
@@ -249,7 +249,7 @@ class Standing:
 def rank_methods(faithful: RemovalScores, truth: Truth | None = None) -> list[Standing]:
     """Rank the methods: those that beat the best control in most settings first, by their gain.
 
-    Fills under which even a map made from the truth does not win are left out.
+    A fill counts once. Fills under which a map made from the truth does not win for sure are left out.
     """
     unfit = _unfit_fills(truth)
     known = controls(faithful)
@@ -259,7 +259,7 @@ def rank_methods(faithful: RemovalScores, truth: Truth | None = None) -> list[St
     for method in methods_in_order(score.method for score in faithful.scores if not score.control):
         if method in CONTROLS:
             continue
-        tested = [one for one in _votes(faithful, method) if (*one, method) in gaps and one[0] not in unfit]
+        tested = [one for one in voting_settings(faithful) if (*one, method) in gaps and one[0] not in unfit]
         beaten = [one for one in tested if _gains(gaps[*one, method]) and _gains(scores[*one, method].srg)]
         gains = [scores[*one, method].srg.estimate for one in tested]
         mean = float(np.mean(gains)) if gains else float("-inf")
@@ -275,7 +275,7 @@ def _believe(faithful: RemovalScores, results: Results) -> Statement:
         return Statement(topic=topic, text="Not known: no method was compared with a control.", tone="caution")
     best = ranked[0]
     fills = [FILL_NAMES.get(fill, fill) for fill in _unfit_fills(truth)]
-    unfit = f" Left out: {listed(fills)}, where even a map made from the truth does not win." if fills else ""
+    unfit = f" Left out: {listed(fills)}, where even a map made from the truth does not win for sure." if fills else ""
     if faithful.trials < FEWEST_UNITS:
         trials = f"{faithful.trials} trials are too few to tell a method from chance; {FEWEST_UNITS} or more are needed"
         return Statement(topic=topic, text=f"Not known: {trials}.", tone="caution")
@@ -340,16 +340,7 @@ def _tell_lead(faithful: RemovalScores, best: Standing, others: list[Standing]) 
 
 
 def _unfit_fills(truth: Truth | None) -> list[str]:
-    return [] if truth is None else [one.fill for one in truth.meta if not one.holds]
-
-
-def _votes(faithful: RemovalScores, method: str) -> list[tuple[str, str]]:
-    """One setting a fill: by pixels where that was done, or a fill tried with several units would count twice."""
-    chosen: dict[str, tuple[str, str]] = {}
-    for fill, unit in settings(faithful):
-        if (fill, unit, method) in faithful.curves:
-            chosen.setdefault(fill, (fill, unit))
-    return list(chosen.values())
+    return [] if truth is None else [one.fill for one in truth.meta if not one.fit]
 
 
 def _gains(gap: Difference) -> bool:

@@ -280,6 +280,11 @@ class OracleTest:
     gap: Difference | None
     """Gain of the perfect map less that of the damaged one."""
 
+    @property
+    def fit(self) -> bool:
+        """Whether the gain can judge maps: the interval of `gap` lies above zero."""
+        return self.gap is not None and self.gap.low > 0
+
 
 @dataclass(frozen=True, kw_only=True)
 class MetaTest(OracleTest):
