@@ -20,8 +20,8 @@ from sliplens.study.curves import Setting
 from sliplens.training import evaluate, train
 
 INPUTS = ("difference", "raw")
-METHODS = ("grad-cam", "integrated-gradients", "poly-cam-thesis", "poly-cam")
-"""The three methods of the thesis, of which Poly-CAM alone is as it was run there, and Poly-CAM for a regressor."""
+METHODS = ("grad-cam-thesis", "integrated-gradients-thesis", "poly-cam-thesis", "poly-cam")
+"""The three methods of the thesis as they were run there, and Poly-CAM for a regressor."""
 STRIP_METHOD = "poly-cam"
 """Method of the first picture: the one whose maps are quickest to read."""
 _SETTINGS = (Setting(fill="reference", unit="pixel"), Setting(fill="noisy-linear", unit="pixel"))

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from dots import draw_dots, make_grid
 
 import sliplens
 from sliplens.errors import ImageError, InputError
 from sliplens.explainers import GradCam, PolyCam, get_explainer
+from sliplens.explainers.occlusion import marker_regions, markers_in_frame
 from sliplens.models import Run
 from sliplens.models.checkpoint import Manifest
 
@@ -48,10 +50,26 @@ def test_a_method_takes_its_options(trained):
     assert get_explainer("poly-cam", variant="+") == PolyCam(variant="+")
     coarse = sliplens.explain(run, FRAMES[:1], method="occlusion", tile_px=SIZE)
     assert len(coarse.relevance.unique()) == 1  # one tile is the whole image
-    with pytest.raises(InputError, match="grad-cam has no option 'tile_px'; it has layer, contrast, batch_size"):
+    with pytest.raises(InputError, match="grad-cam has no option 'tile_px'; it has layer, contrast, relu, batch_size"):
         sliplens.explain(run, FRAMES, method="grad-cam", tile_px=8)
     with pytest.raises(InputError, match="there is no method named 'gradcam'; choose one of grad-cam"):
         sliplens.explain(run, FRAMES, method="gradcam")
+
+
+def test_markers_are_found_in_the_frames_that_the_caller_gave(trained):
+    """Difference images show none; each frame has its own."""
+    pytest.importorskip("cv2", reason="OpenCV, of the extra markers, is not installed")
+    grids = [make_grid(columns=4, rows=4, pitch=14.0, at=(10.0 + shift, 10.0)) for shift in (0.0, 3.0, -2.0)]
+    untouched, *frames = (draw_dots(grid, size=(SIZE, SIZE), radius=3.0) for grid in grids)
+    run = trained("difference")
+    explanation = sliplens.explain(run, np.stack(frames), reference=untouched, method="shapley-marker", pairs=40)
+    for row, frame in enumerate(frames):
+        regions = marker_regions((SIZE, SIZE), markers_in_frame(frame, image_size=SIZE))
+        flat = [explanation.relevance[row][regions == number].unique() for number in regions.unique()]
+        assert len(flat) == 17
+        assert all(len(values) == 1 for values in flat)
+    with pytest.raises(InputError, match="markers do not show in difference images"):
+        sliplens.explain(run, np.stack(frames), method="shapley-marker")
 
 
 def test_frames_of_another_sensor_or_none_at_all_are_refused(trained):

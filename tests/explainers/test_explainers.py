@@ -19,22 +19,34 @@ from sliplens.explainers import (
     PolyCam,
     SmoothGrad,
 )
+from sliplens.explainers.shapley import Shapley
 
-# LRP has laws of its own, in test_lrp.py
-NAMES = [name for name in EXPLAINERS if name != "lrp"]
+# LRP has laws of its own, in test_lrp.py; what the thesis ran is of f itself, and obeys none: test_thesis.py
+NAMES = [name for name in EXPLAINERS if name != "lrp" and not name.endswith("-thesis")]
 every_explainer = pytest.mark.parametrize("name", NAMES)
 # an untrained network is so rough that integrated gradients would go to their most steps in every test
 SHORT = IntegratedGradients(steps=4, max_steps=8)
+MARKERS = torch.tensor([[3.0, 3.0], [5.0, 60.0], [30.0, 31.0], [47.0, 12.0]])
 QUICK = dict(EXPLAINERS) | {
     "integrated-gradients": SHORT,
     "expected-gradients": ExpectedGradients(integrated=SHORT),
     "smooth-grad": SmoothGrad(samples=3),
     # the images here show none
-    "occlusion-marker": Occlusion(markers_px=torch.tensor([[3.0, 3.0], [5.0, 60.0], [30.0, 31.0], [47.0, 12.0]])),
+    "occlusion-marker": Occlusion(markers_px=MARKERS),
+    "shapley": Shapley(tile_px=32),
+    "shapley-marker": Shapley(markers_px=MARKERS),
 }
 CAMS = ["grad-cam", "hires-cam", "layer-cam", "poly-cam"]
 # what adds up to f(x) - f(reference), for some networks at least
-COMPLETE = ["grad-cam", "hires-cam", "poly-cam", "integrated-gradients", "expected-gradients"]
+COMPLETE = [
+    "grad-cam",
+    "hires-cam",
+    "poly-cam",
+    "integrated-gradients",
+    "expected-gradients",
+    "shapley",
+    "shapley-marker",
+]
 
 HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 
@@ -94,7 +106,7 @@ def test_model_is_given_back_as_it_was(name, network, images):
     ("name", "call"),
     [(name, call) for name in NAMES for call in (1, 2)]  # predicting, or looking for layers, or explaining
     + [(name, 3) for name in NAMES if name not in CAMS[:3]]
-    + [("poly-cam", 4), ("poly-cam", 5), ("occlusion", 4), ("occlusion-marker", 4)],
+    + [("poly-cam", 4), ("poly-cam", 5), *((name, 4) for name in NAMES[-4:])],
 )
 def test_model_is_given_back_as_it_was_after_an_exception(name, call, network, images):
     model = in_use(network("small shufflenet"))
@@ -172,6 +184,8 @@ def test_map_moves_with_the_image(name, network):
     moving = {
         "smooth-grad": lambda _: SmoothGrad(samples=1, noise=0.0),
         "occlusion-marker": lambda at: Occlusion(markers_px=places + at - 24, radius_px=6.0),
+        "shapley": lambda _: Shapley(tile_px=16),
+        "shapley-marker": lambda at: Shapley(markers_px=places + at - 24, radius_px=6.0),
     }
     explain = moving.get(name, lambda _: QUICK[name])
     one = explain(24)(model, with_patch(24)).relevance[0, 16:56, 16:56]

@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from captum import attr
+from torchcam.methods import GradCAM
 from torchvision import models
 
 from sliplens.errors import InputError, ModelError
-from sliplens.explainers import PolyCam, capture
+from sliplens.explainers import PolyCam, capture, get_explainer
 from sliplens.explainers.activations import find_published_layers
+from sliplens.explainers.maps import spread
 
 PUBLISHED = [
     "conv1",
@@ -100,3 +103,23 @@ def test_its_weights_are_all_one_where_the_sigmoid_is_saturated(network, images)
 def test_a_level_that_is_not_there_is_told(network, images):
     with pytest.raises(InputError, match="Poly-CAM has no level 5 for 2 layers; count from 0, the finest"):
         PolyCam(score="thesis", layers=("conv1", "stage2"), level=5)(network("small shufflenet"), images[:1])
+
+
+def test_grad_cam_of_the_thesis_is_torch_cams_above_zero_in_its_order(network, images, reference):
+    """It is of f itself, so that the reference sets the scale of the map alone."""
+    model = network("shufflenet")
+    with GradCAM(model, target_layer="conv5") as extractor:
+        oracle = extractor(0, model(images.clone().requires_grad_()), normalized=False)[0]
+    shown = spread(oracle, (images.shape[-2], images.shape[-1]))
+    explanation = get_explainer("grad-cam-thesis")(model, images, reference=reference)
+    expected = shown * (explanation.change / shown.sum(dim=(1, 2)))[:, None, None]
+    torch.testing.assert_close(explanation.relevance, expected.float(), atol=1e-6, rtol=1e-4)
+    assert bool((explanation.influence >= 0).all())
+
+
+def test_integrated_gradients_of_the_thesis_are_captums_from_black(network, images, reference):
+    model = network("gap")
+    integrated = attr.IntegratedGradients(model).attribute(images, n_steps=50)
+    explanation = get_explainer("integrated-gradients-thesis")(model, images, reference=reference)
+    torch.testing.assert_close(explanation.relevance, integrated.sum(dim=1).float(), atol=1e-6, rtol=1e-4)
+    torch.testing.assert_close(explanation.reference_prediction, model(reference[None]).detach().float().expand(3))

@@ -424,14 +424,14 @@ def write_others(workspace: Path, name: str, made: Made) -> None:
     write_quality(workspace, name, made.looks, rougher if made.rougher_told else [])
     seconds = {"grad-cam": 0.02, "integrated-gradients": 0.4, "poly-cam": 3.0}
     timed = {
-        method: MethodTime(seconds=one, seconds_without_forward=one - 0.01, low=one * 0.9, high=one * 1.1)
+        method: MethodTime(seconds=one, seconds_without_forward=one - 0.01, low=one * 0.9, high=one * 1.1, frames=3)
         for method, one in seconds.items()
     }
     write_run(
         workspace / f"timing-{name}",
         "timing",
         {},
-        Timing(input=name, source="simulated", device="cpu", threads=2, repeats=5, forward_seconds=0.01, methods=timed),
+        Timing(input=name, source="simulated", device="cpu", threads=2, frames=3, forward_seconds=0.01, methods=timed),
     )
 
 
@@ -482,6 +482,7 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
         "grad-cam": 0.3,
         "integrated-gradients": 0.4,
         "poly-cam": 0.7,
+        "poly-cam-thesis": 0.2,
         "edges": 0.1,
         "oracle": 1.0,
         "degraded-oracle": 0.8,

@@ -144,9 +144,8 @@ def test_verdict_comes_first_and_the_contents_lead_everywhere(reader):
 def test_all_five_claims_are_answered_for_both_networks(text):
     answers = re.findall(r'<span class="badge ([a-z-]+)">', text)
 
-    # (b) compares both networks and has one answer
-    assert len(answers) == 2 + 1 + 2 + 2 + 2
-    assert set(answers) == {"holds"}
+    # (b) compares both networks and has one answer; of methods that the thesis did not run it holds nothing
+    assert answers == ["undecided"] * (2 + 1 + 2 + 2) + ["holds"] * 2
 
 
 def test_caption_of_the_bins_is_their_largest_error(caption, numbers):

@@ -88,6 +88,10 @@ def test_looks_are_those_of_the_saved_maps(material: Material, fine_dataset: Dat
 
 def test_the_time_without_the_forward_pass_is_shorter_by_that_pass(material: Material):
     timing = time_explainers(material)
+    assert timing.frames == len(material.inputs) == 6
+    assert {one.frames for one in timing.methods.values()} == {6}
+    # a slow method is timed on fewer, and says so
+    assert {one.frames for one in time_explainers(material, longest_s=0.0).methods.values()} == {3}
     for one in timing.methods.values():
         assert one.low <= one.seconds <= one.high
         assert one.seconds_without_forward == pytest.approx(max(0, one.seconds - timing.forward_seconds))

@@ -38,8 +38,8 @@ class Study(Command):
     """Simulate the data set first: the days and trials of the thesis, 80 frames each, some 1.5 GB. The networks of the
     package never saw its trials, so the training trials are chosen from, as in the thesis."""
     method: tuple[str, ...] | None = None
-    """Explainers to compare; poly-cam-thesis is Poly-CAM as the thesis ran it. If not given, the thesis's three,
-    Poly-CAM for a regressor, and occlusion."""
+    """Explainers to compare; those that end in -thesis are as the thesis ran them. If not given, these three, the same
+    against the untouched sensor, occlusion, and Shapley values of markers."""
     split: str | None = None
     """Trials to choose from; test if not given, train with --preset."""
     condition: str = "dry"

@@ -12,7 +12,7 @@ from sliplens.errors import ModelError
 from sliplens.explainers.activations import Layer, capture, recall_layers
 from sliplens.explainers.contract import FrozenModel, Method, require_at_least_one
 from sliplens.explainers.explanation import Explanation, check_slopes
-from sliplens.explainers.maps import spread
+from sliplens.explainers.maps import scale_to, spread
 from sliplens.progress import OnProgress
 
 _Maps: TypeAlias = Float[Tensor, "batch channels rows columns"]
@@ -29,6 +29,7 @@ class _Cam(Method):
 
     layer: str | None = None
     contrast: bool = True
+    relu: bool = False
     batch_size: int = 32
 
     method: ClassVar[str]
@@ -61,17 +62,18 @@ class _Cam(Method):
             change = (prediction - reference_prediction)[:, None, None, None]
             sign = change.sign() if self.one_sided else torch.ones_like(change)
             cells = self.cells(activations - empty if self.contrast else activations, sign * gradients)
-            maps.append(spread(sign[:, 0] * cells, (frozen.images.shape[-2], frozen.images.shape[-1])))
+            cells = torch.relu(cells) if self.relu else sign[:, 0] * cells
+            maps.append(spread(cells, (frozen.images.shape[-2], frozen.images.shape[-1])))
             predictions.append(prediction)
             reference_predictions.append(reference_prediction.expand_as(prediction))
             if on_progress is not None:
                 on_progress(sum(map(len, maps)), len(frozen.images))
         comparison = frozen.compared(torch.cat(predictions), torch.cat(reference_predictions))
-        relevance = torch.cat(maps)
+        relevance = scale_to(torch.cat(maps), total=comparison.change) if self.relu else torch.cat(maps)
         return comparison.explanation(
             relevance,
             method=self.method,
-            complete=self.contrast and not self.one_sided,
+            complete=self.contrast and not self.one_sided and not self.relu,
             target=f"{'f(x) - f(reference)' if self.contrast else 'f(x)'}, through layer {layer.name}",
             warnings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=comparison.change.tolist()),
         )
@@ -112,6 +114,9 @@ class GradCam(_Cam):
     contrast
         Take the reference's activations off. False gives the published map, which does not depend on the reference and
         has no completeness gap; the reference then only decides what `saliency` shows.
+    relu
+        Keep the cells above zero alone, as published; their map is then scaled to add up to f(x) - f(b), so that the
+        order of its pixels is the published one. That is a convention, and says nothing of what one pixel contributes.
 
     References
     ----------

@@ -1,6 +1,6 @@
 """Integrated Gradients along the line from the reference, Expected Gradients, SmoothGrad."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -45,6 +45,9 @@ class IntegratedGradients(Method):
         line, as it was published.
     tolerance
         Completeness gap allowed, as a share of |f(x) - f(b)|.
+    black
+        Start from the black image instead, as published: relevance adds up to f(x) - f(black), and the reference only
+        decides what `saliency` shows.
 
     References
     ----------
@@ -67,6 +70,7 @@ class IntegratedGradients(Method):
     steps: int = 32
     max_steps: int = 1024
     tolerance: float = 0.01
+    black: bool = False
     batch_size: int = 32
 
     def __post_init__(self) -> None:
@@ -82,7 +86,8 @@ class IntegratedGradients(Method):
 
     def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
         comparison, slopes = frozen.compare(), []
-        pairs = (comparison.images, comparison.reference, comparison.prediction, comparison.reference_prediction)
+        black = replace(frozen, references=torch.zeros_like(frozen.references)).compare() if self.black else comparison
+        pairs = (black.images, black.reference, black.prediction, black.reference_prediction)
 
         def integral(index: int) -> Tensor:
             relevance, slope = self.integrate(comparison, *(values[index] for values in pairs))
@@ -92,8 +97,9 @@ class IntegratedGradients(Method):
         return comparison.explanation(
             comparison.map_each(integral, on_progress=on_progress),
             method="integrated-gradients",
-            complete=True,
-            warnings=check_slopes(slopes, change=comparison.change.tolist()),
+            complete=not self.black,
+            target=f"f(x) - f({'black' if self.black else 'reference'})",
+            warnings=check_slopes(slopes, change=black.change.tolist()),
         )
 
     def integrate(

@@ -1,6 +1,6 @@
 """Occlusion: what the prediction loses when a part of the image is replaced by the reference."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -40,22 +40,42 @@ def find_markers(
     return torch.from_numpy(detect_markers(pixels.permute(1, 2, 0).cpu().numpy()).centre_px)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class KnownMarkers:
+    """What tells the markers of images in which they do not show: those of the image it knows that is most alike."""
+
+    images: Float[Tensor, "frames 3 height width"]
+    """As the network gets them, in [0, 1]."""
+    places: tuple[Float[Tensor, "_markers 2"], ...]
+    """x and y of the markers of each, in pixels of these images."""
+
+    def __call__(
+        self, image: Float[Tensor, "3 height width"], _reference: Float[Tensor, "3 height width"]
+    ) -> Float[Tensor, "_markers 2"]:
+        """Places of the markers of the nearest image: noise, or the next frame, leaves it the nearest."""
+        unlike = [(image.to(known) - known).abs().mean() for known in self.images]
+        return self.places[int(torch.stack(unlike).argmin())]
+
+
+def to_network_px(
+    places_px: Float[np.ndarray, "markers 2"], frame_size: Sequence[int], *, image_size: int
+) -> Float[Tensor, "markers 2"]:
+    """Places (x, y) in a network's image of places in a camera frame of (height, width) pixels."""
+    # pixel centres are whole numbers in both images
+    scale = image_size / np.array([frame_size[1], frame_size[0]])
+    return torch.from_numpy((places_px.astype(np.float64) + 0.5) * scale - 0.5)
+
+
 def markers_in_frame(frame: UInt8[np.ndarray, "height width 3"], *, image_size: int) -> Float[Tensor, "markers 2"]:
     """Places (x, y) of the markers of a camera frame, in the network's image."""
-    return _scaled(detect_markers(frame).centre_px, frame.shape[:2], image_size)
+    return to_network_px(detect_markers(frame).centre_px, frame.shape[:2], image_size=image_size)
 
 
 def markers_in_recording(recording: Recording, row: int, *, image_size: int) -> Float[Tensor, "markers 2"]:
     """Places (x, y) of the markers of a trial's frame in the network's image: the simulator's, where it has any."""
     if recording.truth is None:
         return markers_in_frame(recording.frames[row], image_size=image_size)
-    return _scaled(recording.truth.marker_px[row], recording.frames.shape[1:3], image_size)
-
-
-def _scaled(places_px: np.ndarray, size: tuple[int, ...], image_size: int) -> Tensor:
-    # pixel centres are whole numbers in both images
-    scale = image_size / np.array([size[1], size[0]])
-    return torch.from_numpy((places_px.astype(np.float64) + 0.5) * scale - 0.5)
+    return to_network_px(recording.truth.marker_px[row], recording.frames.shape[1:3], image_size=image_size)
 
 
 Places: TypeAlias = Float[Tensor, "markers 2"]

@@ -15,7 +15,7 @@ from sliplens.explainers.contract import Explainer
 from sliplens.explainers.explanation import Explanation
 from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients, SmoothGrad
 from sliplens.explainers.lrp import Lrp
-from sliplens.explainers.occlusion import Occlusion, find_markers
+from sliplens.explainers.occlusion import KnownMarkers, Occlusion, RegionMethod, find_markers, markers_in_frame
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.shapley import Shapley
 from sliplens.extras import Table
@@ -36,9 +36,15 @@ _ROWS: dict[str, Explainer] = {
     "shapley": Shapley(),
     "shapley-marker": Shapley(markers_px=find_markers),
     "lrp": Lrp(),
+    "grad-cam-thesis": GradCam(contrast=False, relu=True),
+    "integrated-gradients-thesis": IntegratedGradients(black=True, steps=50, max_steps=50),
+    "poly-cam-thesis": PolyCam(score="thesis", level=5),
 }
 EXPLAINERS = Table("method", "sliplens.explainers", _ROWS)
 """The explainers by name, with their default options; use `dataclasses.replace` for others. `lrp` needs an extra.
+
+The last three are the thesis's methods as they were published and run, of f itself; the thesis does not say whether it
+ranked the pixels of Integrated Gradients by sign or by size, and here their sign counts as that of all methods does.
 
 An installed package adds its own by the entry point `sliplens.explainers`.
 """
@@ -93,6 +99,10 @@ def explain(
     trained = open_run(run)
     explainer = get_explainer(method, **options) if isinstance(method, str) else method
     inputs, empty = network_inputs(trained, frames, reference)
+    if isinstance(explainer, RegionMethod) and explainer.markers_px is find_markers and reference is not None:
+        # they show in the camera's frames, at their full size, whatever the network is shown
+        places = tuple(markers_in_frame(frame, image_size=trained.manifest.image_size) for frame in frames)
+        explainer = replace(explainer, markers_px=KnownMarkers(images=inputs, places=places))
     return explainer(trained.model, inputs, reference=empty, on_progress=on_progress)
 
 

@@ -351,21 +351,23 @@ def table_times(timing: Mapping[str, Timing]) -> Table:
     rows, methods = [], {one for name in names for one in timing[name].methods}
     for method in methods_in_order(methods):
         cells = []
-        for one in (timing[name].methods.get(method) for name in names):
-            spread = "" if one is None or one.low is None else f" ({_seconds(one.low)} to {_seconds(one.high)})"
+        for whole, one in ((timing[name].frames, timing[name].methods.get(method)) for name in names):
+            part = f" on {one.frames} frames" if one is not None and one.frames < whole else ""
+            spread = "" if one is None else f" ({_seconds(one.low)} to {_seconds(one.high)}{part})"
             cells.append(UNKNOWN if one is None else f"{_seconds(one.seconds)}{spread}")
             cells.append(_seconds(None if one is None else one.seconds_without_forward))
         rows.append((method_name(method), *cells, _thesis_seconds(method, methods)))
     told = "; ".join(
         f"{input_name(name).lower()}: {one.device}"
         f"{f' with {one.threads} threads' if one.threads and one.device == 'cpu' else ''}, "
-        f"{one.repeats} repeats or more, a forward pass takes {_seconds(one.forward_seconds)} s"
+        f"{one.frames} frames, a forward pass takes {_seconds(one.forward_seconds)} s"
         for name in names
         for one in [timing[name]]
     )
     heads = [f"{short_input_name(name)}, {what}" for name in names for what in ("with forward pass", "without")]
     return make_table(
-        f"Seconds to explain one frame: median of the repeats after a warm-up, and their range ({told}). The thesis "
+        f"Seconds to explain one frame: median over the sample's frames after a warm-up, their range, and on how many "
+        f"of them a slow method was timed ({told}). The thesis "
         f"timed images of {NETWORK_PIXELS} px on an RTX 3060 Ti without waiting for the GPU, and left Grad-CAM's "
         "forward pass out.",
         ("Method", *heads, "Thesis"),

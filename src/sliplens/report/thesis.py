@@ -11,18 +11,16 @@ from collections.abc import Collection
 MARK = "thesis (real touch, other data)"
 NETWORK_PIXELS = 224
 
-THESIS_POLY_CAM = "poly-cam-thesis"
-"""Poly-CAM with the score, layers and map of the thesis."""
+AS_RUN = "-thesis"
+"""Ends the names of the methods that are run as the thesis ran them."""
 
 
 def thesis_row(method: str, among: Collection[str]) -> str | None:
     """Name the method of the thesis that one of ours stands beside; None if there is none.
 
-    Its Poly-CAM stands beside ours run as in the thesis, and beside our own only where that was not among those run.
+    Its methods stand beside ours run as in the thesis, and beside our own only where those were not among those run.
     """
-    if method == THESIS_POLY_CAM:
-        return "poly-cam"
-    return None if method == "poly-cam" and THESIS_POLY_CAM in among else method
+    return None if method + AS_RUN in among else method.removesuffix(AS_RUN)
 
 
 ACCURACY: dict[tuple[str, str], tuple[float, float]] = {

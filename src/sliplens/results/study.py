@@ -231,12 +231,14 @@ class MapQuality:
 
 @dataclass(frozen=True, kw_only=True)
 class MethodTime:
-    """Seconds a frame: median with the forward pass and without it, and the range of the repeats."""
+    """Seconds a frame: median over frames with the forward pass and without it, and the range."""
 
     seconds: float
     seconds_without_forward: float
     low: float
     high: float
+    frames: int
+    """Frames that were timed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,7 +249,8 @@ class Timing:
     source: str
     device: str
     threads: int
-    repeats: int
+    frames: int
+    """Frames of the sample."""
     forward_seconds: float
     methods: dict[str, MethodTime]
 

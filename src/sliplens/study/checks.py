@@ -103,44 +103,61 @@ def _once_more(
     return torch.cat(noisy), torch.cat(following), float(np.mean(levels))
 
 
-_REPEATS, _SLOW_REPEATS, _SLOW_S = 5, 3, 3.0
+_LONGEST_S = 120.0
+"""Of the timing of one method."""
+_FEWEST_TIMED = 3
 
 
-def time_explainers(material: Material, *, on_progress: OnProgress | None = None) -> Timing:
-    """Time each method on the first frame: the median and the extremes of a few runs.
+def time_explainers(
+    material: Material, *, longest_s: float = _LONGEST_S, on_progress: OnProgress | None = None
+) -> Timing:
+    """Time each method on every frame of the sample, one at a time: the median and the extremes.
 
-    The thesis's Poly-CAM is timed with all its channels, as it was run, even where a budget makes its maps.
+    The thesis's Poly-CAM is timed with all its channels, as it was run, even where a budget makes its maps. A method
+    that is not through within `longest_s` is timed on fewer frames, a random part of them, and at least three.
     """
-    model, inputs, references = material.trained.model, material.inputs[:1], material.references[:1]
-    forward = float(np.median(_seconds(lambda: material.trained.predict(inputs))))
-    methods, counts = {}, []
+    model, device = material.trained.model, material.inputs.device.type
+    order = np.random.default_rng(0).permutation(len(material.inputs)).tolist()
+    frames = [(material.inputs[row, None], material.references[row, None]) for row in order]
+    forward = float(np.median(_seconds(frames, lambda images, _: material.trained.predict(images), longest_s)))
+    methods = {}
     for name, explainer in counted(as_the_thesis_ran(material.explainers).items(), on_progress):
-        seconds = _seconds(lambda explainer=explainer: explainer(model, inputs, reference=references).relevance)
+
+        def explain(images: Tensor, reference: Tensor, explainer: Explainer = explainer) -> Tensor:
+            return explainer(model, images, reference=reference).relevance
+
+        seconds = _seconds(frames, explain, longest_s)
         median = float(np.median(seconds))
-        counts.append(len(seconds))
         # without the forward pass: the thesis left it out of Grad-CAM's time
         methods[name] = MethodTime(
-            seconds=median, seconds_without_forward=max(0.0, median - forward), low=min(seconds), high=max(seconds)
+            seconds=median,
+            seconds_without_forward=max(0.0, median - forward),
+            low=min(seconds),
+            high=max(seconds),
+            frames=len(seconds),
         )
     return Timing(
         input=material.explained.input,
         source=material.explained.source,
-        device=inputs.device.type,
+        device=device,
         threads=torch.get_num_threads(),
-        # of the method that takes longest; the others have more
-        repeats=min(counts),
+        frames=len(frames),
         forward_seconds=forward,
         methods=methods,
     )
 
 
-def _seconds(work: Callable[[], Tensor]) -> list[float]:
-    """Seconds of each of a few runs, after one that does not count; fewer where one takes long."""
+def _seconds(
+    frames: Sequence[tuple[Tensor, Tensor]], work: Callable[[Tensor, Tensor], Tensor], longest_s: float
+) -> list[float]:
+    """Seconds of each frame, after one run that does not count."""
     seconds: list[float] = []
-    work()
-    while len(seconds) < (_SLOW_REPEATS if seconds and seconds[0] > _SLOW_S else _REPEATS):
+    work(*frames[0])
+    for images, reference in frames:
+        if len(seconds) >= _FEWEST_TIMED and sum(seconds) > longest_s:
+            break
         started = time.perf_counter()
-        result = work()
+        result = work(images, reference)
         if result.is_cuda:
             torch.cuda.synchronize(result.device)
         seconds.append(time.perf_counter() - started)

@@ -209,14 +209,13 @@ def explain_frames(
     chosen: ChosenFrames,
     *,
     methods: Sequence[str] = DEFAULT_METHODS,
-    explainers: Mapping[str, Explainer | Sequence[Explainer]] = EXPLAINERS,
+    explainers: Mapping[str, Explainer] = EXPLAINERS,
     parts: Path | None = None,
     on_progress: OnProgress | None = None,
 ) -> Explained:
     """Explain frames with several methods.
 
-    A method whose options differ from frame to frame has one explainer for each. `parts` is a folder that keeps each
-    map as soon as it is there, so that an interrupted run loses at most one.
+    `parts` is a folder that keeps each map as soon as it is there, so that an interrupted run loses at most one.
 
     Raises
     ------
@@ -228,9 +227,8 @@ def explain_frames(
     references = chosen.references.to(trained.device)
 
     def explain(method: str, index: int) -> _Map:
-        own, frame = explainers[method], slice(index, index + 1)
-        explainer = own[index] if isinstance(own, Sequence) else own
-        explanation = explainer(trained.model, inputs[frame], reference=references[frame])
+        frame = slice(index, index + 1)
+        explanation = explainers[method](trained.model, inputs[frame], reference=references[frame])
         return _Map(
             relevance=explanation.relevance[0].cpu().numpy(),
             saliency=explanation.saliency[0].cpu().numpy(),

@@ -1,14 +1,16 @@
 """What the scores of one network work on: its explanations, what was explained, and the fastest way to ask it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
+from functools import cache
 from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from sliplens.explainers import EXPLAINERS, Explainer, Likeness, PolyCam
+from sliplens.explainers import EXPLAINERS, Explainer, Likeness, PolyCam, get_explainer
+from sliplens.explainers.occlusion import KnownMarkers, RegionMethod, to_network_px
 from sliplens.faithfulness.removal import Units, marker_units, tile_units
 from sliplens.models import Run
 from sliplens.recordings import Dataset
@@ -18,8 +20,9 @@ from sliplens.study.choice import network_places
 from sliplens.study.explaining import frames_at, network_inputs, require_methods
 
 THESIS_POLY_CAM = "poly-cam-thesis"
-STUDY_METHODS = ("grad-cam", "integrated-gradients", THESIS_POLY_CAM, "poly-cam", "occlusion")
-"""Grad-CAM, Integrated Gradients and Poly-CAM as the thesis ran it; Poly-CAM with the regression score, occlusion."""
+_THESIS = ("grad-cam-thesis", "integrated-gradients-thesis", THESIS_POLY_CAM)
+STUDY_METHODS = (*_THESIS, "grad-cam", "integrated-gradients", "poly-cam", "occlusion", "shapley-marker")
+"""The thesis's three as published, the same against the untouched sensor, occlusion, Shapley values of the markers."""
 STUDY_BUDGET = 0.15
 """Share of the channels that Poly-CAM measures at first: more where the map asks for it."""
 _AS_PUBLISHED = Likeness(pearson_r=0.999, top_overlap=0.97)
@@ -27,14 +30,32 @@ _AS_PUBLISHED = Likeness(pearson_r=0.999, top_overlap=0.97)
 
 
 def study_explainers(methods: Sequence[str] = STUDY_METHODS, *, budget: float = STUDY_BUDGET) -> dict[str, Explainer]:
-    """Explainers of a study: rows of `EXPLAINERS`, and `poly-cam-thesis` with the public code's score and layers."""
-    table = {
-        **EXPLAINERS,
-        "poly-cam": PolyCam(budget=budget),
-        THESIS_POLY_CAM: PolyCam(score="thesis", level=5, budget=budget, likeness=_AS_PUBLISHED),
+    """Explainers of a study: rows of `EXPLAINERS`, Poly-CAM with some of the channels measured at first."""
+    require_methods(methods)
+    own: dict[str, Explainer] = {
+        "poly-cam": get_explainer("poly-cam", budget=budget),
+        THESIS_POLY_CAM: get_explainer(THESIS_POLY_CAM, budget=budget, likeness=_AS_PUBLISHED),
     }
-    require_methods(methods, table)
-    return {name: table[name] for name in methods}
+    return {name: own.get(name) or EXPLAINERS[name] for name in methods}
+
+
+def with_markers(
+    explainers: Mapping[str, Explainer],
+    images: Float[Tensor, "frames 3 size size"],
+    places: Callable[[], Sequence[Float[Tensor, "_markers 2"]]],
+) -> dict[str, Explainer]:
+    """The same, but those that look for markers are told their places in each image, which are asked only for them."""
+    find = cache(lambda: KnownMarkers(images=images, places=tuple(places())))
+    return {
+        name: replace(one, markers_px=find()) if isinstance(one, RegionMethod) and callable(one.markers_px) else one
+        for name, one in explainers.items()
+    }
+
+
+def without_markers(explainers: Mapping[str, Explainer]) -> dict[str, Explainer]:
+    """The same where markers are not known: tiles are asked instead."""
+    named = {name.removesuffix("-marker"): one for name, one in explainers.items()}
+    return {name: EXPLAINERS[name] if isinstance(one, RegionMethod) else one for name, one in named.items()}
 
 
 def as_the_thesis_ran(explainers: Mapping[str, Explainer]) -> dict[str, Explainer]:
@@ -122,12 +143,23 @@ def gather(
     places = {frame.id: at for at, frame in enumerate(explained.frames)}
     counted = explained.take([places[frame.id] for frame in chosen])
     frames = frames_at(trained, data, [(frame.trial, frame.frame) for frame in chosen])
+    inputs = network_inputs(trained, counted)
     return Material(
         trained=trained,
         explained=counted,
-        inputs=network_inputs(trained, counted),
+        inputs=inputs,
         references=frames.references.to(trained.device),
         chosen=chosen,
         markers=markers,
-        explainers=explainers,
+        explainers=with_markers(explainers, inputs, lambda: seen_places(trained, chosen, markers)),
     )
+
+
+def seen_places(
+    trained: Run, chosen: Sequence[ChosenFrame], markers: Mapping[str, MarkedFrame]
+) -> list[Float[Tensor, "_markers 2"]]:
+    """Where the markers of each frame are, in the network's pixels; those that were not followed are left out."""
+    now = [markers[frame.id].now_px for frame in chosen]
+    known = [places[np.isfinite(places).all(axis=1)] for places in now]
+    manifest = trained.manifest
+    return [to_network_px(places, manifest.frame_size, image_size=manifest.image_size) for places in known]

@@ -26,6 +26,7 @@ from sliplens.results.study import (
     TABLES,
     Choice,
     MapQuality,
+    MarkedFrame,
     Randomisation,
     States,
     Study,
@@ -38,7 +39,17 @@ from sliplens.study.checks import STAGES, explain_untrained, measure_maps, rando
 from sliplens.study.choice import choose_frames, show_states
 from sliplens.study.curves import RANDOMISED, SETTINGS, STUDY_AREAS, Setting, influences, score_removal
 from sliplens.study.explaining import explain_frames, frames_at
-from sliplens.study.material import STUDY_BUDGET, STUDY_METHODS, Material, gather, method_options, study_explainers
+from sliplens.study.material import (
+    STUDY_BUDGET,
+    STUDY_METHODS,
+    Material,
+    gather,
+    method_options,
+    seen_places,
+    study_explainers,
+    with_markers,
+    without_markers,
+)
 from sliplens.study.processes import run_together
 from sliplens.study.scoring import STEPS, score_explanations, score_remedies
 from sliplens.study.truth import TRUE_FILL, judge_by_truth, true_curves
@@ -222,25 +233,25 @@ class _Stages:
             "Following markers",
             lambda _, count: show_states(choice, self.data, on_progress=count),
         )
+        if unknown := [frame.id for frame in choice.frames if frame.id not in states.markers]:
+            named, self.explainers = list(self.explainers), without_markers(self.explainers)
+            if named != list(self.explainers):
+                what = f"the markers of {len(unknown)} frames are not known"
+                note(self.on_progress, f"{what}, so that tiles are asked instead")
         return choice, states
 
     def judge(self, name: str) -> None:
         """Explain the frames with one network's methods, and judge the explanations in every way but by the clock."""
         run, found, seed, chosen = self.networks[name], self.found[name], self.seed, self._choice.frames
-        found["explain"] = self._run(
-            ("explain", name),
-            Explained,
-            self._about(name),
-            f"Explaining {len(chosen)} frames ({name})",
-            lambda parts, count: explain_frames(
-                run,
-                frames_at(run, self.data, [(frame.trial, frame.frame) for frame in chosen]),
-                methods=list(self.explainers),
-                explainers=self.explainers,
-                parts=parts,
-                on_progress=count,
-            ),
-        )
+
+        def explain(parts: Path, count: OnProgress) -> Explained:
+            frames = frames_at(run, self.data, [(frame.trial, frame.frame) for frame in chosen])
+            images, methods = run.encoding.normalise(frames.images), list(self.explainers)
+            explainers = with_markers(self.explainers, images, lambda: seen_places(run, chosen, self._markers))
+            return explain_frames(run, frames, methods=methods, explainers=explainers, parts=parts, on_progress=count)
+
+        title = f"Explaining {len(chosen)} frames ({name})"
+        found["explain"] = self._run(("explain", name), Explained, self._about(name), title, explain)
         # gathered where a stage is missing: that takes longer than to see that all are there
         material = cache(lambda: self._gather(name))
 
@@ -347,6 +358,10 @@ class _Stages:
     def _choice(self) -> Choice:
         return load_result(self.folder / "choice", Choice, command=_COMMAND)
 
+    @cached_property
+    def _markers(self) -> Mapping[str, MarkedFrame]:
+        return load_result(self.folder / "states", States, command=_COMMAND).markers
+
     @property
     def _frames(self) -> dict[str, Any]:
         return {"data_hash": self.data.hash, "choice": hash_json(self._choice)}
@@ -362,7 +377,7 @@ class _Stages:
             self.found[name]["explain"],
             self.data,
             tuple(frame for frame in self._choice.frames if frame.scored),
-            markers=load_result(self.folder / "states", States, command=_COMMAND).markers,
+            markers=self._markers,
             explainers=self.explainers,
         )
 

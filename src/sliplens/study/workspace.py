@@ -9,10 +9,12 @@ from typing import Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError
-from sliplens.explainers import EXPLAINERS, ExpectedGradients, Explainer, Occlusion, get_explainer
+from sliplens.explainers import EXPLAINERS, ExpectedGradients, Explainer, get_explainer
 from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
 from sliplens.explainers.table import open_run
 from sliplens.faithfulness import get_fill
@@ -37,10 +39,9 @@ from sliplens.study.explaining import (
     nearest_frame,
     require_methods,
 )
-from sliplens.study.material import study_explainers
+from sliplens.study.material import study_explainers, with_markers
 from sliplens.study.scoring import require_same_network, score_explanations
 
-_BY_MARKER = "occlusion-marker"
 _FULL_STICK = 0.9
 """Safety margin from which a labelled frame counts as one without slip."""
 
@@ -210,39 +211,37 @@ def _choose_explainers(
     reference: Path | None,
     methods: Sequence[str],
     budget: float,
-) -> Mapping[str, Explainer | Sequence[Explainer]]:
+) -> Mapping[str, Explainer]:
     """The explainers with the options that these frames allow."""
     free = [index for index, margin in enumerate(chosen.safety_margin) if margin >= _FULL_STICK]
     background = trained.encoding.normalise(chosen.images[free]) if free else None
-    own: dict[str, Explainer | Sequence[Explainer]] = {
+    own: dict[str, Explainer] = {
         "poly-cam": get_explainer("poly-cam", budget=budget),
         "expected-gradients": ExpectedGradients(background=background),
     }
-    if _BY_MARKER in methods:
-        own[_BY_MARKER] = _occlude_markers(trained, chosen, source, reference=reference)
-    return {**EXPLAINERS, **own}
+    inputs = trained.encoding.normalise(chosen.images)
+    named = {name: own.get(name) or EXPLAINERS[name] for name in methods}
+    return with_markers(named, inputs, lambda: _find_markers(trained, chosen, source, reference=reference))
 
 
-def _occlude_markers(
+def _find_markers(
     trained: Run, chosen: ChosenFrames, source: Dataset | Path, *, reference: Path | None
-) -> list[Explainer]:
-    """Occlusion by marker, frame by frame: where the simulator put them, else where they are found."""
+) -> list[Float[Tensor, "_markers 2"]]:
+    """Places of the markers, frame by frame: where the simulator put them, else where they are found."""
     size = trained.manifest.image_size
     if isinstance(source, Dataset):
         opened = {info.trial: source.load(info) for info in source.trials if info.trial in chosen.trial}
-        places = [
+        return [
             markers_in_recording(opened[trial], int(name.removeprefix(f"{trial}-f")), image_size=size)
             for name, trial in zip(chosen.ids, chosen.trial, strict=True)
         ]
-    else:
-        opened_trials = open_source(source, reference=reference)
-        if any(trial.read_reference is None for trial in opened_trials):
-            raise InputError(
-                f"{_BY_MARKER} finds the markers in camera frames, which difference images are not; give camera frames "
-                "and --reference, or a data set"
-            )
-        places = [markers_in_frame(frame, image_size=size) for trial in opened_trials for frame in trial.read_frames()]
-    return [Occlusion(markers_px=centres) for centres in places]
+    opened_trials = open_source(source, reference=reference)
+    if any(trial.read_reference is None for trial in opened_trials):
+        raise InputError(
+            "markers are found in camera frames, which difference images are not; give camera frames and --reference, "
+            "or a data set"
+        )
+    return [markers_in_frame(frame, image_size=size) for trial in opened_trials for frame in trial.read_frames()]
 
 
 _CONFIDENCE = 0.9
