@@ -310,11 +310,11 @@ def test_a_fill_counts_once_whatever_the_units(judged, tmp_path):
 
 
 def test_a_claim_counts_a_fill_once_too(judged, tmp_path, rng):
-    judged(Made())
+    judged(thesis())
     results = load_results(tmp_path)
     faithful = results.study.faithfulness["difference"]
     table = faithful.table
-    turned = (table.fill == "reference") & (table.unit == "marker") & (table.method == "poly-cam")
+    turned = (table.fill == "reference") & (table.unit == "marker") & (table.method == "poly-cam-thesis")
     first, last = (
         np.where(turned, *pair)
         for pair in ((table.least_first, table.most_first), (table.most_first, table.least_first))
