@@ -1,5 +1,7 @@
 """Markers put back one after another: closed forms for a network to which every marker counts for itself."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.faithfulness.removal import SHARES, score_maps_by_marker
+from sliplens.faithfulness.removal import SHARES, answer_scenes, score_maps_by_marker
 
 IMAGES, MARKERS = 3, 40
 
@@ -99,3 +101,14 @@ def test_a_marker_without_influence_is_refused(weights, rng):
     weights[1, 2] = np.nan
     with pytest.raises(InputError, match="lime gives some marker no finite influence; leave out markers"):
         score_maps_by_marker(toy.predict, toy.redraw, {"lime": weights}, rng=rng)
+
+
+def test_a_scene_is_drawn_once_for_each_choice(weights, rng):
+    toy = Toy(weights)
+    answer = answer_scenes(toy.predict, partial(toy.redraw, 1), batch_size=3)
+    back = rng.random((8, MARKERS)) < 0.5
+    expected = (~back * weights[1]).sum(axis=1)
+    np.testing.assert_allclose(answer(np.concatenate([back, back[::-1]])), [*expected, *expected[::-1]], atol=1e-12)
+    assert (toy.drawn, toy.largest) == (8, 3)
+    np.testing.assert_allclose(answer(back[3:5]), expected[3:5], atol=1e-12)
+    assert toy.drawn == 8

@@ -453,7 +453,7 @@ def write_quality(
 def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Generator) -> Path:
     rows, size = scored_frames(made), made.size
     x, y = (size * axis.ravel() for axis in np.meshgrid(*[np.linspace(0.14, 0.86, 6)] * 2))
-    tables, maps = [], {"network": [], "margin": []}
+    tables, maps = [], {"shapley": [], "network": [], "margin": []}
     grid_y, grid_x = np.mgrid[:size, :size]
     for row in rows:
         network = np.full(len(x), (1 - made.top_share) / (len(x) - 2))
@@ -470,12 +470,14 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
                 marker=np.arange(len(x)),
                 x_px=x,
                 y_px=y,
+                shapley=network,
+                shapley_error=0.1 * network,
                 network=network,
                 margin=-margin,
                 state=np.ones(len(x), dtype=np.int64),
             )
         )
-        for key, effects in (("network", network), ("margin", -margin)):
+        for key, effects in (("shapley", network), ("network", network), ("margin", -margin)):
             spots = np.exp(-((grid_x - x[:, None, None]) ** 2 + (grid_y - y[:, None, None]) ** 2) / (0.002 * size**2))
             maps[key].append((effects[:, None, None] * (spots > 0.4)).sum(axis=0).astype(np.float32))
     spearman = {
@@ -488,7 +490,14 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
         "degraded-oracle": 0.8,
     }
     mass: dict[str, float | None] = {"markers": 0.5, "slip_annulus": 0.4, "edges": made.edge_mass}
-    held = {"holds": True, "oracle": 0.3, "degraded": 0.2, "random": 0.0, "gap": interval(0.1, made.trials)}
+    held = {
+        "holds": True,
+        "oracle": 0.3,
+        "degraded": 0.2,
+        "changed": 0.1,
+        "random": 0.0,
+        "gap": interval(0.1, made.trials),
+    }
     return write_run(
         workspace / f"truth-{name}",
         "truth",
@@ -502,18 +511,22 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
                 method: Localisation(
                     mass=mass,
                     rank=mass,
-                    spearman_network=value,
-                    spearman_margin=value / 2,
+                    shapley=interval(value, made.trials),
                     network=interval(value, made.trials),
                     margin=interval(value / 2, made.trials),
                     edges=interval(made.edge_mass - 0.07, made.trials, half=0.01),
                 )
                 for method, value in spearman.items()
             },
+            pairs=400,
+            reliability=interval(0.9, made.trials),
+            sums={"shapley": 1.0, "network": -1.2},
+            shapley_against_margin=interval(0.5, made.trials),
             network_against_margin=interval(0.5, made.trials),
             meta=(MetaTest(fill="true", by_size=OracleTest(**held), **held),),
             summary="Each marker was put back where it rested.",
             effects=MarkerEffects.joined(tables),
+            shapley_maps=np.stack(maps["shapley"]),
             network_maps=np.stack(maps["network"]),
             margin_maps=np.stack(maps["margin"]),
         ),

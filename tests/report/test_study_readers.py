@@ -177,7 +177,9 @@ def test_a_table_without_a_column_is_told(study):
 
 def test_maps_of_other_frames_are_told(study):
     maps = np.zeros((2, 4, 4), dtype=np.float32)
-    np.savez(study / "truth-raw" / "arrays.npz", allow_pickle=False, network_maps=maps, margin_maps=maps)
+    np.savez(
+        study / "truth-raw" / "arrays.npz", allow_pickle=False, shapley_maps=maps, network_maps=maps, margin_maps=maps
+    )
 
     with pytest.raises(InputError, match=r"holds maps of shape \(2, 4, 4\) where 18 finite ones belong"):
         load_results(study)

@@ -24,7 +24,15 @@ from sliplens.simulation.information import visible_markers
 from sliplens.simulation.intervention import draw_with_markers_back, marker_readings
 from sliplens.study import frames_from_dataset
 from sliplens.study.explaining import network_inputs
-from sliplens.study.truth import find_places, judge_by_truth, redrawing, shuffle_half, stage_frames, true_curves
+from sliplens.study.truth import (
+    find_places,
+    judge_by_truth,
+    rank_correlation,
+    redrawing,
+    shuffle_half,
+    stage_frames,
+    true_curves,
+)
 
 SIZE = 112
 RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=20, seed=5)
@@ -32,16 +40,21 @@ LEVELS = (1.0, 0.3)
 """Nothing slips in the first."""
 
 
+PAIRS = 100
+
+
 class Linear(nn.Module):
-    """A weight for each pixel, positive: whatever is put back lowers the answer."""
+    """A weight for each pixel. If all are positive, whatever is put back lowers the answer."""
 
     weight: nn.Parameter
 
-    def __init__(self) -> None:
+    def __init__(self, *, two_signed: bool = False) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(0)
         # smooth, so that markers differ as wholes
         coarse = torch.rand(1, 3, 7, 7, generator=generator) ** 2 / 1000
+        if two_signed:
+            coarse = coarse - coarse.median()
         self.weight = nn.Parameter(nn.functional.interpolate(coarse, size=(SIZE, SIZE), mode="bilinear"))
 
     def forward(self, images: Tensor) -> Tensor:
@@ -58,6 +71,10 @@ def data(tmp_path_factory) -> Dataset:
 
 @pytest.fixture(scope="module")
 def trained() -> Run:
+    return run_of(Linear())
+
+
+def run_of(model: nn.Module) -> Run:
     manifest = Manifest(
         backbone="none",
         # the size of the difference to the untouched sensor, as it is
@@ -68,11 +85,15 @@ def trained() -> Run:
         data_hash="none",
         weights_sha256="of these weights",
     )
-    return Run(model=Linear().eval(), manifest=manifest)
+    return Run(model=model.eval(), manifest=manifest)
 
 
 @pytest.fixture(scope="module")
 def explained(trained: Run, data: Dataset) -> Explained:
+    return explain(trained, data)
+
+
+def explain(trained: Run, data: Dataset) -> Explained:
     chosen = frames_from_dataset(trained, data, levels=LEVELS)
     inputs = trained.encoding.normalise(chosen.images)
     assert isinstance(trained.model, Linear)
@@ -109,6 +130,10 @@ def given(trained: Run, explained: Explained, data: Dataset) -> tuple[Run, Expla
 
 @pytest.fixture(scope="module")
 def maps(trained: Run, explained: Explained) -> dict[str, np.ndarray]:
+    return maps_of(trained, explained)
+
+
+def maps_of(trained: Run, explained: Explained) -> dict[str, np.ndarray]:
     inputs = network_inputs(trained, explained)
     return {"attribution": explained.relevance["attribution"] * explained.towards[:, None, None]} | {
         name: control(inputs).double().numpy() for name, control in CONTROLS.items()
@@ -118,8 +143,17 @@ def maps(trained: Run, explained: Explained) -> dict[str, np.ndarray]:
 @pytest.fixture(scope="module")
 def judged(trained, explained, data, maps, tmp_path_factory) -> Truth:
     folder = tmp_path_factory.mktemp("truth")
-    save_result(judge_by_truth(trained, explained, data, maps=maps, fills=("reference", "grey")), folder)
+    save_result(judge_by_truth(trained, explained, data, maps=maps, fills=("reference", "grey"), pairs=PAIRS), folder)
     return load_result(folder, Truth, command="sliplens study")
+
+
+@pytest.fixture(scope="module")
+def two_signed(data) -> tuple[Run, Explained, Truth]:
+    """A network to which markers speak for and against the answer, what it answers, and its judgement."""
+    trained = run_of(Linear(two_signed=True))
+    explained = explain(trained, data)
+    maps = maps_of(trained, explained)
+    return trained, explained, judge_by_truth(trained, explained, data, maps=maps, fills=(), pairs=PAIRS)
 
 
 def rows_of(truth: Truth, frame: str) -> list[dict]:
@@ -149,35 +183,109 @@ def test_effects_are_what_putting_one_marker_back_changes(trained, explained, da
 
 
 def test_maps_show_the_effects_on_the_markers(judged, explained):
-    painted = {"network": judged.network_maps, "margin": judged.margin_maps}
+    painted = {"shapley": judged.shapley_maps, "network": judged.network_maps, "margin": judged.margin_maps}
     for index, frame in enumerate(explained.frames):
-        for name in ("network", "margin"):
-            assert painted[name].shape == (len(LEVELS), SIZE, SIZE)
-            assert painted[name].dtype == np.float32
+        for name, maps in painted.items():
+            assert maps.shape == (len(LEVELS), SIZE, SIZE)
+            assert maps.dtype == np.float32
             values = {np.float32(row[name]) for row in rows_of(judged, frame.id)}
-            assert set(painted[name][index].ravel()) <= values | {np.float32(0)}
+            assert set(maps[index].ravel()) <= values | {np.float32(0)}
             for row in rows_of(judged, frame.id):
                 # where the marker is, the map has its effect
                 x, y = round(row["x_px"]), round(row["y_px"])
-                assert painted[name][index, y, x] == np.float32(row[name])
+                assert maps[index, y, x] == np.float32(row[name])
 
 
 def test_the_oracle_is_right_and_chance_knows_nothing(judged, explained):
     assert judged.frames == len(explained.frames)
     methods = judged.methods
     assert set(methods) == {"attribution", "edges", "input", "centre", "random", "oracle", "degraded-oracle"}
-    assert methods["oracle"].spearman_network == pytest.approx(1)
+    assert methods["oracle"].shapley.estimate == pytest.approx(1)
     assert methods["oracle"].mass["markers"] == pytest.approx(1)
-    assert 0 < methods["degraded-oracle"].spearman_network < 1
+    assert 0 < methods["degraded-oracle"].shapley.estimate < 1
     # exact for a linear network, but for rounding to grey levels and for what of a marker lies beyond its rim
-    assert methods["attribution"].spearman_network > 0.9
+    assert methods["attribution"].network.estimate > 0.9
+    assert methods["attribution"].shapley.estimate > 0.9
     for measure in ("mass", "rank"):
         # of 12,544 pixels a frame: 2 % is four deviations of a share; where nothing slips, nothing is to be found
         for area in ("markers", "edges", "slip_annulus"):
             assert getattr(methods["random"], measure)[area] == pytest.approx(judged.areas[area], abs=0.02)
     # the effects on the reading, as the oracle ranks them: what the network does against what it should
-    assert methods["oracle"].spearman_margin == pytest.approx(judged.network_against_margin.estimate)
+    assert methods["oracle"].margin.estimate == pytest.approx(judged.shapley_against_margin.estimate)
     assert methods["oracle"].network.units == 1
+
+
+@pytest.mark.parametrize("signs", ["one", "two"])
+def test_shapley_values_of_a_linear_network_are_its_single_effects(judged, two_signed, signs):
+    truth = judged if signs == "one" else two_signed[2]
+    effects = truth.effects
+    assert truth.pairs == PAIRS
+    # but for rounding to grey levels, and for markers that overlap
+    gap = np.abs(effects.shapley - effects.network)
+    assert gap.max() < 0.02 * np.ptp(effects.network)
+    assert np.all(effects.shapley_error < 0.02 * np.ptp(effects.network))
+    assert truth.reliability.estimate > 0.99
+    assert truth.sums["shapley"] == pytest.approx(truth.sums["network"], rel=0.02)
+
+
+def test_shapley_values_add_up_to_the_change_of_the_scene(two_signed, data):
+    trained, explained, truth = two_signed
+    redraw = redrawing(trained, stage_frames(trained, explained, data))
+    for index, frame in enumerate(explained.frames):
+        values = np.array([row["shapley"] for row in rows_of(truth, frame.id)])
+        answers = trained.predict(redraw(index, np.array([[False] * len(values), [True] * len(values)])))
+        assert values.sum() == pytest.approx(float(answers[0] - answers[1]), abs=1e-6)
+
+
+def test_a_map_without_signs_never_outranks_the_attribution_of_a_network_with_two(two_signed):
+    effects, methods = two_signed[2].effects, two_signed[2].methods
+    # half a dozen markers a frame at least speak for either side
+    assert min((effects.network > 0).sum(), (effects.network < 0).sum()) > 12
+    for truth in ("shapley", "network"):
+        attribution = getattr(methods["attribution"], truth)
+        assert attribution.estimate > 0.9
+        for control in (*CONTROLS, "random"):
+            assert getattr(methods[control], truth).estimate < 0.5 < attribution.low
+
+
+def test_supporting_evidence_alone_ties_what_opposes(rng):
+    values = rng.permutation(np.concatenate([-rng.uniform(0.1, 2, 24), rng.uniform(0.1, 2, 18)]))
+    n, tied = 42, 24
+    # ranks that are means over ties: their variance over that of all
+    expected = np.sqrt(1 - (tied**3 - tied) / (n**3 - n))
+    assert rank_correlation(np.clip(values, 0, None), values) == pytest.approx(expected)
+    assert rank_correlation(-values, values) == pytest.approx(-1)
+
+
+def test_by_size_maps_are_ranked_by_size(two_signed, data):
+    trained, explained, truth = two_signed
+    frames = stage_frames(trained, explained, data)
+    places, redraw = [find_places(frame, image_size=SIZE) for frame in frames], redrawing(trained, frames)
+    inputs = network_inputs(trained, explained)
+    found = []
+    for index, frame in enumerate(explained.frames):
+        values = np.array([row["shapley"] for row in rows_of(truth, frame.id)])
+        # of an amplitude image the untouched one is black
+        changed = unit_means(inputs[index].mean(dim=0).double().numpy(), places[index].units)[:-1]
+        own = []
+        for ranked, along in ((explained.towards[index] * values, True), (np.abs(values), False), (changed, False)):
+            areas = []
+            for least in (False, True):
+                order = np.argsort(ranked if least else -ranked)
+                back = np.zeros((len(SHARES), len(values)), dtype=bool)
+                for step, share in enumerate(SHARES):
+                    back[step, order[: round(share * len(values))]] = True
+                answers = trained.predict(redraw(index, back)).double().numpy()
+                lost = explained.towards[index] * (answers[0] - answers)
+                areas.append(np.trapezoid(lost if along else np.abs(lost), SHARES))
+            own.append(areas[0] - areas[1])
+        found.append(own)
+    (test,) = truth.meta
+    expected = np.mean(found, axis=0)
+    assert (test.oracle, test.by_size.oracle, test.by_size.changed) == pytest.approx(expected, abs=1e-6)
+    # nothing is worth more along the answer's change than what knows the signs
+    assert test.holds
+    assert test.oracle > test.changed
 
 
 def test_markers_areas_and_rims_are_where_they_are(trained, explained, data):
@@ -206,6 +314,7 @@ def test_the_meta_test_tells_fills_apart(judged):
     # each marker of this network counts for itself and all one way: the oracle's order is the best there is
     assert meta["true"].holds
     assert meta["true"].gap.low > 0
+    assert meta["true"].oracle >= meta["true"].changed
     # and what is put back moves the answer towards the target only, so that the sign tells nothing more
     assert meta["true"].by_size.oracle == pytest.approx(meta["true"].oracle, abs=1e-6)
 
@@ -217,7 +326,7 @@ def test_an_interrupted_judgement_goes_on_after_the_last_frame(
         assert total == len(LEVELS)
         raise KeyboardInterrupt
 
-    judge = partial(judge_by_truth, *given, parts=tmp_path, maps=maps, fills=("reference", "grey"))
+    judge = partial(judge_by_truth, *given, parts=tmp_path, maps=maps, fills=("reference", "grey"), pairs=PAIRS)
     with pytest.raises(KeyboardInterrupt):
         judge(on_progress=interrupt)
     first = tmp_path / "00000" / "arrays.npz"

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -333,8 +334,8 @@ def score_maps(
 
     Of signed relevance give the part that works towards the target, and `towards`, the sign of f(x) - f(untouched
     sensor) of each image: changes count along it, by their size if None. By size removing what speaks against the
-    target counts like removing what speaks for it, and a map of what each marker really does ranks below the same map
-    half shuffled (docs/study.md).
+    target counts like removing what speaks for it: order by |influence| then, or a map of what each marker really does
+    can rank below the same map half shuffled (docs/study.md).
 
     References
     ----------
@@ -360,6 +361,27 @@ def score_maps(
     return Faithfulness.of_orders(curves, influence, towards=towards)
 
 
+def answer_scenes(
+    predict: Predict,
+    redraw: Callable[[Bool[np.ndarray, "variants markers"]], Float[Tensor, "variants 3 height width"]],
+    *,
+    batch_size: int = 64,
+) -> Callable[[Bool[np.ndarray, "variants markers"]], Float64[np.ndarray, " variants"]]:
+    """Answers to one scene with markers put back; what was asked before is neither drawn nor answered again."""
+    known: dict[bytes, float] = {}
+
+    def answer(back: Bool[np.ndarray, "variants markers"]) -> Float64[np.ndarray, " variants"]:
+        asked = [row.tobytes() for row in back]
+        new = {key: row for key, row in zip(asked, back, strict=True) if key not in known}
+        keys, drawn = list(new), list(new.values())
+        for start in range(0, len(new), batch_size):
+            part = slice(start, start + batch_size)
+            known.update(zip(keys[part], answer_whole(predict, redraw(np.stack(drawn[part]))), strict=True))
+        return np.array([known[key] for key in asked])
+
+    return answer
+
+
 def marker_curves(
     predict: Predict,
     redraw: Redraw,
@@ -378,12 +400,8 @@ def marker_curves(
     for image in counted(range(images), on_progress):
         rank = np.argsort(orders[:, image], axis=-1)
         back = rank[:, None] < counts[:, None]
-        distinct, asked = np.unique(back.reshape(-1, markers), axis=0, return_inverse=True)
-        answered = [
-            answer_whole(predict, redraw(image, distinct[start : start + batch_size]))
-            for start in range(0, len(distinct), batch_size)
-        ]
-        answers[:, image] = np.concatenate(answered)[asked].reshape(back.shape[:2])
+        answer = answer_scenes(predict, partial(redraw, image), batch_size=batch_size)
+        answers[:, image] = answer(back.reshape(-1, markers)).reshape(back.shape[:2])
     return RemovalCurves(areas=areas, answers=answers)
 
 

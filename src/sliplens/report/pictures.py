@@ -15,7 +15,7 @@ from sliplens.plots.contact_sheet import TIMES, brighten, brightening
 from sliplens.plots.errors import MARGIN_LABEL
 from sliplens.plots.layout import place_axes
 from sliplens.plots.markers import ARROWS, MarkedFrame, draw_fields_beside_saliency, plot_arrows, plot_field
-from sliplens.plots.saliency import DIM, lightness
+from sliplens.plots.saliency import DIM, FULL_COLOUR_PERCENTILE, lightness
 from sliplens.plots.strip import draw_strip
 from sliplens.plots.style import (
     BLUE,
@@ -541,25 +541,32 @@ def plate_truth(results: Results, name: str) -> Plate | None:
     for frame_id in chosen:
         index, row = places[frame_id], truth.frame_ids.index(frame_id)
         picture, own = pictures[index], explained.frames[index]
-        effects = (truth.network_maps[row], truth.margin_maps[row])
+        effects = (truth.shapley_maps[row], truth.network_maps[row], truth.margin_maps[row])
         cells = [
             Cell(picture=picture),
             *(Cell(picture=paint_effects(picture, one), words=_points(one)) for one in effects),
-            *(Cell(picture=show_map(picture, explained.saliency[method][index])) for method in methods),
+            *(
+                Cell(picture=paint_effects(picture, explained.relevance[method][index], full=FULL_COLOUR_PERCENTILE))
+                for method in methods
+            ),
         ]
         rows.append((f"Γ {percent(own.safety_margin)}\nread {percent(own.prediction)}", cells))
-    heads = [called, "What moves the\nanswer", "What moves the\nmargin", *(method_name(one) for one in methods)]
+    truths = ("Shapley values\nin the answer", "Put back alone:\nthe answer", "Put back alone:\nthe margin")
+    heads = [called, *truths, *(method_name(one) for one in methods)]
     return Plate(
         name=f"truth-{name}",
-        figure=draw_grid(rows, heads=heads, bar=True).figure,
-        alt=f"{input_name(name)}: effect of each marker on the answer and on the best reading of the margin beside the "
-        f"maps of {listed([method_name(one) for one in methods])}",
-        caption=f"{input_name(name)}: what each marker does to the network's answer and to the best reading of the "
-        "margin, in percentage points (value less value with that marker put back where it rested; orange lowers, blue "
-        "raises, full colour at the largest of each picture), beside the best methods' maps. "
+        figure=draw_grid(rows, heads=heads).figure,
+        alt=f"{input_name(name)}: Shapley value and single effect of each marker in the answer, and its effect on the "
+        f"best reading of the margin, beside the maps of {listed([method_name(one) for one in methods])}",
+        caption=f"{input_name(name)}: what each marker does to the network's answer, in whatever company of markers "
+        "(Shapley value) and alone, and to the best reading of the margin, in percentage points (value less value with "
+        "that marker put back where it rested), beside the best methods' maps. Orange lowers, blue raises; full colour "
+        f"at the largest effect of each picture, and at a map's {FULL_COLOUR_PERCENTILE:g}th percentile. "
         f"{_tell_match(truth, methods)}",
         numbers={
             **{own: getattr(truth.effects, own) for own in ("frame_id", "marker", "x_px", "y_px")},
+            "shapley_value": truth.effects.shapley,
+            "shapley_error": truth.effects.shapley_error,
             "network_effect": truth.effects.network,
             "margin_effect": truth.effects.margin,
             "state": truth.effects.state,
@@ -569,16 +576,16 @@ def plate_truth(results: Results, name: str) -> Plate | None:
 
 
 def paint_effects(
-    picture: UInt8[np.ndarray, "height width 3"], effects: Float[np.ndarray, "rows columns"]
+    picture: UInt8[np.ndarray, "height width 3"], effects: Float[np.ndarray, "rows columns"], *, full: float = 100
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Lay signed effects over a picture in dimmed grey: orange below zero, blue above, the stronger the less grey.
 
-    Effects of another height and width than the picture's are repeated.
+    Effects of another height and width than the picture's are repeated. Colour is full at a percentile of their sizes.
     """
     places = [np.arange(side) * count // side for side, count in zip(picture.shape, effects.shape, strict=False)]
     fitted = effects[np.ix_(*places)].astype(np.float64)
-    size = np.abs(fitted).max()
-    value = fitted / size if size > 0 else fitted
+    size = np.percentile(np.abs(fitted), full)
+    value = np.clip(fitted / size, -1, 1) if size > 0 else fitted
     grey = (DIM * lightness(picture))[..., None]
     alpha = np.abs(value)[..., None]
     # bright on dark, and told apart under every common colour blindness
@@ -609,12 +616,12 @@ def _points(effects: np.ndarray) -> str:
 
 def _tell_match(truth: Truth, methods: list[str]) -> str:
     parts = [
-        f"{method_name(one)} {signed(value, 2)}"
+        f"{method_name(one)} {signed(found.estimate, 2)}"
         for one in methods
-        if one in truth.methods and (value := truth.methods[one].spearman_network) is not None
+        if one in truth.methods and (found := truth.methods[one].shapley) is not None
     ]
-    told = f"Spearman's correlation with what moves the answer: {', '.join(parts)}." if parts else ""
-    gap = truth.network_against_margin
+    told = f"Spearman's correlation with the Shapley values: {', '.join(parts)}." if parts else ""
+    gap = truth.shapley_against_margin
     if gap is not None:
-        told += f" What moves the answer and what moves the margin correlate by {tell_interval(gap, digits=2)}."
+        told += f" These and what moves the margin correlate by {tell_interval(gap, digits=2)}."
     return told.strip()

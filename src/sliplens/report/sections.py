@@ -292,10 +292,14 @@ SECTIONS: tuple[Section, ...] = (
         id="truth",
         title="What the network should have looked at",
         short_title="Truth",
-        intro="Simulated touch can be filmed again with one marker put back where it rested: what that does to the "
-        "network's answer is what a map should show. What it does to the best reading of the margin (linear in the "
-        "markers' displacements, exact for small ones) is where the network should look; stretched over a marker's "
-        "whole motion that reading may exceed the margin itself, and the markers cancel.",
+        intro="Simulated touch can be filmed again with markers put back where they rested: what that does to the "
+        "network's answer is what a map should show, signs included. One marker put back alone tells little where "
+        "others still say the same; its Shapley value is the mean of what it does in all company, and these add up to "
+        "the answer's change. Integrated Gradients shares out the change by nearly the same axioms, over paths from "
+        "the untouched picture, and is kin to this truth by construction. What putting a marker back does to the best "
+        "reading of the margin (linear in the markers' displacements, exact for small ones) is where the network "
+        "should look; stretched over a marker's whole motion that reading may exceed the margin itself, and the "
+        "markers cancel.",
         command="study",
         build=_truth,
         needs=lambda results: results.study.truth,

@@ -399,21 +399,21 @@ def table_localisation(truth: Truth) -> Table:
     """Tabulate where relevance lies, and how well maps rank the markers."""
     names = [*methods_in_order(set(truth.methods) - set(_TRUTHS)), *(one for one in _TRUTHS if one in truth.methods)]
     heads = [f"{what}, {_REGION_NAMES[region]}" for what in ("Mass", "Strongest") for region in REGIONS]
-    nothing = ("A map that knows nothing", *(percent(truth.areas[region]) for region in REGIONS * 2), "0", "0")
+    nothing = ("A map that knows nothing", *(percent(truth.areas[region]) for region in REGIONS * 2), *3 * ["0"])
     return make_table(
         f"{input_name(truth.input)}, {truth.frames} simulated frames: share of the relevance, and of the strongest "
-        "pixels, in three regions; and Spearman's correlation of the map's mean on each marker with what putting that "
-        "marker back does to the network's answer and to the best reading of the margin (95 % interval over "
-        f"{tell_over(one.network for one in truth.methods.values())}).",
-        ("Method", *heads, "With the answer", "With the best reading"),
+        "pixels, in three regions; and Spearman's correlation, signed, of the map's mean on each marker with its "
+        "Shapley value in the network's answer, with what putting it back alone changes there, and with the same of "
+        "the best reading of the margin (95 % interval over "
+        f"{tell_over(one.shapley for one in truth.methods.values())}). {_tell_surety(truth)}",
+        ("Method", *heads, "With Shapley values", "With markers put back alone", "With the best reading"),
         [
             *(
                 (
                     # here it is a map, not an order
                     "Random map (control)" if name == CONTROL else method_name(name),
                     *(percent(shares[region]) for shares in (found.mass, found.rank) for region in REGIONS),
-                    _interval(found.network, found.spearman_network),
-                    _interval(found.margin, found.spearman_margin),
+                    *(_interval(gap) for gap in (found.shapley, found.network, found.margin)),
                 )
                 for name in names
                 for found in [truth.methods[name]]
@@ -423,26 +423,48 @@ def table_localisation(truth: Truth) -> Table:
     )
 
 
+def _tell_surety(truth: Truth) -> str:
+    """Say how sure the Shapley values are, and what both truths add up to."""
+    surety = "" if truth.reliability is None else f" (reliability {tell_interval(truth.reliability, digits=2)})"
+    sums = [decimals(truth.sums[name], 2) for name in ("shapley", "network")]
+    return (
+        f"Shapley values rest on {truth.pairs} pairs of scenes a frame{surety} and add up to {sums[0]} times the "
+        f"answer's change; the markers' effects one at a time to {sums[1]} times."
+    )
+
+
 def table_meta(truth: Truth) -> Table | None:
     """Tabulate whether the score itself ranks a perfect map above a damaged one above chance; None if not tested."""
     if not truth.meta:
         return None
     return make_table(
-        f"{input_name(truth.input)}: the score put to the test. A map made from the truth must gain more than that map "
-        "damaged, beyond the 95 % interval; a fill where this fails cannot judge methods, and the verdict leaves it "
-        "out.",
-        ("Fill", "Holds", "SRG of the truth", "SRG, damaged", "Truth less damaged", "SRG, random"),
+        f"{input_name(truth.input)}: the score put to the test. A map of the markers' Shapley values must gain more "
+        "than that map damaged, beyond the 95 % interval; a fill where this fails along the answer's change cannot "
+        "judge methods, and the verdict leaves it out. Along the change asks what speaks for the answer and what "
+        "against it; by size, maps ordered by |value|, asks what matters at all. Where |x - b|, which knows no "
+        "network, comes near the truth, the setting mostly measures the input.",
+        (
+            "Fill",
+            "Changes counted",
+            "Holds",
+            "SRG of the truth",
+            "SRG, damaged",
+            "Truth less damaged",
+            "SRG of |x - b|",
+        ),
         [
             (
                 FILL_NAMES.get(one.fill, one.fill),
-                "yes" if one.fit else "no",
-                *(decimals(value, 3) for value in (one.oracle, one.degraded)),
-                _interval(one.gap, digits=3),
-                decimals(one.random, 3),
+                counted,
+                "yes" if test.fit else "no",
+                *(decimals(value, 3) for value in (test.oracle, test.degraded)),
+                _interval(test.gap, digits=3),
+                decimals(test.changed, 3),
             )
             for one in truth.meta
+            for counted, test in (("along the answer's", one), ("by size", one.by_size))
         ],
-        names=2,
+        names=3,
     )
 
 

@@ -300,10 +300,10 @@ def _believe(faithful: RemovalScores, results: Results) -> Statement:
     )
     text += _tell_lead(faithful, best, others)
     found = None if truth is None else truth.methods.get(best.method)
-    if found is not None and found.network is not None:
+    if found is not None and found.shapley is not None:
         text += (
-            " Its map ranks the markers by what they do to the answer with a Spearman correlation of "
-            f"{tell_interval(found.network, digits=2)}, as the simulation tells (1 = alike, 0 = chance)."
+            " Its map ranks the markers by their Shapley values in the answer with a Spearman correlation of "
+            f"{tell_interval(found.shapley, digits=2)}, as the simulation tells (1 = alike, 0 = chance)."
         )
     failing = [method_name(one.method) for one in ranked if not one.qualifies]
     if failing:

@@ -262,12 +262,10 @@ class Localisation:
     mass: dict[str, float | None]
     rank: dict[str, float | None]
     """Share of the relevance, and of its strongest pixels, by `REGIONS`."""
-    spearman_network: float | None
-    spearman_margin: float | None
-    """Mean rank correlation, marker by marker, with the effects on the answer and on the true margin."""
+    shapley: Difference | None
     network: Difference | None
     margin: Difference | None
-    """The two with their intervals."""
+    """Mean rank correlation, signed, of the map's means over the markers with the columns of `MarkerEffects`."""
     edges: Difference | None
     """Mass on the edges of markers less the share of the image that they cover."""
 
@@ -279,6 +277,8 @@ class OracleTest:
     holds: bool
     oracle: float
     degraded: float
+    changed: float
+    """Gain of |x - b|, how much each marker's pixels changed, which knows no network."""
     random: float
     gap: Difference | None
     """Gain of the perfect map less that of the damaged one."""
@@ -291,7 +291,10 @@ class OracleTest:
 
 @dataclass(frozen=True, kw_only=True)
 class MetaTest(OracleTest):
-    """The test of a gain under one fill, counted along the answer's change and by the size of changes."""
+    """The test of a gain under one fill: along the answer's change, which asks what speaks for it and what against.
+
+    By size, maps ordered by |value|, it asks what matters at all, either way.
+    """
 
     fill: str
     by_size: OracleTest
@@ -299,7 +302,7 @@ class MetaTest(OracleTest):
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerEffects(Columns):
-    """What putting one marker back does to the network's answer and to the true margin, a row a marker and frame."""
+    """What each marker does to the network's answer and to the true margin, a row a marker and frame."""
 
     frame_id: Shaped[np.ndarray, " rows"]
     day: Int64[np.ndarray, " rows"]
@@ -309,9 +312,13 @@ class MarkerEffects(Columns):
     x_px: Float64[np.ndarray, " rows"]
     y_px: Float64[np.ndarray, " rows"]
     """Place in pixels of the network's input."""
+    shapley: Float64[np.ndarray, " rows"]
+    shapley_error: Float64[np.ndarray, " rows"]
+    """Shapley value in the answer, over scenes with other markers put back, and its standard error."""
     network: Float64[np.ndarray, " rows"]
     margin: Float64[np.ndarray, " rows"]
-    """Answer and best reading as they are less those with the marker put back, in margin units."""
+    """Answer and best reading as they are less those with the marker put back, in margin units. The reading is linear:
+    these are its Shapley values too."""
     state: Int64[np.ndarray, " rows"]
     """Slips (1), sticks (2), or lies outside of the contact (0)."""
 
@@ -326,11 +333,20 @@ class Truth:
     areas: dict[str, float | None]
     """Share of the image that each of `REGIONS` covers, None where no frame has it."""
     methods: dict[str, Localisation]
+    pairs: int
+    """Pairs of scenes drawn for the Shapley values of each frame."""
+    reliability: Difference | None
+    """Expected correlation of the Shapley values with a second estimate, by their standard errors; its root is the most
+    that a map can reach."""
+    sums: dict[str, float | None]
+    """How many times the answer's change the effects add up to, over all frames: `shapley` and `network`."""
+    shapley_against_margin: Difference | None
     network_against_margin: Difference | None
     """Rank correlation of the effects on the answer with those on the best reading of the margin."""
     meta: tuple[MetaTest, ...]
     summary: str
     effects: MarkerEffects
+    shapley_maps: Float32[np.ndarray, "frames size size"]
     network_maps: Float32[np.ndarray, "frames size size"]
     margin_maps: Float32[np.ndarray, "frames size size"]
     """`effects` painted on the markers, a map a frame."""
@@ -338,7 +354,7 @@ class Truth:
     def __post_init__(self) -> None:
         """Hold the maps against the frames."""
         count = len(self.frame_ids)
-        for maps in (self.network_maps, self.margin_maps):
+        for maps in (self.shapley_maps, self.network_maps, self.margin_maps):
             if len(maps) != count or not np.isfinite(maps).all():
                 raise ValueError(f"holds maps of shape {maps.shape} where {count} finite ones belong")
 

@@ -52,7 +52,7 @@ from sliplens.study.material import (
 )
 from sliplens.study.processes import run_together
 from sliplens.study.scoring import STEPS, score_explanations, score_remedies
-from sliplens.study.truth import TRUE_FILL, judge_by_truth, true_curves
+from sliplens.study.truth import TRUE_FILL, TRUTH_PAIRS, judge_by_truth, true_curves
 from sliplens.training.evaluation import evaluate
 
 _COMMAND = "sliplens study"
@@ -330,7 +330,7 @@ class _Stages:
             test(
                 "truth",
                 Truth,
-                "Putting every marker back",
+                "Putting markers back",
                 lambda parts, count: judge_by_truth(
                     run,
                     material().explained,
@@ -341,6 +341,7 @@ class _Stages:
                     parts=parts,
                     on_progress=count,
                 ),
+                pairs=TRUTH_PAIRS,
                 **_NEW_WEIGHTS,
             )
 

@@ -1,7 +1,7 @@
-"""Explanations held against the truth that only a simulator knows: what each marker does when it is put back."""
+"""Explanations held against the truth that only a simulator knows: what each marker does to the answer."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sliplens.codec import keep_part
 from sliplens.errors import InputError
+from sliplens.explainers.shapley import shapley_values
 from sliplens.faithfulness import get_fill
 from sliplens.faithfulness.map_quality import relevance_mass, relevance_rank
 from sliplens.faithfulness.removal import (
@@ -21,7 +22,7 @@ from sliplens.faithfulness.removal import (
     Redraw,
     RemovalCurves,
     Units,
-    answer_whole,
+    answer_scenes,
     influence_orders,
     marker_curves,
     removal_curves,
@@ -188,23 +189,28 @@ RANDOM = "random"
 """A map of even noise."""
 TRUTH_FILLS = ("reference", "grey", "background", "blur")
 """Fills that the oracle is tried under; the true one always is. The noisy-linear one takes longer than all of them."""
+TRUTH_PAIRS = 400
+"""Pairs of scenes for the Shapley values of a frame: their standard error is then about a quarter of their spread."""
+
+_EFFECTS = ("shapley", "network", "margin")
+"""What a map is held against, as `MarkerEffects` and `Localisation` name it."""
 
 Maps = Float[np.ndarray, "frames size size"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrameEffects:
-    """What each marker of a frame does, in margin units: the value as it is less the value with the marker put back."""
+    """What each marker of a frame does, in margin units; columns of `MarkerEffects`."""
 
+    shapley: Float64[np.ndarray, " markers"]
+    shapley_error: Float64[np.ndarray, " markers"]
     network: Float64[np.ndarray, " markers"]
-    """Of the network's answer."""
     margin: Float64[np.ndarray, " markers"]
-    """Of the margin as the best reader of markers reads it (`simulation.best_reading`)."""
     shuffled: Float64[np.ndarray, " markers"]
-    """The network's, those of half of the markers shuffled: an oracle that is half wrong."""
-    gains: dict[str, Float64[np.ndarray, "2 2"]]
-    """Symmetric gain, under each fill, of the map that has `network` and of the one that has `shuffled`: a row for
-    changes by their size, as `Faithfulness` has them, and one for changes counted towards the target."""
+    """`shapley`, the values of half of the markers shuffled: an oracle that is half wrong."""
+    gains: dict[str, Float64[np.ndarray, "2 3"]]
+    """Symmetric gain, under each fill, of the maps that have `shapley`, `shuffled` and |x - b|: a row for changes along
+    the answer's, and one for changes by their size, the maps ordered by |value|."""
 
 
 def shuffle_half(values: Float[np.ndarray, " markers"], *, rng: np.random.Generator) -> Float[np.ndarray, " markers"]:
@@ -215,11 +221,11 @@ def shuffle_half(values: Float[np.ndarray, " markers"], *, rng: np.random.Genera
     return shuffled
 
 
-def _gains(curves: RemovalCurves, towards: float) -> Float[np.ndarray, "2 2"]:
-    """Symmetric gains of two maps, each removed both ways, by the size of the changes and by their part `towards`."""
+def _gains(curves: RemovalCurves, towards: float) -> Float[np.ndarray, "2 3"]:
+    """Symmetric gains along the answer's change and by size, of curves of oracle, damaged one, |x - b|, and sizes."""
     lost = np.trapezoid(curves.lost(np.array([towards]))[:, 0], curves.areas, axis=-1)
-    means = np.stack([curves.mean_changes[:, 0], lost])
-    return means[:, ::2] - means[:, 1::2]
+    along, by_size = (means[::2] - means[1::2] for means in (lost, curves.mean_changes[:, 0]))
+    return np.stack([along[:3], by_size[[3, 4, 2]]])
 
 
 def marker_means(maps: Maps, places: Sequence[Places]) -> list[Float[np.ndarray, " markers"]]:
@@ -241,17 +247,17 @@ def _by_region(places: Sequence[Places], measure: Callable[[int, np.ndarray], fl
 
 
 def rank_correlation(first: Float[np.ndarray, " markers"], second: Float[np.ndarray, " markers"]) -> float:
-    """Spearman's rank correlation of the sizes; NaN where one of the two does not vary."""
-    first, second = np.abs(first), np.abs(second)
+    """Spearman's rank correlation, signed; NaN where one of the two does not vary."""
     if len(first) < 2 or np.ptp(first) == 0 or np.ptp(second) == 0:
         return float("nan")
     return float(np.asarray(spearmanr(first, second))[0])
 
 
 def mean_interval(
-    values: Float[np.ndarray, " frames"], clusters: Shaped[np.ndarray, "2 frames"], *, seed: int
+    measured: Iterable[float], clusters: Shaped[np.ndarray, "2 frames"], *, seed: int
 ) -> Difference | None:
     """Mean over the frames in which it is defined, with a 95 % interval over days and trials; None if in none."""
+    values = np.array(list(measured))
     known = np.isfinite(values)
     if not known.any():
         return None
@@ -259,47 +265,70 @@ def mean_interval(
     return paired_difference(values, 0 * values, clusters=clusters[:, known], rng=np.random.default_rng(seed))
 
 
-def meta_test(
-    effects: Sequence[FrameEffects], clusters: Shaped[np.ndarray, "2 frames"], *, seed: int
-) -> tuple[MetaTest, ...]:
+_Interval = Callable[[Iterable[float]], Difference | None]
+
+
+def meta_test(effects: Sequence[FrameEffects], interval: _Interval) -> tuple[MetaTest, ...]:
     """Whether each fill ranks the map that knows the effects above the one that knows half, and that above chance.
 
-    A gain counts changes of the answer towards the target, as `score_maps` does when it is told; `by_size` counts how
-    large they are, where a marker that works against the answer moves it as far as one that works for it.
+    A gain counts changes of the answer towards the target, as `score_maps` does when it is told, and maps rank what
+    speaks for it before what speaks against it. `by_size` counts how large changes are, and maps rank by |value|.
     """
     tests = []
     for fill in effects[0].gains:
         gains = np.stack([own.gains[fill] for own in effects])
-        signed, by_size = (_test_oracle(gains[:, row], clusters, seed=seed) for row in (1, 0))
-        tests.append(MetaTest(fill=fill, by_size=by_size, **vars(signed)))
+        along, by_size = (_test_oracle(gains[:, row], interval) for row in (0, 1))
+        tests.append(MetaTest(fill=fill, by_size=by_size, **vars(along)))
     return tuple(tests)
 
 
-def _test_oracle(
-    gains: Float[np.ndarray, "frames 2"], clusters: Shaped[np.ndarray, "2 frames"], *, seed: int
-) -> OracleTest:
-    oracle, degraded = gains.mean(axis=0).tolist()
+def _test_oracle(gains: Float[np.ndarray, "frames 3"], interval: _Interval) -> OracleTest:
+    oracle, degraded, changed = gains.mean(axis=0).tolist()
     return OracleTest(
         holds=oracle > degraded > 0,
         oracle=oracle,
         degraded=degraded,
+        changed=changed,
         # a random order turned round is a random order: its symmetric gain is 0 on average
         random=0.0,
-        gap=mean_interval(gains[:, 0] - gains[:, 1], clusters, seed=seed),
+        gap=interval(gains[:, 0] - gains[:, 1]),
     )
 
 
-def _summarise(meta: Sequence[MetaTest], agreement: Difference | None) -> str:
-    """Say which fills can tell, and whether the network looks where the best reader would."""
-    held, by_size = [test.fill for test in meta if test.holds], [test.fill for test in meta if test.by_size.holds]
+def _reliability(effects: FrameEffects) -> float:
+    """Part of the spread of a frame's Shapley values that is no sampling error; NaN where they do not vary."""
+    spread = float(effects.shapley.var(ddof=1)) if len(effects.shapley) > 1 else 0.0
+    return float("nan") if spread == 0 else max(0.0, 1 - float((effects.shapley_error**2).mean()) / spread)
+
+
+def _sum_over_change(effects: Sequence[FrameEffects], change: Float[np.ndarray, " frames"], name: str) -> float | None:
+    """How many times the changes of the answers the effects of a name add up to, over all frames."""
+    sums = np.array([getattr(own, name).sum() for own in effects])
+    return float((np.sign(change) * sums).sum() / np.abs(change).sum()) if change.any() else None
+
+
+def _summarise(truth: Truth) -> str:
+    """Say what the effects add up to and how sure they are, which fills can tell, and who looks where it should."""
+    told = {name: "unknown" if times is None else f"{times:.2f} times" for name, times in truth.sums.items()}
     summary = (
-        "The map of the network's own marker effects ranks above one of which half is shuffled, and that above chance, "
-        f"under {len(held)} of {len(meta)} fills ({', '.join(held) or 'none'}); counted by the size of the answer's "
-        f"changes instead of along them, under {len(by_size)} ({', '.join(by_size) or 'none'})."
+        "Put back one at a time, all markers together change the answer by "
+        f"{told['network']} its whole change; their Shapley values, from {truth.pairs} pairs of scenes a frame, add up "
+        f"to {told['shapley']}."
     )
+    if truth.reliability is not None:
+        summary += f" A second estimate of these would correlate with this one by {truth.reliability.estimate:.2f}."
+    held, by_size = (
+        [test.fill for test in truth.meta if (test if along else test.by_size).holds] for along in (True, False)
+    )
+    summary += (
+        " The map of the Shapley values ranks above one of which half is shuffled, and that above chance, under "
+        f"{len(held)} of {len(truth.meta)} fills ({', '.join(held) or 'none'}) along the answer's change, which asks "
+        f"for signs; under {len(by_size)} ({', '.join(by_size) or 'none'}) by size, which asks for strength alone."
+    )
+    agreement = truth.shapley_against_margin
     if agreement is not None:
         summary += (
-            f" Marker by marker the network's effects agree with those on the best reading of the margin by "
+            f" Marker by marker the Shapley values of the answer agree with those of the best reading of the margin by "
             f"{agreement.estimate:.2f} (Spearman, 95 % interval {agreement.low:.2f} to {agreement.high:.2f})."
         )
     return summary
@@ -312,73 +341,85 @@ def judge_by_truth(
     *,
     maps: Mapping[str, Maps],
     fills: Sequence[str] = TRUTH_FILLS,
+    pairs: int = TRUTH_PAIRS,
     seed: int = 0,
     parts: Path | None = None,
     on_progress: OnProgress | None = None,
 ) -> Truth:
-    """Put every marker of every frame back, and hold maps against what that does.
+    """Put the markers of every frame back, alone and in company, and hold maps against what that does.
+
+    There are two truths: what putting a marker back alone changes, and its Shapley value, the mean of what it changes
+    over all the company of markers that may be put back already. The latter add up to the change of the answer.
 
     A map's mass and rank are those of its positive part, what works towards the answer: a share of a sum needs one
-    sign. Marker by marker it is the size of a map's mean that is compared with the size of the effect: a marker that
-    works against the answer matters as much as one that works for it, and maps that know no sign can be compared too.
+    sign. Marker by marker the mean of the map is compared with the effect along the answer's change, both signed: a map
+    of what supports the answer alone ties the markers that oppose it.
 
     `maps` are influences by method, controls included; `fills` those under which a map that knows the effects is held
-    against one that knows half of them.
+    against one that knows half of them; `pairs` how many pairs of scenes the Shapley values of a frame rest on.
     """
     for fill in fills:
         get_fill(fill)
     frames = stage_frames(trained, explained, data)
     places = [find_places(frame, image_size=trained.manifest.image_size) for frame in frames]
+    pairs = max([pairs, *(2 * len(frame.markers) for frame in frames)])
     effects = _find_effects(
-        trained, explained, frames, places, fills=fills, seed=seed, parts=parts, on_progress=on_progress
+        trained, explained, frames, places, fills=fills, pairs=pairs, seed=seed, parts=parts, on_progress=on_progress
     )
-    size, towards = trained.manifest.image_size, explained.towards
+    size = trained.manifest.image_size
+    # along the answer's change, as the maps are
+    along = [
+        {name: sign * getattr(own, name) for name in (*_EFFECTS, "shuffled")}
+        for sign, own in zip(explained.towards, effects, strict=True)
+    ]
     judged = dict(maps) | {
         RANDOM: np.random.default_rng(seed).random((len(frames), size, size)),
-        ORACLE: _paint(places, [sign * own.network for sign, own in zip(towards, effects, strict=True)]),
-        DEGRADED: _paint(places, [sign * own.shuffled for sign, own in zip(towards, effects, strict=True)]),
+        ORACLE: _paint(places, [own["shapley"] for own in along]),
+        DEGRADED: _paint(places, [own["shuffled"] for own in along]),
     }
-    clusters = explained.clusters
-    own = np.array([rank_correlation(one.network, one.margin) for one in effects])
-    meta, agreement = meta_test(effects, clusters, seed=seed), mean_interval(own, clusters, seed=seed)
-    return Truth(
+    change = np.array([frame.prediction - frame.reference_prediction for frame in explained.frames])
+
+    interval = partial(mean_interval, clusters=explained.clusters, seed=seed)
+    truth = Truth(
         input=explained.input,
         source=explained.source,
         frames=len(frames),
         # the mass of a map of chance
         areas=_by_region(places, lambda _, region: float(region.mean())),
-        methods={name: _judge(values, places, effects, clusters, seed=seed) for name, values in judged.items()},
-        network_against_margin=agreement,
-        meta=meta,
-        summary=_summarise(meta, agreement),
+        methods={name: _judge(values, places, along, interval) for name, values in judged.items()},
+        pairs=pairs,
+        reliability=interval(_reliability(one) for one in effects),
+        sums={name: _sum_over_change(effects, change, name) for name in ("shapley", "network")},
+        shapley_against_margin=interval(rank_correlation(one.shapley, one.margin) for one in effects),
+        network_against_margin=interval(rank_correlation(one.network, one.margin) for one in effects),
+        meta=meta_test(effects, interval),
+        summary="",
         effects=_table(frames, places, effects),
+        shapley_maps=_paint(places, [one.shapley for one in effects]).astype(np.float32),
         network_maps=_paint(places, [one.network for one in effects]).astype(np.float32),
         margin_maps=_paint(places, [one.margin for one in effects]).astype(np.float32),
     )
+    return replace(truth, summary=_summarise(truth))
 
 
 def _judge(
     maps: Maps,
     places: Sequence[Places],
-    effects: Sequence[FrameEffects],
-    clusters: Shaped[np.ndarray, "2 frames"],
-    *,
-    seed: int,
+    effects: Sequence[Mapping[str, Float[np.ndarray, " markers"]]],
+    interval: _Interval,
 ) -> Localisation:
     means, positive = marker_means(maps, places), np.clip(maps.astype(np.float64), 0, None)
-    edges = [relevance_mass(own, place.edges) - place.edges.mean() for own, place in zip(positive, places, strict=True)]
-    network, margin = (
-        np.array([rank_correlation(values, truth) for values, truth in zip(means, truths, strict=True)])
-        for truths in ([own.network for own in effects], [own.margin for own in effects])
-    )
+    alike = {
+        name: interval(rank_correlation(values, own[name]) for values, own in zip(means, effects, strict=True))
+        for name in _EFFECTS
+    }
     return Localisation(
         mass=_by_region(places, lambda frame, region: relevance_mass(positive[frame], region)),
         rank=_by_region(places, lambda frame, region: relevance_rank(positive[frame], region)),
-        spearman_network=mean_of_known(network),
-        spearman_margin=mean_of_known(margin),
-        network=mean_interval(network, clusters, seed=seed),
-        margin=mean_interval(margin, clusters, seed=seed),
-        edges=mean_interval(np.array(edges), clusters, seed=seed),
+        edges=interval(
+            relevance_mass(own, place.edges) - place.edges.mean() for own, place in zip(positive, places, strict=True)
+        ),
+        **alike,
     )
 
 
@@ -393,6 +434,8 @@ def _table(frames: Sequence[StagedFrame], places: Sequence[Places], effects: Seq
                 marker=frame.markers.astype(np.int64),
                 x_px=place.now_px[:, 0],
                 y_px=place.now_px[:, 1],
+                shapley=own.shapley,
+                shapley_error=own.shapley_error,
                 network=own.network,
                 margin=own.margin,
                 state=place.state,
@@ -439,29 +482,33 @@ def _find_effects(
     places: Sequence[Places],
     *,
     fills: Sequence[str],
+    pairs: int,
     seed: int,
     parts: Path | None,
     on_progress: OnProgress | None,
 ) -> list[FrameEffects]:
-    """Put every marker back, and see which fills can tell a map that knows its effects from half of one."""
+    """Put markers back, and see which fills can tell a map that knows their effects from half of one."""
     inputs, redraw = network_inputs(trained, explained), redrawing(trained, frames)
-    # each marker alone, and under each fill two maps both ways
-    passes = len(frames) * (len(frames[0].markers) + 4 * len(SHARES) * (len(fills) + 1))
+    # each marker alone, pairs of scenes, and under each fill five maps both ways
+    passes = len(frames) * (len(frames[0].markers) + 2 * pairs + 10 * len(SHARES) * (len(fills) + 1))
     predict = prepare_passes(trained, inputs, passes)
 
     def find(index: int) -> FrameEffects:
         frame, place, towards = frames[index], places[index], float(explained.towards[index])
+        count, answer = len(frame.markers), answer_scenes(predict, partial(redraw, index))
         # the whole image first
-        back = np.eye(len(frame.markers) + 1, len(frame.markers), k=-1, dtype=bool)
-        answers = answer_whole(predict, redraw(index, back), batch_size=64)
-        network = answers[0] - answers[1:]
+        answers = answer(np.eye(count + 1, count, k=-1, dtype=bool))
         # a run that goes on draws the same
-        shuffled = shuffle_half(network, rng=np.random.default_rng((seed, index)))
-        known = [towards * network, towards * shuffled]
+        rng = np.random.default_rng((seed, index))
+        found = shapley_values(lambda stay: answer(~stay), count, pairs=pairs, rng=rng)
+        shuffled = shuffle_half(found.values, rng=rng)
+        empty = trained.encoding.empty(frame.reference, image_size=trained.manifest.image_size)
+        change = (inputs[index].cpu() - empty).abs().mean(dim=0).double().numpy()
+        oracles = [towards * found.values, towards * shuffled]
+        known = [*oracles, unit_means(change, place.units)[:count], *map(np.abs, oracles)]
         orders = [
             unit_order(place.paint(one), place.units, least_first=least) for one in known for least in (False, True)
         ]
-        empty = trained.encoding.empty(frame.reference, image_size=trained.manifest.image_size)
         curves = {
             name: removal_curves(
                 predict,
@@ -477,7 +524,9 @@ def _find_effects(
             predict, lambda _, back: redraw(index, back), np.concatenate([influence_orders(one[None]) for one in known])
         )
         return FrameEffects(
-            network=network,
+            shapley=found.values,
+            shapley_error=found.standard_errors,
+            network=answers[0] - answers[1:],
             margin=marker_readings(frame.scene, frame.number)[1],
             shuffled=shuffled,
             gains={name: _gains(own, towards) for name, own in curves.items()},
