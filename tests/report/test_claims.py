@@ -9,6 +9,8 @@ from sliplens.intervals import Difference
 from sliplens.report import load_results
 from sliplens.report.claims import all_of, judge_claims, judge_gap, most_of
 from sliplens.report.comparisons import compare_gain, share_of_strongest
+from sliplens.report.sections import build_sections
+from sliplens.report.tables import Table
 from sliplens.report.verdict import _tell_lead, judge, rank_methods
 
 from .study_results import (
@@ -297,7 +299,7 @@ def test_too_few_trials_believe_nothing(judged, tmp_path, rng):
 
     found = judge(load_results(tmp_path), rng=rng)[0]
 
-    assert found.text == "Not known: 3 trials are too few to tell a method from chance; 5 or more are needed."
+    assert found.text.startswith("Not known: 3 trials are too few to tell a method from chance; 5 or more are needed.")
 
 
 def test_a_fill_counts_once_whatever_the_units(judged, tmp_path):
@@ -338,3 +340,23 @@ def test_without_scores_nothing_is_believed(tmp_path, rng):
     statements = judge(load_results(tmp_path), rng=rng)
 
     assert [one.text.split(":")[0] for one in statements] == ["Not known", "Not known"]
+
+
+def test_an_unsound_sample_is_said_beside_each_verdict_and_score_and_nothing_is_good(judged, tmp_path, rng):
+    judged(thesis(sound=False))
+    results = load_results(tmp_path)
+    statements = {one.topic: one for one in judge(results, rng=rng)}
+    assert not [one.topic for one in statements.values() if one.tone == "good"]
+    told = "The sample explains answers that are off by 13 points on average; 5 of 60 trials qualify at ±3 points"
+    assert told in statements["Which to believe, raw images"].text
+    assert "off by 7 points on average" in statements["Which to believe, difference images"].text
+    both = "off by 7 points (difference images) and 13 points (raw images) on average; 5 of 60 trials"
+    sections = {one.id: one for one in build_sections(results, rng=rng)}
+    for name in ("claims", "faithfulness", "randomisation", "maps", "truth"):
+        assert both in str(sections[name].intro)
+        assert all(both in block.caption for block in sections[name].blocks if isinstance(block, Table))
+
+
+def test_a_sound_sample_may_carry_a_verdict(judged, tmp_path, rng):
+    judged(thesis(sound=True))
+    assert "good" in {one.tone for one in judge(load_results(tmp_path), rng=rng)}

@@ -58,6 +58,12 @@ def test_of_two_networks_the_worse_decides(network: Run, fine_dataset: Dataset):
     networks = {"difference": says(network, 0.5), "raw": says(network, 0.9)}
     assert choose_frames(networks, fine_dataset, tolerance=0.6).qualified == 0
     assert choose_frames(networks, fine_dataset, tolerance=0.95).qualified == 3
+    found = choose_frames(networks, fine_dataset, tolerance=0.6)
+    assert found.qualified_alone == {"difference": 3, "raw": 0}
+    # scored are 40, 20 and 0 %: 0.5 is off by 0.3 on average, 0.9 by 0.7, and labels lie within 1/39 of a level
+    assert found.mean_error == pytest.approx({"difference": 0.3, "raw": 0.7}, abs=1 / 39)
+    told = [f"{100 * found.mean_error[name]:.0f} points ({name} images)" for name in networks]
+    assert f"off by {told[0]} and {told[1]} on average" in found.summary
 
 
 def test_where_too_few_qualify_the_text_says_what_was_done(network: Run, fine_dataset: Dataset):
@@ -65,6 +71,7 @@ def test_where_too_few_qualify_the_text_says_what_was_done(network: Run, fine_da
     assert "in 0 of those" in found.summary
     assert "the 3 read best among the others were taken too" in found.summary
     assert "3 instead of 5" in found.summary
+    assert (found.sound, found.qualified_alone) == (False, {"difference": 0})
     enough = choose_frames({"difference": says(network, 0.5)}, fine_dataset, trials=2, tolerance=0.9)
     assert [one.trial for one in enough.trials] == ["test-dry-0", "test-dry-1"]
     assert "The first 2 were taken" in enough.summary

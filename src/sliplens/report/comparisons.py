@@ -7,10 +7,20 @@ import numpy as np
 from jaxtyping import Float64
 
 from sliplens.intervals import Difference, paired_difference
-from sliplens.plots.style import CONTROL, FILL_NAMES, UNIT_NAMES, fill_name, in_order, signed
+from sliplens.plots.style import (
+    CONTROL,
+    FILL_NAMES,
+    UNIT_NAMES,
+    fill_name,
+    in_order,
+    input_name,
+    inputs_in_order,
+    listed,
+    signed,
+)
 from sliplens.results.evaluation import Predictions
 from sliplens.results.faithfulness import Comparison, DeletionCurve, DeletionScores, RemovalCurve, RemovalScores
-from sliplens.results.study import MarkerEffects, Roughness
+from sliplens.results.study import Choice, MarkerEffects, Roughness
 
 
 def compare_errors(first: Predictions, second: Predictions, *, rng: np.random.Generator) -> Difference | None:
@@ -110,6 +120,22 @@ def mean_at(curve: RemovalCurve, area: float) -> tuple[float, float]:
     places: Float64[np.ndarray, " areas"] = curve.areas
     most, chance = (float(np.interp(area, places, values.mean(axis=0))) for values in (curve.most_first, curve.random))
     return most, chance
+
+
+def tell_sample(choice: Choice, name: str = "") -> str:
+    """Write how wrong the explained answers are, and how many trials are read well enough; of one network, if named."""
+    names = [name] if name in choice.mean_error else inputs_in_order(choice.mean_error)[::-1]
+    several = len(names) > 1
+    errors = [
+        f"{100 * choice.mean_error[one]:.0f} points" + (f" ({input_name(one).lower()})" if several else "")
+        for one in names
+    ]
+    alone = [f"{choice.qualified_alone[one]} with {input_name(one).lower()}" for one in names]
+    told = f", {listed(alone)} alone" if len(choice.inputs) > 1 else ""
+    return (
+        f"The sample explains answers that are off by {listed(errors)} on average; {choice.qualified} of "
+        f"{choice.considered} trials qualify at ±{100 * choice.tolerance:g} points{told}."
+    )
 
 
 def tell_over(gaps: Iterable[Difference | None]) -> str:

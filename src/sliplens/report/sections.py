@@ -9,6 +9,7 @@ import numpy as np
 from sliplens.plots.style import input_name, inputs_in_order
 from sliplens.report import charts, pictures, tables
 from sliplens.report.claims import Claim, judge_claims
+from sliplens.report.comparisons import tell_sample
 from sliplens.report.plates import Plate, explained_of
 from sliplens.report.results import Results
 from sliplens.report.verdict import alarms_of, group_alarms
@@ -44,6 +45,8 @@ class Section:
     """Makes its blocks; None for one that is not there. Without any, the section is left out."""
     needs: Callable[[Results], Collection[str]] = lambda results: results.inputs
     """Inputs that its results are there for; one that is missing is named."""
+    of_sample: bool = False
+    """Whether its scores are of the study's sample, how sound which is said beside each."""
     missing: tuple[str, ...] = ()
     blocks: tuple[Block, ...] = ()
     """In the order they are read."""
@@ -61,6 +64,13 @@ def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Secti
         without = [name for name in _names(results.inputs) if name not in section.needs(results)]
         missing = tuple(f"{input_name(name)}: not run yet; `{command}` makes it." for name in without)
         intro = section.intro if isinstance(section.intro, str) else section.intro(results)
+        if results.study.choice is not None and section.of_sample:
+            sample = tell_sample(results.study.choice)
+            intro += f" {sample}"
+            blocks = tuple(
+                replace(block, caption=f"{block.caption} {sample}") if isinstance(block, tables.Table) else block
+                for block in blocks
+            )
         sections.append(replace(section, intro=intro, missing=missing, blocks=blocks))
     return (*sections, _recipe(results, absent))
 
@@ -199,6 +209,7 @@ def _names(found: Iterable[str]) -> list[str]:
 SECTIONS: tuple[Section, ...] = (
     Section(
         id="claims",
+        of_sample=True,
         title="The claims of the thesis, tested here",
         short_title="Claims",
         intro="Each claim holds, does not hold, or stays undecided. A fill is what removed parts become; intervals (95 "
@@ -219,6 +230,7 @@ SECTIONS: tuple[Section, ...] = (
     ),
     Section(
         id="faithfulness",
+        of_sample=True,
         title="How far the explanations can be believed",
         short_title="Faithfulness",
         intro="Table 2 of the thesis beside scores that do not depend on one fill. Parts of a frame are removed: first "
@@ -231,6 +243,7 @@ SECTIONS: tuple[Section, ...] = (
     ),
     Section(
         id="deletion",
+        of_sample=True,
         title="The thesis's score, step by step",
         short_title="Deletion",
         intro="D = (1 \N{MINUS SIGN} |change of Γ|)² while pixels go, the most salient first: 1 where nothing changed, "
@@ -244,6 +257,7 @@ SECTIONS: tuple[Section, ...] = (
     ),
     Section(
         id="randomisation",
+        of_sample=True,
         title="Does the explanation notice that the network forgot everything?",
         short_title="New weights",
         intro="The weights are drawn anew, layer by layer from the output. A map of what was learned has to change.",
@@ -253,6 +267,7 @@ SECTIONS: tuple[Section, ...] = (
     ),
     Section(
         id="maps",
+        of_sample=True,
         title="Where the networks look, and what the maps look like",
         short_title="Saliency maps",
         intro="From full stick (Γ 100 %) to the onset of full slip (Γ 0 %): what each method holds to speak for the "
@@ -290,6 +305,7 @@ SECTIONS: tuple[Section, ...] = (
     ),
     Section(
         id="truth",
+        of_sample=True,
         title="What the network should have looked at",
         short_title="Truth",
         intro="Simulated touch can be filmed again with markers put back where they rested: what that does to the "

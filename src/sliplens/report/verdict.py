@@ -33,6 +33,7 @@ from sliplens.report.comparisons import (
     controls,
     gap_from,
     tell_interval,
+    tell_sample,
     voting_settings,
 )
 from sliplens.report.results import Results
@@ -62,7 +63,9 @@ def judge(results: Results, *, rng: np.random.Generator) -> tuple[Statement, ...
     statements = _accuracy(results)
     for name in inputs_in_order(study.inputs)[::-1]:
         if name in study.faithfulness:
-            statements.append(_believe(study.faithfulness[name], results))
+            found = _believe(study.faithfulness[name], results)
+            sample = "" if study.choice is None else f" {tell_sample(study.choice, name)}"
+            statements.append(replace(found, text=found.text + sample))
         elif study:
             topic = f"Which to believe, {input_name(name).lower()}"
             text = "Not known: the explanations were not scored; `sliplens study` does that."
@@ -79,6 +82,9 @@ def judge(results: Results, *, rng: np.random.Generator) -> tuple[Statement, ...
     real = {name: one for (name, source), one in results.explanations.items() if source == "real"}
     statements += [_real_touch(real[name]) for name in inputs_in_order(real)]
     statements += _tell_scale(results)
+    if study.choice is not None and not study.choice.sound:
+        # an explanation of a wrong answer explains the error
+        statements = [replace(one, tone="plain") if one.tone == "good" else one for one in statements]
     return tuple(sorted(statements, key=lambda one: one.tone == "caution"))
 
 

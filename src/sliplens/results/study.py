@@ -62,6 +62,11 @@ class Choice:
     considered: int
     """Trials that have a frame near every level."""
     qualified: int
+    """Trials that qualify with every network."""
+    qualified_alone: dict[str, int]
+    """Trials that would qualify with one network alone, by input."""
+    mean_error: dict[str, float]
+    """Mean error of the answers on the scored frames, in margin units, by input."""
     summary: str
     """What was done, in a sentence or two."""
     source: str
@@ -71,6 +76,11 @@ class Choice:
     scored_levels: tuple[float, ...]
     trials: tuple[ChosenTrial, ...]
     frames: tuple[ChosenFrame, ...]
+
+    @property
+    def sound(self) -> bool:
+        """Whether every trial that was taken qualifies; otherwise errors are explained too."""
+        return all(trial.qualified for trial in self.trials)
 
 
 @dataclass(frozen=True, kw_only=True)

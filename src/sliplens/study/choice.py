@@ -57,16 +57,18 @@ def choose_frames(
         raise InputError(f"scored levels must be some of the levels {known}, got {scored or 'none'}")
     infos = data.select(split=split, condition=condition)
     candidates: list[tuple[ChosenTrial, list[tuple[int, float]]]] = []
+    errors: dict[str, dict[str, Float[np.ndarray, " levels"]]] = {}
     for info in counted(infos, on_progress):
         recording = data.load(info, truth=False)
         margin = np.where(recording.labelled, recording.safety_margin, np.nan)
         rows = [nearest_frame(margin, level) for level in levels] if np.isfinite(margin).any() else []
         near = bool(rows) and all(abs(margin[row] - level) <= _REACH for row, level in zip(rows, levels, strict=True))
         if near and len(set(rows)) == len(rows):
-            worst = {}
+            own = errors[info.trial] = {}
             for name, trained in networks.items():
                 answers = trained.predict(trained.encode(recording.frames[rows], recording.reference)).numpy()
-                worst[name] = float(np.abs(answers - margin[rows]).max())
+                own[name] = np.abs(answers - margin[rows])
+            worst = {name: float(values.max()) for name, values in own.items()}
             trial = ChosenTrial(trial=info.trial, qualified=max(worst.values()) <= tolerance, worst_error=worst)
             candidates.append((trial, [(row, float(margin[row])) for row in rows]))
     if not candidates:
@@ -93,11 +95,18 @@ def choose_frames(
         for level, (row, label) in zip(levels, rows, strict=True)
         if level in scored_levels or trial.trial in shown
     )
+    counts = [level in scored_levels for level in levels]
     choice = Choice(
         trials_wanted=trials,
         tolerance=tolerance,
         considered=len(candidates),
         qualified=sum(trial.qualified for trial, _ in candidates),
+        qualified_alone={
+            name: sum(trial.worst_error[name] <= tolerance for trial, _ in candidates) for name in networks
+        },
+        mean_error={
+            name: float(np.mean([errors[trial.trial][name][counts] for trial, _ in taken])) for name in networks
+        },
         summary="",
         source=data.source,
         condition=condition,
@@ -126,6 +135,8 @@ def _summarise(choice: Choice, trials: int) -> str:
         )
     elif choice.qualified > wanted:
         summary += f" The first {wanted} were taken."
+    errors = " and ".join(f"{100 * error:.0f} points ({name} images)" for name, error in choice.mean_error.items())
+    summary += f" The answers on the frames to score are off by {errors} on average."
     if len(taken) < wanted:
         summary += f" There were no more: {len(taken)} instead of {wanted}."
     return summary
