@@ -6,12 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64
+from scipy.optimize import fminbound
 from scipy.special import comb
 from torch import Tensor
 
 from sliplens.errors import InputError
 from sliplens.explainers.contract import FrozenModel
 from sliplens.explainers.explanation import Explanation
+from sliplens.explainers.gradients import IntegratedGradients
 from sliplens.explainers.occlusion import RegionMethod
 from sliplens.progress import OnProgress
 
@@ -30,12 +32,23 @@ class ShapleyValues:
     """Of the values, as far as the sampled coalitions tell; 0 where all coalitions were asked."""
 
 
-def shapley_values(value: Value, players: int, *, pairs: int, rng: np.random.Generator) -> ShapleyValues:
+def shapley_values(
+    value: Value,
+    players: int,
+    *,
+    pairs: int,
+    rng: np.random.Generator,
+    guess: Float64[np.ndarray, " players"] | None = None,
+) -> ShapleyValues:
     """Estimate the Shapley values of a game from pairs of coalitions, each with its complement.
 
     Values are those of the weighted least squares whose solution over all coalitions is the Shapley value, on sampled
     ones. With its complement, each coalition tells of the odd part of the game alone, on which the values depend: games
     of pairs that help or hinder each other are told exactly. Errors are the sandwich estimate from the residuals.
+
+    With a first guess the values are drawn towards a multiple of it, and no farther than the noise of the coalitions
+    asks for (empirical Bayes): a good guess saves most of the pairs, a poor one costs little, and both fade as pairs
+    are added.
 
     Parameters
     ----------
@@ -44,6 +57,8 @@ def shapley_values(value: Value, players: int, *, pairs: int, rng: np.random.Gen
         once for all others.
     pairs
         Pairs of coalitions to ask; all of them, exactly, where the players have no more. At least twice the players.
+    guess
+        What the values may be like, in any unit.
 
     Raises
     ------
@@ -54,6 +69,8 @@ def shapley_values(value: Value, players: int, *, pairs: int, rng: np.random.Gen
     ----------
     Lundberg and Lee, *A Unified Approach to Interpreting Model Predictions* (2017), Theorem 2; Covert and Lee,
     *Improving KernelSHAP: Practical Shapley Value Estimation via Linear Regression* (2021), section 4.2, pairs.
+    Patterson and Thompson, *Recovery of inter-block information when block sizes are unequal* (1971), for how far to
+    draw: restricted maximum likelihood.
 
     Examples
     --------
@@ -80,14 +97,45 @@ def shapley_values(value: Value, players: int, *, pairs: int, rng: np.random.Gen
     # the last column takes what the mere number of players does, a cubic that vanishes at both ends: its own Shapley
     # values are 0, and where an answer tips between few and many it is most of the noise
     number = (2 * share - 1) ** 3 - (2 * share - 1)
-    columns = np.column_stack([members - share[:, None], number])
-    solve = np.linalg.pinv(np.sqrt(weights)[:, None] * columns) * np.sqrt(weights)
-    solution = solve @ left
-    spread = (solve * (left - columns @ solution)) ** 2 * len(odd) / max(len(odd) - players, 1)
-    return ShapleyValues(
-        values=solution[:players] + (whole - empty) / players,
-        standard_errors=np.zeros(players) if exact else np.sqrt(spread.sum(axis=1)[:players]),
-    )
+    root, centred = np.sqrt(weights), members - share[:, None]
+    if guess is not None and not exact and np.ptp(guess):
+        fixed = root[:, None] * np.column_stack([centred @ guess, number])
+        differing, errors = _shrink(root[:, None] * centred, fixed, root * left, guess)
+    else:
+        columns = np.column_stack([centred, number])
+        solve = np.linalg.pinv(root[:, None] * columns) * root
+        differing = solve @ left
+        spread = (solve * (left - columns @ differing)) ** 2 * len(odd) / max(len(odd) - players, 1)
+        errors = np.zeros(players + 1) if exact else np.sqrt(spread.sum(axis=1))
+    return ShapleyValues(values=differing[:players] + (whole - empty) / players, standard_errors=errors[:players])
+
+
+def _shrink(
+    columns: Float64[np.ndarray, "pairs players"],
+    fixed: Float64[np.ndarray, "pairs 2"],
+    left: Float64[np.ndarray, " pairs"],
+    guess: Float64[np.ndarray, " players"],
+) -> tuple[Float64[np.ndarray, " players"], Float64[np.ndarray, " players"]]:
+    """Coefficients, a multiple of the guess plus a ridge as wide as restricted likelihood says, and their errors."""
+    known = np.linalg.qr(fixed)[0]
+    rest, inside = (values - known @ (known.T @ values) for values in (left, columns))
+    along, sizes, axes = np.linalg.svd(inside, full_matrices=False)
+    seen = along.T @ rest
+    freedom = len(left) - fixed.shape[1]
+    unexplained = max(float(rest @ rest - seen @ seen), 0.0)
+
+    def variance(ridge: float) -> float:
+        return float((unexplained + (seen**2 / (1 + sizes**2 / ridge)).sum()) / freedom)
+
+    def doubt(log_ridge: float) -> float:
+        ridge = np.exp(log_ridge)
+        return freedom * np.log(variance(ridge) + 1e-300) + np.log1p(sizes**2 / ridge).sum()
+
+    ridge = float(np.exp(fminbound(doubt, -12, 12)))
+    off = axes.T @ (sizes / (sizes**2 + ridge) * seen)
+    multiple = np.linalg.lstsq(fixed, left - columns @ off, rcond=None)[0][0]
+    errors = np.sqrt(variance(ridge) * (axes**2 / (sizes**2 + ridge)[:, None]).sum(axis=0))
+    return multiple * (guess - guess.mean()) + off - off.mean(), errors
 
 
 def _all_pairs(players: int) -> tuple[Bool[np.ndarray, "pairs players"], Float64[np.ndarray, " pairs"]]:
@@ -121,8 +169,9 @@ class Shapley(RegionMethod):
     """Shapley values of tiles, or of markers where their places are given, signed and complete, in margin units.
 
     A region that does not take part is as in the reference. The relevance of a region is its Shapley value, spread
-    evenly over its pixels, so that a map adds up to f(x) - f(b). Where the contributions are hardly surer than they
-    differ, a warning says so; more `pairs` help.
+    evenly over its pixels, so that a map adds up to f(x) - f(b). Integrated Gradients, summed over each region, are the
+    first guess (`shapley_values`). Where the contributions are hardly surer than they differ, a warning says so; more
+    `pairs` help.
 
     References
     ----------
@@ -143,12 +192,18 @@ class Shapley(RegionMethod):
     """
 
     tile_px: int = 28
-    pairs: int = 400
+    pairs: int = 200
     """Pairs of coalitions that are asked for each image, two passes of the network each."""
     seed: int = 0
 
-    @torch.no_grad()
     def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
+        gradients = IntegratedGradients()._explain(frozen, on_progress=None).relevance.double().cpu()
+        with torch.no_grad():
+            return self._share_out(frozen, gradients, on_progress)
+
+    def _share_out(
+        self, frozen: FrozenModel, gradients: Float[Tensor, "batch height width"], on_progress: OnProgress | None
+    ) -> Explanation:
         comparison = frozen.compare()
         engine = comparison.prepare(2 * self.pairs * len(comparison.images), batch_size=self.batch_size)
         unsure = []
@@ -165,7 +220,9 @@ class Shapley(RegionMethod):
                 return torch.cat(list(engine.run(batches))).double().cpu().numpy()
 
             rng = np.random.default_rng((self.seed, index))
-            found = shapley_values(worth, len(numbers), pairs=max(self.pairs, 2 * len(numbers)), rng=rng)
+            guess = players.cpu().flatten().bincount(weights=gradients[index].flatten()).numpy()
+            pairs = max(self.pairs, 2 * len(numbers))
+            found = shapley_values(worth, len(numbers), pairs=pairs, rng=rng, guess=guess)
             unsure.append(float(np.sqrt((found.standard_errors**2).mean())) > _UNSURE * float(found.values.std()))
             shares = torch.from_numpy(found.values).to(image) / players.flatten().bincount()
             return shares[players]
