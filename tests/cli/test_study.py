@@ -30,7 +30,10 @@ def test_a_study_makes_every_stage_and_the_page_and_keeps_what_is_there(
     for name in ("difference", "raw"):
         told = json.loads((output / f"faithfulness-{name}" / "result.json").read_text())
         assert (told["frames"], told["trials"]) == (6, 2)
-        assert {one["method"] for one in told["scores"] if one["control"]} == {"edges", "input", "centre", "randomised"}
+        new = {f"{method}-new-weights" for method in ("grad-cam", "occlusion", "weights-1")}
+        controls = {"edges", "change", "local-change", "weights-1", "centre", *new}
+        assert {one["method"] for one in told["scores"] if one["control"]} == controls
+        assert all((one["lead_over_controls"] is None) == one["control"] for one in told["scores"])
     # as after an interruption: one stage is missing, the others stay as they are; now each network has its process
     before = {path: path.stat().st_mtime_ns for path in output.glob("*/result.json")}
     gone = output / "map-quality-raw"

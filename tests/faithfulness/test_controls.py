@@ -1,16 +1,60 @@
+import numpy as np
 import pytest
 import torch
+from torch import nn
 
-from sliplens.faithfulness.controls import CONTROLS, brightness, centre, edges
+from sliplens.explainers import PolyCam
+from sliplens.faithfulness.controls import (
+    centre,
+    change,
+    control_maps,
+    edges,
+    even_channels,
+    lead_over_controls,
+    relative_change,
+)
+from sliplens.results.faithfulness import is_control
+
+REFERENCE = torch.full((1, 3, 60, 60), 0.25)
 
 
-@pytest.mark.parametrize("name", CONTROLS)
-def test_a_control_gives_a_finite_map_for_each_image(name: str):
-    images = torch.rand(2, 3, 12, 15)
-    maps = CONTROLS[name](images)
-    assert maps.shape == (2, 12, 15)
-    assert torch.isfinite(maps).all()
-    assert (maps >= 0).all()
+def two_layers(*, channels: int) -> nn.Sequential:
+    torch.manual_seed(3)
+    layers = [
+        nn.Conv2d(3, channels, 3, padding=1),
+        nn.ReLU(),
+        nn.MaxPool2d(2),
+        nn.Conv2d(channels, channels, 3),
+        nn.ReLU(),
+    ]
+    for layer in layers:
+        for weights in layer.parameters():
+            nn.init.uniform_(weights, 0, 0.1)
+    return nn.Sequential(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(channels, 1), nn.Flatten(0)).eval()
+
+
+def spot() -> torch.Tensor:
+    images = REFERENCE.clone()
+    images[0, :, 20:32, 25:40] += 0.5 * torch.rand(3, 12, 15, generator=torch.Generator().manual_seed(1))
+    return images
+
+
+def test_every_control_gives_a_finite_map_for_each_image_and_is_known_as_one():
+    images = torch.rand(2, 3, 60, 60)
+    maps = control_maps(two_layers(channels=2), images, REFERENCE.expand_as(images))
+    assert set(maps) == {"change", "local-change", "weights-1", "centre", "edges"}
+    for name, values in maps.items():
+        assert values.shape == (2, 60, 60)
+        assert np.isfinite(values).all()
+        assert (values >= 0).all()
+        assert is_control(name)
+    assert not is_control("poly-cam")
+    assert is_control("poly-cam-new-weights")
+
+
+def test_a_network_without_layers_has_the_other_controls():
+    flat = nn.Sequential(nn.Flatten(), nn.Linear(3 * 3600, 1), nn.Flatten(0))
+    assert set(control_maps(flat, REFERENCE, REFERENCE)) == {"change", "local-change", "centre", "edges"}
 
 
 def test_edges_are_the_slope_of_a_plane_wherever_it_has_one():
@@ -26,10 +70,96 @@ def test_a_turned_image_has_turned_edges():
     torch.testing.assert_close(edges(images.rot90(1, (2, 3))), edges(images).rot90(1, (1, 2)))
 
 
-def test_brightness_is_the_mean_of_the_channels_and_the_centre_is_in_the_middle():
-    images = torch.rand(2, 3, 9, 9)
-    torch.testing.assert_close(brightness(images), images.mean(dim=1))
-    bump = centre(images)[0]
+def test_the_change_is_the_mean_distance_from_the_untouched_sensor():
+    images = REFERENCE.clone()
+    images[0, :, 30, 30] += torch.tensor([0.3, -0.6, 0.0])
+    expected = torch.zeros(1, 60, 60)
+    expected[0, 30, 30] = 0.3
+    torch.testing.assert_close(change(images, REFERENCE), expected)
+
+
+def test_the_local_change_compares_a_marker_with_its_surroundings():
+    # everywhere alike: nothing stands out
+    even = relative_change(REFERENCE + 0.5, REFERENCE)
+    torch.testing.assert_close(even, torch.full((1, 60, 60), 0.5 / 0.501))
+    images = REFERENCE.clone()
+    images[0, :, 30, 30] += 0.5
+    # a marker is 5 pixels wide of these 60, its surroundings 17
+    near, around = 0.5 / 25, 0.5 / 289
+    alone = relative_change(images, REFERENCE)[0]
+    torch.testing.assert_close(alone[28:33, 28:33], torch.full((5, 5), near / (around + 0.001)))
+    assert alone.count_nonzero() == 25
+    assert not relative_change(REFERENCE, REFERENCE).any()
+
+
+def test_even_channels_are_poly_cam_where_there_is_but_one_channel_to_weigh():
+    model = two_layers(channels=1)
+    found = even_channels(model, spot(), REFERENCE)
+    explained = PolyCam()(model, spot(), reference=REFERENCE[0]).saliency
+    torch.testing.assert_close(found / found.max(), explained / explained.max())
+
+
+def test_even_channels_do_not_know_what_the_answer_is_made_of():
+    model = two_layers(channels=4)
+    (head,) = [layer for layer in model if isinstance(layer, nn.Linear)]
+    before, by_poly_cam = even_channels(model, spot(), REFERENCE), PolyCam()(model, spot(), reference=REFERENCE[0])
+    nn.init.normal_(head.weight)
+    torch.testing.assert_close(even_channels(model, spot(), REFERENCE), before)
+    assert not torch.allclose(PolyCam()(model, spot(), reference=REFERENCE[0]).saliency, by_poly_cam.saliency)
+
+
+def test_the_centre_is_in_the_middle():
+    bump = centre(torch.rand(2, 3, 9, 9))[0]
     assert bump.flatten().argmax() == 4 * 9 + 4
     torch.testing.assert_close(bump, bump.flip(0))
     torch.testing.assert_close(bump, bump.T)
+
+
+TRIALS = np.repeat(np.arange(7), 3)
+
+
+def lead(own: np.ndarray, controls: dict[str, np.ndarray]):
+    return lead_over_controls(own, controls, clusters=[TRIALS], rng=np.random.default_rng(5))
+
+
+def test_a_method_equal_to_a_control_has_no_lead():
+    rng = np.random.default_rng(0)
+    own, other = rng.normal(0.5, 0.2, (2, 21))
+    for controls in ({"edges": own}, {"edges": own, "change": other}):
+        found = lead(own, controls)
+        assert found.gap.low <= found.gap.estimate <= found.gap.high <= 0
+        assert not found.shows_something
+
+
+def test_a_lead_is_no_larger_than_that_over_any_control_alone_nor_over_chance():
+    rng = np.random.default_rng(1)
+    own, *others = rng.normal(0.2, 0.3, (6, 21))
+    controls = {f"{number}-new-weights": gains for number, gains in enumerate(others)}
+    among_all = lead(own, controls)
+    alone = [lead(own, {name: gains}) for name, gains in controls.items()] + [lead(own, {})]
+    # of seven trials nothing is drawn: the intervals are Student's
+    nearest = min(alone, key=lambda one: one.gap.estimate)
+    assert (among_all.control, among_all.gap.estimate) == (nearest.control, nearest.gap.estimate)
+    assert among_all.gap.low == min(one.gap.low for one in alone)
+    assert among_all.gap.high == min(one.gap.high for one in alone)
+    # to name the strongest first and look at no other would say too much
+    wild = np.where(TRIALS == 0, -9.0, 0.4) + own.mean()
+    uncertain = lead(own + 0.5, {"edges": own, "wild": wild})
+    assert uncertain.control == "edges"
+    assert lead(own + 0.5, {"edges": own}).shows_something
+    assert not uncertain.shows_something
+
+
+def test_a_method_that_is_ahead_of_all_in_every_trial_shows_something_and_one_below_chance_does_not():
+    gains = np.linspace(0.1, 0.3, 21)
+    ahead = lead(gains + 0.2, {"edges": gains, "centre": gains[::-1]})
+    assert ahead.gap.estimate == pytest.approx(0.2)
+    assert ahead.shows_something
+    below = lead(-gains, {})
+    assert below.control == "random"
+    assert below.gap.estimate == pytest.approx(-0.2)
+    assert not below.shows_something
+    # frames of one trial are no trials
+    few = lead_over_controls(gains + 0.2, {"edges": gains}, clusters=[TRIALS // 2], rng=np.random.default_rng(5))
+    assert few.gap.units == 4
+    assert not few.shows_something

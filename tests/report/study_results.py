@@ -10,12 +10,14 @@ import numpy as np
 from made_up import deletion_table, explained, method_score, picture_and_maps, write_evaluation, write_run
 from scipy.stats import kendalltau
 
+from sliplens.faithfulness.controls import lead_over_controls
 from sliplens.intervals import Difference, paired_difference
 from sliplens.results.explanation import ExplainedFrame, MethodNotes
 from sliplens.results.faithfulness import (
     Agreement,
     Comparison,
     DeletionScores,
+    Lead,
     Remedies,
     RemovalScore,
     RemovalScores,
@@ -321,12 +323,13 @@ def write_faithfulness(workspace: Path, name: str, made: Made, *, rng: np.random
     scores, comparisons, tables, ranks = [], [], [], {}
     chance = 0.4 * areas
     for fill, unit in FILLS:
-        gains = {}
+        gains, resampled = {}, {"clusters": [trials], "rng": rng}
         for method in [*made.methods, *CONTROLS]:
             of_trial = rng.normal(0, made.spread, made.trials)
             gains[method] = np.array([gain_of(made, name, method) + of_trial[int(row.trial[1:])] for row in rows])
-            most = chance + gains[method][:, None] / 2 * bump
-            least = chance - gains[method][:, None] / 2 * bump
+        for method, own in gains.items():
+            most = chance + own[:, None] / 2 * bump
+            least = chance - own[:, None] / 2 * bump
             tables.append(
                 RemovalTable(
                     fill=np.repeat(fill, most.size),
@@ -349,16 +352,18 @@ def write_faithfulness(workspace: Path, name: str, made: Made, *, rng: np.random
                     unit=unit,
                     method=method,
                     control=method in CONTROLS,
-                    srg=paired_difference(gains[method], zero, clusters=[trials], rng=rng),
-                    gain_over_random=paired_difference(gains[method] / 2, zero, clusters=[trials], rng=rng),
+                    srg=paired_difference(own, zero, clusters=[trials], rng=rng),
+                    gain_over_random=paired_difference(own / 2, zero, clusters=[trials], rng=rng),
+                    lead_over_controls=None
+                    if method in CONTROLS
+                    else lead_over_controls(own, {one: gains[one] for one in CONTROLS}, **resampled),
                     most_first=float(np.trapezoid(most, areas).mean()),
                     least_first=float(np.trapezoid(least, areas).mean()),
                     random=0.2,
                     at={area: float(np.interp(area, areas, most.mean(axis=0))) for area in EQUAL_AREAS},
                 )
             )
-        best = max(CONTROLS, key=lambda control, gains=gains: gains[control].mean())
-        pairs = [*combinations(made.methods, 2), *((method, best) for method in made.methods)]
+        pairs = combinations(made.methods, 2)
         comparisons += [
             Comparison(
                 fill=fill,
@@ -518,6 +523,7 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
                     shapley=interval(value, made.trials),
                     network=interval(value, made.trials),
                     margin=interval(value / 2, made.trials),
+                    lead_over_controls=Lead(control="change", gap=interval(value - 0.1, made.trials)),
                     edges=interval(made.edge_mass - 0.07, made.trials, half=0.01),
                 )
                 for method, value in spearman.items()

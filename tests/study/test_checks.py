@@ -1,4 +1,5 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -6,9 +7,11 @@ import torch
 from torch import Tensor, nn
 
 from sliplens.explainers import Explanation, IntegratedGradients
+from sliplens.faithfulness.controls import cascade
 from sliplens.faithfulness.map_quality import gini, total_variation
 from sliplens.recordings import Dataset
 from sliplens.study.checks import explain_untrained, measure_maps, randomise_weights, time_explainers
+from sliplens.study.curves import Setting, influences, score_removal
 from sliplens.study.material import Material
 
 
@@ -57,17 +60,55 @@ def test_a_map_that_only_turns_its_sign_with_the_answers_is_as_similar(material:
     assert found.methods["image"].similarity == pytest.approx([1.0, 1.0, 1.0])
 
 
-def test_the_untrained_control_leaves_the_network_as_it_is(material: Material):
+def test_the_untrained_controls_leave_the_network_as_it_is_and_go_on_after_the_last_trial(
+    material: Material, tmp_path: Path
+):
     before = {name: value.clone() for name, value in material.trained.model.state_dict().items()}
+    small = replace(material, explainers={"integrated-gradients": IntegratedGradients(steps=8, max_steps=8)})
+    name, told = "integrated-gradients-new-weights", []
 
-    def explain(seed: int) -> np.ndarray:
-        return explain_untrained(material, IntegratedGradients(steps=8, max_steps=8), seed=seed).maps
+    def stop(done: int, total: int) -> None:
+        told.append((done, total))
+        if done == 4:
+            raise KeyboardInterrupt
 
-    first, again, other = explain(1), explain(1), explain(2)
-    assert first.shape == (len(material.inputs), *material.inputs.shape[-2:])
-    np.testing.assert_array_equal(first, again)
-    assert np.abs(first - other).max() > 0
+    with pytest.raises(KeyboardInterrupt):
+        explain_untrained(small, seed=1, parts=tmp_path, on_progress=stop)
+    first, again, other = (
+        explain_untrained(small, seed=seed, parts=parts).maps for seed, parts in ((1, tmp_path), (1, None), (2, None))
+    )
+    assert told == [(done, 6) for done in range(1, 5)]
+    assert set(first) == {name, "weights-1-new-weights"}
+    assert first[name].shape == (len(material.inputs), *material.inputs.shape[-2:])
+    for control in first:
+        np.testing.assert_array_equal(first[control], again[control])
+        assert np.abs(first[control] - other[control]).max() > 0
     assert all(torch.equal(value, before[name]) for name, value in material.trained.model.state_dict().items())
+
+
+def test_each_trial_has_a_network_of_its_own(material: Material):
+    small = replace(material, explainers={"grad-cam": material.explainers["grad-cam"]})
+    found = explain_untrained(small, seed=7).maps["grad-cam-new-weights"]
+    trials = material.clusters[1].tolist()
+    for number, trial in enumerate(dict.fromkeys(trials)):
+        seed = 7 + 1000 * number  # no two layers of two networks have the same seed
+        ((_, network),) = cascade(material.trained.model, seed=seed, stages=1, images=material.inputs)
+        for frame in [place for place, own in enumerate(trials) if own == trial]:
+            image, empty = material.inputs[frame, None], material.references[frame, None]
+            explanation = material.explainers["grad-cam"](network, image, reference=empty)
+            np.testing.assert_allclose(found[frame], explanation.influence[0].numpy(), atol=1e-7)
+
+
+def test_a_method_that_ignores_the_weights_shows_nothing_about_the_network(material: Material):
+    shows_the_image = with_image(material, ShowsTheImage())
+    small = replace(shows_the_image, explainers={"image": ShowsTheImage()})
+    maps = {**influences(small), **explain_untrained(small).maps}
+    np.testing.assert_allclose(maps["image-new-weights"], maps["image"], atol=1e-6)
+    scored = score_removal(small, maps=maps, settings=(Setting(fill="grey", unit="pixel"),), random_orders=1)
+    (lead,) = [score.lead_over_controls for score in scored.scores if score.method == "image"]
+    assert lead is not None
+    assert lead.gap.high <= 0
+    assert not lead.shows_something
 
 
 def test_looks_are_those_of_the_saved_maps(material: Material, fine_dataset: Dataset):

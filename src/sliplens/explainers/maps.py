@@ -124,11 +124,11 @@ def scale_to(
 
 
 def local_change(
-    image: Float[Tensor, "3 height width"], reference: Float[Tensor, "3 height width"]
+    image: Float[Tensor, "3 height width"], reference: Float[Tensor, "3 height width"], *, widths: int = 1
 ) -> Float[Tensor, "height width"]:
-    """Mean of |x - b| over the colours and over a square of `CHANGE_WINDOW` around each pixel, the border repeated."""
+    """Mean of |x - b| over the colours and a square of some `CHANGE_WINDOW` around each pixel, the border repeated."""
     change = (image - reference).abs().mean(dim=0)
-    reach = round(CHANGE_WINDOW * change.shape[0]) // 2
+    reach = round(widths * CHANGE_WINDOW * change.shape[0]) // 2
     padded = functional.pad(change[None, None], [reach] * 4, mode="replicate")
     return functional.avg_pool2d(padded, 2 * reach + 1, stride=1)[0, 0]
 

@@ -1,20 +1,28 @@
 """Controls: maps that know nothing of the network, and networks that know nothing, since their weights are new."""
 
 import copy
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 from torch.nn import functional
 
+from sliplens.errors import ModelError
+from sliplens.explainers.activations import capture, recall_layers
+from sliplens.explainers.maps import combine, local_change
 from sliplens.faithfulness.map_quality import stability
+from sliplens.intervals import paired_difference
+from sliplens.results.faithfulness import CHANCE, Lead
 
 Images = Float[Tensor, "images 3 height width"]
 ControlMaps = Float[Tensor, "images height width"]
 Maps = Float[np.ndarray, "images height width"]
+_QUARTER_GREY_LEVEL = 0.001
+"""Added to what is divided by: where nothing changed there is nothing to compare."""
 _BATCH_NORMS = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm)
 
 
@@ -27,9 +35,35 @@ def edges(images: Images) -> ControlMaps:
     return slopes.square().sum(dim=2).sqrt().mean(dim=1)
 
 
-def brightness(images: Images) -> ControlMaps:
-    """The input itself, mean over the channels: of a difference image, how much changed."""
-    return images.abs().mean(dim=1)
+def change(images: Images, references: Images) -> ControlMaps:
+    """What there is to explain, before any network saw it: |x - b|, mean over the channels."""
+    return (images - references).abs().mean(dim=1)
+
+
+def relative_change(images: Images, references: Images) -> ControlMaps:
+    """|x - b| over a marker's width, divided by that over four: where more changed than thereabouts.
+
+    References
+    ----------
+    Carandini and Heeger, *Normalization as a canonical neural computation* (2012).
+    """
+    pairs = list(zip(images, references, strict=True))
+    near, around = (torch.stack([local_change(*pair, widths=widths) for pair in pairs]) for widths in (1, 4))
+    return near / (around + _QUARTER_GREY_LEVEL)
+
+
+@torch.no_grad()
+def even_channels(model: nn.Module, images: Images, references: Images) -> ControlMaps:
+    """Poly-CAM's map with the weight of every channel 1: what the layers show, whatever it does to the answer."""
+    names, size = [layer.name for layer in recall_layers(model, images)], (images.shape[-2], images.shape[-1])
+    with capture(model, names) as outputs:
+        model(images)
+    maps = []
+    for index, pair in enumerate(zip(images, references, strict=True)):
+        activations = [outputs[name][index] for name in names]
+        even = [torch.ones_like(maps[:, 0, 0]) for maps in activations]
+        maps.append(combine(activations, even, size=size)[0] * local_change(*pair))
+    return torch.stack(maps)
 
 
 def centre(images: Images) -> ControlMaps:
@@ -40,13 +74,61 @@ def centre(images: Images) -> ControlMaps:
     return bump.to(images.dtype).expand(len(images), height, width)
 
 
-CONTROLS: dict[str, Callable[[Images], ControlMaps]] = {"edges": edges, "input": brightness, "centre": centre}
-"""Beside these the random orders, and the explainer itself on a network whose weights were drawn anew.
+def control_maps(model: nn.Module, images: Images, references: Images) -> dict[str, Maps]:
+    """Maps that know nothing of what a network learned, by name, of images and of their untouched sensors.
 
-References
-----------
-Clark et al., *XAI-TRIS* (2024), edge filters; Adebayo et al., *Sanity Checks for Saliency Maps* (2018).
-"""
+    Beside these stand random orders, and each explainer on networks whose weights were drawn anew. A network without
+    layers that have a map has no `weights-1`.
+
+    References
+    ----------
+    Clark et al., *XAI-TRIS* (2024), edge filters; Adebayo et al., *Sanity Checks for Saliency Maps* (2018).
+    """
+    maps = {
+        "change": change(images, references),
+        "local-change": relative_change(images, references),
+        "centre": centre(images),
+        "edges": edges(images),
+    }
+    with suppress(ModelError):
+        maps["weights-1"] = even_channels(model, images, references)
+    return {name: values.double().cpu().numpy() for name, values in maps.items()}
+
+
+def lead_over_controls(
+    own: Float[np.ndarray, " frames"],
+    controls: Mapping[str, Float[np.ndarray, " frames"]],
+    *,
+    clusters: Iterable[Shaped[np.ndarray, " frames"]],
+    rng: np.random.Generator,
+) -> Lead:
+    """Mean of a score of frames less that of the strongest control, with a 95 % interval (`paired_difference`).
+
+    No control is chosen beforehand: each end is the lowest of those over all of them, so that a lead is sure only where
+    the method is ahead of each for sure, whichever would be the strongest in other trials. The score is one that is 0
+    by chance, which stands among the controls.
+
+    References
+    ----------
+    Berger, *Multiparameter hypothesis testing and acceptance sampling* (1982): intersection-union tests.
+
+    Examples
+    --------
+    A method that is no more than one of the controls does not lead:
+
+    >>> import numpy as np
+    >>> from sliplens.faithfulness.controls import lead_over_controls
+    >>> gains, trials = np.linspace(0.2, 0.7, 12), np.repeat(np.arange(6), 2)
+    >>> controls = {"edges": gains, "centre": gains / 2}
+    >>> lead = lead_over_controls(gains, controls, clusters=[trials], rng=np.random.default_rng(0))
+    >>> lead.control, lead.gap.high, lead.shows_something
+    ('edges', 0.0, False)
+    """
+    others = {**controls, CHANCE: np.zeros(len(own))}
+    gaps = {name: paired_difference(own, other, clusters=clusters, rng=rng) for name, other in others.items()}
+    control = min(gaps, key=lambda name: gaps[name].estimate)
+    low, high = (min(getattr(gap, end) for gap in gaps.values()) for end in ("low", "high"))
+    return Lead(control=control, gap=replace(gaps[control], low=low, high=high))
 
 
 def cascade(model: nn.Module, *, seed: int, stages: int, images: Images) -> Iterator[tuple[int, nn.Module]]:

@@ -138,7 +138,7 @@ class Faithfulness:
     fill: str = ""
     """Name of what removed pixels became, where it has one."""
     controls: Mapping[str, "Faithfulness"] = field(default_factory=dict)
-    """The same of maps that know nothing of the network, by name (`CONTROLS`), where they were scored too."""
+    """The same of maps that know nothing of the network, by name (`control_maps`), where they were scored too."""
     alarms: tuple[str, ...] = ()
     """Why the score may not measure the maps, a sentence each."""
 

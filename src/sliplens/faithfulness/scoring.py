@@ -14,7 +14,7 @@ from sliplens.errors import SaliencyError
 from sliplens.explainers import Explanation
 from sliplens.explainers.table import network_inputs, open_run
 from sliplens.faithfulness.alarms import controls_win, fill_decides, flat_maps, saturated
-from sliplens.faithfulness.controls import CONTROLS
+from sliplens.faithfulness.controls import control_maps
 from sliplens.faithfulness.deletion import (
     DeletionCurves,
     deletion_curves,
@@ -79,7 +79,7 @@ def score(
     inputs, empty = network_inputs(trained, frames, reference)
     method = maps.method if isinstance(maps, Explanation) else "maps"
     influence = {method: _influence(maps, inputs)}
-    influence |= {name: control(inputs).double().cpu().numpy() for name, control in CONTROLS.items()}
+    influence |= control_maps(trained.model, inputs, empty.expand_as(inputs))
     whole, untouched = (trained.predict(images).double().numpy() for images in (inputs, empty[None]))
     towards = np.sign(whole - untouched)
     shape = (inputs.shape[-2], inputs.shape[-1])

@@ -17,7 +17,6 @@ from sliplens.plots.strip import overlay_relevance, plot_readings
 from sliplens.plots.style import (
     BLACK,
     BLUE,
-    CONTROLS,
     GREY,
     VERMILLION,
     drawing_style,
@@ -28,7 +27,7 @@ from sliplens.plots.style import (
     percent,
 )
 from sliplens.results.explanation import Explained
-from sliplens.results.faithfulness import DeletionScores, RemovalScores
+from sliplens.results.faithfulness import DeletionScores, RemovalScores, is_control
 from sliplens.results.study import Study
 
 __all__ = ["plot"]
@@ -127,7 +126,7 @@ def _removal(scores: RemovalScores, ax: Axes, _: int) -> None:
     own = {score.method: score for score in scores.scores if (score.fill, score.unit) == (fill, unit)}
     names = methods_in_order(own)[::-1]
     for place, name in enumerate(names):
-        gap, colour = own[name].srg, GREY if own[name].control or name in CONTROLS else BLUE
+        gap, colour = own[name].srg, GREY if is_control(name) else BLUE
         ax.plot([gap.low, gap.high], [place, place], color=colour)
         ax.plot([gap.estimate], [place], color=colour, marker="o")
     ax.axvline(0, color=BLACK, linewidth=0.8, linestyle=":")

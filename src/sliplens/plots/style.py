@@ -8,6 +8,8 @@ from typing import Any
 import matplotlib as mpl
 from cycler import cycler
 
+from sliplens.results.faithfulness import CHANCE, CONTROLS, NEW_WEIGHTS, is_control
+
 # Okabe and Ito's palette, told apart under every common colour blindness
 BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILLION, PURPLE = (
     "#000000", "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
@@ -20,9 +22,7 @@ INPUT_NAMES = {"raw": "Raw images", "difference": "Difference images"}
 INPUT_COLOURS = {"raw": ORANGE, "difference": BLUE}
 SOURCE_NAMES = {"simulated": "simulated touch", "real": "real touch"}
 
-CONTROL = "random"
-CONTROLS = ("edges", "input", "centre", "randomised", CONTROL)
-"""Maps that know nothing of the trained network: what an explanation has to beat."""
+CONTROL = CHANCE
 METHOD_NAMES = {
     "grad-cam": "Grad-CAM",
     "integrated-gradients": "Integrated Gradients",
@@ -40,9 +40,10 @@ METHOD_NAMES = {
     "shapley-marker": "Shapley values of markers",
     "lrp": "LRP",
     "edges": "Edge filter (control)",
-    "input": "The input itself (control)",
+    "change": "The change itself (control)",
+    "local-change": "Local change (control)",
+    "weights-1": "All channels alike (control)",
     "centre": "Centred blob (control)",
-    "randomised": "New weights (control)",
     CONTROL: "Random order (control)",
     "oracle": "The truth itself",
     "degraded-oracle": "The truth, damaged",
@@ -136,7 +137,8 @@ def short_input_name(name: str) -> str:
 
 def method_name(name: str) -> str:
     """Name of a method as a reader sees it."""
-    return METHOD_NAMES.get(name, name)
+    of_method = name.removesuffix(NEW_WEIGHTS)
+    return METHOD_NAMES.get(name, name) if of_method == name else f"{method_name(of_method)}, new weights (control)"
 
 
 def source_name(name: str) -> str:
@@ -157,8 +159,8 @@ def inputs_in_order(names: Iterable[str]) -> list[str]:
 
 def methods_in_order(names: Iterable[str]) -> list[str]:
     """Methods as in the thesis, the controls last."""
-    found = set(names)
-    return [*in_order(found - set(CONTROLS), METHOD_NAMES), *(name for name in CONTROLS if name in found)]
+    order = [*METHOD_NAMES, *(name + NEW_WEIGHTS for name in METHOD_NAMES), *CONTROLS]
+    return sorted(in_order(set(names), order), key=is_control)
 
 
 def name_methods(text: str) -> str:

@@ -18,7 +18,6 @@ from sliplens.plots.errors import (
 )
 from sliplens.plots.style import (
     BLACK,
-    CONTROLS,
     INPUT_COLOURS,
     METHOD_COLOURS,
     METHOD_LINES,
@@ -37,10 +36,10 @@ from sliplens.plots.style import (
     signed,
     source_name,
 )
-from sliplens.report.comparisons import controls, settings
+from sliplens.report.comparisons import settings
 from sliplens.report.plates import Plate, named_columns, rows_of
 from sliplens.report.results import Results
-from sliplens.results.faithfulness import DeletionScores, RemovalCurve, RemovalScores
+from sliplens.results.faithfulness import DeletionScores, RemovalCurve, RemovalScores, is_control
 
 _EACH_FIGURES = {"difference": "fig-17-faithfulness-difference", "raw": "fig-18-faithfulness-raw"}
 _FEW = 4  # charts in a row
@@ -216,7 +215,7 @@ def plate_each_frame(scored: DeletionScores) -> Plate:
 
 def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
     """Draw change against area, most and least influential first and at random, by method and fill; None without."""
-    methods = methods_in_order({method for _, _, method in faithful.curves} - controls(faithful) - set(CONTROLS))
+    methods = methods_in_order({method for _, _, method in faithful.curves if not is_control(method)})
     fills = settings(faithful)
     if not methods or not fills:
         return None

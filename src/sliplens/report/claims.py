@@ -24,7 +24,6 @@ from sliplens.plots.style import (
 from sliplens.report.comparisons import (
     compare_deletion,
     compare_gain,
-    controls,
     gap_from,
     mean_at,
     removal_by_setting,
@@ -264,16 +263,15 @@ def _compare_inputs(results: Results, *, rng: np.random.Generator) -> Answer:
 
 def _no_better(faithful: RemovalScores, *, rng: np.random.Generator) -> Answer:
     findings, by_setting, subject, name = [], {}, input_name(faithful.input), method_name(GRAD_CAM)
+    leads = {fill_name(*one.key[:2]): one.lead_over_controls for one in faithful.scores if one.method == GRAD_CAM}
     for where, curves in removal_by_setting(faithful):
         own = curves.get(GRAD_CAM)
         if own is None:
             continue
         nothing = paired_difference(own.srg, np.zeros(len(own.srg)), clusters=own.clusters, rng=rng)
         gaps: dict[str, Difference] = {"chance": nothing}
-        known = [one for one in sorted(controls(faithful)) if one in curves]
-        best = max(known, key=lambda one: float(curves[one].srg.mean()), default=None)
-        if best is not None and (gap := compare_gain((own, curves[best]), rng=rng)) is not None:
-            gaps[method_name(best)] = gap
+        if (lead := leads.get(where)) is not None:
+            gaps[method_name(lead.control)] = lead.gap
         # not faithful is what is claimed: a gain for sure speaks against it
         by_setting[where] = _OPPOSITE.get(all_of(judge_gap(gap) for gap in gaps.values()), "undecided")
         findings += [Finding(where=where, compared=f"SRG, {name} less {one}", gap=gap) for one, gap in gaps.items()]

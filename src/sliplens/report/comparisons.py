@@ -102,11 +102,6 @@ def voting_settings(faithful: RemovalScores) -> list[tuple[str, str]]:
     return [one for one in settings(faithful) if units[one[0]] == one]
 
 
-def controls(faithful: RemovalScores) -> set[str]:
-    """Names of the maps that know nothing of the network."""
-    return {score.method for score in faithful.scores if score.control}
-
-
 def removal_by_setting(faithful: RemovalScores) -> list[tuple[str, dict[str, RemovalCurve]]]:
     """Name of each fill and unit, and its curves by method, in the order they are read."""
     return [

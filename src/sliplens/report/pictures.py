@@ -19,7 +19,6 @@ from sliplens.plots.saliency import DIM, FULL_COLOUR_PERCENTILE, lightness
 from sliplens.plots.strip import draw_strip
 from sliplens.plots.style import (
     BLUE,
-    CONTROLS,
     GREY,
     ORANGE,
     SKY,
@@ -54,7 +53,7 @@ from sliplens.report.plates import (
 from sliplens.report.results import Results
 from sliplens.report.verdict import rank_methods
 from sliplens.results.explanation import Explained, Strip
-from sliplens.results.faithfulness import DeletionCurve, DeletionScores
+from sliplens.results.faithfulness import DeletionCurve, DeletionScores, is_control
 from sliplens.results.study import StateFrame, States, Truth
 
 SHARES = (0.01, 0.05, 0.1, 0.2, 0.5, 1.0)
@@ -221,7 +220,7 @@ def _answer(explained: Explained, index: int) -> str:
 def shown_methods(results: Results) -> list[str]:
     """Methods that have maps, the controls left out."""
     found = {method for one in results.explanations.values() for method in one.saliency}
-    return methods_in_order(found - set(CONTROLS))
+    return methods_in_order(name for name in found if not is_control(name))
 
 
 def plate_deletion(results: Results) -> Plate | None:
@@ -342,7 +341,7 @@ def _materials(results: Results) -> Iterator[tuple[Explained, DeletionScores, in
         explained, scored = explained_of(results, name), results.scores.get((name, results.study.source))
         if explained is None or scored is None:
             continue
-        index = told_frame(explained, {method: one for method, one in scored.curves.items() if method not in CONTROLS})
+        index = told_frame(explained, {method: one for method, one in scored.curves.items() if not is_control(method)})
         if index is not None:
             yield explained, scored, index
 
@@ -606,7 +605,7 @@ def _spread_out(ids: list[str], explained: Explained, places: dict[str, int]) ->
 def _best_methods(results: Results, name: str, explained: Explained) -> list[str]:
     faithful = results.study.faithfulness.get(name)
     ranked = [] if faithful is None else [one.method for one in rank_methods(faithful)]
-    known = methods_in_order(set(explained.saliency) - set(CONTROLS))
+    known = methods_in_order(name for name in explained.saliency if not is_control(name))
     return [*(one for one in ranked if one in known), *(one for one in known if one not in ranked)][:_TRUTH_METHODS]
 
 

@@ -87,6 +87,7 @@ def _faithfulness(results: Results, _: np.random.Generator) -> Iterable[Block | 
     found = results.study.faithfulness
     for name in _names(found):
         yield tables.table_scores(found[name], results.scores.get((name, results.study.source)))
+        yield tables.table_leads(found[name])
         yield _alarms(results, name, "faithfulness")
         yield tables.table_equal_areas(found[name])
         yield tables.table_agreement(found[name])

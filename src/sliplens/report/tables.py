@@ -9,7 +9,6 @@ import numpy as np
 from sliplens.intervals import Difference
 from sliplens.plots.style import (
     CONTROL,
-    CONTROLS,
     FILL_NAMES,
     UNIT_NAMES,
     UNKNOWN,
@@ -30,7 +29,15 @@ from sliplens.report.comparisons import against_control, mean_at, settings, tell
 from sliplens.report.results import Results
 from sliplens.report.thesis import ACCURACY, DELETION, MARK, NETWORK_PIXELS, SECONDS, thesis_row
 from sliplens.results.explanation import Explained
-from sliplens.results.faithfulness import DeletionScores, MethodScore, Remedies, RemovalScore, RemovalScores
+from sliplens.results.faithfulness import (
+    DeletionScores,
+    Lead,
+    MethodScore,
+    Remedies,
+    RemovalScore,
+    RemovalScores,
+    is_control,
+)
 from sliplens.results.study import MAP_MEASURES, REGIONS, Choice, MapQuality, Randomisation, Timing, Truth
 
 Kind = Literal["name", "number", "best", "thesis"]
@@ -214,7 +221,7 @@ def table_scores(faithful: RemovalScores, scored: DeletionScores | None) -> Tabl
     }
     plain = {} if scored is None else scored.methods
     methods = {*(score.method for score in faithful.scores), *plain}
-    lowest = min((one.mean for name, one in plain.items() if name not in CONTROLS), default=None)
+    lowest = min((one.mean for name, one in plain.items() if not is_control(name)), default=None)
     fill = f", {scored.fill} fill" if scored else ""
     return make_table(
         f"{input_name(faithful.input)}: the deletion score D of the thesis{fill} (mean ± standard deviation over "
@@ -231,6 +238,29 @@ def table_scores(faithful: RemovalScores, scored: DeletionScores | None) -> Tabl
                 *(_gain_cell(scores.get((*one, method)), top[one]) for one in fills),
             )
             for method in methods_in_order(methods)
+        ],
+    )
+
+
+def table_leads(faithful: RemovalScores) -> Table:
+    """Tabulate the symmetric gain of each method less that of the strongest control, under every fill."""
+    fills = settings(faithful)
+    leads = {score.key: lead for score in faithful.scores if (lead := score.lead_over_controls) is not None}
+
+    def tell(lead: Lead | None) -> Cell | str:
+        if lead is None:
+            return UNKNOWN
+        return _best(f"{tell_interval(lead.gap)}, {lead.control}", lead.shows_something)
+
+    return make_table(
+        f"{input_name(faithful.input)}: symmetric relevance gain of each method less that of the strongest map that "
+        "knows nothing of what the network learned, named beside it; 95 % intervals in margin units, each end the "
+        "lowest of those over all such maps. Bold: ahead of every one for sure. Otherwise the method has shown "
+        "nothing about this network under that fill.",
+        ("Method", *(fill_name(*one) for one in fills)),
+        [
+            (method_name(method), *(tell(leads.get((*one, method))) for one in fills))
+            for method in methods_in_order({key[2] for key in leads})
         ],
     )
 
@@ -294,7 +324,7 @@ def table_remedies(remedies: Remedies, scored: DeletionScores | None) -> Table:
         variants.insert(0, (f"As in the thesis ({scored.fill})", "lower", scored.methods))
     rows = []
     for title, better, scores in variants:
-        means = [scores[name].mean for name in methods if name in scores and name not in CONTROLS]
+        means = [scores[name].mean for name in methods if name in scores and not is_control(name)]
         best = (min if better == "lower" else max)(means, default=None)
         rows.append((title, better, *(_score_cell(scores.get(name), best) for name in methods)))
     told = " ".join(f"{titles[name]}: {one.summary.rstrip('.')}." for name, one in remedies.variants.items())

@@ -12,7 +12,6 @@ import numpy as np
 from sliplens.intervals import FEWEST_UNITS, Difference
 from sliplens.plots.style import (
     CONTROL,
-    CONTROLS,
     FILL_NAMES,
     conditions_in_order,
     decimals,
@@ -30,7 +29,6 @@ from sliplens.plots.style import (
 from sliplens.report.comparisons import (
     against_control,
     compare_errors,
-    controls,
     gap_from,
     tell_interval,
     tell_sample,
@@ -258,15 +256,12 @@ def rank_methods(faithful: RemovalScores, truth: Truth | None = None) -> list[St
     A fill counts once. Fills under which a map made from the truth does not win for sure are left out.
     """
     unfit = _unfit_fills(truth)
-    known = controls(faithful)
-    gaps = {(one.fill, one.unit, one.first): one.gap for one in faithful.comparisons if one.second in known}
     scores = {score.key: score for score in faithful.scores}
+    leads = {key: score.lead_over_controls for key, score in scores.items()}
     standings = []
     for method in methods_in_order(score.method for score in faithful.scores if not score.control):
-        if method in CONTROLS:
-            continue
-        tested = [one for one in voting_settings(faithful) if (*one, method) in gaps and one[0] not in unfit]
-        beaten = [one for one in tested if _gains(gaps[*one, method]) and _gains(scores[*one, method].srg)]
+        tested = [one for one in voting_settings(faithful) if leads.get((*one, method)) and one[0] not in unfit]
+        beaten = [one for one in tested if (lead := leads[*one, method]) is not None and lead.shows_something]
         gains = [scores[*one, method].srg.estimate for one in tested]
         mean = float(np.mean(gains)) if gains else float("-inf")
         standings.append(Standing(method=method, beaten=tuple(beaten), tested=tuple(tested), mean_gain=mean))

@@ -14,6 +14,29 @@ from sliplens.intervals import Difference
 _Rows = TypeVar("_Rows", "DeletionTable", "RemovalTable")
 Key = tuple[str, str, str]
 """Fill, unit and method."""
+CHANCE = "random"
+NEW_WEIGHTS = "-new-weights"
+"""Ends the name of a method's maps of networks whose weights were drawn anew."""
+CONTROLS = ("change", "local-change", "weights-1", "centre", "edges", CHANCE)
+
+
+def is_control(name: str) -> bool:
+    """Whether a name stands for maps that know nothing of what a network learned: what an explanation has to beat."""
+    return name in CONTROLS or name.endswith(NEW_WEIGHTS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lead:
+    """Score of a method less that of the strongest control, with an interval that lies below those over each."""
+
+    control: str
+    """The strongest in these frames."""
+    gap: Difference
+
+    @property
+    def shows_something(self) -> bool:
+        """Whether the method beats every control for sure; otherwise it has shown nothing about this network."""
+        return self.gap.sure and self.gap.low > 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,6 +149,8 @@ class RemovalScore:
     control: bool
     srg: Difference
     gain_over_random: Difference
+    lead_over_controls: Lead | None
+    """Of the symmetric gain; None for a control."""
     most_first: float
     least_first: float
     random: float

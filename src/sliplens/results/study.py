@@ -13,7 +13,7 @@ from sliplens.codec import Columns
 from sliplens.intervals import Difference
 from sliplens.results.evaluation import Evaluation
 from sliplens.results.explanation import Explained
-from sliplens.results.faithfulness import DeletionScores, Remedies, RemovalScores
+from sliplens.results.faithfulness import DeletionScores, Lead, Remedies, RemovalScores
 
 REGIONS = ("markers", "slip_annulus", "edges")
 """Areas in which a map may lie."""
@@ -165,12 +165,12 @@ class States:
 
 @dataclass(frozen=True, kw_only=True)
 class UntrainedMaps:
-    """Maps of a network whose weights were drawn anew: a control that every map has to beat."""
+    """Maps of networks whose weights were drawn anew: controls that every map has to beat."""
 
     input: str
     source: str
-    maps: Float64[np.ndarray, "frames size size"]
-    """Part of the relevance that works towards that network's own target, in margin units."""
+    maps: dict[str, Float32[np.ndarray, "frames size size"]]
+    """Part of the relevance that works towards those networks' own targets, by method with `NEW_WEIGHTS`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,6 +276,8 @@ class Localisation:
     network: Difference | None
     margin: Difference | None
     """Mean rank correlation, signed, of the map's means over the markers with the columns of `MarkerEffects`."""
+    lead_over_controls: Lead | None
+    """Of the correlation with the Shapley values; None for what is no method."""
     edges: Difference | None
     """Mass on the edges of markers less the share of the image that they cover."""
 

@@ -2,21 +2,32 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from itertools import combinations
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations, product
+from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
+from sliplens.codec import keep_part
 from sliplens.explainers import Explainer, Explanation, IntegratedGradients, PolyCam
-from sliplens.faithfulness.controls import cascade, histogram_entropy, randomisation_scores, smooth_maps
+from sliplens.explainers.shapley import Shapley
+from sliplens.faithfulness.controls import (
+    cascade,
+    even_channels,
+    histogram_entropy,
+    randomisation_scores,
+    smooth_maps,
+)
 from sliplens.faithfulness.map_quality import gini, resolution, stability, total_variation
 from sliplens.intervals import paired_difference
 from sliplens.models import Run
-from sliplens.progress import OnProgress, counted
+from sliplens.progress import OnProgress, continued, counted
 from sliplens.recordings import Dataset
+from sliplens.results.faithfulness import NEW_WEIGHTS
 from sliplens.results.study import (
     ChosenFrame,
     MapMeasures,
@@ -217,12 +228,21 @@ def randomise_weights(
     )
 
 
-def _shortened(explainer: Explainer) -> Explainer:
-    """Without the passes that a network with new weights takes until its map is complete: a correlation needs none."""
+_FEW_CHANNELS, _FEW_PAIRS = 0.05, 100
+
+
+def _shortened(explainer: Explainer, *, passes_matter: bool = False) -> Explainer:
+    """Without the passes that a network with new weights takes until its map is complete: a correlation needs none.
+
+    Where passes matter, with a few of the others alone: what such a network says of each channel or marker is chance.
+    """
     if isinstance(explainer, PolyCam):
-        return replace(explainer, likeness=None)
+        budget = min(explainer.budget, _FEW_CHANNELS) if passes_matter else explainer.budget
+        return replace(explainer, likeness=None, budget=budget)
     if isinstance(explainer, IntegratedGradients):
         return replace(explainer, max_steps=explainer.steps)
+    if isinstance(explainer, Shapley) and passes_matter:
+        return replace(explainer, pairs=_FEW_PAIRS)
     return explainer
 
 
@@ -238,16 +258,47 @@ def _smooth_rise(
         return mean_of_known((after - before) / before)
 
 
+_SEEDS_APART = 1000
+"""`cascade` counts its layers on from the seed: no network has so many."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _TrialMaps:
+    """Maps of the frames of a trial by method."""
+
+    maps: dict[str, Float32[np.ndarray, "frames size size"]]
+
+
 def explain_untrained(
-    material: Material, explainer: Explainer, *, seed: int = 0, on_progress: OnProgress | None = None
+    material: Material, *, seed: int = 0, parts: Path | None = None, on_progress: OnProgress | None = None
 ) -> UntrainedMaps:
-    """Explain the network with all weights drawn anew: a control that every map has to beat."""
-    model = _untrained(material.trained.model, material.inputs, seed=seed)
-    frames = list(zip(material.inputs.split(1), material.references.split(1), strict=True))
-    maps = [_influence(explainer(model, one, reference=empty)) for one, empty in counted(frames, on_progress)]
-    return UntrainedMaps(
-        input=material.explained.input, source=material.explained.source, maps=np.concatenate(maps).astype(np.float64)
-    )
+    """Explain networks with all weights drawn anew by each method: controls that every map has to beat.
+
+    Each trial has a network of its own, so that resampled trials tell what the draw of the weights matters too.
+    """
+    inputs, references = material.inputs, material.references
+    controls = {name: _shortened(explainer, passes_matter=True) for name, explainer in material.explainers.items()}
+
+    def explain(number: int, frames: list[int], on_frame: OnProgress | None) -> _TrialMaps:
+        model = _untrained(material.trained.model, inputs, seed=seed + _SEEDS_APART * number)
+        maps = {"weights-1": list(even_channels(model, inputs[frames], references[frames]).cpu().numpy())}
+        for name, frame in counted(list(product(material.explainers, frames)), on_frame):
+            one, empty = inputs[frame, None], references[frame, None]
+            found = _influence(controls[name](model, one, reference=empty))
+            maps.setdefault(name, []).append(found[0].astype(np.float32))
+        return _TrialMaps(maps={name + NEW_WEIGHTS: np.stack(own) for name, own in maps.items()})
+
+    maps: dict[str, Float32[np.ndarray, "frames size size"]] = {}
+    jobs, total = 0, len(inputs) * len(material.explainers)
+    _, trials = material.clusters
+    for number, trial in enumerate(dict.fromkeys(trials.tolist())):
+        frames = np.flatnonzero(trials == trial).tolist()
+        on_frame = continued(on_progress, before=jobs, total=total)
+        made = keep_part(parts and parts / trial, _TrialMaps, partial(explain, number, frames, on_frame))
+        for name, own in made.maps.items():
+            maps.setdefault(name, np.empty((len(inputs), *inputs.shape[-2:]), np.float32))[frames] = own
+        jobs += len(frames) * len(material.explainers)
+    return UntrainedMaps(input=material.explained.input, source=material.explained.source, maps=maps)
 
 
 def _influence(explanation: Explanation) -> Maps:

@@ -15,17 +15,22 @@ from sliplens.codec import keep_part
 from sliplens.errors import InputError
 from sliplens.faithfulness import get_fill
 from sliplens.faithfulness.alarms import controls_win, fill_decides, flat_maps, rankings_disagree, saturated
-from sliplens.faithfulness.controls import CONTROLS
+from sliplens.faithfulness.controls import control_maps, lead_over_controls
 from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness, Predict, answer_whole, score_maps
 from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.intervals import paired_difference
 from sliplens.progress import OnProgress, continued
 from sliplens.results.explanation import Explained
-from sliplens.results.faithfulness import Agreement, Comparison, RemovalScore, RemovalScores, RemovalTable
+from sliplens.results.faithfulness import (
+    Agreement,
+    Comparison,
+    RemovalScore,
+    RemovalScores,
+    RemovalTable,
+    is_control,
+)
 from sliplens.study.material import Material
 
-RANDOMISED = "randomised"
-"""The control that explains a network whose weights were drawn anew."""
 EQUAL_AREAS = (0.01, 0.02, 0.05, 0.1, 0.2)
 STUDY_AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
 """Fewer than `removal.AREAS`, so that many settings can be scored: the equal areas, and enough for trapezoids."""
@@ -56,15 +61,10 @@ Scoring = Callable[..., Mapping[str, Faithfulness]]
 """Finds the curves of every map; takes `on_progress`."""
 
 
-def is_control(name: str) -> bool:
-    """Whether a row stands for a map that knows nothing of what the network learned."""
-    return name in CONTROLS or name == RANDOMISED
-
-
 def influences(material: Material) -> dict[str, Float[np.ndarray, "frames size size"]]:
     """Maps to rank parts by: the part of each method's relevance that works towards the target, and the controls."""
     maps = {name: material.towards_target(name) for name in material.explained.relevance}
-    return maps | {name: control(material.inputs).double().cpu().numpy() for name, control in CONTROLS.items()}
+    return maps | control_maps(material.trained.model, material.inputs, material.references)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,13 +165,15 @@ def _answer_blank(predict: Predict, material: Material, fill: str, seed: int) ->
 def judge_curves(
     curves: Curves, *, clusters: Shaped[np.ndarray, "2 frames"], seed: int
 ) -> tuple[tuple[RemovalScore, ...], tuple[Comparison, ...]]:
-    """Scores with intervals, and methods compared with each other and with the best control.
+    """Scores with intervals and leads over the controls, and methods compared with each other.
 
     The curves are those of controls too; days and trials are resampled.
     """
     rng = np.random.default_rng(seed)
     scores, comparisons = [], []
     for setting, own in curves.items():
+        gains = {name: curve.symmetric_gain for name, curve in own.items()}
+        controls = {name: gain for name, gain in gains.items() if is_control(name)}
         for name, curve in own.items():
             none = np.zeros_like(curve.symmetric_gain)
             scores.append(
@@ -180,19 +182,19 @@ def judge_curves(
                     unit=setting.unit,
                     method=name,
                     control=is_control(name),
-                    srg=paired_difference(curve.symmetric_gain, none, clusters=clusters, rng=rng),
+                    srg=paired_difference(gains[name], none, clusters=clusters, rng=rng),
                     gain_over_random=paired_difference(curve.gain_over_random, none, clusters=clusters, rng=rng),
+                    lead_over_controls=None
+                    if is_control(name)
+                    else lead_over_controls(gains[name], controls, clusters=clusters, rng=rng),
                     most_first=float(curve.most_first.mean()),
                     least_first=float(curve.least_first.mean()),
                     random=float(curve.random.mean()),
                     at={area: float(curve.at(area)[0].mean()) for area in EQUAL_AREAS if area in curve.areas},
                 )
             )
-        methods, controls = ([name for name in own if is_control(name) is wanted] for wanted in (False, True))
-        best = max(controls, key=lambda name: float(own[name].symmetric_gain.mean()), default=None)
-        pairs = [*combinations(methods, 2), *((name, best) for name in methods if best is not None)]
-        for first, second in pairs:
-            gap = paired_difference(own[first].symmetric_gain, own[second].symmetric_gain, clusters=clusters, rng=rng)
+        for first, second in combinations([name for name in own if not is_control(name)], 2):
+            gap = paired_difference(gains[first], gains[second], clusters=clusters, rng=rng)
             comparisons.append(Comparison(fill=setting.fill, unit=setting.unit, first=first, second=second, gap=gap))
     return tuple(scores), tuple(comparisons)
 

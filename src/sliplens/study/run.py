@@ -11,9 +11,9 @@ from typing import Any, TypeAlias, TypeVar
 
 import torch
 
-from sliplens.codec import load_result, save_result, to_builtins
+from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError
-from sliplens.explainers import Explainer, IntegratedGradients
+from sliplens.explainers import Explainer
 from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness
 from sliplens.files import hash_json, output_folder
 from sliplens.models import Run
@@ -37,7 +37,7 @@ from sliplens.results.study import (
 from sliplens.simulation.intervention import rebuild_trial
 from sliplens.study.checks import STAGES, explain_untrained, measure_maps, randomise_weights, time_explainers
 from sliplens.study.choice import choose_frames, show_states
-from sliplens.study.curves import RANDOMISED, SETTINGS, STUDY_AREAS, Setting, influences, score_removal
+from sliplens.study.curves import SETTINGS, STUDY_AREAS, Setting, influences, score_removal
 from sliplens.study.explaining import explain_frames, frames_at
 from sliplens.study.material import (
     STUDY_BUDGET,
@@ -61,10 +61,8 @@ _Result = TypeVar("_Result")
 _Work: TypeAlias = Callable[[Path, OnProgress], _Result]
 """Takes a folder for parts, and what is called with the steps done and their number."""
 
-_CONTROL = IntegratedGradients(steps=32, max_steps=32)
-"""Explains the network with new weights: a control need not be complete."""
-_NEW_WEIGHTS = {"control": to_builtins(_CONTROL), "statistics": "images"}
-"""What the control depends on, and with it all that it is compared with."""
+_CONTROLS = {"controls": "each method on a network of new weights a trial", "statistics": "images"}
+"""What the controls depend on, and with them all that is compared with them."""
 
 
 TESTS = ("score", "remedies", "faithfulness", "randomisation", "map-quality", "truth", "timing")
@@ -280,11 +278,11 @@ class _Stages:
         test(
             "control",
             UntrainedMaps,
-            "Explaining the network with new weights",
-            lambda _, count: explain_untrained(material(), _CONTROL, seed=seed, on_progress=count),
-            **_NEW_WEIGHTS,
+            "Explaining networks with new weights",
+            lambda parts, count: explain_untrained(material(), seed=seed, parts=parts, on_progress=count),
+            **_CONTROLS,
         )
-        influence = cache(lambda: {**influences(material()), RANDOMISED: found["control"].maps})
+        influence = cache(lambda: {**influences(material()), **found["control"].maps})
         redrawn = "truth" in self.tests and self._redrawn
 
         def put_back(on_progress: OnProgress | None) -> Mapping[str, Faithfulness]:
@@ -310,7 +308,7 @@ class _Stages:
             random_orders=self.random_orders,
             areas=STUDY_AREAS,
             settings=self.settings,
-            **_NEW_WEIGHTS,
+            **_CONTROLS,
         )
         test(
             "randomisation",
@@ -342,7 +340,7 @@ class _Stages:
                     on_progress=count,
                 ),
                 pairs=TRUTH_PAIRS,
-                **_NEW_WEIGHTS,
+                **_CONTROLS,
             )
 
     def time(self, name: str) -> None:

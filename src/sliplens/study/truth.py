@@ -14,6 +14,7 @@ from sliplens.codec import keep_part
 from sliplens.errors import InputError
 from sliplens.explainers.shapley import shapley_values
 from sliplens.faithfulness import get_fill
+from sliplens.faithfulness.controls import lead_over_controls
 from sliplens.faithfulness.map_quality import relevance_mass, relevance_rank
 from sliplens.faithfulness.removal import (
     RANDOM_ORDERS,
@@ -37,6 +38,7 @@ from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
 from sliplens.recordings.trial import SLIPS
 from sliplens.results.explanation import Explained
+from sliplens.results.faithfulness import is_control
 from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTest, OracleTest, Truth
 from sliplens.simulation.information import visible_markers
 from sliplens.simulation.intervention import (
@@ -386,7 +388,7 @@ def judge_by_truth(
         frames=len(frames),
         # the mass of a map of chance
         areas=_by_region(places, lambda _, region: float(region.mean())),
-        methods={name: _judge(values, places, along, interval) for name, values in judged.items()},
+        methods=_judge(judged, places, along, explained.clusters, seed=seed),
         pairs=pairs,
         reliability=interval(_reliability(one) for one in effects),
         sums={name: _sum_over_change(effects, change, name) for name in ("shapley", "network")},
@@ -403,24 +405,40 @@ def judge_by_truth(
 
 
 def _judge(
-    maps: Maps,
+    maps: Mapping[str, Maps],
     places: Sequence[Places],
     effects: Sequence[Mapping[str, Float[np.ndarray, " markers"]]],
-    interval: _Interval,
-) -> Localisation:
-    means, positive = marker_means(maps, places), np.clip(maps.astype(np.float64), 0, None)
+    clusters: Shaped[np.ndarray, "2 frames"],
+    *,
+    seed: int,
+) -> dict[str, Localisation]:
+    means = {name: marker_means(values, places) for name, values in maps.items()}
     alike = {
-        name: interval(rank_correlation(values, own[name]) for values, own in zip(means, effects, strict=True))
-        for name in _EFFECTS
+        name: {
+            truth: np.array([rank_correlation(values, own[truth]) for values, own in zip(of_map, effects, strict=True)])
+            for truth in _EFFECTS
+        }
+        for name, of_map in means.items()
     }
-    return Localisation(
-        mass=_by_region(places, lambda frame, region: relevance_mass(positive[frame], region)),
-        rank=_by_region(places, lambda frame, region: relevance_rank(positive[frame], region)),
-        edges=interval(
+    # a map that tells no marker from another ranks them as chance does
+    ranks = {name: np.nan_to_num(own["shapley"]) for name, own in alike.items()}
+    controls = {name: own for name, own in ranks.items() if is_control(name) and name != RANDOM}
+    rng, interval, found = np.random.default_rng(seed), partial(mean_interval, clusters=clusters, seed=seed), {}
+    for name, values in maps.items():
+        positive = np.clip(values.astype(np.float64), 0, None)
+        on_edges = (
             relevance_mass(own, place.edges) - place.edges.mean() for own, place in zip(positive, places, strict=True)
-        ),
-        **alike,
-    )
+        )
+        found[name] = Localisation(
+            mass=_by_region(places, lambda frame, region, own=positive: relevance_mass(own[frame], region)),
+            rank=_by_region(places, lambda frame, region, own=positive: relevance_rank(own[frame], region)),
+            lead_over_controls=None
+            if is_control(name) or name in (ORACLE, DEGRADED)
+            else lead_over_controls(ranks[name], controls, clusters=clusters, rng=rng),
+            edges=interval(on_edges),
+            **{truth: interval(values) for truth, values in alike[name].items()},
+        )
+    return found
 
 
 def _table(frames: Sequence[StagedFrame], places: Sequence[Places], effects: Sequence[FrameEffects]) -> MarkerEffects:
