@@ -50,7 +50,7 @@ class Study(Command):
     """Largest error of an answer in them, as a share of the margin; where too few qualify, the next best are taken."""
     budget: float = 0.15
     """Share of the channels that Poly-CAM measures at first, more where its map asks for it; 1 for all."""
-    random_orders: int = 20
+    random_orders: int = 10
     """Random orders that every method has to beat."""
     device: Device = "cpu"
     jobs: int | None = None

@@ -14,7 +14,7 @@ import torch
 from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError
 from sliplens.explainers import Explainer
-from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness
+from sliplens.faithfulness.removal import Faithfulness
 from sliplens.files import hash_json, output_folder
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
@@ -83,7 +83,7 @@ def run_study(
     budget: float = STUDY_BUDGET,
     tests: Collection[str] = TESTS,
     settings: Sequence[Setting] = SETTINGS,
-    random_orders: int = RANDOM_ORDERS,
+    random_orders: int = 10,
     device: str = "cpu",
     jobs: int = 1,
     seed: int = 0,
