@@ -500,7 +500,6 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
     }
     mass: dict[str, float | None] = {"markers": 0.5, "slip_annulus": 0.4, "edges": made.edge_mass}
     held = {
-        "holds": True,
         "oracle": 0.3,
         "degraded": 0.2,
         "changed": 0.1,

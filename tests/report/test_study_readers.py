@@ -128,7 +128,7 @@ def test_null_is_unknown(study):
         ("map-quality-raw", ("methods", "poly-cam", "gini"), "much", r"expected `float \| null`, got `str`"),
         ("timing-raw", ("methods", "poly-cam", "seconds"), None, r"expected `float`, got `null`"),
         ("truth-raw", ("areas",), [], r"expected `object`, got `array` at areas"),
-        ("truth-raw", ("meta", 0, "holds"), 1, r"expected `bool`, got `int` at meta\[0\].holds"),
+        ("truth-raw", ("meta", 0, "fill"), 1, r"expected `str`, got `int` at meta\[0\].fill"),
     ],
 )
 def test_malformed_fields_are_told_in_one_sentence(study, file, place, value, message):

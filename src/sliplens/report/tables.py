@@ -486,7 +486,7 @@ def table_meta(truth: Truth) -> Table | None:
             (
                 FILL_NAMES.get(one.fill, one.fill),
                 counted,
-                "yes" if test.fit else "no",
+                "yes" if test.holds else "no",
                 *(decimals(value, 3) for value in (test.oracle, test.degraded)),
                 _interval(test.gap, digits=3),
                 decimals(test.changed, 3),

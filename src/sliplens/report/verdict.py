@@ -341,7 +341,7 @@ def _tell_lead(faithful: RemovalScores, best: Standing, others: list[Standing]) 
 
 
 def _unfit_fills(truth: Truth | None) -> list[str]:
-    return [] if truth is None else [one.fill for one in truth.meta if not one.fit]
+    return [] if truth is None else [one.fill for one in truth.meta if not one.holds]
 
 
 def _gains(gap: Difference) -> bool:

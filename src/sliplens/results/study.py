@@ -284,9 +284,8 @@ class Localisation:
 
 @dataclass(frozen=True, kw_only=True)
 class OracleTest:
-    """Whether a gain ranks a perfect map above a damaged one, and that above chance."""
+    """How much a gain tells a perfect map from a damaged one and from chance, over frames."""
 
-    holds: bool
     oracle: float
     degraded: float
     changed: float
@@ -296,8 +295,8 @@ class OracleTest:
     """Gain of the perfect map less that of the damaged one."""
 
     @property
-    def fit(self) -> bool:
-        """Whether the gain can judge maps: the interval of `gap` lies above zero."""
+    def holds(self) -> bool:
+        """Whether the interval of `gap` lies above zero; a gain for which it does not cannot judge maps."""
         return self.gap is not None and self.gap.low > 0
 
 

@@ -287,7 +287,6 @@ def meta_test(effects: Sequence[FrameEffects], interval: _Interval) -> tuple[Met
 def _test_oracle(gains: Float[np.ndarray, "frames 3"], interval: _Interval) -> OracleTest:
     oracle, degraded, changed = gains.mean(axis=0).tolist()
     return OracleTest(
-        holds=oracle > degraded > 0,
         oracle=oracle,
         degraded=degraded,
         changed=changed,
@@ -323,9 +322,9 @@ def _summarise(truth: Truth) -> str:
         [test.fill for test in truth.meta if (test if along else test.by_size).holds] for along in (True, False)
     )
     summary += (
-        " The map of the Shapley values ranks above one of which half is shuffled, and that above chance, under "
-        f"{len(held)} of {len(truth.meta)} fills ({', '.join(held) or 'none'}) along the answer's change, which asks "
-        f"for signs; under {len(by_size)} ({', '.join(by_size) or 'none'}) by size, which asks for strength alone."
+        " The map of the Shapley values ranks above one of which half is shuffled, beyond the 95 % interval, "
+        f"under {len(held)} of {len(truth.meta)} fills ({', '.join(held) or 'none'}) along the answer's change, which "
+        f"asks for signs; under {len(by_size)} ({', '.join(by_size) or 'none'}) by size, which asks for strength alone."
     )
     agreement = truth.shapley_against_margin
     if agreement is not None:
