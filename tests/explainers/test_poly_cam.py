@@ -1,5 +1,6 @@
 """Poly-CAM against a slow re-derivation that follows the paper's steps one mask at a time."""
 
+import copy
 from dataclasses import replace
 from functools import lru_cache
 
@@ -10,6 +11,7 @@ from torch import nn
 
 from sliplens.errors import InputError
 from sliplens.explainers import PolyCam, capture, find_layers
+from sliplens.explainers.explanation import EXACT, effect_rounding
 
 
 @lru_cache
@@ -264,6 +266,30 @@ def test_warns_where_masked_images_have_no_prediction(images):
     assert explanation.warnings[0] == "image 0: the map holds NaN or infinity and must not be shown or scored"
     assert "4 of 4 channels of layer maps have no finite weight" in explanation.warnings[1]
     assert bool(explanation.relevance.isnan().any())
+
+
+def test_the_error_of_small_effects_stays_within_what_is_said_of_it(network, images):
+    exact_network = network("small shufflenet")
+    single = copy.deepcopy(exact_network).float()
+    images, explain = images.float(), PolyCam(levels=True, engine="eager")
+    seen = []
+    for step in (1.0, 1e-2, 1e-4):
+        near = images[:1] + step * (images[1:2] - images[:1])
+        ours, exact = (explain(model, images[:1].to(kind), reference=near.to(kind)) for model, kind in
+                       ((single, torch.float32), (exact_network, torch.float64)))  # fmt: skip
+        high, low = float(exact.prediction), float(exact.reference_prediction)
+        weights = [level.weights[0] for level in ours.levels]
+        told = effect_rounding(weights, prediction=high, reference_prediction=low)
+        errors = [
+            float((one.weights - other.weights).abs().max() / other.weights.max())
+            for one, other in zip(ours.levels, exact.levels, strict=True)
+        ]
+        assert max(errors) <= told
+        assert any("rounding" in warning for warning in ours.warnings) == (told > EXACT)
+        assert not any("rounding" in warning for warning in exact.warnings)
+        seen.append((max(errors), told))
+    # it is the smallness of the change that makes both the error and what is said of it
+    assert seen[0][1] < EXACT < seen[2][0]
 
 
 @pytest.mark.parametrize(

@@ -96,6 +96,8 @@ CLOSE = 0.02  # margin units; a difference below the regressor's own error expla
 GAP = 0.01  # share of |f(x) - f(reference)| that may stay unexplained
 LOWEST, HIGHEST = -0.1, 1.1  # margins that a regressor tells of data like its own, with its error
 ALIKE_R, ALIKE_TOP = 0.99, 0.9  # what an approximate map should have in common with the exact one
+EXACT = 1e-4  # what two engines' maps in [0, 1] may differ by
+_ULPS = 16  # of four predictions that differ, measured at 2 to 9
 FLAT = 0.1  # share of |f(x) - f(reference)| that gradients at the image must make up, all of one sign
 
 
@@ -143,6 +145,40 @@ def check_weights(
                     f"image {index}: every channel of layer {layer} has the weight {float(weight[0]):.3g}, "
                     "so the masked passes chose nothing and the map shows activity only"
                 )
+
+
+def effect_rounding(
+    weights: Sequence[Float[Tensor, " _channels"]], *, prediction: float, reference_prediction: float
+) -> float:
+    """Share of a layer's largest effect that rounding may add or take, the largest of all layers; 0 without effects.
+
+    An effect is the difference of four predictions, each known to a few units in the last place whoever adds up its
+    sums; what is left of that in a map grows as the effects fall. `weights`: effects over f(x) - f(reference).
+
+    Examples
+    --------
+    >>> import torch
+    >>> from sliplens.explainers.explanation import effect_rounding
+    >>> strong, weak = (
+    ...     effect_rounding([torch.ones(4)], prediction=0.9 - change, reference_prediction=0.9)
+    ...     for change in (0.4, 0.0004)
+    ... )
+    >>> f"{strong:.0e}, {weak:.0e}"
+    '5e-06, 5e-03'
+    """
+    change, size = abs(prediction - reference_prediction), max(1.0, abs(prediction), abs(reference_prediction))
+    largest = [change * float(shares.abs().max()) for shares in weights if len(shares) and shares.any()]
+    return max((_ULPS * torch.finfo(weights[0].dtype).eps * size / one for one in largest if one > 0), default=0.0)
+
+
+def check_rounding(roundings: Sequence[float]) -> Iterator[str]:
+    """Where so little changes that a map depends on the order of sums (`effect_rounding` of each image)."""
+    for index, share in enumerate(roundings):
+        if share > EXACT:
+            yield (
+                f"image {index}: the effects are so small that rounding makes up to {share:.1g} of the strongest, so "
+                "another engine or machine may give another map"
+            )
 
 
 def check_approximations(approximations: Sequence[Approximation]) -> Iterator[str]:

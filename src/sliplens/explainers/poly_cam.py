@@ -12,7 +12,15 @@ from torch import Tensor, nn
 from sliplens.errors import InputError
 from sliplens.explainers.activations import Layer, capture, find_layers, find_published_layers
 from sliplens.explainers.contract import Comparison, FrozenModel, Method
-from sliplens.explainers.explanation import Approximation, Explanation, Level, check_approximations, check_weights
+from sliplens.explainers.explanation import (
+    Approximation,
+    Explanation,
+    Level,
+    check_approximations,
+    check_rounding,
+    check_weights,
+    effect_rounding,
+)
 from sliplens.explainers.maps import combine, local_change, resize, scale_to, to_masks
 from sliplens.explainers.poly_cam_budget import ChannelSearch, GaussianProcess, Likeness, mask_kernel
 from sliplens.models.engines import Engine
@@ -236,11 +244,18 @@ class PolyCam(Method):
             warnings=(
                 *check_weights(names, weights, change=comparison.change.tolist()),
                 *check_approximations(approximations),
+                *check_rounding(self._roundings(comparison, weights)),
             ),
             levels=levels,
             approximations=tuple(approximations),
             engine=engine.name,
         )
+
+    def _roundings(self, comparison: Comparison, weights: list[list[Tensor]]) -> list[float]:
+        if SCORES[self.score].as_published:  # whose weights are no effects
+            return []
+        known = zip(weights, comparison.prediction.tolist(), comparison.reference_prediction.tolist(), strict=True)
+        return [effect_rounding(one, prediction=high, reference_prediction=low) for one, high, low in known]
 
     @property
     def _place(self) -> int:

@@ -1,12 +1,12 @@
 """Estimators of the safety margin from the marker field: one interface, one row a paper."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeAlias, final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from sliplens.errors import InputError
 from sliplens.markers.tracks import Tracks
@@ -17,7 +17,8 @@ _PULL_PX = 0.2  # of the inner markers' mean motion: several times its noise
 _INNER_SHARE = 1 / 3  # of the markers: what surely touches
 
 
-__all__ = ["ESTIMATORS", "FieldTrial", "MarginEstimator", "affine_parts", "field_trial", "find_hold", "get_estimator"]
+__all__ = ["ESTIMATORS", "FieldTrial", "MarginEstimator", "affine_parts", "field_trial", "find_hold", "find_holds",
+           "get_estimator"]  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,20 +120,31 @@ def affine_parts(
 
 
 def find_hold(rest_px: Float[np.ndarray, "markers 2"], displacement_px: Float[np.ndarray, "frames markers 2"]) -> int:
-    """Find the last frame before the pull: pressed, and the inner markers not yet moved by 0.2 px on average.
+    """Find the last frame before the pull, in the whole trial: what `find_holds` says when all frames are seen."""
+    return int(find_holds(rest_px, displacement_px)[-1])
 
-    Pressing ends where the divergence first comes to nine tenths of the trial's largest; a trial without any has its
-    first frame for its hold. It looks at the whole trial: a live reader is told by the hand when it begins to pull.
+
+def find_holds(
+    rest_px: Float[np.ndarray, "markers 2"], displacement_px: Float[np.ndarray, "frames markers 2"]
+) -> Int[np.ndarray, " frames"]:
+    """Last frame before the pull as each frame knows it, from itself and those before it.
+
+    It is pressed, and the inner markers have not yet moved by 0.2 px on average. Pressing ends where the divergence
+    first comes to nine tenths of the largest so far; where there was none yet the first frame is the hold.
     """
     parts = affine_parts(rest_px, displacement_px)
     spread = np.nan_to_num(parts[:, 2], nan=-np.inf)
-    if not np.isfinite(spread).any() or spread.max() <= 0:
-        return 0
-    settled = int(np.argmax(spread >= _PRESSED_SHARE * spread.max()))
-    inner = _ring(rest_px, displacement_px[settled], 0.0, _INNER_SHARE)
-    moved = affine_parts(rest_px[inner], displacement_px[settled:, inner] - displacement_px[settled, inner])[:, :2]
-    later = np.flatnonzero(np.nan_to_num(np.linalg.norm(moved, axis=1), nan=0.0) > _PULL_PX)
-    return settled + max(int(later[0]) - 1, 0) if len(later) else settled
+    largest, frames = np.maximum.accumulate(spread), np.arange(len(spread))
+    settled = np.array([int(np.argmax(spread >= _PRESSED_SHARE * one)) for one in largest])
+    holds = np.zeros(len(spread), dtype=np.int64)
+    for first in np.unique(settled[largest > 0]):
+        inner = _ring(rest_px, displacement_px[first], 0.0, _INNER_SHARE)
+        moved = affine_parts(rest_px[inner], displacement_px[first:, inner] - displacement_px[first, inner])[:, :2]
+        later = np.flatnonzero(np.nan_to_num(np.linalg.norm(moved, axis=1), nan=0.0) > _PULL_PX)
+        pull = first + int(later[0]) if len(later) else len(spread)
+        here = (settled == first) & (largest > 0)
+        holds[here] = np.where(frames[here] >= pull, max(pull - 1, first), first)
+    return holds
 
 
 def field_trial(tracks: Tracks, *, hold: int | None = None) -> FieldTrial:
@@ -154,13 +166,31 @@ def mean_shear(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
 
 
 def shear_over_divergence(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
-    """Mean motion over divergence, in pixels."""
-    return mean_shear(trial) / _pressed(trial)[:, None]
+    """Mean motion over divergence, in pixels; divided by a tenth of the trial's largest divergence at least."""
+    return mean_shear(trial) / _pressed(trial, np.nanmax(trial.spread))[:, None]
 
 
-def _pressed(trial: FieldTrial) -> Float[np.ndarray, " frames"]:
-    """Divergence to divide by: no less than a tenth of the trial's largest."""
-    return np.maximum(trial.spread, 0.1 * max(float(np.nanmax(trial.spread)), 1e-6))
+def _pressed(trial: FieldTrial, largest: np.ndarray | float) -> Float[np.ndarray, " frames"]:
+    return np.maximum(trial.spread, 0.1 * np.fmax(largest, 1e-6))
+
+
+def causal(
+    motion: Callable[[FieldTrial], Float[np.ndarray, "frames features"]],
+) -> Callable[[FieldTrial], Float[np.ndarray, "frames features"]]:
+    """A motion since the hold, over divergence, of which each frame knows no later one.
+
+    `motion` must say of a frame what it and the hold tell; the hold is that of `find_holds`, and the divergence to
+    divide by is no less than a tenth of the largest so far.
+    """
+
+    def values(trial: FieldTrial) -> Float[np.ndarray, "frames features"]:
+        holds = find_holds(trial.rest_px, trial.displacement_px)
+        found = np.empty((len(trial), 1))
+        for hold in np.unique(holds):
+            found[holds == hold] = motion(replace(trial, hold=int(hold)))[holds == hold]
+        return found / _pressed(trial, np.fmax.accumulate(trial.spread))[:, None]
+
+    return values
 
 
 def rigid_residual(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
@@ -343,7 +373,9 @@ def _learn_stick_area(trials: Trials, labels: Margins) -> Reader:
     return readers[int(np.argmin([np.nanmean((answer - labels) ** 2) for answer in answers]))]
 
 
-def _learn_eccentricity(trials: Trials, labels: Margins) -> Reader:
+def _learn_eccentricity(
+    eccentricity: Callable[[FieldTrial], Float[np.ndarray, "frames 1"]], trials: Trials, labels: Margins
+) -> Reader:
     """Ikeda's eccentricity e = delta_t / a: how far the contact's middle has moved, for how far it is pressed.
 
     Gamma = (1 - delta_t / delta_full)^1.5 for a sphere, with delta_full = mu (2 - nu) delta / (2 (1 - nu)): full slip
@@ -356,15 +388,19 @@ def _learn_eccentricity(trials: Trials, labels: Margins) -> Reader:
     Slip Feedback*, IROS 2004; Obinata et al., *Vision Based Tactile Sensor Using Transparent Elastic Fingertip for
     Dexterous Handling*, 2007. Johnson, *Contact Mechanics* (1985), section 7.2.
     """
-    ratio = np.concatenate([_eccentricity(trial) for trial in trials])
+    ratio = np.concatenate([eccentricity(trial) for trial in trials])[:, 0]
     usable = _usable(labels, ratio[:, None])
     tries = np.geomspace(1e-2, 1e2, 400) * max(float(np.median(ratio[usable])), 1e-3)
     errors = [np.mean((_hertz(ratio[usable], full) - labels[usable]) ** 2) for full in tries]
-    return lambda trial: _hertz(_eccentricity(trial), tries[int(np.argmin(errors))])
+    return lambda trial: _hertz(eccentricity(trial)[:, 0], tries[int(np.argmin(errors))])
 
 
-def _eccentricity(trial: FieldTrial) -> Margins:
-    return np.linalg.norm(_mean(trial.increment_px[:, trial.inner]), axis=1) / _pressed(trial)
+def _inner_shear(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
+    return np.linalg.norm(_mean(trial.increment_px[:, trial.inner]), axis=1)[:, None]
+
+
+def _eccentricity(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
+    return _inner_shear(trial) / _pressed(trial, np.nanmax(trial.spread))[:, None]
 
 
 def _hertz(ratio: Margins, full: float) -> Margins:
@@ -375,14 +411,18 @@ ESTIMATORS: dict[str, Callable[[Trials, Margins], Reader]] = {
     "constant": _learn_mean,
     "mean-shear": partial(_learn_features, mean_shear),
     "shear-over-divergence": partial(_learn_features, shear_over_divergence),
-    "ikeda-eccentricity": _learn_eccentricity,
+    "shear-over-divergence-causal": partial(_learn_features, causal(mean_shear)),
+    "ikeda-eccentricity": partial(_learn_eccentricity, _eccentricity),
+    "ikeda-eccentricity-causal": partial(_learn_eccentricity, causal(_inner_shear)),
     "sui-stick-area": _learn_stick_area,
     "dong-rigid-residual": partial(_learn_features, rigid_residual),
     "yuan-entropy": partial(_learn_features, displacement_entropy),
     "khamis-edge-centre": partial(_learn_features, edge_over_centre),
     "helmholtz-hodge": partial(_learn_features, helmholtz_hodge),
 }
-"""What each estimator learns from trials and their margins: the first three trivial, the others named for papers."""
+"""What each estimator learns from trials and their margins: the first four trivial, the others named for papers.
+
+What is causal says of a frame what it and those before it tell; the others need the hold of the trial as a whole."""
 
 
 def get_estimator(name: str) -> MarginEstimator:
