@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from sliplens.recordings.importing import import_recordings, label_dataset
     from sliplens.recordings.splits import split_dataset
     from sliplens.report.page import write_report
+    from sliplens.simulation.sharing import compare_datasets
     from sliplens.simulation.trials import simulate
     from sliplens.study.run import run_study
     from sliplens.training.evaluation import evaluate
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "SliplensError": "sliplens.errors",
     "check_dataset": "sliplens.recordings.check",
+    "compare_datasets": "sliplens.simulation.sharing",
     "evaluate": "sliplens.training.evaluation",
     "explain": "sliplens.explainers.table",
     "export_lerobot": "sliplens.recordings.exporting",
@@ -53,6 +55,7 @@ __all__ = [
     "SliplensError",
     "__version__",
     "check_dataset",
+    "compare_datasets",
     "evaluate",
     "explain",
     "export_lerobot",

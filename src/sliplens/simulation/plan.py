@@ -146,6 +146,7 @@ class TrialPlan:
     unit: int
     """Number of the built sensor, from 0."""
     unit_seed: int
+    day_seed: int
     day_draw: Day
     recipe: SimulationRecipe
     """Recipe that all trials have in common."""
@@ -237,6 +238,7 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
                         seed=_seed(recipe, _TRIALS, day, condition == "wet", number),
                         unit=unit,
                         unit_seed=_seed(recipe, _UNITS, unit),
+                        day_seed=_seed(recipe, _DAYS, day),
                         day_draw=days[day],
                         recipe=recipe,
                         recipe_hash=recipe_hash,

@@ -103,19 +103,20 @@ def _evaluate(
         frames = load_frames(data, trials, encoding=run.encoding, image_size=size, on_progress=count)
     with stage(on_progress, "Predicting frames") as count:
         evaluation = evaluate_frames(run, frames, split=split, on_progress=count)
-    evaluation = replace(evaluation, known_trials=_count_known(trials, run))
+    evaluation = replace(evaluation, known_trials=len(find_known(trials, run)))
     if plan is None:
         return evaluation
     fields = folder / "fields"
     with stage(on_progress, "Following markers") as count:
         scores, answers = evaluate_baselines(plan, data, evaluation.predictions, folder=fields, on_progress=count)
     shutil.rmtree(fields)  # kept until here for whoever is interrupted
-    known = _count_known(plan.training, run)
+    known = len(find_known(plan.training, run))
     return replace(evaluation, baselines=replace(scores, known_trials=known), baseline_predictions=answers)
 
 
-def _count_known(trials: Sequence[TrialInfo], run: Run) -> int:
-    return sum(trial.sha256[:12] in run.manifest.trained_on for trial in trials)
+def find_known(trials: Sequence[TrialInfo], run: Run) -> tuple[TrialInfo, ...]:
+    """Trials that trained or validated a network, or what it started from; told by the hashes of their files."""
+    return tuple(trial for trial in trials if trial.sha256[:12] in run.manifest.trained_on)
 
 
 def _plan_baselines(
