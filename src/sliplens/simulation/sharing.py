@@ -1,6 +1,6 @@
 """What two data sets share: the trials, days and sensors that would make a test of one on the other too easy."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -83,9 +83,6 @@ def _keys(trial: TrialInfo, plans: dict[str, TrialPlan]) -> dict[str, tuple[obje
     return found
 
 
-def _pairs(first: Iterable[tuple[object, str]], second: Iterable[tuple[object, str]]) -> Iterator[tuple[str, str]]:
+def _pairs(first: Iterable[tuple[object, str]], second: Iterable[tuple[object, str]]) -> list[tuple[str, str]]:
     others = dict(second)
-    return ((name, others[key]) for key, name in first if key in others)
-
-
-__all__ = ["SharedMaterial", "compare_datasets"]
+    return [(name, others[key]) for key, name in first if key in others]
