@@ -13,7 +13,7 @@ from sliplens.results.evaluation import (
 )
 from sliplens.results.explanation import Explained, ExplainedFrame, load_explained
 from sliplens.results.faithfulness import DeletionCurve, DeletionScores, Remedies, RemovalCurve, RemovalScores
-from sliplens.results.study import Choice, MapQuality, Randomisation, States, Study, Timing, Truth
+from sliplens.results.study import Choice, MapQuality, PooledScores, Randomisation, States, Study, Timing, Truth
 from sliplens.results.training import LearningCurve, Simulation, SplitCount, Training, describe_simulation
 
 __all__ = [
@@ -30,6 +30,7 @@ __all__ = [
     "LeadTimes",
     "LearningCurve",
     "MapQuality",
+    "PooledScores",
     "Predictions",
     "Randomisation",
     "RegressionScores",

@@ -1,6 +1,7 @@
 """The experiment: pick frames, explain them, score the explanations, keep what was found."""
 
 from sliplens.study.explaining import ChosenFrames, explain_frames, frames_from_dataset, frames_from_folder
+from sliplens.study.pool import pool_studies
 from sliplens.study.run import run_study
 from sliplens.study.scoring import score_explanations
 from sliplens.study.workspace import explain_source, explain_trial, score_explained
@@ -12,6 +13,7 @@ __all__ = [
     "explain_trial",
     "frames_from_dataset",
     "frames_from_folder",
+    "pool_studies",
     "run_study",
     "score_explained",
     "score_explanations",
