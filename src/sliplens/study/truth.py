@@ -515,7 +515,7 @@ def _find_effects(
         count, answer = len(frame.markers), answer_scenes(predict, partial(redraw, index))
         # the whole image first
         answers = answer(np.eye(count + 1, count, k=-1, dtype=bool))
-        # a run that goes on draws the same
+        # a run that goes on draws the same; a first guess would lean the truth towards the map that gave it
         rng = np.random.default_rng((seed, index))
         found = shapley_values(lambda stay: answer(~stay), count, pairs=pairs, rng=rng)
         shuffled = shuffle_half(found.values, rng=rng)
