@@ -1,17 +1,15 @@
 """Scores of several studies together: what holds for other networks, days and trials than those of one."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Float, Shaped
-from scipy.stats import spearmanr
 
 from sliplens.errors import InputError
 from sliplens.faithfulness.controls import lead_over_controls
-from sliplens.intervals import Difference, paired_difference
-from sliplens.results.faithfulness import Key, RemovalScores, is_control
+from sliplens.results.faithfulness import is_control
 from sliplens.results.study import PooledScore, PooledScores, Study
+from sliplens.study.truth import mean_interval, rank_correlation
 
 _Measured: TypeAlias = tuple[np.ndarray, np.ndarray]
 """A score of each frame, and the networks, days and trials of the frames, a row a level."""
@@ -39,41 +37,32 @@ def pool_studies(studies: Sequence[Study], *, seed: int = 0) -> PooledScores:
     inputs = set.intersection(*({*study.faithfulness} & {*study.explanations} for study in studies)) if studies else ()
     if not inputs:
         raise InputError("no input has scores in every study; give studies that explained and scored the same input")
-    rng = np.random.default_rng(seed)
-    return PooledScores(scores=tuple(score for name in sorted(inputs) for score in _pool(name, studies, rng=rng)))
+    return PooledScores(scores=tuple(score for name in sorted(inputs) for score in _pool(name, studies, seed=seed)))
 
 
-def _pool(name: str, studies: Sequence[Study], *, rng: np.random.Generator) -> list[PooledScore]:
-    scored = [(study.explanations[name].weights_sha256, study.faithfulness[name]) for study in studies]
-    truth = {
-        method: _join([_with_truth(study, name, method) for study in studies])
-        for method in set.intersection(*({*study.explanations[name].methods} for study in studies))
-        if all(name in study.truth for study in studies)
-    }
-    shared = set.intersection(*({*own.curves} for _, own in scored))
+def _pool(name: str, studies: Sequence[Study], *, seed: int) -> list[PooledScore]:
+    shared = set.intersection(*({*study.faithfulness[name].curves} for study in studies))
+    explained = set.intersection(*({*study.explanations[name].methods} for study in studies))
+    simulated = all(name in study.truth for study in studies)
+    truth = {method: _join(_with_truth(study, name, method) for study in studies) for method in explained if simulated}
     pooled = []
-    for setting in dict.fromkeys(key[:2] for key in scored[0][1].curves if key in shared):
-        found = {key[2]: _join([_gains(*one, key) for one in scored]) for key in sorted(shared) if key[:2] == setting}
+    for fill, unit in dict.fromkeys(key[:2] for key in studies[0].faithfulness[name].curves if key in shared):
+        methods = [method for *setting, method in sorted(shared) if setting == [fill, unit]]
+        found = {method: _join(_gains(study, name, (fill, unit, method)) for study in studies) for method in methods}
         controls = {method: gains for method, (gains, _) in found.items() if is_control(method)}
         for method, (gains, clusters) in found.items():
+            gain, rng = mean_interval(gains, clusters, seed=seed), np.random.default_rng(seed)
+            assert gain is not None  # gains are always known
+            lead = None if method in controls else lead_over_controls(gains, controls, clusters=clusters, rng=rng)
+            held = mean_interval(*truth[method], seed=seed) if method in truth else None
             pooled.append(
-                PooledScore(
-                    input=name,
-                    fill=setting[0],
-                    unit=setting[1],
-                    method=method,
-                    gain=paired_difference(gains, 0 * gains, clusters=clusters, rng=rng),
-                    lead=None
-                    if method in controls
-                    else lead_over_controls(gains, controls, clusters=clusters, rng=rng),
-                    truth=_mean(*truth[method], rng=rng) if method in truth else None,
-                )
+                PooledScore(input=name, fill=fill, unit=unit, method=method, gain=gain, lead=lead, truth=held)
             )
     return pooled
 
 
-def _gains(network: str, scores: RemovalScores, key: Key) -> _Measured:
-    curve = scores.curves[key]
+def _gains(study: Study, name: str, key: tuple[str, str, str]) -> _Measured:
+    curve, network = study.faithfulness[name].curves[key], study.explanations[name].weights_sha256
     return curve.srg, np.stack([np.repeat(network, len(curve.srg)), *curve.clusters])
 
 
@@ -86,21 +75,11 @@ def _with_truth(study: Study, name: str, method: str) -> _Measured:
     for values, painted in zip(chosen.relevance[method], truth.shapley_maps, strict=True):
         # a marker's pixels have its value, which no other has; 0 lies beside them all
         effects, marker = np.unique(painted, return_inverse=True)
-        means = np.bincount(marker.ravel(), weights=values.ravel().astype(np.float64)) / np.bincount(marker.ravel())
-        seen = effects != 0
-        varies = seen.sum() > 1 and np.ptp(means[seen]) > 0
-        correlations.append(float(np.asarray(spearmanr(effects[seen], means[seen]))[0]) if varies else np.nan)
+        means = np.bincount(marker.ravel(), weights=values.ravel()) / np.bincount(marker.ravel())
+        correlations.append(rank_correlation(effects[effects != 0], means[effects != 0]))
     return np.array(correlations), np.stack([np.repeat(explained.weights_sha256, len(chosen.frames)), *chosen.clusters])
 
 
-def _join(parts: Sequence[_Measured]) -> _Measured:
+def _join(parts: Iterable[_Measured]) -> _Measured:
     values, clusters = zip(*parts, strict=True)
     return np.concatenate(values), np.concatenate(clusters, axis=1)
-
-
-def _mean(
-    values: Float[np.ndarray, " frames"], clusters: Shaped[np.ndarray, "3 frames"], *, rng: np.random.Generator
-) -> Difference | None:
-    known = np.isfinite(values)
-    values = values[known]
-    return paired_difference(values, 0 * values, clusters=clusters[:, known], rng=rng) if len(values) else None

@@ -256,9 +256,9 @@ def rank_correlation(first: Float[np.ndarray, " markers"], second: Float[np.ndar
 
 
 def mean_interval(
-    measured: Iterable[float], clusters: Shaped[np.ndarray, "2 frames"], *, seed: int
+    measured: Iterable[float], clusters: Shaped[np.ndarray, "levels frames"], *, seed: int
 ) -> Difference | None:
-    """Mean over the frames in which it is defined, with a 95 % interval over days and trials; None if in none."""
+    """Mean over the frames in which it is defined, with a 95 % interval over its clusters; None if in none."""
     values = np.array(list(measured))
     known = np.isfinite(values)
     if not known.any():
