@@ -18,12 +18,13 @@ from sliplens.models import Manifest, Run
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.results import Explained, ExplainedFrame
 from sliplens.results.explanation import MethodNotes
-from sliplens.results.study import Truth
+from sliplens.results.study import Study, Truth
 from sliplens.simulation import CHROMATOUCH, SimulationRecipe, simulate_dataset
 from sliplens.simulation.information import visible_markers
 from sliplens.simulation.intervention import draw_with_markers_back, marker_readings
 from sliplens.study import frames_from_dataset
 from sliplens.study.explaining import network_inputs
+from sliplens.study.pool import _with_truth as pooled_truth
 from sliplens.study.truth import (
     find_places,
     judge_by_truth,
@@ -402,3 +403,12 @@ def test_frames_of_other_data_are_refused(given, maps, small_dataset):
         judge(replace(explained, weights_sha256="of others"))
     with pytest.raises(InputError, match="no fill named 'pink'"):
         judge_by_truth(trained, explained, data, maps=maps, fills=("pink",))
+
+
+def test_pooled_maps_are_held_against_the_truth_as_in_a_study(two_signed):
+    _, explained, truth = two_signed
+    study = Study(explanations={"difference": explained}, truth={"difference": truth})
+    correlations, _ = pooled_truth(study, "difference", "attribution")
+    told = truth.methods["attribution"].shapley
+    assert told is not None
+    assert np.nanmean(correlations) == pytest.approx(told.estimate)
