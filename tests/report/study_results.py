@@ -54,6 +54,7 @@ EQUAL_AREAS = (0.01, 0.02, 0.05, 0.1, 0.2)
 LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 SCORED = (0.4, 0.2, 0.0)
 GAINS = {"grad-cam": -0.05, "integrated-gradients": 0.06, "poly-cam": 0.16, "edges": 0.02, "centre": 0.01}
+SPEARMAN = {"grad-cam": 0.3, "integrated-gradients": 0.4, "poly-cam": 0.7, "poly-cam-thesis": 0.2}
 MAP_MEASURES = {
     "grad-cam": {"resolution": 0.05, "total_variation": 0.01, "gini": 0.4, "noise_stability": 0.98},
     "integrated-gradients": {"resolution": 0.7, "total_variation": 0.2, "gini": 0.7, "noise_stability": 0.6},
@@ -81,6 +82,8 @@ class Made:
     top_share: float = 0.8
     """Of the network's effects that two markers hold."""
     edge_mass: float = 0.3
+    spearman: Mapping[str, float] = field(default_factory=lambda: SPEARMAN)
+    """Of each method's map with the markers' Shapley values; every interval reaches 0.05 either way."""
     sound: bool = True
     """Whether every trial that was taken qualifies."""
 
@@ -489,15 +492,8 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
         for key, effects in (("shapley", network), ("network", network), ("margin", -margin)):
             spots = np.exp(-((grid_x - x[:, None, None]) ** 2 + (grid_y - y[:, None, None]) ** 2) / (0.002 * size**2))
             maps[key].append((effects[:, None, None] * (spots > 0.4)).sum(axis=0).astype(np.float32))
-    spearman = {
-        "grad-cam": 0.3,
-        "integrated-gradients": 0.4,
-        "poly-cam": 0.7,
-        "poly-cam-thesis": 0.2,
-        "edges": 0.1,
-        "oracle": 1.0,
-        "degraded-oracle": 0.8,
-    }
+    known = {"edges": 0.1, "oracle": 1.0, "degraded-oracle": 0.8}
+    spearman = {**made.spearman, **known}
     mass: dict[str, float | None] = {"markers": 0.5, "slip_annulus": 0.4, "edges": made.edge_mass}
     held = {
         "oracle": 0.3,
@@ -522,7 +518,14 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
                     shapley=interval(value, made.trials),
                     network=interval(value, made.trials),
                     margin=interval(value / 2, made.trials),
-                    lead_over_controls=Lead(control="change", gap=interval(value - 0.1, made.trials)),
+                    lead_over_controls=None
+                    if method in known
+                    else Lead(control="edges", gap=interval(value - known["edges"], made.trials)),
+                    lead_over_methods={
+                        other: interval(value - less, made.trials)
+                        for other, less in (() if method in known else made.spearman.items())
+                        if other != method
+                    },
                     edges=interval(made.edge_mass - 0.07, made.trials, half=0.01),
                 )
                 for method, value in spearman.items()

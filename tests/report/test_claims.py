@@ -1,6 +1,7 @@
 """The verdicts flip where the data flips."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from sliplens.intervals import Difference
 from sliplens.report import load_results
 from sliplens.report.claims import all_of, judge_claims, judge_gap, most_of
 from sliplens.report.comparisons import compare_gain, share_of_strongest
+from sliplens.report.results import Results
 from sliplens.report.sections import build_sections
 from sliplens.report.tables import Table
 from sliplens.report.verdict import _tell_lead, judge, rank_methods
@@ -21,6 +23,7 @@ from .study_results import (
 )
 from .study_results import (
     METHODS,
+    SPEARMAN,
     Made,
     write_choice,
     write_faithfulness,
@@ -238,16 +241,82 @@ def test_a_gap_over_too_few_trials_decides_nothing():
     assert judge_gap(gap) == "undecided"
 
 
-def test_the_method_to_believe_is_the_one_that_beats_the_controls(judged, tmp_path, rng):
+def removal_alone(folder: Path) -> Results:
+    """What a study finds where the scene cannot be drawn anew."""
+    results = load_results(folder)
+    return replace(results, study=replace(results.study, truth={}))
+
+
+def test_without_truth_the_method_to_believe_is_the_one_that_beats_the_controls(judged, tmp_path, rng):
     judged(Made(gains=OURS | {"integrated-gradients": 0.4}))
 
-    statements = {one.topic: one for one in judge(load_results(tmp_path), rng=rng)}
+    statements = {one.topic: one for one in judge(removal_alone(tmp_path), rng=rng)}
 
-    found = statements["Which to believe, difference images"]
+    found = statements["What to believe, difference images"]
     assert found.tone == "good"
     assert found.text.startswith("Believe Integrated Gradients. Under 4 of 4 fills")
     assert "ahead of Poly-CAM, the next, under untouched frame, grey, blur and true scene" in found.text
     assert "Grad-CAM does not beat the controls" in found.text
+    assert "no truth tells whether" in found.text
+
+
+@pytest.mark.parametrize(
+    ("spearman", "expected"),
+    [
+        ({}, ("Believe Poly-CAM: of 4 methods its map tells best", "good")),
+        # a lead of 0.04 is not off zero: intervals reach 0.05 either way
+        ({"grad-cam": 0.66}, ("None is shown to be the best: Poly-CAM comes first, and 1 of 3 others tie", "caution")),
+        # the control has 0.1
+        (dict.fromkeys(SPEARMAN, -0.1) | {"poly-cam": 0.14}, ("None: no map is shown to tell", "caution")),
+    ],
+)
+def test_recommended_is_what_leads_every_control_and_every_method(judged, tmp_path, rng, spearman, expected):
+    first, tone = expected
+    judged(Made(spearman=SPEARMAN | spearman))
+    statements = judge(load_results(tmp_path), rng=rng)
+    found = {one.topic: one for one in statements}["What to believe, raw images"]
+    assert found.text.startswith(first)
+    assert found.tone == tone
+    assert "Found over 6 trials, one day, one network: another network or day may say otherwise." in found.text
+    assert "It would be overturned by a study of other trials" in found.text
+    assert ("Not told apart from it, by the lead over each: Grad-CAM (+0.04" in found.text) is first.startswith(
+        "None is"
+    )
+    assert "a perfect map would reach 0.95." in found.text  # the root of 0.9
+
+
+@pytest.mark.parametrize(("name", "kin"), [("integrated-gradients", True), ("poly-cam", False)])
+def test_a_method_that_is_kin_to_the_truth_is_called_so(judged, tmp_path, rng, name, kin):
+    judged(Made(inputs=("raw",), spearman=SPEARMAN | {name: 0.9}))
+    found = judge(load_results(tmp_path), rng=rng)[0]
+    assert found.topic == "What to believe, raw images"
+    assert ("kin to that truth by construction" in found.text) is kin
+
+
+def test_what_was_found_over_several_networks_and_days_is_not_told_of_one(judged, tmp_path, rng):
+    judged(Made(inputs=("raw",)))
+    results = load_results(tmp_path)
+    truth = results.study.truth["raw"]
+    assert truth.methods["poly-cam"].shapley is not None
+    over = replace(truth.methods["poly-cam"].shapley, networks=3, days=4)
+    methods = truth.methods | {"poly-cam": replace(truth.methods["poly-cam"], shapley=over)}
+    study = replace(results.study, truth={"raw": replace(truth, methods=methods)})
+    found = judge(replace(results, study=study), rng=rng)[0]
+    assert "Found over 6 trials, 4 days, 3 networks. It would" in found.text
+
+
+def test_the_claims_of_the_thesis_are_counted_by_outcome(judged, tmp_path, rng):
+    judged(thesis(gains=GAINS | {"poly-cam-thesis": -0.1}))
+    results = load_results(tmp_path)
+    claims = judge_claims(results, rng=rng)
+    found = {one.topic: one for one in judge(results, claims=claims, rng=rng)}["The thesis's claims"]
+    counted = [{answer.outcome for answer in claim.answers} for claim in claims]
+    assert found.text.startswith("Of the thesis's 5 claims ")
+    assert f"{counted.count({'holds'})} hold" in found.text
+    assert f"{counted.count({'does not hold'})} do not hold" in found.text
+    assert "Do not hold: Poly-CAM is the most faithful of the three methods" in found.text
+    assert "Poly-CAM, is not borne out on raw images: Poly-CAM leads it, as the thesis ran it, by +0.50" in found.text
+    assert "The thesis's claims" not in {one.topic for one in judge(results, rng=rng)}
 
 
 def test_where_the_next_method_gains_more_it_is_told_with_both_means(judged, tmp_path, rng):
@@ -273,7 +342,7 @@ def test_where_the_next_method_gains_more_it_is_told_with_both_means(judged, tmp
 def test_no_method_is_believed_where_a_control_wins(judged, tmp_path, rng):
     judged(Made(gains=OURS | {"edges": 0.5}))
 
-    found = judge(load_results(tmp_path), rng=rng)[0]
+    found = judge(removal_alone(tmp_path), rng=rng)[0]
 
     assert found.tone == "caution"
     assert found.text.startswith("None: no method beats both chance and the best control under most fills.")
@@ -348,8 +417,8 @@ def test_an_unsound_sample_is_said_beside_each_verdict_and_score_and_nothing_is_
     statements = {one.topic: one for one in judge(results, rng=rng)}
     assert not [one.topic for one in statements.values() if one.tone == "good"]
     told = "The sample explains answers that are off by 13 points on average; 5 of 60 trials qualify at ±3 points"
-    assert told in statements["Which to believe, raw images"].text
-    assert "off by 7 points on average" in statements["Which to believe, difference images"].text
+    assert told in statements["What to believe, raw images"].text
+    assert "off by 7 points on average" in statements["What to believe, difference images"].text
     both = "off by 7 points (difference images) and 13 points (raw images) on average; 5 of 60 trials"
     sections = {one.id: one for one in build_sections(results, rng=rng)}
     for name in ("claims", "faithfulness", "randomisation", "maps", "truth"):

@@ -10,6 +10,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from sliplens.errors import InputError
 from sliplens.plots.layout import written_whole
+from sliplens.report.claims import Claim
 from sliplens.report.comparisons import tell_interval
 from sliplens.report.pictures import plate_strip
 from sliplens.report.plates import FOLDER, Plate, write_plates
@@ -64,8 +65,9 @@ def write_report(
     results = load_results(folder)
     # one stream, seeded: the same results give the same intervals
     rng = np.random.default_rng(0)
-    statements = judge(results, rng=rng)
     sections = build_sections(results, rng=rng)
+    claims = [block for section in sections for block in section.blocks if isinstance(block, Claim)]
+    statements = judge(results, claims=claims, rng=rng)
     opening = None if results.strip is None else plate_strip(results.strip)
     text = _render(results, statements, sections, opening=opening, waiting_for=waiting_for)
     plates = [] if opening is None else [opening]

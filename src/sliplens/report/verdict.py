@@ -1,8 +1,8 @@
-"""The verdict: what a person can rely on, then what to be careful with; no sentence claims more than its numbers."""
+"""The verdict: what to believe about these networks, on which evidence, and what would overturn it."""
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
@@ -26,6 +26,7 @@ from sliplens.plots.style import (
     signed,
     source_name,
 )
+from sliplens.report.claims import POLY_CAM, Claim
 from sliplens.report.comparisons import (
     against_control,
     compare_errors,
@@ -37,8 +38,8 @@ from sliplens.report.comparisons import (
 from sliplens.report.results import Results
 from sliplens.report.thesis import NETWORK_PIXELS
 from sliplens.results.explanation import Explained
-from sliplens.results.faithfulness import DeletionScores, RemovalScores
-from sliplens.results.study import Truth
+from sliplens.results.faithfulness import DeletionScores, Lead, RemovalScores
+from sliplens.results.study import Localisation, Truth
 
 Tone = Literal["good", "plain", "caution"]
 
@@ -52,22 +53,27 @@ class Statement:
     tone: Tone = "plain"
 
 
-def judge(results: Results, *, rng: np.random.Generator) -> tuple[Statement, ...]:
-    """State what the results show: which network reads how well, which method to look at, and on which evidence.
+def judge(results: Results, *, claims: Sequence[Claim] = (), rng: np.random.Generator) -> tuple[Statement, ...]:
+    """State what the results show: which explanation to look at, which claims of the thesis hold, who reads how well.
 
-    What carries comes first, then what warns, each in that order; what was not run is left out.
+    What carries comes first, then what warns, each in that order; what was not run is left out. Where the sample holds
+    trials that do not qualify, nothing carries for sure: an explanation of a wrong answer explains the error.
     """
-    study = results.study
-    statements = _accuracy(results)
-    for name in inputs_in_order(study.inputs)[::-1]:
-        if name in study.faithfulness:
-            found = _believe(study.faithfulness[name], results)
-            sample = "" if study.choice is None else f" {tell_sample(study.choice, name)}"
-            statements.append(replace(found, text=found.text + sample))
-        elif study:
-            topic = f"Which to believe, {input_name(name).lower()}"
+    study, statements = results.study, []
+    for name in inputs_in_order(study.inputs)[::-1] if study else ():
+        truth, faithful = study.truth.get(name), study.faithfulness.get(name)
+        topic = f"What to believe, {input_name(name).lower()}"
+        if truth is not None and (choice := recommend(truth)) is not None:
+            found = _tell_recommended(topic, choice, truth, faithful)
+        elif faithful is not None:
+            found = replace(_believe(faithful, results), topic=topic)
+        else:
             text = "Not known: the explanations were not scored; `sliplens study` does that."
-            statements.append(Statement(topic=topic, text=text, tone="caution"))
+            found = Statement(topic=topic, text=text, tone="caution")
+        sample = "" if study.choice is None else f" {tell_sample(study.choice, name)}"
+        statements.append(replace(found, text=found.text + sample))
+    statements += _tell_claims(claims, results)
+    statements += _accuracy(results)
     statements += _winners(results, rng=rng)
     # a study's sound scores say more than deletion does
     if not study:
@@ -81,9 +87,137 @@ def judge(results: Results, *, rng: np.random.Generator) -> tuple[Statement, ...
     statements += [_real_touch(real[name]) for name in inputs_in_order(real)]
     statements += _tell_scale(results)
     if study.choice is not None and not study.choice.sound:
-        # an explanation of a wrong answer explains the error
         statements = [replace(one, tone="plain") if one.tone == "good" else one for one in statements]
     return tuple(sorted(statements, key=lambda one: one.tone == "caution"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recommended:
+    """Method whose map ranks the markers most like their Shapley values, and whether it may be recommended."""
+
+    method: str
+    found: Localisation
+    correlation: Difference
+    lead: Lead
+    """Over the strongest control."""
+    tied: tuple[str, ...]
+    """Other methods from which it is not told apart, the nearest first."""
+
+    @property
+    def shown(self) -> bool:
+        """Whether its lead over every control and over every other method is off zero."""
+        return self.lead.shows_something and not self.tied
+
+
+def recommend(truth: Truth) -> Recommended | None:
+    """Method with the best signed correlation with the Shapley values; None where no method was held against them."""
+    known = {
+        name: (own.shapley.estimate, own.shapley, own.lead_over_controls)
+        for name, own in truth.methods.items()
+        if own.shapley is not None and own.lead_over_controls is not None
+    }
+    if not known:
+        return None
+    best = max(known, key=lambda name: known[name][0])
+    over = truth.methods[best].lead_over_methods
+    return Recommended(
+        method=best,
+        found=truth.methods[best],
+        correlation=known[best][1],
+        lead=known[best][2],
+        tied=tuple(sorted((one for one, gap in over.items() if not _gains(gap)), key=lambda one: over[one].estimate)),
+    )
+
+
+_KIN = ("shapley-marker", "shapley", "integrated-gradients", "integrated-gradients-thesis", "expected-gradients")
+
+
+def _tell_recommended(topic: str, best: Recommended, truth: Truth, faithful: RemovalScores | None) -> Statement:
+    name, over, control = method_name(best.method), best.found.lead_over_methods, method_name(best.lead.control)
+    if best.correlation.units < FEWEST_UNITS:
+        few = f"{best.correlation.units} trials are too few to tell a method from chance; {FEWEST_UNITS} or more are"
+        return Statement(topic=topic, text=f"Not known: {few} needed.", tone="caution")
+    evidence = (
+        f"its signed rank correlation with the markers' Shapley values is {tell_interval(best.correlation, digits=2)}"
+    )
+    ahead = f"its lead over the strongest control, {control}, is {tell_interval(best.lead.gap, digits=2)}"
+    if best.shown:
+        text = f"Believe {name}: of {len(over) + 1} methods its map tells best what each marker adds to this answer. "
+        text += _sentence(f"{evidence}, {ahead}")
+        if over:
+            near = min(over, key=lambda one: over[one].estimate)
+            text += f" It leads the next method, {method_name(near)}, by {tell_interval(over[near], digits=2)}."
+    elif best.lead.shows_something:
+        tied = [f"{method_name(one)} ({tell_interval(over[one], digits=2)})" for one in best.tied]
+        text = f"None is shown to be the best: {name} comes first, and {len(tied)} of {len(over)} others tie with it. "
+        text += _sentence(f"{evidence}, {ahead}")
+        text += f" Not told apart from it, by the lead over each: {listed(tied)}."
+    else:
+        text = f"None: no map is shown to tell what this network uses; the first, {name}, does not beat every control. "
+        text += _sentence(f"{evidence}, but {ahead}, not off zero: a map that knows nothing of it may do as well")
+    if truth.reliability is not None:
+        most = decimals(max(truth.reliability.estimate, 0.0) ** 0.5, 2)
+        text += f" The truth is itself estimated: a perfect map would reach {most}."
+    if best.method in _KIN:
+        text += " It is kin to that truth by construction: both share the answer out by the rule of Shapley."
+    standing = (
+        next((one for one in rank_methods(faithful, truth) if one.method == best.method), None) if faithful else None
+    )
+    if standing is not None and standing.tested:
+        text += (
+            f" By removal, too, it was tried: it beats every control under {len(standing.beaten)} of "
+            f"{len(standing.tested)} fills that can tell."
+        )
+    other = "its lead is not off zero" if best.shown else "one method leads every other and every control for sure"
+    text += _tell_limits(
+        best.correlation, f"a study of other trials, or of a second seed of the network, in which {other}"
+    )
+    return Statement(topic=topic, text=text, tone="good" if best.shown else "caution")
+
+
+def _tell_limits(gap: Difference, overturned_by: str) -> str:
+    """Say over what it was found, and what it would take to change it."""
+    single = [what for what, count in (("network", gap.networks), ("day", gap.days)) if count == 1]
+    text = f" Found over {gap.over}"
+    if single:
+        text += f": another {' or '.join(single)} may say otherwise"
+    return f"{text}. It would be overturned by {overturned_by}."
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def _tell_claims(claims: Sequence[Claim], results: Results) -> list[Statement]:
+    if not claims:
+        return []
+    outcomes = {claim.title: {answer.outcome for answer in claim.answers} for claim in claims}
+    kinds = {
+        "hold": [title for title, own in outcomes.items() if own == {"holds"}],
+        "do not hold": [title for title, own in outcomes.items() if own == {"does not hold"}],
+        "are undecided": [title for title, own in outcomes.items() if own == {"undecided"}],
+        "differ between the networks": [title for title, own in outcomes.items() if len(own) > 1],
+    }
+    counts = [f"{len(titles)} {'hold' if kind == 'hold' else kind}" for kind, titles in kinds.items() if titles]
+    text = f"Of the thesis's {len(claims)} claims {listed(counts)}."
+    text += "".join(
+        f" {_sentence(kind.removeprefix('are '))[:-1]}: {'; '.join(titles)}."
+        for kind, titles in kinds.items()
+        if titles
+    )
+    for name in inputs_in_order(results.study.truth)[::-1]:
+        best = recommend(results.study.truth[name])
+        gap = None if best is None else best.found.lead_over_methods.get(POLY_CAM)
+        if best is not None and gap is not None and _gains(gap):
+            text += (
+                f" Its recommendation, Poly-CAM, is not borne out on {input_name(name).lower()}: "
+                f"{method_name(best.method)} leads it, as the thesis ran it, by {tell_interval(gap, digits=2)}."
+            )
+    text += (
+        " Tested with its methods as published, on networks and data of our own: its network and most of its data are "
+        "not here, so that a claim may fail for those reasons too."
+    )
+    return [Statement(topic="The thesis's claims", text=text)]
 
 
 def _accuracy(results: Results) -> list[Statement]:
@@ -94,9 +228,12 @@ def _accuracy(results: Results) -> list[Statement]:
         conditions = conditions_in_order(scores)
         r2 = [f"{decimals(scores[condition].r2, 2)} on {condition}" for condition in conditions]
         mae = [decimals(100 * scores[condition].mae, 1) for condition in conditions]
+        asked = results.evaluations[name].predictions
+        trials, days = (len(np.unique(labels)) for labels in (asked.trial, asked.day))
         text = (
             f"The network reads the safety margin with R² {listed(r2)} objects of test trials; on average it is off by "
-            f"{listed(mae)} percentage points."
+            f"{listed(mae)} percentage points. That is of one network, over {trials} trials of "
+            f"{'one day' if days == 1 else f'{days} days'}."
         )
         poor = [condition for condition in conditions if (scores[condition].r2 or 0.0) <= 0]
         if poor:
@@ -300,12 +437,6 @@ def _believe(faithful: RemovalScores, results: Results) -> Statement:
         f"Under {fill_name(score.fill, score.unit)} its symmetric gain is {tell_interval(score.srg)} in margin units."
     )
     text += _tell_lead(faithful, best, others)
-    found = None if truth is None else truth.methods.get(best.method)
-    if found is not None and found.shapley is not None:
-        text += (
-            " Its map ranks the markers by their Shapley values in the answer with a Spearman correlation of "
-            f"{tell_interval(found.shapley, digits=2)}, as the simulation tells (1 = alike, 0 = chance)."
-        )
     failing = [method_name(one.method) for one in ranked if not one.qualifies]
     if failing:
         text += f" {listed(failing)} {'does' if len(failing) == 1 else 'do'} not beat the controls under most fills."
@@ -313,6 +444,8 @@ def _believe(faithful: RemovalScores, results: Results) -> Statement:
     if faithful.alarms:
         count = len(faithful.alarms)
         text += f" {count} {'alarm' if count == 1 else 'alarms'} about these scores: see beside their table."
+    text += " Without the scene to draw anew, no truth tells whether it also shows how much each part adds."
+    text += _tell_limits(score.srg, "a study of other trials in which it beats the controls under fewer fills")
     return Statement(topic=topic, text=text, tone="good")
 
 

@@ -279,6 +279,8 @@ class Localisation:
     """Mean rank correlation, signed, of the map's means over the markers with the columns of `MarkerEffects`."""
     lead_over_controls: Lead | None
     """Of the correlation with the Shapley values; None for what is no method."""
+    lead_over_methods: dict[str, Difference]
+    """The same correlation less that of each other method."""
     edges: Difference | None
     """Mass on the edges of markers less the share of the image that they cover."""
 

@@ -423,7 +423,9 @@ def _judge(
     ranks = {name: np.nan_to_num(own["shapley"]) for name, own in alike.items()}
     controls = {name: own for name, own in ranks.items() if is_control(name) and name != RANDOM}
     rng, interval, found = np.random.default_rng(seed), partial(mean_interval, clusters=clusters, seed=seed), {}
+    methods = [name for name in maps if not is_control(name) and name not in (ORACLE, DEGRADED)]
     for name, values in maps.items():
+        others = [one for one in methods if one != name] if name in methods else []
         positive = np.clip(values.astype(np.float64), 0, None)
         on_edges = (
             relevance_mass(own, place.edges) - place.edges.mean() for own, place in zip(positive, places, strict=True)
@@ -431,9 +433,12 @@ def _judge(
         found[name] = Localisation(
             mass=_by_region(places, lambda frame, region, own=positive: relevance_mass(own[frame], region)),
             rank=_by_region(places, lambda frame, region, own=positive: relevance_rank(own[frame], region)),
-            lead_over_controls=None
-            if is_control(name) or name in (ORACLE, DEGRADED)
-            else lead_over_controls(ranks[name], controls, clusters=clusters, rng=rng),
+            lead_over_controls=lead_over_controls(ranks[name], controls, clusters=clusters, rng=rng)
+            if name in methods
+            else None,
+            lead_over_methods={
+                one: paired_difference(ranks[name], ranks[one], clusters=clusters, rng=rng) for one in others
+            },
             edges=interval(on_edges),
             **{truth: interval(values) for truth, values in alike[name].items()},
         )
