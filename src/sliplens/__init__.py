@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from sliplens.report.page import write_report
     from sliplens.simulation.sharing import compare_datasets
     from sliplens.simulation.trials import simulate
+    from sliplens.study.diagnose import diagnose
     from sliplens.study.run import run_study
     from sliplens.training.evaluation import evaluate
     from sliplens.training.fitting import train
@@ -31,6 +32,7 @@ _MODULES = {
     "SliplensError": "sliplens.errors",
     "check_dataset": "sliplens.recordings.check",
     "compare_datasets": "sliplens.simulation.sharing",
+    "diagnose": "sliplens.study.diagnose",
     "evaluate": "sliplens.training.evaluation",
     "explain": "sliplens.explainers.table",
     "export_lerobot": "sliplens.recordings.exporting",
@@ -56,6 +58,7 @@ __all__ = [
     "__version__",
     "check_dataset",
     "compare_datasets",
+    "diagnose",
     "evaluate",
     "explain",
     "export_lerobot",

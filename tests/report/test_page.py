@@ -129,6 +129,7 @@ def test_missing_stages_are_named(build, workspace):
         "Difference images: not run yet; `sliplens explain` makes it.",
         "Difference images: not run yet; `sliplens explain` makes it.",
         "Claims, Faithfulness, New weights, Trials, Truth: not run yet; `sliplens study` makes it.",
+        "Why it fails: not run yet; `sliplens diagnose` makes it.",
         "Deletion: not run yet; `sliplens score` makes it.",
         "Real touch: not run yet; `sliplens explain` makes it.",
     ]

@@ -10,6 +10,7 @@ from sliplens._version import __version__
 from sliplens.cli.check import Check
 from sliplens.cli.console import fail
 from sliplens.cli.demo import Demo
+from sliplens.cli.diagnose import Diagnose
 from sliplens.cli.evaluate import Evaluate
 from sliplens.cli.explain import Explain
 from sliplens.cli.export import Export
@@ -28,7 +29,7 @@ from sliplens.errors import SliplensError
 
 _Recordings = Simulate | Import | Label | Split | Check | View | Track
 _Networks = Train | Evaluate | Predict | Export
-Command = Demo | _Recordings | _Networks | Explain | Score | Study | Report
+Command = Demo | _Recordings | _Networks | Explain | Score | Diagnose | Study | Report
 
 _DESCRIPTION = """sliplens tells how close a soft robotic fingertip is to losing its grip, from the images of the camera
 inside it, and shows why the network says so. Start with `sliplens demo runs/demo`; every stage it runs is a command

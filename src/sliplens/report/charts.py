@@ -61,7 +61,7 @@ def plate_bins(results: Results) -> Plate:
     ]
     # one scale for all conditions, or the eye compares bars that do not compare
     top = 1.15 * max((row[5] for row in rows if row[5] is not None), default=1.0)
-    figure, axes = _charts(len(conditions), each=(4.4, 3.2))
+    figure, axes = make_charts(len(conditions), each=(4.4, 3.2))
     told = []
     with drawing_style():
         for ax, condition in zip(axes, conditions, strict=True):
@@ -94,7 +94,7 @@ def plate_predictions(results: Results) -> Plate:
         for one in [results.evaluations[name]]
         if condition in one.conditions and (one.predictions.condition == condition).any()
     ]
-    figure, axes = _charts(len(shown), each=(3.4, 3.1))
+    figure, axes = make_charts(len(shown), each=(3.4, 3.1))
     rows = []
     with drawing_style():
         for ax, (name, condition, frames) in zip(axes, shown, strict=True):
@@ -118,7 +118,7 @@ def plate_over_time(results: Results) -> Plate | None:
     chosen = {one: trial for one in _conditions(results) if (trial := _typical_trial(results, one)) is not None}
     if not chosen:
         return None
-    figure, axes = _charts(len(chosen), each=(4.6, 3.1))
+    figure, axes = make_charts(len(chosen), each=(4.6, 3.1))
     rows = []
     with drawing_style():
         for ax, (condition, trial) in zip(axes, chosen.items(), strict=True):
@@ -149,7 +149,7 @@ def plate_learning(results: Results) -> Plate:
         f"after {decimals(one.epochs, 1)} epochs (stopped by {one.stopped_by})"
         for name, one in trainings.items()
     )
-    figure, axes = _charts(1, each=(5.6, 3.2))
+    figure, axes = make_charts(1, each=(5.6, 3.2))
     with drawing_style():
         plot_learning_curves(trainings, ax=axes[0])
     rows = [
@@ -168,7 +168,7 @@ def plate_learning(results: Results) -> Plate:
 
 def plate_faithfulness(scores: Mapping[str, DeletionScores]) -> Plate:
     """Draw the mean deletion score while pixels go, a chart an input, all of one source (thesis, Fig. 9)."""
-    figure, axes = _charts(len(scores), each=(4.6, 3.5))
+    figure, axes = make_charts(len(scores), each=(4.6, 3.5))
     with drawing_style():
         for ax, (name, one) in zip(axes, scores.items(), strict=True):
             plot_faithfulness(one.curves, pixels=_pixels(one), ax=ax).set_title(input_name(name))
@@ -190,7 +190,7 @@ def plate_faithfulness(scores: Mapping[str, DeletionScores]) -> Plate:
 def plate_each_frame(scored: DeletionScores) -> Plate:
     """Draw the thesis's curve of every frame, a chart a method (thesis, Figs. 17 and 18)."""
     methods, name = methods_in_order(scored.curves), input_name(scored.input).lower()
-    figure, axes = _charts(len(methods), each=(2.9, 2.5))
+    figure, axes = make_charts(len(methods), each=(2.9, 2.5))
     told = []
     with drawing_style():
         for ax, method in zip(axes, methods, strict=True):
@@ -265,7 +265,7 @@ def plate_randomisation(results: Results) -> Plate:
     found = results.study.randomisation
     names = inputs_in_order(found)[::-1]
     rows, told = [], []
-    figure, axes = _charts(len(names), each=(4.6, 3.5), sharey=True)
+    figure, axes = make_charts(len(names), each=(4.6, 3.5), sharey=True)
     with drawing_style():
         for ax, name in zip(axes, names, strict=True):
             for method in methods_in_order(found[name].methods):
@@ -294,7 +294,7 @@ def plate_randomisation(results: Results) -> Plate:
     )
 
 
-def _charts(count: int, *, each: tuple[float, float], sharey: bool = False) -> tuple[Figure, list[Axes]]:
+def make_charts(count: int, *, each: tuple[float, float], sharey: bool = False) -> tuple[Figure, list[Axes]]:
     """Make a figure of some charts, at most `_FEW` in a row."""
     wide = min(count, _FEW)
     high = -(-count // wide)

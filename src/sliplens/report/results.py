@@ -8,13 +8,20 @@ from sliplens.codec import load_record, load_result
 from sliplens.errors import InputError
 from sliplens.files import RUN_FILE, Provenance, require_folder
 from sliplens.recordings.dataset import load_dataset
+from sliplens.results.diagnosis import Diagnosis
 from sliplens.results.evaluation import Evaluation
 from sliplens.results.explanation import Explained, Strip, load_explained
 from sliplens.results.faithfulness import DeletionScores, Remedies, RemovalScores
 from sliplens.results.study import TABLES, Choice, MapQuality, Randomisation, States, Study, Timing, Truth
 from sliplens.results.training import Simulation, Training, describe_simulation
 
-_OF_A_COMMAND: dict[str, type] = {"train": Training, "evaluate": Evaluation, "score": DeletionScores, "strip": Strip}
+_OF_A_COMMAND: dict[str, type] = {
+    "train": Training,
+    "evaluate": Evaluation,
+    "diagnose": Diagnosis,
+    "score": DeletionScores,
+    "strip": Strip,
+}
 _OF_A_STUDY: dict[str, type] = {
     "choice": Choice,
     "states": States,
@@ -38,6 +45,7 @@ class Results:
     trainings: dict[str, Training] = field(default_factory=dict)
     evaluations: dict[str, Evaluation] = field(default_factory=dict)
     """By input ("raw", "difference")."""
+    diagnoses: dict[str, Diagnosis] = field(default_factory=dict)
     explanations: dict[tuple[str, str], Explained] = field(default_factory=dict)
     scores: dict[tuple[str, str], DeletionScores] = field(default_factory=dict)
     """By input and source ("simulated", "real")."""
@@ -51,7 +59,12 @@ class Results:
     @property
     def inputs(self) -> set[str]:
         """Inputs that any stage tells of."""
-        named = {*self.trainings, *self.evaluations, *(name for name, _ in (*self.explanations, *self.scores))}
+        named = {
+            *self.trainings,
+            *self.evaluations,
+            *self.diagnoses,
+            *(name for name, _ in (*self.explanations, *self.scores)),
+        }
         return named | self.study.inputs if self.study or not named else named
 
 
@@ -113,6 +126,7 @@ def load_results(workspace: Path) -> Results:
         simulation=of("simulate").get(""),
         trainings=of("train"),
         evaluations=of("evaluate"),
+        diagnoses={name: one for (own, name, _), one in found.items() if own == "diagnose"},
         explanations={key[1:]: value for key, value in found.items() if key[0] == "explain"},
         scores={key[1:]: value for key, value in found.items() if key[0] == "score"},
         strip=next(iter(of("strip").values()), None),

@@ -10,6 +10,7 @@ from sliplens.plots.style import input_name, inputs_in_order
 from sliplens.report import charts, pictures, tables
 from sliplens.report.claims import Claim, judge_claims
 from sliplens.report.comparisons import tell_sample
+from sliplens.report.diagnosis import show_diagnosis
 from sliplens.report.plates import Plate, explained_of
 from sliplens.report.results import Results
 from sliplens.report.verdict import alarms_of, group_alarms
@@ -41,6 +42,8 @@ class Section:
     intro: str | Callable[[Results], str]
     command: str = ""
     """Command that makes its results, in a workspace that is no study."""
+    apart: bool = False
+    """Whether they are no part of a study, which does not miss them."""
     build: Callable[[Results, np.random.Generator], Iterable[Block | None]] = lambda *_: ()
     """Makes its blocks; None for one that is not there. Without any, the section is left out."""
     needs: Callable[[Results], Collection[str]] = lambda results: results.inputs
@@ -58,6 +61,8 @@ def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Secti
     for section in SECTIONS:
         blocks = tuple(block for block in section.build(results, rng) if block is not None)
         command = f"sliplens {'study' if results.study else section.command}"
+        if not blocks and results.study and section.apart:
+            continue
         if not blocks:
             absent.setdefault(command, []).append(section.short_title)
             continue
@@ -169,6 +174,15 @@ def _truth(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
         yield _notes(f"How this was measured, {input_name(name).lower()}", [found[name].summary])
 
 
+def _diagnosis(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
+    for name in _names(results.diagnoses):
+        found = results.diagnoses[name]
+        groups = {sentence: [sentence] for sentence in found.sentences}
+        yield Notes(title=f"What was found, {input_name(name).lower()}", groups=groups)
+        yield _notes("Left out", [found.left_out], tone="caution")
+        yield from show_diagnosis(found)
+
+
 def _recipe(results: Results, absent: dict[str, list[str]]) -> Section:
     simulation = results.simulation
     again = " `sliplens study` with the same options goes on where it stopped, and" if results.study else ""
@@ -228,6 +242,18 @@ SECTIONS: tuple[Section, ...] = (
         command="evaluate",
         build=_accuracy,
         needs=lambda results: results.evaluations,
+    ),
+    Section(
+        id="diagnosis",
+        title="Where the network fails, and why",
+        short_title="Why it fails",
+        intro="Slices of the trials in which the error is large, tested on trials they were not found on; what the "
+        "network looked at there, and what the best reading of the markers needed; what it says of the same press and "
+        "pull where friction alone differs; and the kinds of explanations there are.",
+        command="diagnose",
+        apart=True,
+        build=_diagnosis,
+        needs=lambda results: results.diagnoses,
     ),
     Section(
         id="faithfulness",

@@ -1,5 +1,6 @@
 """Records of what the stages find: they return them, and a report loads them. None needs torch."""
 
+from sliplens.results.diagnosis import Diagnosis
 from sliplens.results.evaluation import (
     BaselinePredictions,
     Baselines,
@@ -24,6 +25,7 @@ __all__ = [
     "Choice",
     "DeletionCurve",
     "DeletionScores",
+    "Diagnosis",
     "Evaluation",
     "Explained",
     "ExplainedFrame",

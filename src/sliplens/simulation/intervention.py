@@ -14,7 +14,15 @@ from sliplens.errors import ContactError, InputError
 from sliplens.files import RUN_FILE, read_json
 from sliplens.recordings import Recording
 from sliplens.simulation.filming import Film, batches
-from sliplens.simulation.information import Touch, marker_sensitivity, prior_sigma, reading_gain, visible_markers
+from sliplens.simulation.information import (
+    MARGIN,
+    Sensitivity,
+    Touch,
+    marker_sensitivity,
+    prior_sigma,
+    reading_gain,
+    visible_markers,
+)  # fmt: skip
 from sliplens.simulation.loading import Loading
 from sliplens.simulation.nuisances import Nuisances
 from sliplens.simulation.plan import FrameTotals, SimulationRecipe, TrialPlan, plan_trials
@@ -112,6 +120,15 @@ def rebuild_trial(folder: Path, recording: Recording, *, recipe: SimulationRecip
     return FilmedTrial(plan=plans[name], loading=loading, film=film)
 
 
+def film_with_friction(trial: FilmedTrial, friction: Float[np.ndarray, " frames"]) -> FilmedTrial:
+    """Film a trial anew as if the object had another friction in each frame: same forces, light, sensor and noise.
+
+    Margins are NaN where that cannot be told (`loading.with_friction`): those frames mean nothing.
+    """
+    loading, film = prepare_trial(trial.plan, friction=friction)
+    return FilmedTrial(plan=trial.plan, loading=loading, film=film)
+
+
 def put_markers_back(film: Film, frame: int, back: Bool[np.ndarray, "variants markers"]) -> Film:
     """Film of one moment, in each of its frames with other markers put back; all else stays, the noise too.
 
@@ -177,24 +194,38 @@ def marker_readings(
 
     Gives numbers of the markers, and the reading as it is less the reading with that marker put back, in margin units.
     """
-    margin = float(trial.loading.safety_margin[frame])
+    gain, _ = _best_reading(trial, frame, noise_px)
+    motion, seen = trial.film.motion, visible_markers(trial.plan.recipe.sensor)
+    moved = (motion.centres_px[frame] - motion.rest_px)[seen]
+    return seen, (gain.reshape(-1, 2) * moved).sum(axis=1)
+
+
+def reading_slope(trial: FilmedTrial, frame: int, *, noise_px: float = NOISE_PX) -> float:
+    """Rise of the best reading over that of the margin, where friction alone changes and the forces stay.
+
+    It is told from the same markers whether the margin or the friction differs, and how far the reader expects each:
+    below 1 the best reader, too, ascribes a part of what it sees to the friction. With friction mu and the same forces
+    d log(mu) = d Gamma / (1 - Gamma).
+    """
+    gain, sensitivity = _best_reading(trial, frame, noise_px)
+    moved = dict(zip(sensitivity.unknowns, sensitivity.jacobian[0].T, strict=True))
+    used = max(1 - float(trial.loading.safety_margin[frame]), _NEAREST_END)
+    return float(gain @ (moved[MARGIN] + moved["log_friction"] / used))
+
+
+def _best_reading(trial: FilmedTrial, frame: int, noise_px: float) -> tuple[np.ndarray, Sensitivity]:
+    """Gain of the best linear reading of a frame, and what it rests on."""
+    recipe, margin = trial.plan.recipe, float(trial.loading.safety_margin[frame])
     if np.isnan(margin):
         raise ContactError(
             f"frame {frame} of {trial.plan.trial} has no contact, and so no margin; choose another frame"
         )
-    recipe, motion = trial.plan.recipe, trial.film.motion
     sensitivity = marker_sensitivity(
         np.array([np.clip(margin, _NEAREST_END, 1 - _NEAREST_END)]),
         sensor=recipe.sensor,
         touch=trial.touch(frame),
         displacement=recipe.resolved_displacement,
     )
-    gain = reading_gain(
-        sensitivity.jacobian[0],
-        sensitivity.unknowns,
-        noise_px=noise_px,
-        prior=prior_sigma(recipe.nuisances, wet=trial.plan.condition == "wet"),
-    )
-    seen = visible_markers(recipe.sensor)
-    moved = (motion.centres_px[frame] - motion.rest_px)[seen]
-    return seen, (gain.reshape(-1, 2) * moved).sum(axis=1)
+    prior = prior_sigma(recipe.nuisances, wet=trial.plan.condition == "wet")
+    gain = reading_gain(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=noise_px, prior=prior)
+    return gain, sensitivity

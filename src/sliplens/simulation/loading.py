@@ -1,6 +1,6 @@
 """The load on the fingertip through a trial: touch, press, hold, pull until it slips, slide on, let go."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -168,8 +168,6 @@ def _label(time_s: Frames, *, normal: Frames, static: Frames, friction: Friction
     on_top = np.clip((friction.used * coefficient - carried) / np.where(left > 0, left, 1), 0, 1)
     again = ~np.isnan(margin) & ~slips & (carried > 0)
     stick_margin = np.where(again, 1 - on_top, margin)
-    states = (ContactState.NO_CONTACT, ContactState.CONTACT, ContactState.INCIPIENT_SLIP, ContactState.FULL_SLIP)
-    state = np.select([np.isnan(margin), margin >= 1, margin > 0], [0, 1, 2], default=3)
     return Loading(
         time_s=time_s,
         normal_force_n=normal,
@@ -181,7 +179,36 @@ def _label(time_s: Frames, *, normal: Frames, static: Frames, friction: Friction
         carried_friction=carried,
         stick_margin=stick_margin,
         held_s=held_s,
-        contact_state=tuple(states[index] for index in state),
+        contact_state=_states(margin),
+    )
+
+
+def _states(margin: Frames) -> tuple[ContactState, ...]:
+    states = (ContactState.NO_CONTACT, ContactState.CONTACT, ContactState.INCIPIENT_SLIP, ContactState.FULL_SLIP)
+    return tuple(states[at] for at in np.select([np.isnan(margin), margin >= 1, margin > 0], [0, 1, 2], default=3))
+
+
+def with_friction(loading: Loading, friction: Frames) -> Loading:
+    """Press and pull with the same forces on an object of another friction, one value a frame.
+
+    A frame whose friction stays is as it was. Of the others the margin is NaN where that friction cannot hold the pull,
+    and after the first slip: what slipping leaves behind would have been another.
+    """
+    same = friction == loading.friction_coefficient
+    normal, tangential = loading.normal_force_n, loading.tangential_force_n
+    known = ((loading.safety_margin > 0) & (loading.carried_friction == 0) & (tangential < friction * normal)) | same
+    margin = np.where(same, loading.safety_margin, safety_margin(normal, tangential, friction))
+    margin = np.where(known, margin, np.nan)
+    stick_margin = np.where(same, loading.stick_margin, margin)
+    return replace(
+        loading,
+        friction_coefficient=friction,
+        static_friction=np.where(same, loading.static_friction, friction),
+        safety_margin=margin,
+        stick_ratio=stick_ratio(stick_margin),
+        carried_friction=np.where(same, loading.carried_friction, 0.0),
+        stick_margin=stick_margin,
+        contact_state=_states(margin),
     )
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from sliplens.errors import InputError
 from sliplens.extras import require_device
@@ -16,7 +17,7 @@ from sliplens.recordings import Dataset, GroundTruth, Recording
 from sliplens.recordings.dataset import load_dataset, trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import read_header, save_recording
 from sliplens.simulation.filming import Film, batches, prepare_film
-from sliplens.simulation.loading import Loading, load_grasp
+from sliplens.simulation.loading import Loading, load_grasp, with_friction
 from sliplens.simulation.nuisances import draw_grasp, draw_unit
 from sliplens.simulation.plan import SimulationRecipe, TrialPlan, make_recipe, plan_trials
 
@@ -25,13 +26,15 @@ _LABELS = ("time_s", "normal_force_n", "tangential_force_n", "friction_coefficie
 """What a recording takes from a loading."""
 
 
-def prepare_trial(plan: TrialPlan) -> tuple[Loading, Film]:
-    """Load a trial and make it ready to be drawn."""
+def prepare_trial(plan: TrialPlan, *, friction: Float[np.ndarray, " frames"] | None = None) -> tuple[Loading, Film]:
+    """Load a trial, with another friction if given (`with_friction`), and make it ready to be drawn."""
     recipe, unit_rng = plan.recipe, np.random.default_rng(plan.unit_seed)
     grasp_rng, load_rng, rng = np.random.default_rng(plan.seed).spawn(3)
     day, sensor = plan.day_draw, recipe.sensor
     grasp = draw_grasp(recipe.nuisances, day=day, wet=plan.condition == "wet", rng=grasp_rng)
     loading = load_grasp(grasp, frames=plan.frames, rng=load_rng, release=recipe.release)
+    if friction is not None:
+        loading = with_friction(loading, friction)
     unit = draw_unit(recipe.nuisances, markers=sensor.geometry.markers, rng=unit_rng)
     displacement = recipe.resolved_displacement
     return loading, prepare_film(

@@ -1,0 +1,133 @@
+"""Page of a diagnosis: slices of the error, other frictions, and kinds of explanations."""
+
+from collections.abc import Iterable
+from dataclasses import fields
+
+import numpy as np
+from matplotlib import colormaps
+
+from sliplens.plots.contact_sheet import TIMES, brighten, brightening
+from sliplens.plots.layout import place_axes
+from sliplens.plots.style import BLACK, BLUE, GREY, ORANGE, decimals, drawing_style, input_name, percent, signed
+from sliplens.report.charts import make_charts
+from sliplens.report.plates import Cell, Plate, draw_grid, named_columns, rows_of
+from sliplens.report.tables import Table, make_table
+from sliplens.results.diagnosis import Diagnosis, FrictionTable
+
+_DIVERGING = "PuOr"
+"""Colours of two signs that every common colour blindness tells apart."""
+_COLOURS = {"dry": ORANGE, "wet": BLUE}
+
+
+def show_diagnosis(diagnosis: Diagnosis) -> Iterable[Table | Plate]:
+    """Table and plates of a diagnosis, those left out whose numbers are not there."""
+    yield table_slices(diagnosis)
+    if len(diagnosis.frictions):
+        yield plate_frictions(diagnosis)
+        yield plate_refilmed(diagnosis)
+    yield plate_kinds(diagnosis)
+
+
+def table_slices(diagnosis: Diagnosis) -> Table:
+    """Slices with their error on held-out trials, and whether it is larger than elsewhere."""
+    return make_table(
+        f"Where the error is, {input_name(diagnosis.input).lower()}, in percentage points of Γ: slices that a tree "
+        "found on half of the trials, tested on the other half. Larger: beyond the 95 % interval, on five trials.",
+        ("Slice", "Frames", "Trials", "Mean |error|", "Mean error", "Less elsewhere (95 %)"),
+        [
+            (
+                one.name, f"{one.frames:,}", str(one.trials), f"{100 * one.error:.1f}", signed(100 * one.bias, 1),
+                "{} ({} to {}){}".format(
+                    *(signed(100 * end, 1) for end in (one.excess.estimate, one.excess.low, one.excess.high)),
+                    ", larger" if one.holds else "",
+                ),
+            )
+            for one in diagnosis.slices
+        ],
+    )  # fmt: skip
+
+
+def plate_frictions(diagnosis: Diagnosis) -> Plate:
+    """Draw the answer against the true margin as friction alone changes, a line a frame."""
+    names, groups = [field.name for field in fields(FrictionTable)], diagnosis.frictions.groups("condition")
+    figure, axes = make_charts(len(groups), each=(4.2, 3.6))
+    told = {
+        one.condition: f"slope {decimals(one.network.estimate, 2)}, best {decimals(one.reading.estimate, 2)}"
+        for one in diagnosis.slopes
+    }
+    with drawing_style():
+        for ax, ((condition,), own) in zip(axes, groups.items(), strict=True):
+            ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1)
+            for rows in own.groups("frame_id").values():
+                line = {"color": _COLOURS.get(condition, GREY), "alpha": 0.7, "linewidth": 1.2, "markersize": 3}
+                ax.plot(100 * rows.safety_margin, 100 * rows.prediction, marker="o", **line)
+            ax.set_title(f"{condition.capitalize()}: {told.get(condition, 'no slope')}", parse_math=False)
+            ax.set(xlabel="True Γ with that friction (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103))
+    return Plate(
+        name=f"diagnosis-frictions-{diagnosis.input}",
+        figure=figure,
+        alt=f"Answer against true margin as friction alone changes: {told}",
+        caption="The same press and pull filmed anew with other frictions, the forces kept, a line a frame: a network "
+        "that reads friction from what it sees rises as the dashed line does, one that answers by habit stays level. "
+        "Best: the best reading of the markers, which knows how far frictions and loads range.",
+        numbers=named_columns(names, rows_of(*(getattr(diagnosis.frictions, name) for name in names))),
+    )
+
+
+def plate_refilmed(diagnosis: Diagnosis) -> Plate:
+    """Show one frame with each of its frictions."""
+    own = diagnosis.frictions.where(diagnosis.frictions.frame_id == diagnosis.shown_frame)
+    pictures, name = _bright(diagnosis, diagnosis.other_frictions)
+    rows = rows_of(own.friction, own.safety_margin, own.prediction)
+    words = [f"Γ {percent(margin)}, read {percent(answer)}" for _, margin, answer in rows]
+    cells = [Cell(picture=picture, words=below) for picture, below in zip(pictures, words, strict=True)]
+    return Plate(
+        name=f"diagnosis-refilmed-{diagnosis.input}",
+        figure=draw_grid([(name, cells)], heads=[f"friction {row[0]:.2f}" for row in rows]).figure,
+        alt=f"One frame filmed with other frictions: {'; '.join(words)}",
+        caption=f"{diagnosis.shown_frame} with the same forces on objects of other friction, as the network would see "
+        "it, with the true margin and the answer.",
+        numbers=named_columns(("friction", "safety_margin", "prediction"), rows),
+        pixels=True,
+    )
+
+
+def plate_kinds(diagnosis: Diagnosis) -> Plate:
+    """Show the frames most like each kind of explanation beside their maps, in one scale of colours."""
+    table, maps = diagnosis.explained, diagnosis.maps
+    pictures, name = _bright(diagnosis, diagnosis.pictures)
+    top = float(np.percentile(np.abs(maps), 99.5)) or 1.0
+    colours = (255 * colormaps[_DIVERGING]((np.clip(maps / top, -1, 1) + 1) / 2)[..., :3]).astype(np.uint8)
+    rows, shown, columns = [], [], ("kind", "frames", "trials", "error", "bias", "safety_margin", "friction")
+    for kind in np.unique(table.cluster).tolist():
+        own = table.where(table.cluster == kind)
+        means = [float(values.mean()) for values in (np.abs(own.error), own.error, own.safety_margin, own.friction)]
+        rows.append((kind + 1, len(own), len(np.unique(own.trial)), *means))
+        cells = []
+        for example in np.sort(own.example[own.example >= 0]).tolist():
+            one = own.where(own.example == example)
+            ((margin, answer, condition),) = rows_of(one.safety_margin, one.prediction, one.condition)
+            words = f"Γ {percent(margin)}, read {percent(answer)}"
+            cells += [Cell(picture=pictures[example], words=words), Cell(picture=colours[example], words=condition)]
+        shown.append((f"Kind {kind + 1}: {len(own)} frames, off by {100 * means[0]:.1f} points", cells))
+    heads = [name, "parts"] * (max(len(cells) for _, cells in shown) // 2)
+    grid = draw_grid(shown, heads=heads, below_in=0.6)
+    with drawing_style():
+        bar = place_axes(grid.figure, 1.25, grid.bottom_in + 0.12, 4.2, 0.14)
+        bar.imshow(np.linspace(-1, 1, 256)[None], cmap=_DIVERGING, extent=(-100 * top, 100 * top, 0, 1), aspect="auto")
+        bar.set(yticks=[], xlabel="Part in the answer (percentage points of Γ): lowers it, raises it")
+    return Plate(
+        name=f"diagnosis-kinds-{diagnosis.input}",
+        figure=grid.figure,
+        alt=f"Examples of each kind of explanation: {'; '.join(words for words, _ in shown)}",
+        caption=f"Kinds of explanations, that of the largest error first (k-means on {diagnosis.method}, each frame's "
+        "divided by the sum of their sizes), and the frames nearest to the middle of each.",
+        numbers=named_columns(columns, rows),
+        pixels=True,
+    )
+
+
+def _bright(diagnosis: Diagnosis, pictures: np.ndarray) -> tuple[np.ndarray, str]:
+    """Pictures, brightened alike where they are differences, and what to call them."""
+    factor = 1.0 if diagnosis.input == "raw" else brightening([diagnosis.pictures])
+    return brighten(pictures, factor), "Input" if factor == 1 else f"Input {TIMES}\N{NO-BREAK SPACE}{factor:g}"

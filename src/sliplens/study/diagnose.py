@@ -1,0 +1,500 @@
+"""Where a network fails, and why: slices of its errors, its markers, other frictions, and kinds of explanations."""
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int64, UInt8
+from scipy.stats import spearmanr
+from torch.nn.functional import adaptive_avg_pool2d
+
+from sliplens.codec import keep_part, load_result, save_result
+from sliplens.errors import InputError
+from sliplens.explainers.shapley import shapley_values
+from sliplens.extras import require_packages
+from sliplens.faithfulness.removal import answer_whole
+from sliplens.faithfulness.scoring import prepare_passes
+from sliplens.files import output_folder
+from sliplens.intervals import FEWEST_UNITS, Difference, paired_difference
+from sliplens.models import Run
+from sliplens.models.checkpoint import load
+from sliplens.plots.style import decimals, signed
+from sliplens.progress import OnProgress, counted, note, stage, wrote
+from sliplens.recordings import Dataset
+from sliplens.recordings.dataset import load_dataset
+from sliplens.results.diagnosis import (
+    Diagnosis,
+    ErrorSlice,
+    ErrorTable,
+    ExplainedErrors,
+    FrictionSlope,
+    FrictionTable,
+)  # fmt: skip
+from sliplens.results.evaluation import Predictions
+from sliplens.results.explanation import Explained
+from sliplens.simulation.intervention import film_with_friction, marker_readings, reading_slope
+from sliplens.study.explaining import explain_frames, frames_at, network_inputs
+from sliplens.study.truth import StagedFrame, find_places, redrawing, stage_frames
+from sliplens.training import evaluate
+
+Markers = Float64[np.ndarray, " markers"]
+LEVELS = (0.8, 0.5, 0.2)
+"""Margins at which frames are explained."""
+FRICTION_FACTORS = (0.67, 0.8, 1.0, 1.25, 1.5)
+"""Other frictions over a frame's own, none so far that the object would be another."""
+_SLICES, _LEAST_SHARE, _LEAST_GAIN = 5, 0.1, 0.01
+"""Slices at most, the share of the frames that each holds at least, and of the variance that each cut explains."""
+_KINDS, _EXAMPLES, _BLOCKS = 6, 2, 8
+"""Kinds of explanations at most, examples of each, and blocks across a map that has no markers to compare."""
+_DISTINCT = 0.25
+"""Silhouette below which Kaufman and Rousseeuw (*Finding Groups in Data*, 1990) find no structure."""
+_LOOKED = ("agreement", "network_slipping", "reading_slipping")
+_ANSWERED = ("trial", "condition", "day", "frame", "safety_margin", "prediction")
+"""What answers already have of an `ErrorTable`."""
+
+
+def diagnose(
+    run: Run | Path | str,
+    data: Dataset | Path | str,
+    out: Path | str | None = None,
+    *,
+    split: str = "test",
+    trials: int = 8,
+    pairs: int = 120,
+    seed: int = 0,
+    overwrite: bool = False,
+    on_progress: OnProgress | None = None,
+) -> Diagnosis:
+    """Find out where a network fails, and why.
+
+    Half of the trials tell in which slices (condition, friction, force, place of contact, day, sensor) the error is
+    large; the other half tests them. Frames are explained, and the explanations sorted into kinds. In simulation those
+    are Shapley values of the markers over redrawn scenes, beside those of the best reading, and the same press and pull
+    is filmed anew with other frictions.
+
+    Parameters
+    ----------
+    run
+        Network, its folder, or the name of one that comes with sliplens.
+    out
+        Workspace, with a subfolder for the evaluation and one for the diagnosis; nothing is kept if None.
+    trials, pairs
+        Trials of each condition of which three frames are explained, and pairs of coalitions of markers that are asked
+        for each, at least twice the markers.
+
+    Raises
+    ------
+    InputError
+        If scikit-learn is missing, or the network or the data set cannot be found.
+    RecordingError
+        If no frame has a label.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> diagnosis = sl.diagnose("chromatouch-difference", "runs/mine/data", "runs/mine")  # doctest: +SKIP
+    >>> [one.name for one in diagnosis.slices if one.holds]  # doctest: +SKIP
+    ['normal force above 0.493 N, friction up to 0.242']
+    """
+    require_packages("sklearn", extra="diagnose", purpose="finding where a network fails")
+    if trials < 1:
+        raise InputError(f"--trials must be at least 1, got {trials}")
+    run = run if isinstance(run, Run) else load(run)
+    data = data if isinstance(data, Dataset) else load_dataset(data)
+    name, weights = run.manifest.input, run.manifest.weights_sha256
+    kept = None if out is None else Path(out) / f"evaluate-{name}"
+    answers = evaluate(run, data, kept, split=split, overwrite=overwrite, on_progress=on_progress).predictions
+    make = partial(_diagnose, run, data, answers, on_progress, trials=trials, pairs=pairs, seed=seed)
+    if out is None:
+        return make(None)
+    config = {"weights_sha256": weights, "data_hash": data.hash, "input": name, "split": split, **make.keywords}
+    target = Path(out) / f"diagnose-{name}"
+    with output_folder(target, stage="diagnose", config=config, overwrite=overwrite) as output:
+        if not output.complete:
+            save_result(make(parts := output.folder / "parts"), output.folder)
+            shutil.rmtree(parts, ignore_errors=True)
+    wrote(on_progress, target, "where the network fails, and why", kept=output.complete)
+    return load_result(target, Diagnosis, command="sliplens diagnose")
+
+
+def _diagnose(
+    run: Run, data: Dataset, answers: Predictions, on_progress: OnProgress | None, parts: Path | None, *, trials: int,
+    pairs: int, seed: int,
+) -> Diagnosis:  # fmt: skip
+    rng = np.random.default_rng(seed)
+    with stage(on_progress, "Reading what may explain the errors") as count:
+        errors = tabulate_errors(data, answers, on_progress=count)
+    slices, errors = find_slices(errors, seed=seed)
+    own = errors.where(_spread_rows(errors, trials))
+    chosen = frames_at(run, data, list(zip(own.trial.tolist(), own.frame.tolist(), strict=True)))
+    explained, left_out = explain_frames(run, chosen, methods=()), ""
+    try:
+        frames = stage_frames(run, explained, data)
+    except InputError as error:
+        left_out = f"What the markers do, and what other frictions would change, is left out: {error}."
+        note(on_progress, left_out)
+        with stage(on_progress, "Explaining frames") as count:
+            ig, method = "integrated-gradients", "Integrated Gradients"
+            maps = explain_frames(run, chosen, methods=(ig,), parts=parts, on_progress=count).relevance[ig]
+        rows = adaptive_avg_pool2d(torch.from_numpy(maps)[:, None], _BLOCKS).flatten(1).double().numpy()
+        looked = dict.fromkeys(_LOOKED, np.full(len(own), np.nan))
+        frictions, pictures, shown = as_frictions([]), explained.pictures[:0], ""
+    else:
+        with stage(on_progress, "Asking for each marker's part") as count:
+            found = find_contributions(run, explained, frames, pairs=pairs, seed=seed, parts=parts, on_progress=count)
+        size, rows = run.manifest.image_size, np.stack([one.values for one in found])
+        maps = np.stack([find_places(one, image_size=size).paint(row) for one, row in zip(frames, rows, strict=True)])
+        looked = {name: np.array([getattr(one, name) for one in found]) for name in _LOOKED}
+        method = "Shapley values of the markers"
+        with stage(on_progress, "Filming with other frictions") as count:
+            frictions, pictures, shown = refilm(run, frames, own.condition.tolist(), on_progress=count)
+    kinds, examples, silhouette = cluster_explanations(rows, np.abs(own.error), seed=seed)
+    place = np.full(len(own), -1)
+    place[examples] = np.arange(len(examples))
+    table = ExplainedErrors(**vars(own), **looked, cluster=kinds, example=place)
+    slopes, known = friction_slopes(frictions, rng), (say_errors(errors, rng), say_slices(slices))
+    sentences = (*known, *say_looked(table, slices, rng), *map(say_slope, slopes), say_kinds(table, silhouette))
+    return Diagnosis(
+        input=run.manifest.input, source=data.source, sentences=sentences, left_out=left_out, slices=slices,
+        slopes=slopes, method=method, errors=errors, explained=table, frictions=frictions,
+        pictures=explained.pictures[examples], maps=maps[examples].astype(np.float32), shown_frame=shown,
+        other_frictions=pictures,
+    )  # fmt: skip
+
+
+def tabulate_errors(data: Dataset, answers: Predictions, *, on_progress: OnProgress | None = None) -> ErrorTable:
+    """Put beside each answer what may have made it wrong."""
+    pieces = []
+    for (trial,), own in counted(answers.groups("trial").items(), on_progress):
+        info, places = data.find(trial), [np.full(len(own), np.nan)] * 2
+        recording = data.load(info)
+        if recording.truth is not None:
+            touching = (recording.truth.contact_map[own.frame] > 0).astype(np.float64)
+            pixels = np.maximum(touching.sum(axis=(1, 2)), 1)
+            along = [touching.sum(axis=axis) for axis in (1, 2)]
+            places = [one @ (np.arange(one.shape[1]) + 0.5) / one.shape[1] / pixels for one in along]
+        table = ErrorTable(
+            **{name: getattr(own, name) for name in _ANSWERED},
+            sensor=np.repeat(info.sensor, len(own)),
+            friction=recording.friction_coefficient[own.frame].astype(np.float64),
+            normal_force_n=recording.normal_force_n[own.frame].astype(np.float64),
+            contact_x=places[0],
+            contact_y=places[1],
+            slice=np.full(len(own), -1),
+        )
+        pieces.append(table)
+    return ErrorTable.joined(pieces)
+
+
+_Say = Callable[[float, float], str]
+"""Words for values of a feature above the first number and up to the second."""
+
+
+def _features(errors: ErrorTable) -> list[tuple[Float64[np.ndarray, " frames"], _Say]]:
+    """What the tree may cut by: what is known of all frames, and varies."""
+
+    def say_kind(kind: str, others: str, low: float, _: float) -> str:
+        return kind if low > 0 else others
+
+    def say_range(words: str, low: float, high: float) -> str:
+        ends = f"above {low:.3g}" if np.isinf(high) else f"{low:.3g} to {high:.3g}"
+        return words.format(f"up to {high:.3g}" if np.isinf(low) else ends)
+
+    features: list[tuple[np.ndarray, _Say]] = []
+    for name, words in (("condition", "{} objects"), ("day", "day {}"), ("sensor", "sensor {}")):
+        values = getattr(errors, name).astype(str)
+        first, *more = np.unique(values).tolist()
+        for kind in more if len(more) == 1 else [first, *more]:
+            others = words.format(first) if len(more) == 1 else f"not {words.format(kind)}"
+            features.append(((values == kind).astype(float), partial(say_kind, words.format(kind), others)))
+    numbers = {"friction {}": errors.friction, "normal force {} N": errors.normal_force_n}
+    numbers |= {
+        "contact {} % from the left": 100 * errors.contact_x,
+        "contact {} % from the top": 100 * errors.contact_y,
+    }
+    features += [(values, partial(say_range, words)) for words, values in numbers.items()]
+    return [(values, say) for values, say in features if np.isfinite(values).all() and np.ptp(values) > 0]
+
+
+def hold_out(errors: ErrorTable, *, seed: int) -> Bool[np.ndarray, " frames"]:
+    """Frames of every second trial of each condition, drawn."""
+    rng, trials = np.random.default_rng(seed), []
+    for own in errors.groups("condition").values():
+        trials += rng.permutation(np.unique(own.trial))[1::2].tolist()
+    return np.isin(errors.trial, trials)
+
+
+def find_slices(errors: ErrorTable, *, seed: int) -> tuple[tuple[ErrorSlice, ...], ErrorTable]:
+    """Find slices in which the error is large, and test each on held-out trials, the largest error first.
+
+    They are the leaves of a regression tree (Breiman et al., 1984) of the error and its size, fitted on the trials that
+    are not held out. Gives them, and the table with each frame's.
+    """
+    from sklearn.tree import DecisionTreeRegressor  # noqa: PLC0415 (an extra)
+
+    rng, held, features = np.random.default_rng(seed), hold_out(errors, seed=seed), _features(errors)
+    columns = np.column_stack([np.zeros(len(errors)), *(values for values, _ in features)])
+    # both: where it errs either way alike, or not at all, the mean error alone tells nothing
+    wanted = np.stack([np.abs(errors.error), errors.error], axis=1)[~held]
+    least, rules = wanted.var(axis=0).mean(), {"max_leaf_nodes": _SLICES, "min_samples_leaf": _LEAST_SHARE}
+    grown = DecisionTreeRegressor(**rules, min_impurity_decrease=_LEAST_GAIN * least, random_state=seed)
+    tree = grown.fit(columns[~held], wanted).tree_
+    leaves, tested, found = grown.apply(columns), errors.where(held), []
+    bounds: dict[int, dict[int, tuple[float, float]]] = {0: {}}
+    for node in range(tree.node_count):  # a parent comes before its children
+        at, cut, ranges = int(tree.feature[node]), float(tree.threshold[node]), bounds[node]
+        low, high = ranges.get(at, (-np.inf, np.inf))
+        if at >= 0:
+            bounds[int(tree.children_left[node])] = {**ranges, at: (low, cut)}
+            bounds[int(tree.children_right[node])] = {**ranges, at: (cut, high)}
+        elif (inside := leaves[held] == node).any():
+            name = ", ".join(features[column - 1][1](*ends) for column, ends in ranges.items()) or "all frames"
+            there, excess = tested.where(inside), compare_errors(tested, inside, rng)
+            error, bias, trials = float(np.abs(there.error).mean()), float(there.error.mean()), len(set(there.trial))
+            own = ErrorSlice(name=name, frames=len(there), trials=trials, error=error, bias=bias, excess=excess)
+            found.append((node, own))
+    found.sort(key=lambda pair: -pair[1].error)
+    place = {node: at for at, (node, _) in enumerate(found)}
+    slices = np.array([place.get(leaf, -1) for leaf in leaves.tolist()], dtype=np.int64)
+    return tuple(one for _, one in found), replace(errors, slice=slices)
+
+
+def _mean(
+    values: Float[np.ndarray, " rows"], table: ErrorTable | FrictionTable, rng: np.random.Generator
+) -> Difference:
+    """Mean over rows of a table with a 95 % interval over days and trials."""
+    clusters = [table.day.astype(str), table.trial]
+    return paired_difference(values, np.zeros(len(values)), clusters=clusters, rng=rng)
+
+
+def compare_errors(table: ErrorTable, inside: Bool[np.ndarray, " frames"], rng: np.random.Generator) -> Difference:
+    """Mean size of the error inside a group less that outside, with a 95 % interval; 0 where all are of one group.
+
+    A trial may lie in both: each frame counts with its influence on the difference, whose mean is the difference.
+    """
+    share, sizes = float(inside.mean()), np.abs(table.error)
+    if share in {0, 1}:
+        return _mean(0 * sizes, table, rng)
+    there, elsewhere = sizes[inside].mean(), sizes[~inside].mean()
+    influence = np.where(inside, (sizes - there) / share, (elsewhere - sizes) / (1 - share))
+    return _mean(there - elsewhere + influence, table, rng)
+
+
+def _spread_rows(errors: ErrorTable, trials: int) -> Int64[np.ndarray, " rows"]:
+    """Rows of frames along the margin of so many trials of each condition, spread evenly over them."""
+    rows = []
+    for (condition,) in errors.groups("condition"):
+        names = list(dict.fromkeys(errors.trial[errors.condition == condition].tolist()))
+        count = min(trials, len(names))
+        for trial in (names[at * len(names) // count] for at in range(count)):
+            own = np.flatnonzero(errors.trial == trial)
+            rows += sorted({int(own[np.abs(errors.safety_margin[own] - level).argmin()]) for level in LEVELS})
+    return np.array(rows)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkerContributions:
+    """Contributions of a frame's markers in margin units, and what an `ExplainedErrors` says of them."""
+
+    values: Markers
+    agreement: float
+    network_slipping: float
+    reading_slipping: float
+
+
+def hold_against(values: Markers, reading: Markers, state: Int64[np.ndarray, " markers"]) -> MarkerContributions:
+    """Hold contributions of markers that slip (1), stick (2) or touch nothing (0) against those to the best reading."""
+    sizes, least = (np.abs(values), np.abs(reading)), np.finfo(float).tiny
+    network, best = (float(size[state == 1].sum() / max(size[state > 0].sum(), least)) for size in sizes)
+    agreement = float(np.asarray(spearmanr(values, reading))[0])
+    return MarkerContributions(values=values, agreement=agreement, network_slipping=network, reading_slipping=best)
+
+
+def find_contributions(
+    run: Run, explained: Explained, frames: Sequence[StagedFrame], *, pairs: int, seed: int, parts: Path | None = None,
+    on_progress: OnProgress | None = None,
+) -> list[MarkerContributions]:  # fmt: skip
+    """Shapley values of the markers over redrawn scenes: a marker that takes no part lies where it rested.
+
+    The best reading is linear in the markers: what each adds to it is its Shapley value.
+    """
+    redraw, markers = redrawing(run, frames), len(frames[0].markers)
+    pairs = max(pairs, 2 * markers)
+    predict = prepare_passes(run, network_inputs(run, explained), 2 * pairs * len(frames))
+
+    def find(index: int) -> MarkerContributions:
+        def worth(members: Bool[np.ndarray, "coalitions markers"]) -> Float64[np.ndarray, " coalitions"]:
+            some = np.array_split(~members, -(-len(members) // 64))
+            return np.concatenate([answer_whole(predict, redraw(index, back)) for back in some])
+
+        # a run that goes on asks the same
+        values = shapley_values(worth, markers, pairs=pairs, rng=np.random.default_rng((seed, index))).values
+        reading = marker_readings(frames[index].scene, frames[index].number)[1]
+        state = find_places(frames[index], image_size=run.manifest.image_size).state
+        return hold_against(values, reading, state)
+
+    indices = counted(range(len(frames)), on_progress)
+    return [keep_part(parts and parts / f"{at:05d}", MarkerContributions, partial(find, at)) for at in indices]
+
+
+def refilm(
+    run: Run, frames: Sequence[StagedFrame], conditions: Sequence[str], *, on_progress: OnProgress | None = None
+) -> tuple[FrictionTable, UInt8[np.ndarray, "shown size size 3"], str]:
+    """Film frames anew with other frictions, and ask the network; gives the table, pictures of one frame, and its name.
+
+    That frame is of the last condition, in the middle of the margin.
+    """
+    rows, pictures, films, last = [], {}, [], None
+    for frame, condition in counted(list(zip(frames, conditions, strict=True)), on_progress):
+        at, scene = frame.number, frame.scene
+        if scene is not last:  # frames of a trial stand together
+            own, last = scene.loading.friction_coefficient, scene
+            films = [film_with_friction(scene, factor * own) for factor in FRICTION_FACTORS]
+        known = [film for film in films if np.isfinite(film.loading.safety_margin[at])]
+        drawn = np.concatenate([film.film.draw(slice(at, at + 1)).numpy() for film in known])
+        inputs = run.encode(drawn, frame.reference).to(run.device)
+        pictures[frame.id] = (255 * inputs).round().byte().permute(0, 2, 3, 1).cpu().numpy()
+        for film, answer in zip(known, run.predict(inputs).tolist(), strict=True):
+            truth = (film.loading.friction_coefficient[at], film.loading.safety_margin[at])
+            rows.append((frame.id, frame.trial, condition, frame.day, *truth, answer, reading_slope(film, at)))
+    of_last = [frame for frame, condition in zip(frames, conditions, strict=True) if condition == conditions[-1]]
+    shown = min(of_last, key=lambda frame: abs(frame.safety_margin - 0.5)).id
+    return as_frictions(rows), pictures[shown], shown
+
+
+def as_frictions(rows: Sequence[tuple[Any, ...]]) -> FrictionTable:
+    """Table of rows, or of none."""
+    columns = dict(zip((field.name for field in fields(FrictionTable)), zip(*rows, strict=True), strict=False))
+    kinds = {"frame_id": str, "trial": str, "condition": str, "day": np.int64}
+    named = {field.name: kinds.get(field.name, np.float64) for field in fields(FrictionTable)}
+    return FrictionTable(**{name: np.array(columns.get(name, ()), dtype=kind) for name, kind in named.items()})
+
+
+def friction_slopes(frictions: FrictionTable, rng: np.random.Generator) -> tuple[FrictionSlope, ...]:
+    """How far answer and best reading follow the margin as friction alone changes, by condition.
+
+    The network's is the least-squares slope over a frame's frictions, the best reading's the mean of its own over the
+    same range of margins.
+    """
+    slopes = []
+    for (condition,), table in frictions.groups("condition").items():
+        frames = [own.where(np.argsort(own.safety_margin)) for own in table.groups("frame_id").values()]
+        frames = [own for own in frames if np.ptp(own.safety_margin) > 0]
+        if frames:
+            network = np.array([np.polyfit(own.safety_margin, own.prediction, 1)[0] for own in frames])
+            areas = [np.trapezoid(own.reading_slope, own.safety_margin) for own in frames]
+            reading = np.array(areas) / [np.ptp(own.safety_margin) for own in frames]
+            firsts = FrictionTable.joined([own.where(np.array([0])) for own in frames])
+            mean, best, gap = (_mean(values, firsts, rng) for values in (network, reading, network - reading))
+            slopes.append(FrictionSlope(condition=condition, network=mean, reading=best, gap=gap))
+    return tuple(slopes)
+
+
+def cluster_explanations(
+    rows: Float[np.ndarray, "frames parts"], sizes: Float64[np.ndarray, " frames"], *, seed: int
+) -> tuple[Int64[np.ndarray, " frames"], list[int], float | None]:
+    """Sort explanations, each divided by the sum of its sizes, into as many kinds as have the largest silhouette.
+
+    Gives each one's kind, that of the largest mean of `sizes` (errors) first; the rows nearest to the middle of each
+    kind; and the silhouette (Rousseeuw, 1987), None where too few differ to have kinds.
+    """
+    from sklearn.cluster import KMeans  # noqa: PLC0415 (an extra)
+    from sklearn.metrics import silhouette_score  # noqa: PLC0415
+
+    rows = rows / np.maximum(np.abs(rows).sum(axis=1, keepdims=True), np.finfo(float).tiny)
+    best, highest = np.zeros(len(rows), dtype=np.int64), None
+    for count in range(2, min(_KINDS, len(np.unique(rows, axis=0)) - 1) + 1):
+        labels = KMeans(count, n_init=10, random_state=seed).fit_predict(rows)  # pyright: ignore[reportArgumentType]
+        silhouette = float(silhouette_score(rows, labels))
+        # a frame alone is no kind
+        if np.bincount(labels).min() >= _EXAMPLES and (highest is None or silhouette > highest):
+            best, highest = labels, silhouette
+    order = sorted(np.unique(best).tolist(), key=lambda label: -sizes[best == label].mean())
+    kinds, examples = np.array([order.index(label) for label in best.tolist()], dtype=np.int64), []
+    for kind in range(len(order)):
+        own = np.flatnonzero(kinds == kind)
+        away = np.linalg.norm(rows[own] - rows[own].mean(axis=0), axis=1)
+        examples += own[np.argsort(away, kind="stable")[:_EXAMPLES]].tolist()
+    return kinds, examples, highest
+
+
+def _gap(gap: Difference, *, points: bool = False) -> str:
+    scale, digits = (100, 1) if points else (1, 2)
+    ends = " to ".join(decimals(scale * end, digits) for end in (gap.low, gap.high))
+    return f"{signed(scale * gap.estimate, digits)} (95 % interval {ends}; {gap.over})"
+
+
+def _frames(table: ErrorTable) -> str:
+    return f"{len(table):,} frames of {len(np.unique(table.trial))} trials"
+
+
+def _off(table: ErrorTable) -> str:
+    return f"off by {100 * np.abs(table.error).mean():.1f}"
+
+
+def say_errors(errors: ErrorTable, rng: np.random.Generator) -> str:
+    """Say how large the error is, in each condition, and whether it is larger on wet objects."""
+    groups = {condition: own for (condition,), own in errors.groups("condition").items()}
+    each = [f"{_off(own)} on {name} objects ({signed(100 * own.error.mean(), 1)} mean)" for name, own in groups.items()]
+    text = f"Over {_frames(errors)} the answer is {_off(errors)} percentage points on average: {', '.join(each)}."
+    if {"dry", "wet"} - set(groups):
+        return text
+    both = ErrorTable.joined([groups["wet"], groups["dry"]])
+    gap = compare_errors(both, both.condition == "wet", rng)
+    return f"{text} Wet less dry: {_gap(gap, points=True)}{'' if gap.sure else ', which may be chance'}."
+
+
+def say_slices(slices: Sequence[ErrorSlice]) -> str:
+    """Say where the error is larger on trials that the tree has not seen."""
+    texts = [
+        f"{one.name}: off by {100 * one.error:.1f} ({signed(100 * one.bias, 1)} mean) in {one.frames} frames of "
+        f"{one.trials} trials, against elsewhere {_gap(one.excess, points=True)}"
+        for one in slices
+        if one.holds
+    ]
+    if not texts:
+        return "No slice found on half of the trials has a larger error on the other half beyond chance."
+    return f"On held-out trials the error is larger than elsewhere where {'; where '.join(texts)}."
+
+
+def say_looked(table: ExplainedErrors, slices: Sequence[ErrorSlice], rng: np.random.Generator) -> list[str]:
+    """Say how far the markers' parts are those of the best reading, in each condition and where the error is larger."""
+    groups = {f"{name} objects": table.condition == name for (name,) in table.groups("condition")}
+    groups["those slices"] = np.isin(table.slice, [at for at, one in enumerate(slices) if one.holds])
+    known = {name: table.where(rows & np.isfinite(table.agreement)) for name, rows in groups.items()}
+    return [
+        f"In {_frames(own)} on {name} the markers' parts in the answer are ranked as in the best reading with a "
+        f"signed Spearman of {_gap(_mean(own.agreement, own, rng))}; of the parts in contact, "
+        f"{100 * own.network_slipping.mean():.0f} % of the answer's and {100 * own.reading_slipping.mean():.0f} % of "
+        "the best reading's are of slipping markers."
+        for name, own in known.items()
+        if len(np.unique(own.trial)) >= FEWEST_UNITS
+    ]
+
+
+def say_slope(slope: FrictionSlope) -> str:
+    """Say whether the answer follows the margin where friction alone changes, and whether the markers let it."""
+    verdict = "not told from" if not slope.gap.sure else "more than" if slope.gap.estimate > 0 else "less than"
+    return (
+        f"With the forces kept and friction alone changed, the answer on {slope.condition} objects follows the margin "
+        f"with a slope of {_gap(slope.network)}, {verdict} that of the best reading of the markers, "
+        f"{decimals(slope.reading.estimate, 2)}: difference {_gap(slope.gap)}."
+    )
+
+
+def say_kinds(table: ExplainedErrors, silhouette: float | None) -> str:
+    """Say how many kinds of explanations there are, whether they are distinct, and which has the largest error."""
+    if silhouette is None:
+        return "The explanations are too few to be sorted into kinds."
+    kinds = [table.where(table.cluster == kind) for kind in np.unique(table.cluster)]
+    distinct = "distinct" if silhouette >= _DISTINCT else "hardly distinct: they shade into one another"
+    first, last = (f"({_frames(own)}) is {_off(own)} percentage points" for own in (kinds[0], kinds[-1]))
+    return (
+        f"Explanations fall into {len(kinds)} kinds (silhouette {decimals(silhouette, 2)}, {distinct}). That of the "
+        f"largest error {first}, that of the smallest {last}."
+    )

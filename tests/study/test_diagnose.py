@@ -1,0 +1,253 @@
+"""Where a network fails: planted faults, planted kinds of explanations, and answers whose slope is known."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_line import run
+from torch import Tensor, nn
+
+import sliplens as sl
+from sliplens.errors import InputError
+from sliplens.files import output_folder
+from sliplens.models import Manifest, Run
+from sliplens.recordings import Dataset, load_dataset
+from sliplens.results.diagnosis import ErrorTable, FrictionTable
+from sliplens.simulation import SimulationRecipe, simulate_dataset
+from sliplens.study import diagnose as diagnosing
+from sliplens.study.diagnose import (
+    cluster_explanations,
+    compare_errors,
+    find_slices,
+    friction_slopes,
+    hold_against,
+    hold_out,
+    say_errors,
+    say_kinds,
+    say_slices,
+    say_slope,
+)
+
+TRIALS, FRAMES = 40, 12
+
+
+def table_of_errors(rng: np.random.Generator, **columns: np.ndarray) -> ErrorTable:
+    """Half of the trials wet, friction and force drawn apart, errors of 0.05 either way."""
+    count, trial = TRIALS * FRAMES, np.repeat(np.arange(TRIALS), FRAMES)
+    margin = rng.random(count)
+    made = {
+        "trial": np.array([f"trial-{one:02d}" for one in trial]),
+        "condition": np.where(trial % 2 == 0, "dry", "wet"),
+        "sensor": np.full(count, "one"),
+        "day": trial // 5 % 4 + 1,
+        "frame": np.tile(np.arange(FRAMES), TRIALS),
+        "safety_margin": margin,
+        "prediction": margin + rng.normal(0, 0.05, count),
+        # two in five trials slippery, and none near the border
+        "friction": np.where(trial % 5 < 2, 0.3, 0.9) + np.repeat(rng.uniform(-0.1, 0.1, TRIALS), FRAMES),
+        "normal_force_n": rng.uniform(0.5, 2.0, count),
+        "contact_x": rng.uniform(0.4, 0.6, count),
+        "contact_y": np.full(count, np.nan),
+        "slice": np.full(count, -1),
+    }
+    return ErrorTable(**{**made, **columns})
+
+
+@pytest.fixture
+def errors(rng) -> ErrorTable:
+    return table_of_errors(rng)
+
+
+def test_a_fault_of_all_trials_is_found_and_one_of_the_training_half_is_not(errors):
+    slippery = errors.friction < 0.5
+    held = hold_out(errors, seed=3)
+    # each half has trials of each condition
+    assert {name: held[errors.condition == name].mean() for name in ("dry", "wet")} == {"dry": 0.5, "wet": 0.5}
+    everywhere = replace(errors, prediction=errors.prediction + 0.4 * slippery)
+    slices, found = find_slices(everywhere, seed=3)
+    bad = [at for at, one in enumerate(slices) if one.holds]
+    assert bad
+    assert slices[0].holds
+    assert all("friction up to" in slices[at].name for at in bad)
+    np.testing.assert_array_equal(np.isin(found.slice, bad), slippery)
+    assert slices[0].bias == pytest.approx(0.4, abs=0.05)
+    assert slices[0].name in say_slices(slices)
+
+    once = replace(errors, prediction=errors.prediction + 0.4 * (slippery & ~held))
+    slices, found = find_slices(once, seed=3)
+    assert "friction up to" in slices[int(found.slice[slippery][0])].name  # the tree has learned it
+    assert not any(one.holds for one in slices)
+    assert say_slices(slices).startswith("No slice")
+
+
+def test_slices_are_named_for_what_their_frames_have_in_common(errors, rng):
+    wet = replace(errors, prediction=errors.prediction + 0.5 * (errors.condition == "wet"))
+    slices, found = find_slices(wet, seed=0)
+    for at, one in enumerate(slices):
+        own = found.where(found.slice == at)
+        assert one.name.startswith(f"{own.condition[0]} objects")
+        assert len(set(own.condition.tolist())) == 1
+        # what is not known of all frames, or is the same in all, tells nothing
+        assert "top" not in one.name
+        assert "sensor" not in one.name
+    assert "Wet less dry: +4" in say_errors(wet, rng)
+    tested = found.where(hold_out(found, seed=0) & (found.slice == 0))
+    assert (slices[0].frames, slices[0].error) == (len(tested), pytest.approx(np.abs(tested.error).mean()))
+
+
+def test_a_group_is_compared_with_the_rest_as_trials_drawn_again_do(errors, rng):
+    inside = errors.friction < 0.5
+    planted = replace(errors, prediction=errors.prediction + np.repeat(rng.normal(0, 0.1, TRIALS), FRAMES) * inside)
+    gap, sizes = compare_errors(planted, inside, rng), np.abs(planted.error)
+    assert gap.estimate == pytest.approx(sizes[inside].mean() - sizes[~inside].mean())
+    # one day alone: else the interval is over days
+    gap = compare_errors(replace(planted, day=np.ones(len(planted), dtype=np.int64)), inside, rng)
+    drawn = []
+    for _ in range(1000):
+        rows = np.concatenate([at * FRAMES + np.arange(FRAMES) for at in rng.integers(0, TRIALS, TRIALS)])
+        drawn.append(sizes[rows][inside[rows]].mean() - sizes[rows][~inside[rows]].mean())
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    # two ways to draw: alike within a fourth of their width
+    assert (gap.low, gap.high) == pytest.approx((low, high), abs=0.25 * (high - low))
+    assert compare_errors(errors, np.ones(len(errors), dtype=bool), rng).estimate == 0
+
+
+def test_kinds_of_explanations_are_recovered_whatever_their_size(rng):
+    patterns = np.eye(3, 12) - np.eye(3, 12, k=5)
+    planted = rng.permutation(np.repeat(np.arange(3), 8))
+    rows = (patterns[planted] + rng.normal(0, 0.02, (24, 12))) * rng.uniform(0.1, 10, (24, 1))
+    sizes = np.array([0.1, 0.3, 0.2])[planted]
+    kinds, examples, silhouette = cluster_explanations(rows, sizes, seed=0)
+    # the largest error first
+    np.testing.assert_array_equal(kinds, np.array([2, 0, 1])[planted])
+    assert silhouette is not None
+    assert silhouette > 0.8
+    assert kinds[examples].tolist() == [0, 0, 1, 1, 2, 2]
+    assert cluster_explanations(np.ones((4, 3)), sizes[:4], seed=0)[2] is None
+
+
+def test_contributions_are_held_against_those_of_the_best_reading():
+    state = np.array([1, 1, 2, 0])
+    values = np.array([0.3, -0.1, 0.4, 5.0])
+    same = hold_against(values, values, state)
+    assert same.agreement == pytest.approx(1)
+    assert same.network_slipping == same.reading_slipping == pytest.approx(0.4 / 0.8)
+    # signed: what works the other way round disagrees
+    assert hold_against(-values, values, state).agreement == pytest.approx(-1)
+
+
+def frictions(slope: float, best: float, *, trials: int = 12) -> FrictionTable:
+    """Frames of trials whose answers lie on lines, at other margins in each."""
+    margins = np.concatenate([np.array([0.6, 0.2, 0.4]) + 0.01 * trial for trial in range(trials)])
+    trial = np.repeat(np.arange(trials), 3)
+    return FrictionTable(
+        frame_id=np.array([f"frame-{one}" for one in trial]),
+        trial=np.array([f"trial-{one}" for one in trial]),
+        condition=np.full(len(trial), "wet"),
+        day=np.ones(len(trial), dtype=np.int64),
+        friction=0.5 / (1 - margins),
+        safety_margin=margins,
+        prediction=0.1 * np.sin(trial) + slope * margins + 1e-3 * np.cos(7 * margins),
+        reading_slope=np.full(len(trial), best),
+    )
+
+
+@pytest.mark.parametrize(
+    ("slope", "best", "verdict"), [(0.1, 0.4, "less than"), (0.6, 0.4, "more than"), (0.4, 0.4, "not told from")]
+)
+def test_a_slope_is_that_of_the_line_the_answers_lie_on(slope, best, verdict, rng):
+    (found,) = friction_slopes(frictions(slope, best), rng)
+    # the ripple that keeps the lines apart has a slope of 0.007 at most
+    assert found.network.estimate == pytest.approx(slope, abs=0.007)
+    assert found.reading.estimate == pytest.approx(best)
+    assert found.gap.estimate == pytest.approx(found.network.estimate - best)
+    if slope == best:
+        found = replace(found, gap=replace(found.gap, low=-0.01, high=0.01))
+    sentence = say_slope(found)
+    assert f"{verdict} that of the best reading" in sentence
+    assert f"{found.network.estimate:+.2f}" in sentence
+
+
+class Brightness(nn.Module):
+    """Sum of the input with a weight for each pixel: contributions add up exactly."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        across = torch.linspace(0, 1e-3, 56)
+        self.weight = nn.Parameter(across.expand(1, 3, 56, 56).clone())
+
+    def forward(self, images: Tensor) -> Tensor:
+        return (images * self.weight).sum(dim=(1, 2, 3))[:, None]
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory) -> tuple[Run, Dataset]:
+    recipe = SimulationRecipe(dry_trials=3, wet_trials=0, frames_per_trial=20, seed=6)
+    folder = tmp_path_factory.mktemp("simulated") / "data"
+    with output_folder(folder, stage="simulate", config={"recipe": recipe}) as out:
+        simulate_dataset(out.folder, recipe)
+    manifest = Manifest(
+        backbone="none", input="amplitude", image_size=56, frame_size=(224, 224), sensor="chromatouch",
+        data_hash="none", weights_sha256="of these weights",
+    )  # fmt: skip
+    return Run(model=Brightness().eval(), manifest=manifest), load_dataset(folder)
+
+
+def test_simulated_frames_are_explained_and_filmed_anew(simulated, tmp_path, monkeypatch):
+    network, data = simulated
+    monkeypatch.setattr(diagnosing, "LEVELS", (0.5,))
+    found = sl.diagnose(network, data, tmp_path, trials=1)
+    assert found.left_out == ""
+    assert np.isfinite(found.explained.agreement).all()
+    for own in found.frictions.groups("frame_id").values():
+        # the forces stay: 1 - margin is inverse to the friction
+        np.testing.assert_allclose((1 - own.safety_margin) * own.friction, (1 - own.safety_margin[0]) * own.friction[0])
+        # among them is the frame as it was, with the answer that it had
+        trial, frame = own.frame_id[0].rsplit("-f", 1)
+        rows = (found.errors.trial == trial) & (found.errors.frame == int(frame))
+        at = np.abs(own.safety_margin - found.errors.safety_margin[rows]).argmin()
+        assert own.prediction[at] == pytest.approx(found.errors.prediction[rows][0], abs=1e-6)
+    assert len(found.other_frictions) == (found.frictions.frame_id == found.shown_frame).sum()
+    # the middle of the contact, as the labels' map has it
+    recording = data.load(data.find(str(found.errors.trial[0])))
+    assert recording.truth is not None
+    rows, columns = np.nonzero(recording.truth.contact_map[found.errors.frame[0]])
+    assert found.errors.contact_x[0] == pytest.approx((columns.mean() + 0.5) / 224)
+    assert found.errors.contact_y[0] == pytest.approx((rows.mean() + 0.5) / 224)
+    # kept: the same call reads it
+    monkeypatch.setattr(diagnosing, "find_contributions", None)
+    assert sl.diagnose(network, data, tmp_path, trials=1).sentences == found.sentences
+    page = sl.write_report(tmp_path).page.read_text(encoding="utf-8")
+    assert "Where the network fails" in page
+    assert "friction alone" in page
+
+
+def test_recordings_say_what_is_left_out(difference_run: Path, fine_dataset: Dataset, tmp_path):
+    found = sl.diagnose(difference_run, fine_dataset, tmp_path, trials=2)
+    assert "known of simulated frames alone" in found.left_out
+    assert len(found.frictions) == len(found.slopes) == len(found.other_frictions) == 0
+    assert np.isnan(found.explained.agreement).all()
+    # but errors and kinds are told: of each condition the trials that were asked for, three frames each
+    assert len(found.explained) == 3 * (2 + 1)
+    assert (found.explained.example >= 0).sum() == len(found.pictures) == len(found.maps)
+    assert found.sentences[-1] == say_kinds(found.explained, None) or "kinds (silhouette" in found.sentences[-1]
+    assert found.left_out.rstrip(".") in sl.write_report(tmp_path).page.read_text(encoding="utf-8")
+
+
+def test_what_is_missing_or_impossible_is_refused(difference_run, fine_dataset, monkeypatch):
+    with pytest.raises(InputError, match="--trials must be at least 1"):
+        sl.diagnose(difference_run, fine_dataset, trials=0)
+    monkeypatch.setitem(sys.modules, "sklearn", None)
+    with pytest.raises(InputError, match=r'needs sklearn, which is not installed; .*"sliplens\[diagnose\]"'):
+        sl.diagnose(difference_run, fine_dataset)
+
+
+def test_the_command_says_what_was_found_and_draws_the_page(difference_run, fine_dataset, tmp_path, capsys):
+    assert run("diagnose", difference_run, fine_dataset.folder, "-o", tmp_path / "runs", "--trials", 1) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "the answer is off by" in said
+    assert "is left out" in said
+    assert (tmp_path / "runs" / "report.html").is_file()
