@@ -159,7 +159,7 @@ def inputs_in_order(names: Iterable[str]) -> list[str]:
 
 def methods_in_order(names: Iterable[str]) -> list[str]:
     """Methods as in the thesis, the controls last."""
-    order = [*METHOD_NAMES, *(name + NEW_WEIGHTS for name in METHOD_NAMES), *CONTROLS]
+    order = [*METHOD_NAMES, *(name + NEW_WEIGHTS for name in METHOD_NAMES)]
     return sorted(in_order(set(names), order), key=is_control)
 
 

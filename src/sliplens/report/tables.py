@@ -250,7 +250,9 @@ def table_leads(faithful: RemovalScores) -> Table:
     def tell(lead: Lead | None) -> Cell | str:
         if lead is None:
             return UNKNOWN
-        return _best(f"{tell_interval(lead.gap)}, {lead.control}", lead.shows_something)
+        return _best(
+            f"{tell_interval(lead.gap)}, {method_name(lead.control).removesuffix(' (control)')}", lead.shows_something
+        )
 
     return make_table(
         f"{input_name(faithful.input)}: symmetric relevance gain of each method less that of the strongest map that "
@@ -429,24 +431,34 @@ def table_localisation(truth: Truth) -> Table:
     """Tabulate where relevance lies, and how well maps rank the markers."""
     names = [*methods_in_order(set(truth.methods) - set(_TRUTHS)), *(one for one in _TRUTHS if one in truth.methods)]
     heads = [f"{what}, {_REGION_NAMES[region]}" for what in ("Mass", "Strongest") for region in REGIONS]
-    nothing = ("A map that knows nothing", *(percent(truth.areas[region]) for region in REGIONS * 2), *3 * ["0"])
+    nothing = ("A map that knows nothing", *(percent(truth.areas[region]) for region in REGIONS * 2), *4 * ["0"])
     return make_table(
         f"{input_name(truth.input)}, {truth.frames} simulated frames: share of the relevance, and of the strongest "
         "pixels, in three regions; and Spearman's correlation, signed, of the map's mean on each marker with its "
         "Shapley value in the network's answer, with what putting it back alone changes there, and with the same of "
         "the best reading of the margin (95 % interval over "
-        f"{tell_over(one.shapley for one in truth.methods.values())}). {_tell_surety(truth)}",
-        ("Method", *heads, "With Shapley values", "With markers put back alone", "With the best reading"),
+        f"{tell_over(one.shapley for one in truth.methods.values())}). Lead: the first of these less that of the "
+        "strongest map that knows nothing of what the network learned; a method whose lead is not above zero for sure "
+        f"has shown nothing about this network. {_tell_surety(truth)}",
+        (
+            "Method",
+            *heads,
+            "With Shapley values",
+            "Lead over controls",
+            "With markers put back alone",
+            "With the best reading",
+        ),
         [
             *(
                 (
                     # here it is a map, not an order
                     "Random map (control)" if name == CONTROL else method_name(name),
                     *(percent(shares[region]) for shares in (found.mass, found.rank) for region in REGIONS),
-                    *(_interval(gap) for gap in (found.shapley, found.network, found.margin)),
+                    *(_interval(gap) for gap in (found.shapley, lead and lead.gap, found.network, found.margin)),
                 )
                 for name in names
                 for found in [truth.methods[name]]
+                for lead in [found.lead_over_controls]
             ),
             nothing,
         ],

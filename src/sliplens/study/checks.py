@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, product
@@ -13,6 +14,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
 from sliplens.codec import keep_part
+from sliplens.errors import ModelError
 from sliplens.explainers import Explainer, Explanation, IntegratedGradients, PolyCam
 from sliplens.explainers.shapley import Shapley
 from sliplens.faithfulness.controls import (
@@ -281,7 +283,9 @@ def explain_untrained(
 
     def explain(number: int, frames: list[int], on_frame: OnProgress | None) -> _TrialMaps:
         model = _untrained(material.trained.model, inputs, seed=seed + _SEEDS_APART * number)
-        maps = {"weights-1": list(even_channels(model, inputs[frames], references[frames]).cpu().numpy())}
+        maps: dict[str, list[np.ndarray]] = {}
+        with suppress(ModelError):  # without layers that have a map
+            maps["weights-1"] = list(even_channels(model, inputs[frames], references[frames]).cpu().numpy())
         for name, frame in counted(list(product(material.explainers, frames)), on_frame):
             one, empty = inputs[frame, None], references[frame, None]
             found = _influence(controls[name](model, one, reference=empty))
