@@ -1,7 +1,10 @@
 """What a network that was trained on simulated touch alone reads from real difference images.
 
 The network that comes with the package by default; the images are those of `SLIPLENS_REFERENCE`, or of any folder whose
-files are named as `image_433_20.png`, with the safety margin in percent at the end.
+files are named as `image_433_20.png`, with the safety margin in percent at the end. Five frames of one trial say
+little, the less as the simulator was fitted to them: so each answer is told with its interval, the error also where the
+frames are moved a little (2 px, 2 degrees and 3 % of their size at most, drawn evenly), and with `--refit` what the
+simulator's markers do in a frame that its fit has not seen. Nothing is to be chosen by these figures.
 """
 
 import argparse
@@ -12,7 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from torch.nn import functional
 
+from realism.refit import leave_one_out
 from sliplens.errors import SliplensError
 from sliplens.models.checkpoint import load
 from sliplens.study import frames_from_folder
@@ -21,16 +27,40 @@ NETWORK = "chromatouch-difference"
 FRAMES = Path(os.environ.get("SLIPLENS_REFERENCE", "../shared/reference")) / "chromatouch" / "difference"
 
 
-def read_real_frames(run: Path, frames: Path) -> dict[str, Any]:
+NOTE = "n = 1 trial, simulator fitted to these frames"
+SHIFT_PX, TURN_DEG, SCALE = 2.0, 2.0, 0.03
+
+
+def jitter(images: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
+    """Images (batch, 3, size, size), each moved, turned and scaled a little; black where nothing was seen."""
+    count, size = len(images), images.shape[-1]
+    turn, scale = np.radians(rng.uniform(-TURN_DEG, TURN_DEG, count)), rng.uniform(1 - SCALE, 1 + SCALE, count)
+    shift = rng.uniform(-SHIFT_PX, SHIFT_PX, (2, count)) * 2 / 224
+    along, across = np.cos(turn) / scale, np.sin(turn) / scale
+    rows = [[along, -across, shift[0]], [across, along, shift[1]]]
+    grid = functional.affine_grid(
+        torch.from_numpy(np.array(rows)).permute(2, 0, 1).float(), [count, 3, size, size], align_corners=False
+    )
+    return functional.grid_sample(images, grid, align_corners=False).clamp(0, 1)
+
+
+def read_real_frames(run: Path, frames: Path, *, draws: int = 40) -> dict[str, Any]:
     """Answers of a network to real frames, their mean absolute error, and whether their order is right."""
     trained = load(run)
     chosen = frames_from_folder(trained, frames, labels_in_names=True)
-    estimate = trained.estimate(trained.encoding.normalise(chosen.images))
+    inputs = trained.encoding.normalise(chosen.images)
+    estimate = trained.estimate(inputs)
     labels = chosen.safety_margin.astype(np.float64)
     # of frames with one label none need come first
     pairs = [(one, other) for one in range(len(labels)) for other in range(len(labels)) if labels[one] > labels[other]]
+    rng = np.random.default_rng(0)
+    moved = np.stack([trained.estimate(jitter(inputs, rng)).margin for _ in range(draws)])
+    off = np.abs(moved - labels).mean(axis=1)
     told: dict[str, Any] = {
+        "note": NOTE,
         "mae": float(np.abs(estimate.margin - labels).mean()),
+        "jittered_mae": {"mean": float(off.mean()), "sd": float(off.std(ddof=1)), "draws": draws},
+        "jittered_sd": dict(zip(chosen.ids, moved.std(axis=0, ddof=1).round(4).tolist(), strict=True)),
         "order_right": all(estimate.margin[one] > estimate.margin[other] for one, other in pairs),
         "predictions": {
             name: round(float(margin), 4) for name, margin in zip(chosen.ids, estimate.margin, strict=True)
@@ -39,6 +69,8 @@ def read_real_frames(run: Path, frames: Path) -> dict[str, Any]:
     }
     interval = estimate.interval(0.9) if estimate.calibration else None
     if interval is not None:
+        low, high = (np.round(ends, 4).tolist() for ends in interval)
+        told["intervals_90"] = dict(zip(chosen.ids, zip(low, high, strict=True), strict=True))
         told["within_90"] = float(np.mean((labels >= interval[0]) & (labels <= interval[1])))
     return told
 
@@ -48,18 +80,30 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--run", type=Path, default=Path(NETWORK), help="a trained network, or one of the package")
     parser.add_argument("--frames", type=Path, default=FRAMES, help="folder of images whose names end in _GG.png")
+    parser.add_argument("--refit", action="store_true", help="fit the simulator's markers anew, a frame left out each")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     try:
         told = read_real_frames(options.run, options.frames)
+        if options.refit:
+            told["left_out"] = leave_one_out(options.frames.parent)
     except SliplensError as error:
         sys.exit(f"{Path(__file__).name}: {error}")
     if options.json:
         print(json.dumps(told))
         return
+    print(told["note"])
     for name, margin in told["predictions"].items():
-        print(f"{name:24} true {100 * told['labels'][name]:4.0f} %   read {100 * margin:6.1f} %")
+        low, high = told.get("intervals_90", {}).get(name, (np.nan, np.nan))
+        spread = 100 * told["jittered_sd"][name]
+        print(
+            f"{name:24} true {100 * told['labels'][name]:4.0f} %   read {100 * margin:6.1f} %   "
+            f"90 % interval {100 * low:.0f} to {100 * high:.0f} %   under jitter +- {spread:.1f}"
+        )
     print(f"mean absolute error {told['mae']:.3f}, order {'right' if told['order_right'] else 'wrong'}")
+    print(f"under jitter {told['jittered_mae']['mean']:.3f} +- {told['jittered_mae']['sd']:.3f}")
+    for margin, fit in told.get("left_out", {}).items():
+        print(f"markers at {margin}: {fit['left_out_px']:.2f} px left out, {fit['fitted_px']:.2f} px fitted")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,8 @@ from scipy.stats import spearmanr
 
 import sliplens
 from sliplens.errors import InputError
+from sliplens.faithfulness.controls import cascade
+from sliplens.models import Run
 from sliplens.models.checkpoint import find_run, shipped_names
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 from sliplens.study import frames_from_folder
@@ -30,12 +32,24 @@ def test_every_network_of_the_package_loads_and_says_what_it_learned_from(name: 
 @pytest.mark.parametrize("name", shipped_names())
 def test_it_reads_a_simulated_grip_in_the_right_order(name: str):
     trained = sliplens.load(name)
-    plan = plan_trials(replace(PRESETS["small"], seed=77))[0]  # a day and a sensor it never saw
-    trial = simulate_trial(plan)
-    margins = trained.predict(trained.encode(trial.frames[trial.labelled], trial.reference)).numpy()
+    # another series and seed than its training's: a day and a sensor it never saw
+    trial = simulate_trial(plan_trials(replace(PRESETS["small"], seed=77, frames_per_trial=30))[0])
+    inputs = trained.encode(trial.frames[trial.labelled], trial.reference)
     labels = trial.safety_margin[trial.labelled]
-    ranked = float(np.asarray(spearmanr(labels, margins))[0])
+
+    def judge(network: Run) -> tuple[float, float]:
+        margins = network.predict(inputs).numpy()
+        return float(np.asarray(spearmanr(labels, margins))[0]), float(np.mean((margins - labels) ** 2) / labels.var())
+
+    ranked, error = judge(trained)
     assert ranked > (0.9 if trained.encoding.empty_is_black else 0.3)
+    ((_, drawn_anew),) = cascade(trained.model, seed=0, stages=1, images=inputs[::4])
+    of_chance, error_of_chance = judge(replace(trained, model=drawn_anew))
+    # it is what it learned: the same network with new weights neither ranks the frames so nor errs as little
+    assert ranked > of_chance + 0.2
+    assert error < 0.8 * error_of_chance
+    if trained.encoding.empty_is_black:
+        assert error < 0.5
 
 
 @pytest.mark.real

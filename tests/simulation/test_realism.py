@@ -78,6 +78,9 @@ def test_simulated_markers_move_as_a_fit_free_in_size_and_contrast_says(real, ta
     # the fit starts at the simulated motion; that it does not stay there for want of evidence shows from another start
     elsewhere = fit_crescents(real[1:], table.rest_px, table.displacement_px[labels])
     assert rms((ours - fitted)[seen]) < 0.5
+    # half the markers' mean shear at a margin of 20 % too much would not pass
+    wrong = ours + np.array([0.0, 1.5])
+    assert rms((wrong - fit_crescents(real[1:], table.rest_px, wrong))[seen]) > 1.0
     assert rms((ours - elsewhere)[seen]) < rms((table.displacement_px[labels] - elsewhere)[seen])
 
 
