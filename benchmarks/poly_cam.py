@@ -27,6 +27,7 @@ from torch import Tensor
 from fairness import at_its_best, busy_process
 from sliplens.errors import SliplensError
 from sliplens.explainers import Explanation, PolyCam, capture, find_layers
+from sliplens.explainers.explanation import EXACT, effect_rounding
 from sliplens.explainers.maps import pearson_r, resize, to_masks, top_overlap
 from sliplens.files import machine, versions
 from sliplens.models import Run
@@ -111,6 +112,11 @@ def measure(run: Path, images: Tensor, references: Tensor, *, options: argparse.
                 "exact_s": whole.seconds,
                 "fast_s": quick.seconds,
                 "exact_error": float((whole.saliency - oracle.saliency).abs().max()) if oracle else math.nan,
+                "rounding": effect_rounding(
+                    [level.weights[0] for level in whole.levels],
+                    prediction=float(whole.prediction),
+                    reference_prediction=float(whole.reference_prediction),
+                ),
                 "weight_error": check_effects(whole, effects, change=float(whole.change)),
                 "pearson_r": pearson_r(whole.saliency[0], quick.saliency[0]),
                 "top10_overlap": top_overlap(whole.saliency[0], quick.saliency[0]),
@@ -130,6 +136,13 @@ def measure(run: Path, images: Tensor, references: Tensor, *, options: argparse.
         "exact_speedup": sum(row["loop_s"] for row in rows) / sum(row["exact_s"] for row in rows),
         "fast_speedup": sum(row["loop_s"] for row in rows) / sum(row["fast_s"] for row in rows),
         "exact_max_error": max(row["exact_error"] for row in rows) if options.oracle else None,
+        # without the frames whose effects are as small as rounding, of which the explanation warns
+        "exact_max_error_unwarned": max((row["exact_error"] for row in rows if row["rounding"] <= EXACT), default=None)
+        if options.oracle
+        else None,
+        "exact_error_over_rounding": max(row["exact_error"] / row["rounding"] for row in rows if row["rounding"])
+        if options.oracle
+        else None,
         "exact_max_weight_error": max(row["weight_error"] for row in rows),
         "fast_pearson_r": min(row["pearson_r"] for row in rows),
         "fast_top10_overlap": min(row["top10_overlap"] for row in rows),
@@ -187,6 +200,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             ("exact_speedup", min),
             ("exact_speedup_beside_busy", min),
             ("exact_max_error", max),
+            ("exact_max_error_unwarned", max),
+            ("exact_error_over_rounding", max),
             ("fast_speedup", min),
             ("fast_pearson_r", min),
             ("fast_top10_overlap", min),
