@@ -314,7 +314,7 @@ def test_the_claims_of_the_thesis_are_counted_by_outcome(judged, tmp_path, rng):
     assert found.text.startswith("Of the thesis's 5 claims ")
     assert f"{counted.count({'holds'})} hold" in found.text
     assert f"{counted.count({'does not hold'})} do not hold" in found.text
-    assert "Do not hold: Poly-CAM is the most faithful of the three methods" in found.text
+    assert "These do not hold: Poly-CAM is the most faithful of the three methods" in found.text
     assert "Poly-CAM, is not borne out on raw images: Poly-CAM leads it, as the thesis ran it, by +0.50" in found.text
     assert "The thesis's claims" not in {one.topic for one in judge(results, rng=rng)}
 

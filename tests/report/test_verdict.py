@@ -7,7 +7,7 @@ import pytest
 
 from sliplens.explainers.explanation import check_slopes
 from sliplens.report import load_results
-from sliplens.report.verdict import count_alarms, group_alarms, judge
+from sliplens.report.verdict import Statement, count_alarms, group_alarms, judge
 
 
 def test_what_carries_comes_before_what_warns(verdict):
@@ -198,3 +198,9 @@ def test_the_reduced_image_is_told(verdict):
     text = verdict()["What this run is"].text
 
     assert "images of 24 px, shrunk from the camera's 224 x 224 (the thesis: 224 px)" in text
+
+
+def test_a_statement_begins_with_its_finding():
+    parts = Statement(topic="", text="Believe it: its lead is +0.10. Found over one day.").parts
+    assert parts == ("Believe it:", "its lead is +0.10. Found over one day.")
+    assert Statement(topic="", text="MSE is 0.01 less. So be it.").parts == ("MSE is 0.01 less.", "So be it.")

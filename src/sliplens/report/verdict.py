@@ -52,6 +52,12 @@ class Statement:
     text: str
     tone: Tone = "plain"
 
+    @property
+    def parts(self) -> tuple[str, str]:
+        """The first sentence, which carries the finding, and the others."""
+        first, _, others = re.sub(r"(?<=[.:]) ", "\n", self.text, count=1).partition("\n")
+        return first, others
+
 
 def judge(results: Results, *, claims: Sequence[Claim] = (), rng: np.random.Generator) -> tuple[Statement, ...]:
     """State what the results show: which explanation to look at, which claims of the thesis hold, who reads how well.
@@ -165,8 +171,8 @@ def _tell_recommended(topic: str, best: Recommended, truth: Truth, faithful: Rem
     )
     if standing is not None and standing.tested:
         text += (
-            f" By removal, too, it was tried: it beats every control under {len(standing.beaten)} of "
-            f"{len(standing.tested)} fills that can tell."
+            f" By removal it beats every control under {len(standing.beaten)} of {len(standing.tested)} fills that "
+            "can tell."
         )
     other = "its lead is not off zero" if best.shown else "one method leads every other and every control for sure"
     text += _tell_limits(
@@ -200,11 +206,7 @@ def _tell_claims(claims: Sequence[Claim], results: Results) -> list[Statement]:
     }
     counts = [f"{len(titles)} {'hold' if kind == 'hold' else kind}" for kind, titles in kinds.items() if titles]
     text = f"Of the thesis's {len(claims)} claims {listed(counts)}."
-    text += "".join(
-        f" {_sentence(kind.removeprefix('are '))[:-1]}: {'; '.join(titles)}."
-        for kind, titles in kinds.items()
-        if titles
-    )
+    text += "".join(f" These {kind}: {'; '.join(titles)}." for kind, titles in kinds.items() if titles)
     for name in inputs_in_order(results.study.truth)[::-1]:
         best = recommend(results.study.truth[name])
         gap = None if best is None else best.found.lead_over_methods.get(POLY_CAM)
@@ -217,6 +219,8 @@ def _tell_claims(claims: Sequence[Claim], results: Results) -> list[Statement]:
         " Tested with its methods as published, on networks and data of our own: its network and most of its data are "
         "not here, so that a claim may fail for those reasons too."
     )
+    if results.study.choice is not None:
+        text += f" {tell_sample(results.study.choice)}"
     return [Statement(topic="The thesis's claims", text=text)]
 
 
