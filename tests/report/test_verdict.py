@@ -92,7 +92,7 @@ def test_a_clear_winner_is_named(workspace, verdict):
 
     assert found.tone == "good"
     assert "On dry objects difference images have the lower error" in found.text
-    assert "holds when the 6 test trials are resampled" in found.text
+    assert "holds beyond the 95 % interval over 6 trials, one day, one network" in found.text
 
 
 def test_a_lead_that_can_be_chance_is_called_so(workspace, verdict, rng):

@@ -269,9 +269,9 @@ def _winners(results: Results, *, rng: np.random.Generator) -> list[Statement]:
         elif gap.units < FEWEST_UNITS:
             text += f" With {gap.units} test trials, that can be chance."
         elif sure:
-            text += f" That holds when the {gap.units} test trials are resampled."
+            text += f" That holds beyond the 95 % interval over {gap.over}."
         else:
-            text += f" Resampling the {gap.units} test trials does not rule out chance."
+            text += f" The 95 % interval over {gap.over} does not rule out chance."
         tone: Tone = "good" if sure else "caution"
         statements.append(Statement(topic=f"Raw or difference, {condition}", text=text, tone=tone))
     if statements:
