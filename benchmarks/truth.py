@@ -1,7 +1,8 @@
 """Do maps rank the markers as the simulator knows they count? Signed, against Shapley values and single effects.
 
 Frames of simulated trials whose seed no preset and no study has; both networks of the package unless `--network` names
-others. `|x - b|` knows no network. `--json` ends with one line of JSON.
+others. Beside the methods stand the controls of a study, which know nothing of what the network learned. `--json` ends
+with one line of JSON.
 """
 
 import argparse
@@ -16,14 +17,15 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # must be set before torch 
 
 import numpy as np
 
-from sliplens.faithfulness.controls import control_maps
 from sliplens.intervals import Difference
 from sliplens.models.checkpoint import load
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.results.study import Truth
 from sliplens.simulation import simulate
+from sliplens.study.checks import explain_untrained
+from sliplens.study.curves import influences
 from sliplens.study.explaining import explain_frames, frames_at, nearest_frame, network_inputs
-from sliplens.study.material import study_explainers
+from sliplens.study.material import Material, study_explainers
 from sliplens.study.truth import TRUTH_PAIRS, judge_by_truth
 
 NETWORKS = ("chromatouch-difference", "chromatouch-raw")
@@ -41,8 +43,16 @@ def judge(network: str, data: Dataset, args: argparse.Namespace) -> Truth:
     chosen = frames_at(run, data, rows)
     explainers = study_explainers(METHODS, budget=0.15)
     explained = explain_frames(run, chosen, methods=METHODS, explainers=explainers)
-    maps = control_maps(run.model, network_inputs(run, explained), chosen.references.to(run.device))
-    maps |= {name: own * explained.towards[:, None, None] for name, own in explained.relevance.items()}
+    material = Material(
+        trained=run,
+        explained=explained,
+        inputs=network_inputs(run, explained),
+        references=chosen.references.to(run.device),
+        chosen=(),
+        markers={},
+        explainers=explainers,
+    )
+    maps = influences(material) | explain_untrained(material).maps
     return judge_by_truth(run, explained, data, maps=maps, fills=("reference", "blur", "grey"), pairs=args.pairs)
 
 
@@ -57,7 +67,9 @@ def report(network: str, truth: Truth) -> dict[str, Any]:
     for name, found in sorted(
         truth.methods.items(), key=lambda one: -one[1].shapley.estimate if one[1].shapley else 0.0
     ):
-        print(f"  {name:22} Shapley {told(found.shapley)}, single {told(found.network)}, margin {told(found.margin)}")
+        print(f"  {name:30} Shapley {told(found.shapley)}, single {told(found.network)}, margin {told(found.margin)}")
+        if found.lead_over_controls is not None:
+            print(f"  {'':30} lead over {found.lead_over_controls.control} {told(found.lead_over_controls.gap)}")
     for test in truth.meta:
         for counted, own in (("along", test), ("by size", test.by_size)):
             gains = f"truth {own.oracle:+.3f}, damaged {own.degraded:+.3f}, |x - b| {own.changed:+.3f}"
@@ -67,6 +79,9 @@ def report(network: str, truth: Truth) -> dict[str, Any]:
     towards = np.sign([sums[frame] for frame in effects.frame_id])
     return {
         "spearman": {name: found.shapley and asdict(found.shapley) for name, found in truth.methods.items()},
+        "lead_over_controls": {
+            name: asdict(lead.gap) for name, found in truth.methods.items() if (lead := found.lead_over_controls)
+        },
         "spearman_single": {name: found.network and asdict(found.network) for name, found in truth.methods.items()},
         "reliability": truth.reliability and asdict(truth.reliability),
         "sums": truth.sums,
