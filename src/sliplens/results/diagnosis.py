@@ -7,19 +7,14 @@ from jaxtyping import Float32, Float64, Int64, Shaped, UInt8
 
 from sliplens.codec import Columns
 from sliplens.intervals import FEWEST_UNITS, Difference
+from sliplens.results.evaluation import Predictions
 
 
 @dataclass(frozen=True, kw_only=True)
-class ErrorTable(Columns):
-    """Label and answer of frames in margin units, and what may have made the answer wrong; NaN where not known."""
+class ErrorTable(Predictions):
+    """Label and answer of frames, and what may have made the answer wrong; NaN where not known."""
 
-    trial: Shaped[np.ndarray, " frames"]
-    condition: Shaped[np.ndarray, " frames"]
     sensor: Shaped[np.ndarray, " frames"]
-    day: Int64[np.ndarray, " frames"]
-    frame: Int64[np.ndarray, " frames"]
-    safety_margin: Float64[np.ndarray, " frames"]
-    prediction: Float64[np.ndarray, " frames"]
     friction: Float64[np.ndarray, " frames"]
     """Coefficient of friction that holds."""
     normal_force_n: Float64[np.ndarray, " frames"]

@@ -54,8 +54,6 @@ _KINDS, _EXAMPLES, _BLOCKS = 6, 2, 8
 _DISTINCT = 0.25
 """Silhouette below which Kaufman and Rousseeuw (*Finding Groups in Data*, 1990) find no structure."""
 _LOOKED = ("agreement", "network_slipping", "reading_slipping")
-_ANSWERED = ("trial", "condition", "day", "frame", "safety_margin", "prediction")
-"""What answers already have of an `ErrorTable`."""
 
 
 def diagnose(
@@ -179,7 +177,7 @@ def tabulate_errors(data: Dataset, answers: Predictions, *, on_progress: OnProgr
             along = [touching.sum(axis=axis) for axis in (1, 2)]
             places = [one @ (np.arange(one.shape[1]) + 0.5) / one.shape[1] / pixels for one in along]
         table = ErrorTable(
-            **{name: getattr(own, name) for name in _ANSWERED},
+            **vars(own),
             sensor=np.repeat(info.sensor, len(own)),
             friction=recording.friction_coefficient[own.frame].astype(np.float64),
             normal_force_n=recording.normal_force_n[own.frame].astype(np.float64),
