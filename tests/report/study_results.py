@@ -499,7 +499,6 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
         "oracle": 0.3,
         "degraded": 0.2,
         "changed": 0.1,
-        "random": 0.0,
         "gap": interval(0.1, made.trials),
     }
     return write_run(

@@ -439,7 +439,7 @@ def table_localisation(truth: Truth) -> Table:
         "the best reading of the margin (95 % interval over "
         f"{tell_over(one.shapley for one in truth.methods.values())}). Lead: the first of these less that of the "
         "strongest map that knows nothing of what the network learned; a method whose lead is not above zero for sure "
-        f"has shown nothing about this network. {_tell_surety(truth)}",
+        "has shown nothing about this network.",
         (
             "Method",
             *heads,
@@ -462,16 +462,6 @@ def table_localisation(truth: Truth) -> Table:
             ),
             nothing,
         ],
-    )
-
-
-def _tell_surety(truth: Truth) -> str:
-    """Say how sure the Shapley values are, and what both truths add up to."""
-    surety = "" if truth.reliability is None else f" (reliability {tell_interval(truth.reliability, digits=2)})"
-    sums = [decimals(truth.sums[name], 2) for name in ("shapley", "network")]
-    return (
-        f"Shapley values rest on {truth.pairs} pairs of scenes a frame{surety} and add up to {sums[0]} times the "
-        f"answer's change; the markers' effects one at a time to {sums[1]} times."
     )
 
 

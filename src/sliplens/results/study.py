@@ -287,13 +287,12 @@ class Localisation:
 
 @dataclass(frozen=True, kw_only=True)
 class OracleTest:
-    """How much a gain tells a perfect map from a damaged one and from chance, over frames."""
+    """How much a gain tells a perfect map from a damaged one, over frames."""
 
     oracle: float
     degraded: float
     changed: float
     """Gain of |x - b|, how much each marker's pixels changed, which knows no network."""
-    random: float
     gap: Difference | None
     """Gain of the perfect map less that of the damaged one."""
 

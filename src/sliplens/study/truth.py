@@ -271,7 +271,7 @@ _Interval = Callable[[Iterable[float]], Difference | None]
 
 
 def meta_test(effects: Sequence[FrameEffects], interval: _Interval) -> tuple[MetaTest, ...]:
-    """Whether each fill ranks the map that knows the effects above the one that knows half, and that above chance.
+    """Whether each fill ranks the map that knows the effects above the one that knows half.
 
     A gain counts changes of the answer towards the target, as `score_maps` does when it is told, and maps rank what
     speaks for it before what speaks against it. `by_size` counts how large changes are, and maps rank by |value|.
@@ -290,8 +290,6 @@ def _test_oracle(gains: Float[np.ndarray, "frames 3"], interval: _Interval) -> O
         oracle=oracle,
         degraded=degraded,
         changed=changed,
-        # a random order turned round is a random order: its symmetric gain is 0 on average
-        random=0.0,
         gap=interval(gains[:, 0] - gains[:, 1]),
     )
 
