@@ -94,7 +94,7 @@ def evaluate_baselines(
         answers[name] = replace(predictions, prediction=prediction)
     scores = Baselines(
         markers=plan.markers,
-        hold="found in each trial as a whole, by find_hold",
+        hold="found in each trial as a whole, by find_hold; by each frame for itself where causal",
         offered_trials=plan.offered_trials,
         training_trials=len(fitted),
         known_trials=0,
