@@ -96,8 +96,8 @@ def _print_baselines(evaluation: "Evaluation", baselines: "Baselines") -> None:
         f"{100 * baselines.followed:.1f} % of the markers were followed while in view"
     )
     say(
-        "  note: but for the causal ones they count motion from the last frame before the pull, found in each trial as a "
-        "whole; the network sees one frame"
+        "  note: but for the causal ones they count motion from the last frame before the pull, found in each trial as "
+        "a whole; the network sees one frame"
     )
     if baselines.shared_trials:
         say("  note: they were fitted on trials that they are scored on; their scores flatter them")
