@@ -27,25 +27,10 @@ _NAMES = {
 _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [
-    "ContactState",
-    "Dataset",
-    "Export",
-    "GroundTruth",
-    "LabelSettings",
-    "Labelling",
-    "Labels",
-    "ReadOptions",
-    "Recording",
-    "TrialFacts",
-    "TrialInfo",
-    "check_dataset",
-    "export_lerobot",
-    "export_mcap",
-    "import_recordings",
-    "label_dataset",
-    "load_dataset",
-    "split_dataset",
-]
+    "ContactState", "Dataset", "Export", "GroundTruth", "LabelSettings", "Labelling", "Labels", "ReadOptions",
+    "Recording", "TrialFacts", "TrialInfo", "check_dataset", "export_lerobot", "export_mcap",
+    "import_recordings", "label_dataset", "load_dataset", "split_dataset"
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -229,15 +229,9 @@ PRESETS: dict[str, Callable[[Sequence[TrialFacts]], SplitPlan]] = {
 validation and test, by whole objects or by single trials."""
 
 __all__ = [
-    "PRESETS",
-    "SPLITS_FILE",
-    "SplitPlan",
-    "SplitResult",
-    "SplitRule",
-    "assign_splits",
-    "read_splits",
-    "split_dataset",
-]
+    "PRESETS", "SPLITS_FILE", "SplitPlan", "SplitResult", "SplitRule", "assign_splits", "read_splits",
+    "split_dataset"
+]  # fmt: skip
 
 SPLITS_FILE = "splits.json"
 """Keeps, in the folder of a data set, the rules that its splits come from."""

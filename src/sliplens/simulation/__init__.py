@@ -7,21 +7,7 @@ from sliplens.simulation.stream import SimulatedFrame, SimulatedFrames
 from sliplens.simulation.trials import simulate, simulate_dataset, simulate_examples, simulate_trial
 
 __all__ = [
-    "CHROMATOUCH",
-    "FLAT_GEL",
-    "PRESETS",
-    "SENSORS",
-    "FrameTotals",
-    "Nuisances",
-    "Sensor",
-    "SimulatedFrame",
-    "SimulatedFrames",
-    "SimulationRecipe",
-    "TrialPlan",
-    "make_recipe",
-    "plan_trials",
-    "simulate",
-    "simulate_dataset",
-    "simulate_examples",
-    "simulate_trial",
-]
+    "CHROMATOUCH", "FLAT_GEL", "PRESETS", "SENSORS", "FrameTotals", "Nuisances", "Sensor", "SimulatedFrame",
+    "SimulatedFrames", "SimulationRecipe", "TrialPlan", "make_recipe", "plan_trials", "simulate",
+    "simulate_dataset", "simulate_examples", "simulate_trial"
+]  # fmt: skip

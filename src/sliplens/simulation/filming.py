@@ -13,7 +13,7 @@ from sliplens.simulation.geometry import pixel_grid
 from sliplens.simulation.loading import Loading
 from sliplens.simulation.motion import Motion, move_markers
 from sliplens.simulation.nuisances import Day, Grasp, Unit
-from sliplens.simulation.sensor import DrawnMarkers, Noise, NoisePicks, Sensor, draw_look, mix_noise, pick_noise
+from sliplens.simulation.sensor import DrawnMarkers, Noise, Sensor, draw_look, mix_noise, pick_noise
 
 _BATCHES = {"cpu": 4, "cuda": 512}
 """Frames drawn at once: few enough for a processor's caches, many enough for a GPU."""
@@ -41,8 +41,9 @@ class Film:
     """Untouched markers as the camera sees them, with the jitter of the print and the seat of the camera."""
     marker_px: Float[np.ndarray, "frames markers 2"]
     blur_px: Float[np.ndarray, " frames_and_reference"]
-    """Blur of the untouched sensor, then of each frame, as in the picks."""
-    noise_picks: NoisePicks
+    """Blur of the untouched sensor, then of each frame."""
+    noise_picks: Int[np.ndarray, "frames_and_reference 2 3"]
+    """See `pick_noise`."""
     rays: Float[np.ndarray, "height width 2"]
     texture: Float32[np.ndarray, "3 markers side side"]
     """Grain of the print, of unit strength."""
@@ -69,7 +70,7 @@ class Film:
             pressure=np.zeros((1, markers)),
             **nothing,
         )
-        picks, blur_px = self.noise_picks.at(first), self.blur_px[first]
+        picks, blur_px = self.noise_picks[first], self.blur_px[first]
         return replace(self, motion=motion, marker_px=self.marker_rest_px[None], blur_px=blur_px, noise_picks=picks)
 
     def draw_reference(self, *, device: str | torch.device = "cpu") -> UInt8[Tensor, "height width 3"]:
@@ -99,7 +100,7 @@ class Film:
             excess, share = _channels(noise.marker, device) - background, shade.clamp_(0, 1)
             strength = torch.addcmul((1 + noise.edge) * excess, share, noise.edge * excess, value=-1)
             strength.mul_(share).add_(background)
-            picks = self.noise_picks.at(_after_reference(frames))
+            picks = self.noise_picks[_after_reference(frames)]
             mixed = mix_noise(picks, noise=noise, image_size_px=sensor.image_size_px, device=device)
             planes.addcmul_(strength, mixed)
         planes.add_(0.5).clamp_(0, 255)

@@ -156,7 +156,7 @@ def put_markers_back(film: Film, frame: int, back: Bool[np.ndarray, "variants ma
         ),
         marker_px=where_back(film.marker_rest_px, film.marker_px[frame]),
         blur_px=film.blur_px[np.append(0, taken)],
-        noise_picks=film.noise_picks.at(np.append(0, taken)),
+        noise_picks=film.noise_picks[np.append(0, taken)],
     )
 
 

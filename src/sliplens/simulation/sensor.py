@@ -40,27 +40,16 @@ class Noise:
     """Unevenness of a marker's edge."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class NoisePicks:
-    """Two fields of the bank that each frame adds, and where their windows begin (row, column)."""
-
-    field: Int[np.ndarray, "frames 2"]
-    corner: Int[np.ndarray, "frames 2 2"]
-
-    def at(self, frames: slice | Int[np.ndarray, " frames"]) -> "NoisePicks":
-        """Picks of some of the frames."""
-        return NoisePicks(field=self.field[frames], corner=self.corner[frames])
-
-
-def pick_noise(frames: int, *, rng: np.random.Generator) -> NoisePicks:
-    """Draw two different fields and their windows for each frame."""
+def pick_noise(frames: int, *, rng: np.random.Generator) -> Int[np.ndarray, "frames 2 3"]:
+    """Draw two different fields of the bank for each frame, and where their windows begin: field, row, column."""
     first = rng.integers(_FIELDS, size=frames)
     second = (first + rng.integers(1, _FIELDS, size=frames)) % _FIELDS
-    return NoisePicks(field=np.stack([first, second], axis=-1), corner=rng.integers(_PLAY_PX + 1, size=(frames, 2, 2)))
+    corner = rng.integers(_PLAY_PX + 1, size=(frames, 2, 2))
+    return np.concatenate([np.stack([first, second], axis=-1)[..., None], corner], axis=-1)
 
 
 def mix_noise(
-    picks: NoisePicks, *, noise: Noise, image_size_px: int, device: str | torch.device
+    picks: Int[np.ndarray, "frames 2 3"], *, noise: Noise, image_size_px: int, device: str | torch.device
 ) -> Float[Tensor, "3 frames size size"]:
     """Noise of unit variance for each frame.
 
@@ -70,14 +59,8 @@ def mix_noise(
     bank = _noise_bank(noise, image_size_px + _PLAY_PX, str(device))
     size = image_size_px
     first, second = (
-        torch.stack(
-            [
-                bank[:, field, row : row + size, column : column + size]
-                for field, (row, column) in zip(picks.field[:, part], picks.corner[:, part], strict=True)
-            ],
-            dim=1,
-        )
-        for part in (0, 1)
+        torch.stack([bank[:, field, row : row + size, column : column + size] for field, row, column in part], dim=1)
+        for part in (picks[:, 0], picks[:, 1])
     )
     return first + second
 
@@ -245,57 +228,34 @@ class Sensor:
 CHROMATOUCH = Sensor(
     name="chromatouch",
     geometry=Dome(
-        radius_m=0.020,
-        camera_offset=0.34,
-        focal_px_per_rad=183.7,
-        centre_px=(115.8, 111.3),
-        ring_spacing_deg=12.9,
-        ring_counts=(1, 6, 12, 17, 21, 25),
-        ring_scale=(0.87, 1.03, 1.0, 1.07, 1.07, 1.0),
+        radius_m=0.020, camera_offset=0.34, focal_px_per_rad=183.7, centre_px=(115.8, 111.3), ring_spacing_deg=12.9,
+        ring_counts=(1, 6, 12, 17, 21, 25), ring_scale=(0.87, 1.03, 1.0, 1.07, 1.07, 1.0),
     ),
-    youngs_modulus_pa=400_000.0,
-    poisson_ratio=0.5,
-    effective_modulus_pa=18_900.0,
+    youngs_modulus_pa=400_000.0, poisson_ratio=0.5, effective_modulus_pa=18_900.0,
     image_size_px=224,
     look=MarkerLook(
-        radius_px=(7.16, 6.08, 5.75),
-        edge_px=(0.73, 0.88, 0.72),
-        contrast=(129.0, 166.0, 75.0),
-        defocus_px=(0.45, 0.20, 0.10),
-        focus_tilt=(5.5, 2.1),
-        squeeze=(0.12, 0.05, -0.03),
-        aslant_fade=(0.6, 0.23, 0.46),
-        pressed_fade=(0.10, 0.055, 0.11),
+        radius_px=(7.16, 6.08, 5.75), edge_px=(0.73, 0.88, 0.72), contrast=(129.0, 166.0, 75.0),
+        defocus_px=(0.45, 0.20, 0.10), focus_tilt=(5.5, 2.1), squeeze=(0.12, 0.05, -0.03),
+        aslant_fade=(0.6, 0.23, 0.46), pressed_fade=(0.10, 0.055, 0.11),
     ),
     background=(212.0, 208.0, 128.0),
     glare=Glare(centre_px=(105.0, 112.0), radius_px=128.0, bearing_deg=-5.0, width_px=30.0, colour=(0.0, 84.0, 230.0)),
     vignette=0.2,
     noise=Noise(
-        background=(2.3, 2.2, 2.2),
-        marker=(8.8, 8.6, 2.8),
-        edge=3.0,
-        smoothness=0.2,
-        red_in_green=0.5,
-        grain=(0.12, 0.07, 0.03),
-        ragged_px=(0.4, 0.35, 0.2),
+        background=(2.3, 2.2, 2.2), marker=(8.8, 8.6, 2.8), edge=3.0, smoothness=0.2, red_in_green=0.5,
+        grain=(0.12, 0.07, 0.03), ragged_px=(0.4, 0.35, 0.2),
     ),
-)
+)  # fmt: skip
 """The ChromaTouch of the thesis: Lin, Willemet, Bailleul and Wiertlewski, RoboSoft 2020; camera, looks and noise fitted
 to its published difference images; gel as in Lin and Wiertlewski 2019 (SortaClear 12)."""
 
 FLAT_GEL = Sensor(
     name="flat-gel",
     geometry=FlatPad(
-        ball_radius_m=0.012,
-        camera_distance_m=0.020,
-        focal_px=340.0,
-        centre_px=(111.5, 111.5),
-        spacing_m=0.0019,
-        columns=9,
-        rows=9,
+        ball_radius_m=0.012, camera_distance_m=0.020, focal_px=340.0, centre_px=(111.5, 111.5),
+        spacing_m=0.0019, columns=9, rows=9,
     ),
-    youngs_modulus_pa=500_000.0,
-    poisson_ratio=0.48,
+    youngs_modulus_pa=500_000.0, poisson_ratio=0.48,
     image_size_px=224,
     look=MarkerLook(radius_px=(5.6, 5.6, 5.6), edge_px=(0.9, 0.9, 0.9), contrast=(84.0, 104.0, 136.0)),
     background=(120.0, 140.0, 176.0),
@@ -307,15 +267,10 @@ FLAT_GEL = Sensor(
     vignette=0.25,
     sees_contact=False,
     noise=Noise(
-        background=(2.0, 1.6, 2.2),
-        marker=(2.0, 1.6, 2.2),
-        edge=0.0,
-        smoothness=0.3,
-        red_in_green=0.3,
-        grain=(0.05, 0.05, 0.05),
-        ragged_px=(0.25, 0.25, 0.25),
+        background=(2.0, 1.6, 2.2), marker=(2.0, 1.6, 2.2), edge=0.0, smoothness=0.3, red_in_green=0.3,
+        grain=(0.05, 0.05, 0.05), ragged_px=(0.25, 0.25, 0.25),
     ),
-)
+)  # fmt: skip
 """A flat gel like that of a GelSight Mini with dots: a square grid under an opaque skin lit from three sides. Its
 numbers are typical (assumed), not fitted to one device."""
 

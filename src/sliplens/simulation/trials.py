@@ -12,7 +12,7 @@ from jaxtyping import Float
 from sliplens.errors import InputError
 from sliplens.extras import require_device
 from sliplens.files import output_folder, scratch_folder
-from sliplens.progress import OnProgress, stage, wrote
+from sliplens.progress import OnProgress, counted, stage, wrote
 from sliplens.recordings import Dataset, GroundTruth, Recording
 from sliplens.recordings.dataset import load_dataset, trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import read_header, save_recording
@@ -89,12 +89,7 @@ def simulate_examples(
     wet = [plan for plan in plans if plan.condition == "wet"][:1]
     shown = min(count - len(wet), len(dry))
     chosen = [dry[index * (len(dry) - 1) // max(1, shown - 1)] for index in range(shown)] + wet
-    recordings = []
-    for plan in chosen:
-        recordings.append(simulate_trial(plan, device=device))
-        if on_progress is not None:
-            on_progress(len(recordings), len(chosen))
-    return recordings
+    return [simulate_trial(plan, device=device) for plan in counted(chosen, on_progress)]
 
 
 def simulate(

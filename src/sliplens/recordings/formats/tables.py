@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labels.smoothing import typical_step
+from sliplens.recordings.labels.axes import typical_step
 
 _SEPARATORS = ("\t", ";", ",")  # a comma may be a decimal one where another separator is there
 _COMMENTS = ("#", "%")

@@ -9,22 +9,7 @@ from sliplens.recordings.labels.reference import choose_reference
 from sliplens.recordings.options import LabelSettings
 
 __all__ = [
-    "ContactForces",
-    "ForceAxes",
-    "Found",
-    "FoundLabels",
-    "FrictionEstimate",
-    "ImageMotion",
-    "LabelSettings",
-    "Lag",
-    "Reason",
-    "apply_axes",
-    "choose_reference",
-    "contact_threshold",
-    "estimate_friction",
-    "estimate_lag",
-    "infer_axes",
-    "label_frames",
-    "label_trial",
-    "measure_motion",
-]
+    "ContactForces", "ForceAxes", "Found", "FoundLabels", "FrictionEstimate", "ImageMotion", "LabelSettings",
+    "Lag", "Reason", "apply_axes", "choose_reference", "contact_threshold", "estimate_friction", "estimate_lag",
+    "infer_axes", "label_frames", "label_trial", "measure_motion"
+]  # fmt: skip

@@ -7,8 +7,7 @@ from jaxtyping import Float, Int
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.labelling import Found, FrictionEstimate
-from sliplens.recordings.labels.axes import ContactForces, magnitude
-from sliplens.recordings.labels.smoothing import mean_force, typical_step
+from sliplens.recordings.labels.axes import ContactForces, magnitude, mean_force, typical_step
 
 _REACH_S = 0.08  # how far the break may lie from the rough guess
 _TRIES = 41  # breaks tried over that reach

@@ -8,8 +8,7 @@ from jaxtyping import Bool, Float, Float32
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Lag
-from sliplens.recordings.labels.axes import infer_axes
-from sliplens.recordings.labels.smoothing import mean_force, typical_step
+from sliplens.recordings.labels.axes import infer_axes, mean_force, typical_step
 
 # blocks across the shorter side: wide enough to average the camera's noise, narrower than a marker's spacing
 _MOTION_BLOCKS = 28

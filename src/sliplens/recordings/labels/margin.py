@@ -13,10 +13,17 @@ from sliplens.errors import RecordingError
 from sliplens.mechanics import safety_margin, stick_ratio
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import FrictionEstimate, LabelBasis, Lag
-from sliplens.recordings.labels.axes import ContactForces, apply_axes, infer_axes, magnitude
+from sliplens.recordings.labels.axes import (
+    ContactForces,
+    apply_axes,
+    half_window,
+    infer_axes,
+    magnitude,
+    mean_force,
+    typical_step,
+)
 from sliplens.recordings.labels.friction import ImageMotion, estimate_friction
 from sliplens.recordings.labels.lag import estimate_lag
-from sliplens.recordings.labels.smoothing import half_window, mean_force, typical_step
 from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.trial import ContactState, Labels
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplens.recordings.labels.smoothing import mean_force, noise_sigma, typical_step
+from sliplens.recordings.labels.axes import mean_force, noise_sigma, typical_step
 
 
 def test_no_window_is_linear_interpolation(rng: np.random.Generator):
