@@ -2,9 +2,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from readers import read_force_table
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.formats.tables import read_force_table
 
 TIME = [0.0, 0.01, 0.02]
 FORCE = [[0.5, -0.25, 2.0], [0.75, -0.5, 4.0], [1.0, -0.75, 6.0]]
@@ -25,7 +25,7 @@ def table(*, header: str = "time_s,fx,fy,fz", separator: str = ",", comma: bool 
 
 
 def test_times_and_forces_are_read(tmp_path: Path):
-    forces = read_force_table(write(tmp_path, table())).forces
+    forces, _ = read_force_table(write(tmp_path, table()))
     np.testing.assert_allclose(forces.time_s, TIME)
     np.testing.assert_allclose(forces.force_n, FORCE)
     assert forces.source == str(tmp_path / "forces.csv")
@@ -48,7 +48,7 @@ def test_times_and_forces_are_read(tmp_path: Path):
     ids=["semicolons", "tabs", "decimal commas", "both", "mark", "comments", "numpy", "windows", "quotes", "trailing"],
 )
 def test_however_it_is_laid_out_the_table_says_the_same(tmp_path: Path, text: str):
-    forces = read_force_table(write(tmp_path, text)).forces
+    forces, _ = read_force_table(write(tmp_path, text))
     np.testing.assert_allclose(forces.time_s, TIME)
     np.testing.assert_allclose(forces.force_n, FORCE)
 
@@ -56,7 +56,7 @@ def test_however_it_is_laid_out_the_table_says_the_same(tmp_path: Path, text: st
 @pytest.mark.parametrize("encoding", ["utf-16", "cp1252", "utf-8"])
 def test_a_micro_sign_is_read_in_any_encoding(tmp_path: Path, encoding: str):
     text = "t [\u00b5s];fx [mN];fy [mN];fz [mN]\n0;1;2;3\n1000;4;5;6\n"
-    forces = read_force_table(write(tmp_path, text, encoding=encoding)).forces
+    forces, _ = read_force_table(write(tmp_path, text, encoding=encoding))
     np.testing.assert_allclose(forces.time_s, [0, 1e-3])
     np.testing.assert_allclose(forces.force_n, [[1e-3, 2e-3, 3e-3], [4e-3, 5e-3, 6e-3]])
 
@@ -72,7 +72,7 @@ def test_a_micro_sign_is_read_in_any_encoding(tmp_path: Path, encoding: str):
     ],
 )
 def test_columns_are_guessed_from_their_names(tmp_path: Path, names: str):
-    forces = read_force_table(write(tmp_path, table(header=names))).forces
+    forces, _ = read_force_table(write(tmp_path, table(header=names)))
     np.testing.assert_allclose(forces.time_s, TIME)
     np.testing.assert_allclose(forces.force_n, FORCE)
 
@@ -81,7 +81,7 @@ def test_columns_are_guessed_from_their_names(tmp_path: Path, names: str):
     "names", ["t,Fn,Ft", "t,normal_force_n,tangential_force_n", "t,f_n,f_t", "t,normal [N],shear [N]"]
 )
 def test_a_normal_and_a_tangential_force_lie_along_z_and_x(tmp_path: Path, names: str):
-    forces = read_force_table(write(tmp_path, f"{names}\n0,5,1\n0.1,6,2\n")).forces
+    forces, _ = read_force_table(write(tmp_path, f"{names}\n0,5,1\n0.1,6,2\n"))
     np.testing.assert_array_equal(forces.force_n, [[1, 0, 5], [2, 0, 6]])
 
 
@@ -89,8 +89,8 @@ def test_a_normal_and_a_tangential_force_lie_along_z_and_x(tmp_path: Path, names
     ("unit", "newtons"), [("N", 1.0), ("mN", 1e-3), ("gf", 9.80665e-3), ("kgf", 9.80665), ("kN", 1e3)]
 )
 def test_units_are_read_from_brackets_or_declared(tmp_path: Path, unit: str, newtons: float):
-    named = read_force_table(write(tmp_path, table(header=f"t,fx [{unit}],fy [{unit}],fz [{unit}]"))).forces
-    declared = read_force_table(write(tmp_path, table()), force_unit=unit).forces
+    named, _ = read_force_table(write(tmp_path, table(header=f"t,fx [{unit}],fy [{unit}],fz [{unit}]")))
+    declared, _ = read_force_table(write(tmp_path, table()), force_unit=unit)
     np.testing.assert_allclose(named.force_n, newtons * np.array(FORCE))
     np.testing.assert_allclose(declared.force_n, newtons * np.array(FORCE))
 
@@ -111,27 +111,27 @@ def test_units_are_read_from_brackets_or_declared(tmp_path: Path, unit: str, new
 )
 def test_the_unit_of_time_is_guessed_and_told(tmp_path: Path, times: str, seconds: float):
     text = "t,fx,fy,fz\n" + "".join(f"{time},0,0,1\n" for time in times.split(","))
-    read = read_force_table(write(tmp_path, text))
+    forces, notes = read_force_table(write(tmp_path, text))
     # double precision holds seconds since 1970 to 0.24 us
-    np.testing.assert_allclose(np.diff(read.forces.time_s), seconds, rtol=1e-3)
-    assert "guessed: 3 samples in" in read.notes[0]
+    np.testing.assert_allclose(np.diff(forces.time_s), seconds, rtol=1e-3)
+    assert "guessed: 3 samples in" in notes[0]
 
 
 def test_what_is_declared_is_not_guessed(tmp_path: Path):
     text = "t,clock,a,b,c\n9,0,1,2,3\n8,10,4,5,6\n"
-    read = read_force_table(
-        write(tmp_path, text), time_column="clock", force_columns=["C", "b", "a"], time_unit="ms", force_unit="mN"
+    forces, notes = read_force_table(
+        write(tmp_path, text), time_column="clock", force_columns=("C", "b", "a"), time_unit="ms", force_unit="mN"
     )
-    np.testing.assert_allclose(read.forces.time_s, [0, 0.01])
-    np.testing.assert_allclose(read.forces.force_n, [[3e-3, 2e-3, 1e-3], [6e-3, 5e-3, 4e-3]])
-    assert read.notes == (
+    np.testing.assert_allclose(forces.time_s, [0, 0.01])
+    np.testing.assert_allclose(forces.force_n, [[3e-3, 2e-3, 1e-3], [6e-3, 5e-3, 4e-3]])
+    assert notes == (
         "forces.csv: times are those of column 'clock' (declared), in ms (declared).",
         "forces.csv: forces are those of 'c', 'b', 'a' as x, y, z (declared), in mN (declared).",
     )
 
 
 def test_what_was_assumed_is_told(tmp_path: Path):
-    assert read_force_table(write(tmp_path, table(separator=";", comma=True))).notes == (
+    assert read_force_table(write(tmp_path, table(separator=";", comma=True)))[1] == (
         "forces.csv: times are those of column 'time_s' (by its name), in s (by its name).",
         "forces.csv: forces are those of 'fx', 'fy', 'fz' as x, y, z (by their names), in N (assumed, for the names "
         "give no unit).",
@@ -186,9 +186,9 @@ def test_what_is_no_text_is_refused(tmp_path: Path, rng: np.random.Generator):
     ("options", "message"),
     [
         ({"time_column": "when"}, r"no column 'when', it has 'time_s', 'fx', 'fy', 'fz'; name one of them with"),
-        ({"force_columns": ["fx", "fy", "fw"]}, "no column 'fw'"),
-        ({"force_columns": ["fx"]}, "1 force columns were named"),
-        ({"force_columns": ["fx", "fx", "fz"]}, "the force columns fx, fx, fz repeat"),
+        ({"force_columns": ("fx", "fy", "fw")}, "no column 'fw'"),
+        ({"force_columns": ("fx",)}, "1 force columns were named"),
+        ({"force_columns": ("fx", "fx", "fz")}, "the force columns fx, fx, fz repeat"),
         ({"time_unit": "weeks"}, "'weeks' is no unit of time; use one of s, ms, us, ns"),
         ({"force_unit": "V"}, "'V' is no unit of force; use one of N, mN, kN, gf, kgf, lbf"),
     ],

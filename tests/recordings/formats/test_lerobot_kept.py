@@ -12,12 +12,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
+from readers import read_lerobot
 
 from sliplens.errors import RecordingError
 from sliplens.recordings import ContactState, Recording, load_dataset
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.formats.lerobot import read_lerobot
 from sliplens.recordings.formats.lerobot_export import write_lerobot
 from sliplens.recordings.store import forces_path, save_forces, save_recording
 
@@ -95,7 +95,7 @@ def test_without_what_is_kept_it_is_a_data_set_like_any_other(exported):
 
 def test_a_feature_that_is_named_is_read_as_of_any_data_set(exported):
     for named in ({"camera_key": CAMERA}, {"force_key": "observation.force"}):
-        (capture,) = read_lerobot(exported, episode=1, **named)
+        capture = read_lerobot(exported, **named)[1]
         assert capture.labels is None
         assert capture.trial == "exported-000001"
 
@@ -133,7 +133,7 @@ def test_episodes_that_changed_since_are_not_given_the_labels_of_others(exported
     whole = path.read_text()
     path.write_text(whole.splitlines()[0])
     with pytest.raises(RecordingError, match=r"are no longer those that .* tells of; export the trials again"):
-        read_lerobot(exported, episode=0)
+        read_lerobot(exported)
     path.write_text(whole)
     edit_line(exported, 0, lambda trial: trial.update(frames=FRAMES - 1))
     with pytest.raises(RecordingError, match="are no longer those that"):
@@ -213,6 +213,7 @@ def test_words_that_are_not_known_are_refused(exported):
 
 
 def test_an_episode_is_read_without_those_that_share_its_file(exported):
+    first, second = read_lerobot(exported)[:2]
     path = exported / "data" / "chunk-000" / "file-000.parquet"
     damaged = bytearray(path.read_bytes())
     group = pq.read_metadata(path).row_group(0)
@@ -223,9 +224,9 @@ def test_an_episode_is_read_without_those_that_share_its_file(exported):
         images.total_compressed_size
     )
     path.write_bytes(damaged)
-    assert len(list(read_lerobot(exported, episode=1)[0].read_frames())) == FRAMES
+    assert len(list(second.read_frames())) == FRAMES
     with pytest.raises(RecordingError, match=r"file-000\.parquet is not a readable Parquet file"):
-        read_lerobot(exported, episode=0)
+        list(first.read_frames())
 
 
 def test_a_data_set_with_any_byte_changed_raises_no_foreign_error(exported, rng):

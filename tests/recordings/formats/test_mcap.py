@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from readers import read_rosbag
 
 from sliplens.codec import to_builtins
 from sliplens.errors import InputError, RecordingError
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_info, trial_path, write_dataset_table
 from sliplens.recordings.exporting import export_mcap
-from sliplens.recordings.formats.rosbag import read_rosbag
 from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.importing import import_trial
 from sliplens.recordings.labelling import Clip, ForceAxes, Found, LabelBasis, Labelling, Lag, ReferenceChoice

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from readers import read_rosbag
 
 from sliplens.errors import InputError, RecordingError
-from sliplens.recordings.formats.rosbag import read_rosbag
 
 pytest.importorskip("rosbags")
 

@@ -2,11 +2,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from readers import read_thesis
 
 from sliplens.errors import ImageError, RecordingError
 from sliplens.images import write_png
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.formats.thesis import read_thesis
+from sliplens.recordings.formats import thesis
+from sliplens.recordings.options import ReadOptions
 
 HOME = "/home/training-pc/Data/november/"
 
@@ -173,12 +175,17 @@ def test_lists_that_do_not_fit_are_refused(
         read_thesis(write_lists(data, frames, references, margins))
 
 
+def test_a_unit_of_no_margin_is_refused(data: Path):
+    options = ReadOptions()
+    object.__setattr__(options, "margin_unit", "ratio")  # as a caller without type checks may give it
+    with pytest.raises(RecordingError, match="'ratio' is no unit of a safety margin"):
+        thesis.read_thesis(write_lists(data, FRAMES, REFERENCE, MARGINS), options)
+
+
 def test_missing_and_binary_lists_are_refused(data: Path):
     lists = write_lists(data, FRAMES, REFERENCE, MARGINS)
     with pytest.raises(RecordingError, match=r"is not a list of the thesis; name the file that ends in _images_L\.txt"):
         read_thesis(data / "train_dataset_gamma.csv")
-    with pytest.raises(RecordingError, match="'ratio' is no unit of a safety margin"):
-        read_thesis(lists, margin_unit="ratio")
     (data / "train_dataset_images_Lref.txt").unlink()
     with pytest.raises(RecordingError, match=r"Lref\.txt does not exist; the lists of a set must lie in one folder"):
         read_thesis(lists)

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from readers import read_video
 
 from sliplens.errors import RecordingError
 from sliplens.images import write_png
 from sliplens.recordings.formats.gelsight import list_gelsight_clips, read_gelsight_clip
-from sliplens.recordings.formats.video import least_contact, read_video, small_copies, stale_frames
+from sliplens.recordings.formats.video import least_contact, small_copies, stale_frames
 from sliplens.recordings.labelling import Clip
 
 MILLISECOND = Fraction(1, 1000)

@@ -33,8 +33,7 @@ class Reader:
     """Told by names alone, without reading."""
     takes: tuple[str, ...]
     """Fields of `ReadOptions` that it understands."""
-    read: Callable[..., Capture | list[Capture]]
-    """Called with the path and the options that were given."""
+    read: Callable[[Path, ReadOptions], Capture | list[Capture]]
 
 
 _FORCE_TABLE = ("forces", "frame_rate", "start_s", "time_column", "force_columns", "time_unit", "force_unit")
@@ -44,7 +43,7 @@ _ROWS = {
         words="data set of sliplens, simulated or imported, with its labels",
         recognises=lambda path: (path / DATASET_FILE).is_file(),
         takes=(),
-        read=read_stored,
+        read=lambda path, _: read_stored(path),
     ),
     "rosbag": Reader(
         words="ROS 2 bag (MCAP or sqlite3)",
@@ -96,12 +95,7 @@ def recognise(path: Path) -> str | None:
 def open_captures(path: Path, *, format: str | None = None, options: ReadOptions) -> tuple[Capture, ...]:
     """Open a source with the reader of its format: a row of `FORMATS`, recognised by names if None.
 
-    Raises
-    ------
-    InputError
-        If the source is missing, its format is not known, or its reader does not take an option that was given.
-    RecordingError
-        If it cannot be read.
+    Raises `InputError` where the source is missing, of no known format, or does not take an option that was given.
     """
     if format is not None:
         FORMATS.pick(format)  # a wrong name is told before a wrong path
@@ -112,13 +106,11 @@ def open_captures(path: Path, *, format: str | None = None, options: ReadOptions
         known = "; ".join(f"{name}: {FORMATS[name].words}" for name in FORMATS)
         raise InputError(f"{path} is none of the formats that are known ({known}); name one with --format")
     reader = FORMATS[name]
-    given = options.given()
-    strange = [option for option in given if option not in reader.takes]
-    if strange:
+    if strange := [option for option in options.given() if option not in reader.takes]:
         raise InputError(
             f"{path} is read as {name}, which does not take {spoken(strange)}; leave it out or name another format"
         )
-    captures = reader.read(path, **{option: getattr(options, option) for option in given})
+    captures = reader.read(path, options)
     return (captures,) if isinstance(captures, Capture) else tuple(captures)
 
 

@@ -8,8 +8,10 @@ import numpy as np
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Capture
+from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.formats.video import count_stale, least_contact, read_video, small_copies
 from sliplens.recordings.labelling import Clip
+from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.trial import labels_of_margins
 
 LABELS_FILE = "labels.csv"
@@ -29,7 +31,7 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
     key = "/".join(path.absolute().parts[-3:])
     if key not in rows:
         raise RecordingError(f"{table} does not list {key}; name a clip of the data set it belongs to")
-    row, whole = rows[key], read_video(path)
+    row, whole = rows[key], read_video(path, ReadOptions())
     if len(whole) != int(row["n_frames"]):
         raise RecordingError(
             f"{path} has {len(whole)} frames but {table.name} says {row['n_frames']}; copy the clip again"
@@ -37,7 +39,7 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
     copies = small_copies(whole.read_frames())
     stale = count_stale(copies)
     slipped = row["slip_label"].strip() == "1"
-    capture = read_video(path, frame_rate=frame_rate, skip_frames=stale, name=f"{path.parent.name}-{path.stem}")
+    capture = read_video(path, ReadOptions(frame_rate=frame_rate, skip_frames=stale))
     reference = least_contact(copies[stale:])
     label = "slips" if slipped else "does not slip"
     notes = (
@@ -49,6 +51,7 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
     )
     return replace(
         capture,
+        trial=trial_name(f"{path.parent.name}-{path.stem}"),
         notes=capture.notes + notes,
         labels=labels_of_margins(np.full(len(capture), np.nan)),
         reference_index=reference,
@@ -58,7 +61,7 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
     )
 
 
-def read_gelsight(path: Path, *, frame_rate: float | None = None) -> list[Capture]:
+def read_gelsight(path: Path, options: ReadOptions) -> list[Capture]:
     """Read clips: all of the data set's folder that are there, those of the folder of a grasp, or a single one."""
     if (path / LABELS_FILE).is_file():
         clips = list_gelsight_clips(path)
@@ -66,7 +69,7 @@ def read_gelsight(path: Path, *, frame_rate: float | None = None) -> list[Captur
         clips = [path] if path.is_file() else sorted(path.glob("*.avi"))
     if not clips:
         raise RecordingError(f"{path} holds no clip; name a clip, the folder of a grasp, or that of {LABELS_FILE}")
-    rate = FRAME_RATE_HZ if frame_rate is None else frame_rate
+    rate = FRAME_RATE_HZ if options.frame_rate is None else options.frame_rate
     return [read_gelsight_clip(clip, frame_rate=rate) for clip in clips]
 
 

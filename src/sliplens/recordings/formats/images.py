@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +17,6 @@ from sliplens.images import list_images, read_image
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.formats.tables import (
     UNITS,
-    ForceColumns,
     TextTable,
     evenly_spaced,
     guess_time_column,
@@ -30,6 +29,7 @@ from sliplens.recordings.formats.tables import (
     trial_name,
     unit_of,
 )
+from sliplens.recordings.options import ReadOptions
 
 _DAMAGED = (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning)
 
@@ -158,23 +158,9 @@ def _stamps(text: TextTable, name_column: str, time_column: str) -> tuple[dict[s
 _LOSSY = frozenset({".jpg", ".jpeg"})
 
 
-def read_image_folder(
-    folder: Path,
-    *,
-    forces: Path | None = None,
-    times: Path | None = None,
-    frame_rate: float | None = None,
-    name_unit: str | None = None,
-    start_s: float | None = None,
-    name: str | None = None,
-    **columns: Unpack[ForceColumns],
-) -> Capture:
-    """Open a folder of images, and a table of forces recorded beside it.
-
-    Images are TIFF, PNG, JPEG or BMP, 8-bit RGB or grey, in natural order (2 before 10). Where they were taken in time
-    must be said in one of three ways: by `times`, `frame_rate` or `name_unit`.
-    Options are those of `ReadOptions`.
-    """
+def read_image_folder(folder: Path, options: ReadOptions) -> Capture:
+    """Open a folder of images, in natural order (2 before 10), and a table of forces recorded beside it."""
+    times, frame_rate, name_unit = options.times, options.frame_rate, options.name_unit
     given = [option for option in (times, frame_rate, name_unit) if option is not None]
     if len(given) != 1:
         raise RecordingError(
@@ -199,9 +185,9 @@ def read_image_folder(
             "record PNG or TIFF where you can."
         )
     size = common_size(paths)
-    time, samples, more = place_on_clock(time, forces=forces, start_s=start_s, source=folder.name, **columns)
+    time, samples, more = place_on_clock(time, options, source=folder.name)
     return Capture(
-        trial=trial_name(folder.resolve().name if name is None else name),
+        trial=trial_name(folder.resolve().name),
         source=str(folder),
         frame_time_s=time,
         frame_size=size,

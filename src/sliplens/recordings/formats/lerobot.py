@@ -3,7 +3,6 @@
 import json
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from math import floor, isfinite, prod
@@ -18,7 +17,7 @@ import pyarrow.compute as pc
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 from av.container import InputContainer
-from av.error import FFmpegError
+from av.video.stream import VideoStream
 from jaxtyping import Float
 
 from sliplens.errors import RecordingError
@@ -26,9 +25,11 @@ from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.formats.images import open_encoded, rgb_pixels, telling_damage
 from sliplens.recordings.formats.stored import ExportedTrial
 from sliplens.recordings.formats.tables import trial_name
-from sliplens.recordings.formats.video import MOST_PIXELS, open_container
+from sliplens.recordings.formats.video import open_video, require_size
+from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.store import DAMAGED_PARQUET, load_forces, one_line
 
+_NO_VIDEO = "copy the data set again, with its videos"
 _VERSION = re.compile(r"v3\.\d+")
 _FIELD = re.compile(r"\{(video_key|chunk_index|file_index)(?::0?([1-9])d)?\}")
 
@@ -102,7 +103,7 @@ def read_layout(folder: Path) -> Layout:
     )
 
 
-def read_episodes(layout: Layout, *, camera_key: str, only: int | None = None) -> list[Episode]:
+def read_episodes(layout: Layout, *, camera_key: str) -> list[Episode]:
     """Episodes of a data set and where their frames from a camera lie, in their order."""
     in_video = layout.features[camera_key].dtype == "video"
     columns = ["episode_index", "length", "data/chunk_index", "data/file_index"]
@@ -133,13 +134,7 @@ def read_episodes(layout: Layout, *, camera_key: str, only: int | None = None) -
                 video_start_s=float(video[2]) if in_video else 0.0,
             )
         )
-    found = [one for one in episodes if only is None or one.index == only]
-    if not found:
-        raise RecordingError(
-            f"{layout.folder} has no episode {only}; it has {len(episodes)}, from {episodes[0].index} to "
-            f"{episodes[-1].index}"
-        )
-    return found
+    return episodes
 
 
 def read_columns(path: Path, columns: list[str]) -> pa.Table:
@@ -239,23 +234,18 @@ def read_rows(layout: Layout, episodes: list[Episode], columns: list[str]) -> It
 
 def read_video_header(path: Path) -> tuple[tuple[int, int], tuple[str, ...]]:
     """Height and width of the frames of a video, and what is said of its coding."""
-    with _open_video(path) as container:
-        coder = container.streams.video[0].codec_context
-        if coder is None:
-            raise RecordingError(f"{path} is coded in a way that FFmpeg cannot read; write it as AV1 or H.264")
-        size, codec = (coder.height, coder.width), coder.codec
-        if min(size) <= 0 or size[0] * size[1] > MOST_PIXELS:
-            raise RecordingError(f"{path} claims frames of {size[0]} x {size[1]} pixels; copy it again")
+    with open_video(path, missing=_NO_VIDEO) as (_, video):
+        codec = video.codec_context.codec
         note = f"Frames are coded with loss ({codec.canonical_name}), which moves markers a little."
-        return size, (note,) * codec.lossy
+        return require_size(path, video), (note,) * codec.lossy
 
 
 def video_frames(
     path: Path, wanted_s: Float[np.ndarray, " frames"], *, tolerance_s: float, frame_size: tuple[int, int]
 ) -> Iterator[Frame]:
     """Decode the frames nearest to some stamps of a video."""
-    with _open_video(path) as container:
-        shown = _decode_from(container, float(wanted_s[0]) - tolerance_s)
+    with open_video(path, missing=_NO_VIDEO) as (container, video):
+        shown = _decode_from(container, video, float(wanted_s[0]) - tolerance_s)
         current, following = next(shown, None), next(shown, None)
         for wanted in wanted_s:
             while current and following and abs(following[0] - wanted) < abs(current[0] - wanted):
@@ -316,29 +306,16 @@ def decode_image(data: bytes, *, where: str) -> Frame:
         return rgb_pixels(image)
 
 
-def _decode_from(container: InputContainer, start_s: float) -> Iterator[tuple[float, av.VideoFrame]]:
+def _decode_from(
+    container: InputContainer, stream: VideoStream, start_s: float
+) -> Iterator[tuple[float, av.VideoFrame]]:
     """Frames with their stamps, from a key frame at or before `start_s`."""
-    stream = container.streams.video[0]
     stream.thread_type = "AUTO"
     if stream.time_base is not None:
         container.seek(max(floor(start_s / stream.time_base), 0), stream=stream)
     for frame in container.decode(stream):
         if frame.time is not None and not frame.is_corrupt:
             yield frame.time, frame
-
-
-@contextmanager
-def _open_video(path: Path) -> Iterator[InputContainer]:
-    if not path.is_file():
-        raise RecordingError(f"{path} does not exist; copy the data set again, with its videos")
-    try:
-        with open_container(path) as container:
-            if not container.streams.video:
-                raise RecordingError(f"{path} has no video stream; copy it again")
-            yield container
-    except (FFmpegError, OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise RecordingError(f"{path} cannot be decoded as a video ({reason}); copy it again") from None
 
 
 CAMERA, TIME, FORCE = "observation.images.tactile", "observation.time_s", "observation.force"
@@ -381,7 +358,7 @@ def read_kept(layout: Layout) -> tuple[ExportedTrial, ...] | None:
     return trials
 
 
-def kept_captures(layout: Layout, trials: tuple[ExportedTrial, ...], *, episode: int | None) -> list[Capture]:
+def kept_captures(layout: Layout, trials: tuple[ExportedTrial, ...]) -> list[Capture]:
     """Trials of a data set as they were exported."""
     episodes = read_episodes(layout, camera_key=CAMERA)
     exported = [(index, trial.frames) for index, trial in enumerate(trials)]
@@ -391,7 +368,7 @@ def kept_captures(layout: Layout, trials: tuple[ExportedTrial, ...], *, episode:
             f"the episodes of {layout.folder} are no longer those that {path} tells of; export the trials again, or "
             "remove that file to read the data set without labels"
         )
-    rows = read_rows(layout, read_episodes(layout, camera_key=CAMERA, only=episode), _COLUMNS)
+    rows = read_rows(layout, episodes, _COLUMNS)
     return [_capture(one, trials[one.episode.index]) for one in rows]
 
 
@@ -442,9 +419,7 @@ _FORCE = re.compile(r"force|wrench|(?<![a-z])f_?t(?![a-z])", re.IGNORECASE)
 _TORQUE = re.compile(r"torque|moment|(?<![a-z])[tm]_?[xyz](?![a-z])", re.IGNORECASE)
 
 
-def read_lerobot(
-    folder: Path, *, camera_key: str | None = None, force_key: str | None = None, episode: int | None = None
-) -> list[Capture]:
+def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
     """Read a data set, one trial an episode.
 
     Frames and forces are rows of one table: each force was taken with its frame, and both have its time, in seconds
@@ -455,15 +430,15 @@ def read_lerobot(
     with their labels; where a feature is named, like those of any data set.
     """
     layout = read_layout(folder)
-    if camera_key is None and force_key is None and (kept := read_kept(layout)) is not None:
-        return kept_captures(layout, kept, episode=episode)
-    camera, notes = _choose_camera(layout, camera_key)
-    force = _choose_force(layout, force_key)
+    if options.camera_key is None and options.force_key is None and (kept := read_kept(layout)) is not None:
+        return kept_captures(layout, kept)
+    camera, notes = _choose_camera(layout, options.camera_key)
+    force = _choose_force(layout, options.force_key)
     if force is None:
         notes.append("There are no forces: no feature of 3 or 6 numbers is named like one.")
     video_header = cache(read_video_header)  # episodes share files
     captures = []
-    episodes = read_episodes(layout, camera_key=camera, only=episode)
+    episodes = read_episodes(layout, camera_key=camera)
     for rows in read_rows(layout, episodes, ["timestamp", *([force] if force else [])]):
         one, own_notes, forces = rows.episode, (), None
         time = rows.table.column("timestamp").to_numpy().astype(np.float64)

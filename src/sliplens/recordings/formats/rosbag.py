@@ -36,6 +36,7 @@ from sliplens.recordings.formats.mcap import (
 )
 from sliplens.recordings.formats.stored import FORMAT, ExportedTrial
 from sliplens.recordings.formats.tables import trial_name
+from sliplens.recordings.options import ReadOptions
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
@@ -408,21 +409,18 @@ def _require_whole(found: dict[str, _Topic], about: ExportedTrial, path: Path) -
 _IMAGES, _WRENCHES = (RAW, COMPRESSED), ("geometry_msgs/msg/WrenchStamped",)
 
 
-def read_rosbag(path: Path, *, image_topic: str | None = None, wrench_topic: str | None = None) -> Capture:
-    """Read a bag as one trial.
+def read_rosbag(path: Path, options: ReadOptions) -> Capture:
+    """Read a bag as one trial; one that `write_mcap` exported as it was, where no topic is named.
 
-    Images are `sensor_msgs/Image` (rgb8, bgr8, mono8) or `CompressedImage` (JPEG, PNG), forces the x, y, z of
-    `geometry_msgs/WrenchStamped`; torques are left out. A first pass reads stamps and sizes; pixels are decoded when
-    frames are read. Frames and forces share one clock, that of the message headers; where a header has no stamp, or
-    the two topics have clocks that never meet, both take the times at which the bag received them, and `notes` say so.
+    A first pass reads stamps and sizes; pixels are decoded when frames are read. Frames
+    and forces share one clock, that of the message headers; where a header has no stamp, or the two topics have clocks
+    that never meet, both take the times at which the bag received them, and `notes` say so.
     Times are seconds since the first frame or force: since the epoch, double precision would round them to 0.2 us.
-
-    A trial that `write_mcap` exported comes back as it was, with its labels; where a topic is named, like any bag.
     """
-    topics = bag_topics(path)
-    if image_topic is None and wrench_topic is None and (trial := read_trial_bag(path, topics)) is not None:
+    topics, wrench_topic = bag_topics(path), options.wrench_topic
+    if options.image_topic is None and wrench_topic is None and (trial := read_trial_bag(path, topics)) is not None:
         return trial
-    images = _choose(topics, image_topic, types=_IMAGES, what="images", path=path)
+    images = _choose(topics, options.image_topic, types=_IMAGES, what="images", path=path)
     wrenches = _choose(topics, wrench_topic, types=_WRENCHES, what="wrenches", path=path)
     if images is None:
         raise RecordingError(

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
-from typing import TypedDict, Unpack
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +15,7 @@ from jaxtyping import Float
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labels.axes import typical_step
+from sliplens.recordings.options import ReadOptions
 
 _SEPARATORS = ("\t", ";", ",")  # a comma may be a decimal one where another separator is there
 _COMMENTS = ("#", "%")
@@ -336,41 +336,20 @@ MOST_FORCE_N = 1e4
 """No fingertip survives more; a larger number is in another unit."""
 
 
-class ForceColumns(TypedDict, total=False):
-    """What `read_force_table` may be told of a table."""
+def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[str, ...]]:
+    """Read times and forces from a text table with a header, and notes of what was declared or guessed.
 
-    time_column: str | None
-    force_columns: Sequence[str] | None
-    time_unit: str | None
-    force_unit: str | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class ForceTable:
-    """Forces of a table, and how its columns were read."""
-
-    forces: Forces
-    notes: tuple[str, ...]
-    """What was declared or guessed, a sentence each, to be shown to the user."""
-
-
-def read_force_table(path: Path, **declared: Unpack[ForceColumns]) -> ForceTable:
-    """Read times and forces from a text table with a header; what is said of it goes before what is guessed.
-
-    Columns are separated by commas, semicolons or tabs, decimals by points or (where columns are not separated by
-    commas) commas; lines that begin with # or % are comments. What is not declared is guessed from the names of the
-    columns (`time_s`, `t [ms]`, `stamp`; `fx`, `force_x [mN]`, `wrench.force.x`; `fn` and `ft`), the unit of the time
-    also from its steps. Two force columns, normal and tangential, become z and x.
+    What is not declared is guessed from the names of the columns (`time_s`, `t [ms]`, `stamp`; `fx`, `force_x [mN]`,
+    `wrench.force.x`; `fn` and `ft`), the unit of the time also from its steps.
     """
-    table = open_table(path)
-    time_column, force_columns = declared.get("time_column"), declared.get("force_columns")
+    table, time_column, force_columns = open_table(path), options.time_column, options.force_columns
     time_name = guess_time_column(table) if time_column is None else table.require(time_column, option="--time-column")
     names = _force_names(table, force_columns)
     values, lines, decimal_comma = read_numbers(table, [time_name, *names])
     time = values[:, 0]
     require_rising(time, lines, path=path, column=time_name)
-    unit, how = _time_unit(table, time_name, declared.get("time_unit"), time)
-    scales, units = _force_scales(table, names, declared.get("force_unit"))
+    unit, how = _time_unit(table, time_name, options.time_unit, time)
+    scales, units = _force_scales(table, names, options.force_unit)
     forces = values[:, 1:] * scales
     large = np.abs(forces).max(axis=1) > MOST_FORCE_N
     if large.any():
@@ -386,34 +365,29 @@ def read_force_table(path: Path, **declared: Unpack[ForceColumns]) -> ForceTable
     ]
     if decimal_comma:
         notes.append(f"{path.name}: commas were read as decimal points.")
-    return ForceTable(
-        forces=Forces(time_s=time * UNITS["time"][unit][0], force_n=_to_axes(forces), source=str(path)),
-        notes=tuple(notes),
-    )
+    if len(names) == 2:
+        # normal and tangential: z points into the gel, the tangential force has no direction and is laid along x
+        forces = np.stack([forces[:, 1], np.zeros(len(forces)), forces[:, 0]], axis=1)
+    samples = Forces(time_s=time * UNITS["time"][unit][0], force_n=np.ascontiguousarray(forces), source=str(path))
+    return samples, tuple(notes)
 
 
 def place_on_clock(
-    time_s: Float[np.ndarray, " frames"],
-    *,
-    forces: Path | None,
-    start_s: float | None,
-    source: str,
-    **columns: Unpack[ForceColumns],
+    time_s: Float[np.ndarray, " frames"], options: ReadOptions, *, source: str
 ) -> tuple[Float[np.ndarray, " frames"], Forces | None, tuple[str, ...]]:
     """Times of frames on the clock of the forces in the table beside them, these forces, and notes.
 
     The first frame was taken at `start_s` on the clock of the forces; where that is None, both count from one zero.
     """
-    table = None if forces is None else read_force_table(forces, **columns)
-    notes = () if table is None else table.notes
+    start_s = options.start_s
+    samples, notes = (None, ()) if options.forces is None else read_force_table(options.forces, options)
     if start_s is not None:
         if not isfinite(start_s):
             raise RecordingError(f"the first frame cannot start at {start_s} s; give the time of the force clock")
         time_s = time_s - time_s[0] + start_s
         notes += (f"{source}: the first frame was declared to be taken at {start_s:.6g} s of the force clock.",)
-    elif table is not None:
+    elif samples is not None:
         notes += (f"{source}: the times of its frames and of the forces were taken to count from the same zero.",)
-    samples = None if table is None else table.forces
     if samples is not None and (time_s[-1] < samples.time_s[0] or time_s[0] > samples.time_s[-1]):
         raise RecordingError(
             f"the frames of {source} ({time_s[0]:.6g} to {time_s[-1]:.6g} s) and the forces of {samples.source} "
@@ -434,13 +408,6 @@ def _force_names(table: TextTable, declared: Sequence[str] | None) -> tuple[str,
     if len(set(names)) < len(names):
         raise RecordingError(f"the force columns {', '.join(names)} repeat; name each once")
     return names
-
-
-def _to_axes(forces: Float[np.ndarray, "samples columns"]) -> Float[np.ndarray, "samples 3"]:
-    if forces.shape[1] == 3:
-        return np.ascontiguousarray(forces)
-    # normal and tangential: z points into the gel, the tangential force has no direction and is laid along x
-    return np.stack([forces[:, 1], np.zeros(len(forces)), forces[:, 0]], axis=1)
 
 
 def _time_unit(

@@ -12,6 +12,7 @@ from sliplens.images import natural_key
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.formats.images import common_size, read_frame
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
+from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.trial import labels_of_margins, require_unit_interval
 
 
@@ -74,17 +75,14 @@ FRAMES, REFERENCES, MARGINS = "_images_L.txt", "_images_Lref.txt", "_gamma.csv"
 _FRAME_RATE_HZ = 30.0
 
 
-def read_thesis(
-    path: Path, *, image_root: Path | None = None, margin_unit: str | None = None, frame_rate: float | None = None
-) -> list[Capture]:
+def read_thesis(path: Path, options: ReadOptions) -> list[Capture]:
     """Read the lists of a set: `SET_images_L.txt`, `SET_images_Lref.txt` and `SET_gamma.csv`, in one folder.
 
     The thesis's programs (`get_data` in github.com/MaxPolak97/polycam-regression) read a path a line, and a margin a
     line as a fraction, without a header. The lists themselves are not public, so more is accepted: a header, several
-    columns (that called gamma, else the last), percent, backslashes, empty lines and comments. Their paths are those
-    of the computer that recorded them; a path that does not exist here is looked for under `image_root` by its last
-    parts, the most first.
+    columns (that called gamma, else the last), percent, backslashes, empty lines and comments.
     """
+    frame_rate = options.frame_rate
     rate = _FRAME_RATE_HZ if frame_rate is None else frame_rate
     how = "assumed" if frame_rate is None else "declared"
     times = f"The lists give no times: {rate:g} frames/s were {how}; how fast the margin falls rests on it."
@@ -92,13 +90,13 @@ def read_thesis(
     stem = frames_list.name.removesuffix(FRAMES)
     lists = [frames_list, *(frames_list.with_name(stem + ending) for ending in (REFERENCES, MARGINS))]
     frames, references = (read_lines(file) for file in lists[:2])
-    margins, notes = _read_margins(lists[2], unit=margin_unit)
+    margins, notes = _read_margins(lists[2], unit=options.margin_unit)
     if not len(frames) == len(references) == len(margins):
         raise RecordingError(
             f"{frames_list} has {len(frames)} frames, {lists[1].name} {len(references)} references and {lists[2].name} "
             f"{len(margins)} margins; give one of each a line"
         )
-    root = frames_list.parent if image_root is None else image_root
+    root = options.image_root or frames_list.parent
     listed: dict[Path, str] = {}
 
     def find(text: str, where: str) -> Path:
@@ -163,7 +161,6 @@ def _trial(
         frame_time_s=evenly_spaced(len(paths), frame_rate=rate),
         frame_size=size,
         read_frames=lambda: (read_frame(path, size=size) for path in paths),
-        forces=None,
         notes=notes,
         labels=labels_of_margins(np.array([margin for _, margin in ordered])),
         reference=read_frame(reference, size=size),

@@ -1,10 +1,11 @@
 """Frames of a video file, with the presentation stamps of its container."""
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import av
 import numpy as np
@@ -17,7 +18,8 @@ from jaxtyping import Float, Float32, Int64
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Capture, Frame
-from sliplens.recordings.formats.tables import ForceColumns, evenly_spaced, place_on_clock, trial_name
+from sliplens.recordings.formats.tables import evenly_spaced, place_on_clock, trial_name
+from sliplens.recordings.options import ReadOptions
 
 HEAD = 13
 """Frames at the start that may be stale."""
@@ -117,13 +119,8 @@ class VideoFile:
 
 def inspect_video(path: Path) -> VideoFile:
     """Read the stamps of all frames."""
-    with _open(path) as container:
-        video = _video_stream(container, path)
-        size = video.codec_context.height, video.codec_context.width
-        if min(size) <= 0 or size[0] * size[1] > MOST_PIXELS:
-            raise RecordingError(
-                f"{path} claims frames of {size[1]} x {size[0]} pixels; the file is damaged, copy or export it again"
-            )
+    with open_video(path) as (container, video):
+        size = require_size(path, video)
         # AVI counts frames; the presentation stamps made up from that are late where frames are reordered
         counted = container.format.name == "avi"
         found, cut = _read_stamps(container, video, path=path, counted=counted)
@@ -163,29 +160,33 @@ def _read_stamps(
     return found, cut
 
 
-def open_container(path: Path) -> InputContainer:
-    """Container of a video, never a play list."""
-    # an absolute path cannot be taken for an address or a pattern of file names
-    return av.open(str(path.absolute()), options=_OPTIONS, **_LENIENT)
-
-
-def _open(path: Path) -> InputContainer:
+@contextmanager
+def open_video(path: Path, *, missing: str = "name a video file") -> Iterator[tuple[InputContainer, VideoStream]]:
+    """Container of a video, never a play list, and its first stream of moving pictures; tells what FFmpeg raises."""
     if not path.is_file():
-        raise RecordingError(f"{path} {'is no file' if path.exists() else 'does not exist'}; name a video file")
+        raise RecordingError(f"{path} {'is no file' if path.exists() else 'does not exist'}; {missing}")
     try:
-        return open_container(path)
+        # an absolute path cannot be taken for an address or a pattern of file names
+        with av.open(str(path.absolute()), options=_OPTIONS, **_LENIENT) as container:
+            streams = _moving(container)
+            if not streams:
+                raise RecordingError(f"{path} has no video stream; name the file that the camera wrote")
+            if streams[0].codec_context is None:
+                raise RecordingError(f"{path} {_NO_DECODER}")
+            yield container, streams[0]
     except (FFmpegError, OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise RecordingError(f"{path} cannot be read as a video ({reason}); copy or export it again") from None
 
 
-def _video_stream(container: InputContainer, path: Path) -> VideoStream:
-    streams = _moving(container)
-    if not streams:
-        raise RecordingError(f"{path} has no video stream; name the file that the camera wrote")
-    if streams[0].codec_context is None:
-        raise RecordingError(f"{path} {_NO_DECODER}")
-    return streams[0]
+def require_size(path: Path, video: VideoStream) -> tuple[int, int]:
+    """Height and width of the frames as the header claims them, where they can be true."""
+    size = video.codec_context.height, video.codec_context.width
+    if min(size) <= 0 or size[0] * size[1] > MOST_PIXELS:
+        raise RecordingError(
+            f"{path} claims frames of {size[1]} x {size[0]} pixels; the file is damaged, copy or export it again"
+        )
+    return size
 
 
 def _moving(container: InputContainer) -> list[VideoStream]:
@@ -231,8 +232,7 @@ def decode_video(file: VideoFile) -> Iterator[Frame]:
     """Decode the frames in the order they are shown."""
     path, count = file.path, 0
     to_rgb = VideoReformatter()  # one for all: preparing it costs as much as a frame
-    with _open(path) as container:
-        video = _video_stream(container, path)
+    with open_video(path) as (container, video):
         video.thread_type = "AUTO"
         try:
             for frame in container.decode(video):
@@ -259,23 +259,9 @@ def _damaged(path: Path, frame: int, reason: str | None) -> str:
     return f"frame {frame} of {path} cannot be decoded ({reason}); the file is damaged, copy or export it again"
 
 
-def read_video(
-    path: Path,
-    *,
-    forces: Path | None = None,
-    frame_rate: float | None = None,
-    start_s: float | None = None,
-    skip_frames: int = 0,
-    skip_stale: bool = False,
-    name: str | None = None,
-    **columns: Unpack[ForceColumns],
-) -> Capture:
-    """Open a video, and a table of forces recorded beside it.
-
-    Times are the presentation stamps of the container, so that a variable frame rate is kept.
-    Options are those of `ReadOptions`.
-    """
-    file = inspect_video(path)
+def read_video(path: Path, options: ReadOptions) -> Capture:
+    """Open a video at its presentation stamps, which keep a variable rate, and a table of forces recorded beside it."""
+    file, frame_rate = inspect_video(path), options.frame_rate
     notes = list(file.notes)
     if frame_rate is not None:
         time = evenly_spaced(file.frames, frame_rate=frame_rate)
@@ -286,14 +272,19 @@ def read_video(
         raise RecordingError(f"{path} has no presentation stamps; declare its rate with --frame-rate")
     else:
         time = file.time_s
-    time, samples, more = place_on_clock(time, forces=forces, start_s=start_s, source=path.name, **columns)
+    time, samples, more = place_on_clock(time, options, source=path.name)
     notes.extend(more)
-    skipped = _skipped(path, file, skip_frames=skip_frames, skip_stale=skip_stale)
+    skipped = options.skip_frames or 0
+    if skipped < 0:
+        raise RecordingError(f"{skipped} frames cannot be skipped; give 0 or more")
+    if options.skip_stale:
+        skipped = max(skipped, stale_frames(decode_video(file)))
+    if skipped >= file.frames:
+        raise RecordingError(f"{path} has {file.frames} frames, {skipped} were to be skipped; skip fewer")
     if skipped:
         notes.append(f"{path.name}: the first {skipped} of {file.frames} frames were left out.")
-
     return Capture(
-        trial=trial_name(path.stem if name is None else name),
+        trial=trial_name(path.stem),
         source=str(path),
         frame_time_s=time[skipped:],
         frame_size=file.frame_size,
@@ -301,12 +292,3 @@ def read_video(
         forces=samples,
         notes=tuple(notes),
     )
-
-
-def _skipped(path: Path, file: VideoFile, *, skip_frames: int, skip_stale: bool) -> int:
-    if skip_frames < 0:
-        raise RecordingError(f"{skip_frames} frames cannot be skipped; give 0 or more")
-    skipped = max(skip_frames, stale_frames(decode_video(file))) if skip_stale else skip_frames
-    if skipped >= file.frames:
-        raise RecordingError(f"{path} has {file.frames} frames, {skipped} were to be skipped; skip fewer")
-    return skipped

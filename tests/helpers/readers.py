@@ -1,0 +1,22 @@
+"""Readers of recordings that take the fields of their options by keyword."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from sliplens.recordings.formats import images, lerobot, rosbag, tables, thesis, video
+from sliplens.recordings.options import ReadOptions
+
+Found = TypeVar("Found")
+
+
+def _by_keyword(read: Callable[[Path, ReadOptions], Found]) -> Callable[..., Found]:
+    return lambda path, **options: read(path, ReadOptions(**options))
+
+
+read_force_table = _by_keyword(tables.read_force_table)
+read_image_folder = _by_keyword(images.read_image_folder)
+read_lerobot = _by_keyword(lerobot.read_lerobot)
+read_rosbag = _by_keyword(rosbag.read_rosbag)
+read_thesis = _by_keyword(thesis.read_thesis)
+read_video = _by_keyword(video.read_video)
