@@ -117,11 +117,11 @@ def test_looks_are_those_of_the_saved_maps(material: Material, fine_dataset: Dat
     found = quality.methods["grad-cam"]
     assert found.total_variation == pytest.approx(np.mean([total_variation(one) for one in maps]))
     assert found.gini == pytest.approx(np.mean([gini(one) for one in maps]))
-    ((pair, gap),) = quality.rougher.items()
+    (compared,) = quality.comparisons
     assert found.total_variation is not None
-    other = np.mean([total_variation(one) for one in material.explained.saliency[pair[1]].astype(np.float64)])
-    assert pair[0] == "grad-cam"
-    assert gap.estimate == pytest.approx(found.total_variation - other)
+    other = np.mean([total_variation(one) for one in material.explained.saliency[compared.second].astype(np.float64)])
+    assert compared.first == "grad-cam"
+    assert compared.gap.estimate == pytest.approx(found.total_variation - other)
     # frames that follow each other share a reference without noise: nothing shakes, so the maps stay as they are
     assert quality.noise_sd == 0
     assert found.noise_stability == pytest.approx(1.0, abs=1e-4)

@@ -9,33 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from sliplens.plots.errors import (
-    plot_bins,
-    plot_faithfulness,
-    plot_learning_curves,
-    plot_margin_over_time,
-    plot_predictions,
-)
-from sliplens.plots.style import (
-    BLACK,
-    INPUT_COLOURS,
-    METHOD_COLOURS,
-    METHOD_LINES,
-    PURPLE,
-    conditions_in_order,
-    decimals,
-    drawing_style,
-    fill_name,
-    input_name,
-    inputs_in_order,
-    listed,
-    method_name,
-    methods_in_order,
-    percent,
-    short_input_name,
-    signed,
-    source_name,
-)
+from sliplens.plots import errors, style
 from sliplens.report.comparisons import settings
 from sliplens.report.plates import Plate, named_columns, rows_of
 from sliplens.report.results import Results
@@ -48,11 +22,14 @@ _FEW = 4  # charts in a row
 def plate_bins(results: Results) -> Plate:
     """Draw the MSE by bins of the margin, a chart a condition (thesis, Fig. 7)."""
     evaluations, conditions = results.evaluations, _conditions(results)
-    bins = {condition: {} for condition in conditions}
-    for condition in conditions:
-        for name in inputs_in_order(evaluations):
-            if condition in evaluations[name].conditions:
-                bins[condition][name] = evaluations[name].conditions[condition].bins
+    bins = {
+        condition: {
+            name: evaluations[name].conditions[condition].bins
+            for name in style.inputs_in_order(evaluations)
+            if condition in evaluations[name].conditions
+        }
+        for condition in conditions
+    }
     rows = [
         (condition, name, row.low, row.high, row.frames, row.mse)
         for condition, by_input in bins.items()
@@ -63,14 +40,14 @@ def plate_bins(results: Results) -> Plate:
     top = 1.15 * max((row[5] for row in rows if row[5] is not None), default=1.0)
     figure, axes = make_charts(len(conditions), each=(4.4, 3.2))
     told = []
-    with drawing_style():
+    with style.drawing_style():
         for ax, condition in zip(axes, conditions, strict=True):
-            plot_bins(bins[condition], ax=ax).set(ylim=(0, top))
+            errors.plot_bins(bins[condition], ax=ax).set(ylim=(0, top))
             ax.set_title(f"{condition.capitalize()} objects", parse_math=False)
             known = [row for row in rows if row[0] == condition and row[5] is not None]
             if known:
                 _, name, low, high, _, mse = max(known, key=lambda row: row[5] or 0.0)
-                place = f"{percent(low)} to {percent(high)}, {input_name(name).lower()}"
+                place = f"{style.percent(low)} to {style.percent(high)}, {style.input_name(name).lower()}"
                 told.append(f"{condition}: {place}, MSE {mse:.4f}")
     return Plate(
         name="fig-07-mse-by-bin",
@@ -90,23 +67,24 @@ def plate_predictions(results: Results) -> Plate:
     shown = [
         (name, condition, one.predictions.where(one.predictions.condition == condition))
         for condition in _conditions(results)
-        for name in inputs_in_order(results.evaluations)
+        for name in style.inputs_in_order(results.evaluations)
         for one in [results.evaluations[name]]
         if condition in one.conditions and (one.predictions.condition == condition).any()
     ]
     figure, axes = make_charts(len(shown), each=(3.4, 3.1))
     rows = []
-    with drawing_style():
+    with style.drawing_style():
         for ax, (name, condition, frames) in zip(axes, shown, strict=True):
-            r2 = decimals(results.evaluations[name].conditions[condition].r2, 2)
-            plot_predictions(frames, colour=INPUT_COLOURS.get(name, PURPLE), ax=ax).set(ylim=(low - 5, high + 5))
-            ax.set_title(f"{short_input_name(name)}, {condition} (R² {r2})", parse_math=False)
+            r2 = style.decimals(results.evaluations[name].conditions[condition].r2, 2)
+            errors.plot_predictions(frames, colour=style.INPUT_COLOURS.get(name, style.PURPLE), ax=ax)
+            ax.set(ylim=(low - 5, high + 5))
+            ax.set_title(f"{style.short_input_name(name)}, {condition} (R² {r2})", parse_math=False)
             answered = (frames.trial, frames.condition, frames.frame, frames.safety_margin, frames.prediction)
             rows += [(name, *values) for values in rows_of(*answered)]
     return Plate(
         name="predictions",
         figure=figure,
-        alt=f"Predicted against true Γ: {listed([f'{input_name(one[0])}, {one[1]}' for one in shown])}",
+        alt=f"Predicted against true Γ: {style.listed([f'{style.input_name(one[0])}, {one[1]}' for one in shown])}",
         caption=f"Predicted against true safety margin, {len(answers)} answers on frames of test trials. A perfect "
         "network would put every dot on the dashed line.",
         numbers=named_columns(("input", "trial", "condition", "frame", "safety_margin", "prediction"), rows),
@@ -120,7 +98,7 @@ def plate_over_time(results: Results) -> Plate | None:
         return None
     figure, axes = make_charts(len(chosen), each=(4.6, 3.1))
     rows = []
-    with drawing_style():
+    with style.drawing_style():
         for ax, (condition, trial) in zip(axes, chosen.items(), strict=True):
             shown = {}
             for name, one in results.evaluations.items():
@@ -129,7 +107,7 @@ def plate_over_time(results: Results) -> Plate | None:
                     shown[name] = frames = one.predictions.where(of_trial)
                     values = rows_of(frames.time_s, frames.safety_margin, frames.prediction)
                     rows += [(name, trial, *own) for own in values]
-            plot_margin_over_time(shown, ax=ax).set_title(condition.capitalize(), parse_math=False)
+            errors.plot_margin_over_time(shown, ax=ax).set_title(condition.capitalize(), parse_math=False)
     told = ", ".join(f"{trial} ({condition})" for condition, trial in chosen.items())
     return Plate(
         name="over-time",
@@ -143,15 +121,15 @@ def plate_over_time(results: Results) -> Plate | None:
 
 def plate_learning(results: Results) -> Plate:
     """Draw the learning curves of all inputs."""
-    trainings = {name: results.trainings[name] for name in inputs_in_order(results.trainings)}
+    trainings = {name: results.trainings[name] for name in style.inputs_in_order(results.trainings)}
     told = "; ".join(
-        f"{input_name(name)}: best validation MSE {decimals(one.best_validation_mse, 4)} "
-        f"after {decimals(one.epochs, 1)} epochs (stopped by {one.stopped_by})"
+        f"{style.input_name(name)}: best validation MSE {style.decimals(one.best_validation_mse, 4)} "
+        f"after {style.decimals(one.epochs, 1)} epochs (stopped by {one.stopped_by})"
         for name, one in trainings.items()
     )
     figure, axes = make_charts(1, each=(5.6, 3.2))
-    with drawing_style():
-        plot_learning_curves(trainings, ax=axes[0])
+    with style.drawing_style():
+        errors.plot_learning_curves(trainings, ax=axes[0])
     rows = [
         (name, *values)
         for name, one in trainings.items()
@@ -169,11 +147,11 @@ def plate_learning(results: Results) -> Plate:
 def plate_faithfulness(scores: Mapping[str, DeletionScores]) -> Plate:
     """Draw the mean deletion score while pixels go, a chart an input, all of one source (thesis, Fig. 9)."""
     figure, axes = make_charts(len(scores), each=(4.6, 3.5))
-    with drawing_style():
+    with style.drawing_style():
         for ax, (name, one) in zip(axes, scores.items(), strict=True):
-            plot_faithfulness(one.curves, pixels=_pixels(one), ax=ax).set_title(input_name(name))
-    told = "; ".join(f"{input_name(name).lower()}: {_tell_order(one)}" for name, one in scores.items())
-    source = " or ".join(sorted({source_name(one.source) for one in scores.values()}))
+            errors.plot_faithfulness(one.curves, pixels=_pixels(one), ax=ax).set_title(style.input_name(name))
+    told = "; ".join(f"{style.input_name(name).lower()}: {_tell_order(one)}" for name, one in scores.items())
+    source = " or ".join(sorted({style.source_name(one.source) for one in scores.values()}))
     fill = " or ".join(sorted({one.fill for one in scores.values()}))
     real = "-real" if all(one.source == "real" for one in scores.values()) else ""
     return Plate(
@@ -189,20 +167,20 @@ def plate_faithfulness(scores: Mapping[str, DeletionScores]) -> Plate:
 
 def plate_each_frame(scored: DeletionScores) -> Plate:
     """Draw the thesis's curve of every frame, a chart a method (thesis, Figs. 17 and 18)."""
-    methods, name = methods_in_order(scored.curves), input_name(scored.input).lower()
+    methods, name = style.methods_in_order(scored.curves), style.input_name(scored.input).lower()
     figure, axes = make_charts(len(methods), each=(2.9, 2.5))
     told = []
-    with drawing_style():
+    with style.drawing_style():
         for ax, method in zip(axes, methods, strict=True):
-            curve, colour = scored.curves[method], METHOD_COLOURS.get(method, PURPLE)
+            curve, colour = scored.curves[method], style.METHOD_COLOURS.get(method, style.PURPLE)
             share = 100 * curve.pixels_removed / _pixels(scored)
             # dozens of curves as vectors would swell the page
             ax.plot(share, curve.scores.T, color=colour, alpha=0.3, linewidth=0.7, rasterized=True)
-            ax.plot(share, curve.scores.mean(axis=0), color=BLACK, linewidth=2)
+            ax.plot(share, curve.scores.mean(axis=0), color=style.BLACK, linewidth=2)
             ax.set(xlim=(0, 100), ylim=(0, 1.03), xlabel="Pixels removed (%)", ylabel="D (no unit)")
-            ax.set_title(method_name(method), fontsize=9.5)
+            ax.set_title(style.method_name(method), fontsize=9.5)
             means = curve.scores.mean(axis=1)
-            told.append(f"{method_name(method)} {means.mean():.3f} (standard deviation {means.std():.3f})")
+            told.append(f"{style.method_name(method)} {means.mean():.3f} (standard deviation {means.std():.3f})")
     frames = max(len(curve.frame_ids) for curve in scored.curves.values())
     return Plate(
         name=_EACH_FIGURES.get(scored.input, f"faithfulness-{scored.input}"),
@@ -215,7 +193,7 @@ def plate_each_frame(scored: DeletionScores) -> Plate:
 
 def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
     """Draw change against area, most and least influential first and at random, by method and fill; None without."""
-    methods = methods_in_order({method for _, _, method in faithful.curves if not is_control(method)})
+    methods = style.methods_in_order({method for _, _, method in faithful.curves if not is_control(method)})
     fills = settings(faithful)
     if not methods or not fills:
         return None
@@ -223,7 +201,7 @@ def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
     top = max(float(curve.most_first.mean(axis=0).max()) for curve in shown)
     # below zero where more speaks for the answer than before
     bottom = min(float(line.mean(axis=0).min()) for one in shown for line in (one.most_first, one.least_first))
-    with drawing_style():
+    with style.drawing_style():
         figure = Figure(figsize=(1.75 * len(fills) + 0.9, 1.55 * len(methods) + 0.9), layout="constrained")
         axes = figure.subplots(len(methods), len(fills), squeeze=False, sharex=True, sharey=True)
         for line, method in zip(axes, methods, strict=True):
@@ -233,12 +211,12 @@ def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
                     ax.set_axis_off()
                 else:
                     _plot_removal(curve, method, ax=ax)
-            line[0].set_ylabel(wrap(method_name(method), 20), fontsize=8.5)
+            line[0].set_ylabel(wrap(style.method_name(method), 20), fontsize=8.5)
         for ax, (fill, unit) in zip(axes[0], fills, strict=True):
-            ax.set_title(fill_name(fill, unit).capitalize().replace(" (", "\n("), fontsize=8.5)
+            ax.set_title(style.fill_name(fill, unit).capitalize().replace(" (", "\n("), fontsize=8.5)
         axes[0, 0].set(ylim=(1.15 * min(bottom, 0.0), 1.15 * max(top, 1e-3)), xlim=(0, 100), xticks=[0, 50, 100])
         kinds: dict[str, Any] = {"most supporting first": "-", "least supporting first": "--", "random orders": ":"}
-        handles = [Line2D([], [], color=BLACK, linestyle=line, label=label) for label, line in kinds.items()]
+        handles = [Line2D([], [], color=style.BLACK, linestyle=line, label=label) for label, line in kinds.items()]
         figure.legend(handles=handles, loc="outside upper left", ncols=3)
         figure.supxlabel("Removed (% of the image)", fontsize=9)
         figure.supylabel("Evidence lost (margin units)", fontsize=9)
@@ -249,10 +227,10 @@ def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
     return Plate(
         name=f"sound-curves-{faithful.input}",
         figure=figure,
-        alt=f"Evidence lost against the area removed, {input_name(faithful.input).lower()}, for "
-        f"{listed([method_name(one) for one in methods])}",
-        caption=f"{input_name(faithful.input)}: how much of the answer's change from the untouched sensor is lost "
-        "while parts go, most supporting first, "
+        alt=f"Evidence lost against the area removed, {style.input_name(faithful.input).lower()}, for "
+        f"{style.listed([style.method_name(one) for one in methods])}",
+        caption=f"{style.input_name(faithful.input)}: how much of the answer's change from the untouched sensor is "
+        "lost while parts go, most supporting first, "
         f"least supporting first, and in {faithful.random_orders} random orders; the band holds the middle half of "
         f"{faithful.frames} frames. The area between the first two is the symmetric gain. "
         f"{_tell_gains(faithful, methods)}",
@@ -263,24 +241,25 @@ def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
 def plate_randomisation(results: Results) -> Plate:
     """Draw how alike maps stay as layers get new weights, a chart an input."""
     found = results.study.randomisation
-    names = inputs_in_order(found)[::-1]
+    names = style.inputs_in_order(found)[::-1]
     rows, told = [], []
     figure, axes = make_charts(len(names), each=(4.6, 3.5), sharey=True)
-    with drawing_style():
+    with style.drawing_style():
         for ax, name in zip(axes, names, strict=True):
-            for method in methods_in_order(found[name].methods):
+            for method in style.methods_in_order(found[name].methods):
                 one = found[name].methods[method]
-                colour, line = METHOD_COLOURS.get(method, PURPLE), METHOD_LINES.get(method, "-")
-                dots = {"marker": "o", "markersize": 3.5, "label": method_name(method)}
+                colour, line = style.METHOD_COLOURS.get(method, style.PURPLE), style.METHOD_LINES.get(method, "-")
+                dots = {"marker": "o", "markersize": 3.5, "label": style.method_name(method)}
                 similarity = np.array(one.similarity, dtype=np.float64)
                 ax.plot(one.layers, similarity, color=colour, linestyle=line, **dots)
                 rows += [(name, method, layer, value) for layer, value in zip(one.layers, one.similarity, strict=True)]
                 last = one.similarity[-1] if one.similarity else None
                 if last is not None:
-                    told.append(f"{method_name(method)} {signed(last, 2)} ({short_input_name(name).lower()})")
-            ax.axhline(0, color=BLACK, linewidth=0.8, linestyle=":")
+                    where = style.short_input_name(name).lower()
+                    told.append(f"{style.method_name(method)} {style.signed(last, 2)} ({where})")
+            ax.axhline(0, color=style.BLACK, linewidth=0.8, linestyle=":")
             ax.set(xlabel="Layers with new weights, from the output", ylabel="Similarity of the map (no unit)")
-            ax.set_title(input_name(name))
+            ax.set_title(style.input_name(name))
         lines = {line.get_label(): line for ax in axes for line in ax.get_lines() if line.get_marker() == "o"}
         figure.legend(handles=list(lines.values()), loc="outside upper left", ncols=3)
     return Plate(
@@ -298,7 +277,7 @@ def make_charts(count: int, *, each: tuple[float, float], sharey: bool = False) 
     """Make a figure of some charts, at most `_FEW` in a row."""
     wide = min(count, _FEW)
     high = -(-count // wide)
-    with drawing_style():
+    with style.drawing_style():
         figure = Figure(figsize=(each[0] * wide, each[1] * high), layout="constrained")
         axes = list(figure.subplots(high, wide, squeeze=False, sharey=sharey).ravel())
     for ax in axes[count:]:
@@ -307,12 +286,12 @@ def make_charts(count: int, *, each: tuple[float, float], sharey: bool = False) 
 
 
 def _conditions(results: Results) -> list[str]:
-    return conditions_in_order(name for one in results.evaluations.values() for name in one.conditions)
+    return style.conditions_in_order(name for one in results.evaluations.values() for name in one.conditions)
 
 
 def _typical_trial(results: Results, condition: str) -> str | None:
     # judged by the last input (difference where it was run), so that the choice favours neither curve by eye
-    shown = results.evaluations[inputs_in_order(results.evaluations)[-1]].predictions
+    shown = results.evaluations[style.inputs_in_order(results.evaluations)[-1]].predictions
     shown = shown.where(shown.condition == condition)
     error = np.abs(shown.prediction - shown.safety_margin)
     ranked = sorted(np.unique(shown.trial).tolist(), key=lambda trial: float(error[shown.trial == trial].mean()))
@@ -325,14 +304,14 @@ def _pixels(scored: DeletionScores) -> int:
 
 def _tell_order(scored: DeletionScores) -> str:
     means = {method: float(curve.scores.mean()) for method, curve in scored.curves.items()}
-    return ", ".join(f"{method_name(one)} {means[one]:.3f}" for one in sorted(means, key=lambda one: means[one]))
+    return ", ".join(f"{style.method_name(one)} {means[one]:.3f}" for one in sorted(means, key=lambda one: means[one]))
 
 
 def _deletion_numbers(scores: Mapping[str, DeletionScores]) -> dict[str, list]:
     names = ("input", "method", "pixels_removed", "share_removed", "mean", "quartile_low", "quartile_high", "sd")
     rows = []
     for name, one in scores.items():
-        for method in methods_in_order(one.curves):
+        for method in style.methods_in_order(one.curves):
             curve = one.curves[method]
             mean, quartiles = curve.scores.mean(axis=0), np.quantile(curve.scores, [0.25, 0.75], axis=0)
             removed = (curve.pixels_removed, curve.pixels_removed / _pixels(one))
@@ -341,12 +320,12 @@ def _deletion_numbers(scores: Mapping[str, DeletionScores]) -> dict[str, list]:
 
 
 def _plot_removal(curve: RemovalCurve, method: str, *, ax: Axes) -> None:
-    share, colour = 100 * curve.areas, METHOD_COLOURS.get(method, PURPLE)
+    share, colour = 100 * curve.areas, style.METHOD_COLOURS.get(method, style.PURPLE)
     low, high = np.quantile(curve.most_first, [0.25, 0.75], axis=0)
     ax.fill_between(share, low, high, color=colour, alpha=0.15, linewidth=0)
     ax.plot(share, curve.most_first.mean(axis=0), color=colour, linewidth=1.6)
     ax.plot(share, curve.least_first.mean(axis=0), color=colour, linestyle="--", linewidth=1.3)
-    ax.plot(share, curve.random.mean(axis=0), color=BLACK, linestyle=":", linewidth=1.3)
+    ax.plot(share, curve.random.mean(axis=0), color=style.BLACK, linestyle=":", linewidth=1.3)
     ax.tick_params(labelsize=7.5)
 
 
@@ -355,5 +334,5 @@ def _tell_gains(faithful: RemovalScores, methods: list[str]) -> str:
     curves = {method: faithful.curves.get((fill, unit, method)) for method in methods}
     gains = {method: float(curve.srg.mean()) for method, curve in curves.items() if curve is not None}
     ranked = sorted(gains, key=lambda one: -gains[one])
-    told = ", ".join(f"{method_name(one)} {signed(gains[one], 3)}" for one in ranked)
-    return f"Under {fill_name(fill, unit)} it is {told}."
+    told = ", ".join(f"{style.method_name(one)} {style.signed(gains[one], 3)}" for one in ranked)
+    return f"Under {style.fill_name(fill, unit)} it is {told}."

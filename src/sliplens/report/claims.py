@@ -12,15 +12,7 @@ from typing import ClassVar, Literal, TypeVar
 import numpy as np
 
 from sliplens.intervals import Difference, paired_difference
-from sliplens.plots.style import (
-    decimals,
-    fill_name,
-    input_name,
-    inputs_in_order,
-    listed,
-    method_name,
-    percent,
-)
+from sliplens.plots.style import decimals, fill_name, input_name, inputs_in_order, listed, method_name, percent
 from sliplens.report.comparisons import (
     compare_deletion,
     compare_gain,

@@ -7,17 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from sliplens.intervals import Difference, paired_difference
-from sliplens.plots.style import (
-    CONTROL,
-    FILL_NAMES,
-    UNIT_NAMES,
-    fill_name,
-    in_order,
-    input_name,
-    inputs_in_order,
-    listed,
-    signed,
-)
+from sliplens.plots import style
 from sliplens.results.evaluation import Predictions
 from sliplens.results.faithfulness import Comparison, DeletionCurve, DeletionScores, RemovalCurve, RemovalScores
 from sliplens.results.study import Choice, MarkerEffects, Roughness
@@ -45,9 +35,9 @@ def compare_deletion(first: DeletionCurve, second: DeletionCurve, *, rng: np.ran
 
 def against_control(scored: DeletionScores, method: str, *, rng: np.random.Generator) -> Difference | None:
     """Difference of a method's D_AUC from the random control's; None for the control itself or without one."""
-    if method == CONTROL or not {method, CONTROL} <= set(scored.curves):
+    if method == style.CONTROL or not {method, style.CONTROL} <= set(scored.curves):
         return None
-    return compare_deletion(scored.curves[method], scored.curves[CONTROL], rng=rng)
+    return compare_deletion(scored.curves[method], scored.curves[style.CONTROL], rng=rng)
 
 
 def compare_gain(*pairs: tuple[RemovalCurve, RemovalCurve], rng: np.random.Generator) -> Difference | None:
@@ -91,8 +81,8 @@ def share_of_strongest(effects: MarkerEffects, *, count: int, rng: np.random.Gen
 def settings(faithful: RemovalScores) -> list[tuple[str, str]]:
     """Fills and units that were scored, in the order they are read."""
     found = {(fill, unit) for fill, unit, _ in faithful.curves}
-    fills = in_order({fill for fill, _ in found}, FILL_NAMES)
-    units = in_order({unit for _, unit in found}, UNIT_NAMES)
+    fills = style.in_order({fill for fill, _ in found}, style.FILL_NAMES)
+    units = style.in_order({unit for _, unit in found}, style.UNIT_NAMES)
     return [(fill, unit) for unit in units for fill in fills if (fill, unit) in found]
 
 
@@ -105,7 +95,7 @@ def voting_settings(faithful: RemovalScores) -> list[tuple[str, str]]:
 def removal_by_setting(faithful: RemovalScores) -> list[tuple[str, dict[str, RemovalCurve]]]:
     """Name of each fill and unit, and its curves by method, in the order they are read."""
     return [
-        (fill_name(*setting), {key[2]: curve for key, curve in faithful.curves.items() if key[:2] == setting})
+        (style.fill_name(*setting), {key[2]: curve for key, curve in faithful.curves.items() if key[:2] == setting})
         for setting in settings(faithful)
     ]
 
@@ -119,16 +109,16 @@ def mean_at(curve: RemovalCurve, area: float) -> tuple[float, float]:
 
 def tell_sample(choice: Choice, name: str = "") -> str:
     """Write how wrong the explained answers are, and how many trials are read well enough; of one network, if named."""
-    names = [name] if name in choice.mean_error else inputs_in_order(choice.mean_error)[::-1]
+    names = [name] if name in choice.mean_error else style.inputs_in_order(choice.mean_error)[::-1]
     several = len(names) > 1
     errors = [
-        f"{100 * choice.mean_error[one]:.0f} points" + (f" ({input_name(one).lower()})" if several else "")
+        f"{100 * choice.mean_error[one]:.0f} points" + (f" ({style.input_name(one).lower()})" if several else "")
         for one in names
     ]
-    alone = [f"{choice.qualified_alone[one]} with {input_name(one).lower()}" for one in names]
-    told = f", {listed(alone)} alone" if len(choice.inputs) > 1 else ""
+    alone = [f"{choice.qualified_alone[one]} with {style.input_name(one).lower()}" for one in names]
+    told = f", {style.listed(alone)} alone" if len(choice.inputs) > 1 else ""
     return (
-        f"The sample explains answers that are off by {listed(errors)} on average; {choice.qualified} of "
+        f"The sample explains answers that are off by {style.listed(errors)} on average; {choice.qualified} of "
         f"{choice.considered} trials qualify at ±{100 * choice.tolerance:g} points{told}."
     )
 
@@ -140,9 +130,9 @@ def tell_over(gaps: Iterable[Difference | None]) -> str:
 
 def tell_interval(gap: Difference, *, digits: int = 3) -> str:
     """Write an estimate with its 95 % interval."""
-    return f"{signed(gap.estimate, digits)} ({tell_bounds(gap, digits=digits)})"
+    return f"{style.signed(gap.estimate, digits)} ({tell_bounds(gap, digits=digits)})"
 
 
 def tell_bounds(gap: Difference, *, digits: int = 3) -> str:
     """Write the ends of a 95 % interval."""
-    return f"{signed(gap.low, digits)} to {signed(gap.high, digits)}"
+    return f"{style.signed(gap.low, digits)} to {style.signed(gap.high, digits)}"

@@ -11,8 +11,8 @@ from sliplens.recordings.dataset import load_dataset
 from sliplens.results.diagnosis import Diagnosis
 from sliplens.results.evaluation import Evaluation
 from sliplens.results.explanation import Explained, Strip, load_explained
-from sliplens.results.faithfulness import DeletionScores, Remedies, RemovalScores
-from sliplens.results.study import TABLES, Choice, MapQuality, Randomisation, States, Study, Timing, Truth
+from sliplens.results.faithfulness import DeletionScores
+from sliplens.results.study import STAGES, TABLES, Study
 from sliplens.results.training import Simulation, Training, describe_simulation
 
 _OF_A_COMMAND: dict[str, type] = {
@@ -21,16 +21,6 @@ _OF_A_COMMAND: dict[str, type] = {
     "diagnose": Diagnosis,
     "score": DeletionScores,
     "strip": Strip,
-}
-_OF_A_STUDY: dict[str, type] = {
-    "choice": Choice,
-    "states": States,
-    "remedies": Remedies,
-    "faithfulness": RemovalScores,
-    "randomisation": Randomisation,
-    "map-quality": MapQuality,
-    "timing": Timing,
-    "truth": Truth,
 }
 
 
@@ -59,12 +49,8 @@ class Results:
     @property
     def inputs(self) -> set[str]:
         """Inputs that any stage tells of."""
-        named = {
-            *self.trainings,
-            *self.evaluations,
-            *self.diagnoses,
-            *(name for name, _ in (*self.explanations, *self.scores)),
-        }
+        of_source = {name for name, _ in (*self.explanations, *self.scores)}
+        named = {*self.trainings, *self.evaluations, *self.diagnoses} | of_source
         return named | self.study.inputs if self.study or not named else named
 
 
@@ -73,11 +59,6 @@ def load_results(workspace: Path) -> Results:
 
     A folder counts when it holds `run.json`; its stage, input and source say what it is. Of two results of one kind the
     one that finished last is kept, and `Results.notes` says so.
-
-    Parameters
-    ----------
-    workspace
-        Folder with one subfolder a stage.
 
     Raises
     ------
@@ -97,19 +78,17 @@ def load_results(workspace: Path) -> Results:
             result = describe_simulation(load_dataset(folder))
         elif run.stage == "explain":
             result = load_explained(folder)
-        elif run.stage in _OF_A_COMMAND:
-            result = load_result(folder, _OF_A_COMMAND[run.stage], command=f"sliplens {run.stage}")
-        elif run.stage in _OF_A_STUDY:
-            result = load_result(folder, _OF_A_STUDY[run.stage], command="sliplens study")
+        elif kind := (_OF_A_COMMAND | STAGES).get(run.stage):
+            command = run.stage if run.stage in _OF_A_COMMAND else "study"
+            result = load_result(folder, kind, command=f"sliplens {command}")
         else:
             continue
         name = getattr(result, "input", "")
         key = (run.stage, name, getattr(result, "source", "") if name else "")
         if key in found:
-            kind = " ".join(part for part in key if part)
             notes.append(
-                f"Two folders hold a result of “{kind}”: {folder.name} finished last and is shown, "
-                f"{folder_of[key].name} is not."
+                f"Two folders hold a result of “{' '.join(filter(None, key))}”: {folder.name} finished last and is "
+                f"shown, {folder_of[key].name} is not."
             )
         found[key], folder_of[key] = result, folder
     if not found:
@@ -126,7 +105,7 @@ def load_results(workspace: Path) -> Results:
         simulation=of("simulate").get(""),
         trainings=of("train"),
         evaluations=of("evaluate"),
-        diagnoses={name: one for (own, name, _), one in found.items() if own == "diagnose"},
+        diagnoses=of("diagnose"),
         explanations={key[1:]: value for key, value in found.items() if key[0] == "explain"},
         scores={key[1:]: value for key, value in found.items() if key[0] == "score"},
         strip=next(iter(of("strip").values()), None),

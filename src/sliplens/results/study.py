@@ -234,11 +234,6 @@ class MapQuality:
     methods: dict[str, MapMeasures]
     comparisons: tuple[Roughness, ...]
 
-    @property
-    def rougher(self) -> dict[tuple[str, str], Difference]:
-        """Differences of the total variation by the two methods compared."""
-        return {(one.first, one.second): one.gap for one in self.comparisons}
-
 
 @dataclass(frozen=True, kw_only=True)
 class MethodTime:
@@ -380,17 +375,19 @@ class Truth:
 _Test = Remedies | RemovalScores | Randomisation | MapQuality | Timing | Truth
 
 
-TABLES = {
-    "evaluate": "evaluations",
-    "explain": "explanations",
-    "score": "deletion",
-    "remedies": "remedies",
-    "faithfulness": "faithfulness",
-    "randomisation": "randomisation",
-    "map-quality": "map_quality",
-    "timing": "timing",
-    "truth": "truth",
+STAGES: dict[str, type] = {
+    "choice": Choice,
+    "states": States,
+    "remedies": Remedies,
+    "faithfulness": RemovalScores,
+    "randomisation": Randomisation,
+    "map-quality": MapQuality,
+    "timing": Timing,
+    "truth": Truth,
 }
+"""Record of each stage that a study alone makes."""
+TABLES = {"evaluate": "evaluations", "explain": "explanations", "score": "deletion"}
+TABLES |= {stage: stage.replace("-", "_") for stage in STAGES if stage not in ("choice", "states")}
 """Tables of a study by the stage that fills them, a record an input."""
 
 

@@ -7,14 +7,6 @@ from sliplens.study.scoring import score_explanations
 from sliplens.study.workspace import explain_source, explain_trial, score_explained
 
 __all__ = [
-    "ChosenFrames",
-    "explain_frames",
-    "explain_source",
-    "explain_trial",
-    "frames_from_dataset",
-    "frames_from_folder",
-    "pool_studies",
-    "run_study",
-    "score_explained",
-    "score_explanations",
-]
+    "ChosenFrames", "explain_frames", "explain_source", "explain_trial", "frames_from_dataset", "frames_from_folder",
+    "pool_studies", "run_study", "score_explained", "score_explanations",
+]  # fmt: skip

@@ -17,13 +17,7 @@ from sliplens.codec import keep_part
 from sliplens.errors import ModelError
 from sliplens.explainers import Explainer, Explanation, IntegratedGradients, PolyCam
 from sliplens.explainers.shapley import Shapley
-from sliplens.faithfulness.controls import (
-    cascade,
-    even_channels,
-    histogram_entropy,
-    randomisation_scores,
-    smooth_maps,
-)
+from sliplens.faithfulness.controls import cascade, even_channels, histogram_entropy, randomisation_scores, smooth_maps
 from sliplens.faithfulness.map_quality import gini, resolution, stability, total_variation
 from sliplens.intervals import paired_difference
 from sliplens.models import Run
@@ -177,7 +171,8 @@ def _seconds(
     return seconds
 
 
-STAGES = 3
+CASCADE = 3
+"""Parts of the network that get new weights one after another."""
 _SMOOTH_WITHIN_S = 1.0
 """Methods that take longer a frame are not explained sixteen times over."""
 _STILL_SIMILAR = 0.5
@@ -203,10 +198,10 @@ def randomise_weights(
             material.trained.model,
             inputs,
             seed=seed,
-            stages=STAGES,
+            stages=CASCADE,
             before=material.towards_target(name)[:frames],
         )
-        seconds = (time.perf_counter() - started) / STAGES / len(inputs)
+        seconds = (time.perf_counter() - started) / CASCADE / len(inputs)
         similarity = tuple(mean_of_known(row) for row in scores.similarity)
         methods[name] = RandomisedMethod(
             layers=tuple(scores.layers),

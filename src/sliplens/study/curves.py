@@ -21,14 +21,7 @@ from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.intervals import paired_difference
 from sliplens.progress import OnProgress, continued
 from sliplens.results.explanation import Explained
-from sliplens.results.faithfulness import (
-    Agreement,
-    Comparison,
-    RemovalScore,
-    RemovalScores,
-    RemovalTable,
-    is_control,
-)
+from sliplens.results.faithfulness import Agreement, Comparison, RemovalScore, RemovalScores, RemovalTable, is_control
 from sliplens.study.material import Material
 
 EQUAL_AREAS = (0.01, 0.02, 0.05, 0.1, 0.2)

@@ -27,14 +27,7 @@ from sliplens.plots.style import decimals, signed
 from sliplens.progress import OnProgress, counted, note, stage, wrote
 from sliplens.recordings import Dataset
 from sliplens.recordings.dataset import load_dataset
-from sliplens.results.diagnosis import (
-    Diagnosis,
-    ErrorSlice,
-    ErrorTable,
-    ExplainedErrors,
-    FrictionSlope,
-    FrictionTable,
-)  # fmt: skip
+from sliplens.results.diagnosis import Diagnosis, ErrorSlice, ErrorTable, ExplainedErrors, FrictionSlope, FrictionTable
 from sliplens.results.evaluation import Predictions
 from sliplens.results.explanation import Explained
 from sliplens.simulation.intervention import film_with_friction, marker_readings, reading_slope

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import torch
 
@@ -21,21 +21,10 @@ from sliplens.models.checkpoint import load
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.results.explanation import Explained
-from sliplens.results.faithfulness import DeletionScores, Remedies, RemovalScores
-from sliplens.results.study import (
-    TABLES,
-    Choice,
-    MapQuality,
-    MarkedFrame,
-    Randomisation,
-    States,
-    Study,
-    Timing,
-    Truth,
-    UntrainedMaps,
-)
+from sliplens.results.faithfulness import DeletionScores, RemovalScores
+from sliplens.results.study import STAGES, TABLES, Choice, MarkedFrame, States, Study, Truth, UntrainedMaps
 from sliplens.simulation.intervention import rebuild_trial
-from sliplens.study.checks import STAGES, explain_untrained, measure_maps, randomise_weights, time_explainers
+from sliplens.study.checks import CASCADE, explain_untrained, measure_maps, randomise_weights, time_explainers
 from sliplens.study.choice import choose_frames, show_states
 from sliplens.study.curves import SETTINGS, STUDY_AREAS, Setting, influences, score_removal
 from sliplens.study.explaining import explain_frames, frames_at
@@ -56,9 +45,9 @@ from sliplens.study.truth import TRUE_FILL, TRUTH_PAIRS, judge_by_truth, true_cu
 from sliplens.training.evaluation import evaluate
 
 _COMMAND = "sliplens study"
+_KINDS: dict[str, type] = {"explain": Explained, "score": DeletionScores, "control": UntrainedMaps, **STAGES}
 Network: TypeAlias = Run | Path | str
-_Result = TypeVar("_Result")
-_Work: TypeAlias = Callable[[Path, OnProgress], _Result]
+_Work: TypeAlias = Callable[[Path, OnProgress], object]
 """Takes a folder for parts, and what is called with the steps done and their number."""
 
 _CONTROLS = {"controls": "each method on a network of new weights a trial", "statistics": "images"}
@@ -187,6 +176,15 @@ def load_network(network: Network, name: str, *, device: str = "cpu") -> Run:
     return run
 
 
+_TITLES = {
+    "score": "Deleting pixels, as the thesis did",
+    "remedies": "Trying the thesis's remedies",
+    "control": "Explaining networks with new weights",
+    "faithfulness": "Removing parts under every fill",
+    "randomisation": "Drawing weights anew, layer by layer",
+    "map-quality": "Measuring how maps look",
+    "truth": "Putting markers back",
+}
 _NEEDED_BY = {"score": {"score", "remedies"}, "control": {"faithfulness", "truth"}}
 """Tests that need a stage, where it is not that test alone."""
 
@@ -216,21 +214,12 @@ class _Stages:
         """Choose the frames, and keep what the camera saw of them."""
         wanted: dict[str, Any] = {"split": split, "condition": condition, "trials": trials, "tolerance": tolerance}
         weights = {name: run.manifest.weights_sha256 for name, run in self.networks.items()}
-        choice = self._run(
-            ("choice",),
-            Choice,
-            {"data_hash": self.data.hash, "weights_sha256": weights, **wanted},
-            "Choosing trials",
-            lambda _, count: choose_frames(self.networks, self.data, on_progress=count, **wanted),
-        )
+        config = {"data_hash": self.data.hash, "weights_sha256": weights, **wanted}
+        choose = partial(choose_frames, self.networks, self.data, **wanted)
+        choice = self._run("choice", "", config, "Choosing trials", lambda _, count: choose(on_progress=count))
         note(self.on_progress, choice.summary)
-        states = self._run(
-            ("states",),
-            States,
-            self._frames,
-            "Following markers",
-            lambda _, count: show_states(choice, self.data, on_progress=count),
-        )
+        show = partial(show_states, choice, self.data)
+        states = self._run("states", "", self._frames, "Following markers", lambda _, count: show(on_progress=count))
         if unknown := [frame.id for frame in choice.frames if frame.id not in states.markers]:
             named, self.explainers = list(self.explainers), without_markers(self.explainers)
             if named != list(self.explainers):
@@ -249,109 +238,58 @@ class _Stages:
             return explain_frames(run, frames, methods=methods, explainers=explainers, parts=parts, on_progress=count)
 
         title = f"Explaining {len(chosen)} frames ({name})"
-        found["explain"] = self._run(("explain", name), Explained, self._about(name), title, explain)
+        found["explain"] = self._run("explain", name, self._about(name), title, explain)
         # gathered where a stage is missing: that takes longer than to see that all are there
         material = cache(lambda: self._gather(name))
-
-        def test(stage: str, kind: type, title: str, work: _Work[Any], **depends: object) -> None:
-            if not _NEEDED_BY.get(stage, {stage}).isdisjoint(self.tests):
-                config = {**self._about(name), **depends}
-                found[stage] = self._run((stage, name), kind, config, f"{title} ({name})", work)
-
-        test(
-            "score",
-            DeletionScores,
-            "Deleting pixels, as the thesis did",
-            lambda _, count: score_explanations(run, material().explained, seed=seed, on_progress=count),
-            # the report reads these of every score
-            input=name,
-            source=self.data.source,
-            fill="grey",
-        )
-        test(
-            "remedies",
-            Remedies,
-            "Trying the thesis's remedies",
-            lambda _, count: score_remedies(material(), grey=found["score"], seed=seed, on_progress=count),
-            steps=STEPS,
-        )
-        test(
-            "control",
-            UntrainedMaps,
-            "Explaining networks with new weights",
-            lambda parts, count: explain_untrained(material(), seed=seed, parts=parts, on_progress=count),
-            **_CONTROLS,
-        )
         influence = cache(lambda: {**influences(material()), **found["control"].maps})
         redrawn = "truth" in self.tests and self._redrawn
+        maps: dict[str, Any] = {"seed": seed, "random_orders": self.random_orders}
 
         def put_back(on_progress: OnProgress | None) -> Mapping[str, Faithfulness]:
-            orders, explained = self.random_orders, material().explained
-            return true_curves(
-                run, explained, self.data, maps=influence(), random_orders=orders, seed=seed, on_progress=on_progress
-            )
+            return true_curves(run, material().explained, self.data, maps=influence(), on_progress=on_progress, **maps)
 
-        test(
-            "faithfulness",
-            RemovalScores,
-            "Removing parts under every fill",
-            lambda parts, count: score_removal(
-                material(),
-                maps=influence(),
-                settings=self.settings,
-                random_orders=self.random_orders,
-                further={Setting(fill=TRUE_FILL, unit="marker"): put_back} if redrawn else {},
-                seed=seed,
-                parts=parts,
-                on_progress=count,
-            ),
-            random_orders=self.random_orders,
-            areas=STUDY_AREAS,
-            settings=self.settings,
-            **_CONTROLS,
-        )
-        test(
-            "randomisation",
-            Randomisation,
-            "Drawing weights anew, layer by layer",
-            lambda _, count: randomise_weights(material(), seed=seed, on_progress=count),
-            stages=STAGES,
-            statistics="images",
-        )
-        test(
-            "map-quality",
-            MapQuality,
-            "Measuring how maps look",
-            lambda _, count: measure_maps(material(), self.data, seed=seed, on_progress=count),
-        )
-        if redrawn:
-            test(
-                "truth",
-                Truth,
-                "Putting markers back",
-                lambda parts, count: judge_by_truth(
-                    run,
-                    material().explained,
-                    self.data,
-                    maps=influence(),
-                    fills=list(dict.fromkeys(setting.fill for setting in SETTINGS)),
-                    seed=seed,
-                    parts=parts,
-                    on_progress=count,
-                ),
-                pairs=TRUTH_PAIRS,
-                **_CONTROLS,
-            )
+        def remove(parts: Path, count: OnProgress) -> RemovalScores:
+            further = {Setting(fill=TRUE_FILL, unit="marker"): put_back} if redrawn else {}
+            own: dict[str, Any] = {"maps": influence(), "settings": self.settings, "further": further, **maps}
+            return score_removal(material(), parts=parts, on_progress=count, **own)
+
+        def hold_against_truth(parts: Path, count: OnProgress) -> Truth:
+            fills = list(dict.fromkeys(setting.fill for setting in SETTINGS))
+            own: dict[str, Any] = {"maps": influence(), "fills": fills, "seed": seed}
+            return judge_by_truth(run, material().explained, self.data, parts=parts, on_progress=count, **own)
+
+        works: dict[str, _Work] = {
+            "score": lambda _, count: score_explanations(run, material().explained, seed=seed, on_progress=count),
+            "remedies": lambda _, count: score_remedies(material(), grey=found["score"], seed=seed, on_progress=count),
+            "control": lambda parts, count: explain_untrained(material(), seed=seed, parts=parts, on_progress=count),
+            "faithfulness": remove,
+            "randomisation": lambda _, count: randomise_weights(material(), seed=seed, on_progress=count),
+            "map-quality": lambda _, count: measure_maps(material(), self.data, seed=seed, on_progress=count),
+            "truth": hold_against_truth,
+        }
+        removal = {"random_orders": self.random_orders, "areas": STUDY_AREAS, "settings": self.settings}
+        depends: dict[str, dict[str, Any]] = {
+            # the report reads these of every score
+            "score": {"input": name, "source": self.data.source, "fill": "grey"},
+            "remedies": {"steps": STEPS},
+            "control": _CONTROLS,
+            "faithfulness": removal | _CONTROLS,
+            "randomisation": {"stages": CASCADE, "statistics": "images"},
+            "truth": {"pairs": TRUTH_PAIRS, **_CONTROLS},
+        }
+        for test, work in works.items():
+            if not _NEEDED_BY.get(test, {test}).isdisjoint(self.tests) and (redrawn or test != "truth"):
+                config = self._about(name) | depends.get(test, {})
+                found[test] = self._run(test, name, config, f"{_TITLES[test]} ({name})", work)
 
     def time(self, name: str) -> None:
         """Time one network's methods."""
-        self.found[name]["timing"] = self._run(
-            ("timing", name),
-            Timing,
-            self._about(name),
-            f"Timing the methods ({name})",
-            lambda _, count: time_explainers(self._gather(name), on_progress=count),
-        )
+
+        def work(_: Path, count: OnProgress) -> object:
+            return time_explainers(self._gather(name), on_progress=count)
+
+        title = f"Timing the methods ({name})"
+        self.found[name]["timing"] = self._run("timing", name, self._about(name), title, work)
 
     @cached_property
     def _choice(self) -> Choice:
@@ -371,14 +309,9 @@ class _Stages:
         return {**self._frames, "methods": methods, "seed": self.seed, "weights_sha256": weights}
 
     def _gather(self, name: str) -> Material:
-        return gather(
-            self.networks[name],
-            self.found[name]["explain"],
-            self.data,
-            tuple(frame for frame in self._choice.frames if frame.scored),
-            markers=self._markers,
-            explainers=self.explainers,
-        )
+        scored, explained = tuple(frame for frame in self._choice.frames if frame.scored), self.found[name]["explain"]
+        own: dict[str, Any] = {"markers": self._markers, "explainers": self.explainers}
+        return gather(self.networks[name], explained, self.data, scored, **own)
 
     @cached_property
     def _redrawn(self) -> bool:
@@ -393,15 +326,13 @@ class _Stages:
             return False
         return True
 
-    def _run(
-        self, name: tuple[str, ...], kind: type[_Result], config: Mapping[str, Any], title: str, work: _Work[_Result]
-    ) -> _Result:
-        """Make a stage (of an input) that is not there yet, or read it."""
-        target, what = self.folder / "-".join(name), title[0].lower() + title[1:]
-        with output_folder(target, stage=name[0], config=config, overwrite=self.overwrite) as out:
+    def _run(self, name: str, network: str, config: Mapping[str, Any], title: str, work: _Work) -> Any:
+        """Make a stage, of an input where there is one, that is not there yet, or read it."""
+        target, what = self.folder / "-".join(filter(None, (name, network))), title[0].lower() + title[1:]
+        with output_folder(target, stage=name, config=config, overwrite=self.overwrite) as out:
             if out.complete:
                 wrote(self.on_progress, target, what, kept=True)
-                return load_result(target, kind, command=_COMMAND)
+                return load_result(target, _KINDS[name], command=_COMMAND)
             with stage(self.on_progress, title) as count:
                 result = work(out.folder / "parts", count)
             shutil.rmtree(out.folder / "parts", ignore_errors=True)

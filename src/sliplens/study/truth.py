@@ -286,12 +286,7 @@ def meta_test(effects: Sequence[FrameEffects], interval: _Interval) -> tuple[Met
 
 def _test_oracle(gains: Float[np.ndarray, "frames 3"], interval: _Interval) -> OracleTest:
     oracle, degraded, changed = gains.mean(axis=0).tolist()
-    return OracleTest(
-        oracle=oracle,
-        degraded=degraded,
-        changed=changed,
-        gap=interval(gains[:, 0] - gains[:, 1]),
-    )
+    return OracleTest(oracle=oracle, degraded=degraded, changed=changed, gap=interval(gains[:, 0] - gains[:, 1]))
 
 
 def _reliability(effects: FrameEffects) -> float:
