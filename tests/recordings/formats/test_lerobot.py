@@ -293,9 +293,9 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
         "{": "is not valid JSON",
         "[" * 100_000: "is not valid JSON",
         "[]": "has no codebase_version",
-        '{"codebase_version": "v3.0", "fps": 0}': "has fps 0; write a positive number",
-        '{"codebase_version": "v3.0", "fps": "30"}': "has fps 30; write a positive number",
-        '{"codebase_version": "v3.0", "fps": 30, "features": {"a": 1}}': "lacks features with dtype and shape",
+        '{"codebase_version": "v3.0", "fps": 0}': r"is not .*`float` > 0.* at `\$.fps`\); copy it",
+        '{"codebase_version": "v3.0", "fps": "30"}': r"is not .*Expected `float`, got `str`",
+        '{"codebase_version": "v3.0", "fps": 30, "features": {"a": 1}}': "is not .*, got `int`.*features",
     }.items():
         info.write_text(text)
         with pytest.raises(RecordingError, match=rf"info\.json {message}"):

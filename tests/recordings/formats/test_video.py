@@ -12,7 +12,7 @@ from readers import read_video
 from sliplens.errors import RecordingError
 from sliplens.images import write_png
 from sliplens.recordings.formats.gelsight import list_gelsight_clips, read_gelsight_clip
-from sliplens.recordings.formats.video import least_contact, small_copies, stale_frames
+from sliplens.recordings.formats.video import count_stale, least_contact, small_copies
 from sliplens.recordings.labelling import Clip
 
 MILLISECOND = Fraction(1, 1000)
@@ -276,13 +276,13 @@ def scene(rng: np.random.Generator, count: int) -> np.ndarray:
 def test_dark_frames_at_the_start_are_stale(dark: int, brightness: float):
     frames = scene(np.random.default_rng(0), 60)
     frames[:dark] = (brightness * frames[:dark]).astype(np.uint8)
-    assert stale_frames(frames) == dark
+    assert count_stale(small_copies(frames)) == dark
 
 
 def test_frames_up_to_a_leap_from_another_scene_are_stale(rng: np.random.Generator):
     frames = scene(rng, 60)
     frames[4:9, 10:50, 20:80] = 255 - frames[4:9, 10:50, 20:80]  # an earlier touch, after the gel was seen untouched
-    assert stale_frames(frames) == 9
+    assert count_stale(small_copies(frames)) == 9
 
 
 def test_a_touch_that_comes_and_goes_is_not_stale(rng: np.random.Generator):
@@ -291,24 +291,24 @@ def test_a_touch_that_comes_and_goes_is_not_stale(rng: np.random.Generator):
         for step in range(10):
             depth = 6 * min(step, 9 - step)
             frames[start + step, 10:50, 20:80] += np.uint8(depth)
-    assert stale_frames(frames) == 0
+    assert count_stale(small_copies(frames)) == 0
 
 
 def test_steady_motion_is_not_stale(rng: np.random.Generator):
     texture = rng.integers(0, 256, (SIZE[0], SIZE[1] + 180, 3), dtype=np.uint8)
-    assert stale_frames([texture[:, 3 * shift : 3 * shift + SIZE[1]] for shift in range(60)]) == 0
+    assert count_stale(small_copies([texture[:, 3 * shift : 3 * shift + SIZE[1]] for shift in range(60)])) == 0
 
 
 def test_an_object_that_slides_away_at_the_start_is_not_stale(rng: np.random.Generator):
     frames = scene(rng, 60)
     for index in range(10):
         frames[index, 10:50, 8 * index : 8 * index + 16] //= 2
-    assert stale_frames(frames) == 0
+    assert count_stale(small_copies(frames)) == 0
 
 
 def test_short_videos_have_no_rule_to_break(rng: np.random.Generator):
-    assert stale_frames([]) == 0
-    assert stale_frames(scene(rng, 2)) == 0
+    assert count_stale(small_copies([])) == 0
+    assert count_stale(small_copies(scene(rng, 2))) == 0
 
 
 def test_the_candidate_for_a_reference_shows_no_relief(rng: np.random.Generator):

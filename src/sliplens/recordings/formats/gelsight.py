@@ -77,14 +77,10 @@ def is_gelsight(path: Path) -> bool:
     """Whether a path is a clip of the data set, the folder of a grasp, or the data set; told by its `labels.csv`."""
     tables = [folder / LABELS_FILE for folder in (path, *path.absolute().parents[1:3])]
     try:
-        return any(table.is_file() and {"file", "slip_label"} <= _columns(table) for table in tables)
+        heads = [table.read_text(encoding="utf-8-sig").partition("\n")[0] for table in tables if table.is_file()]
+        return any({"file", "slip_label"} <= set(*csv.reader([head])) for head in heads)
     except (OSError, UnicodeDecodeError, csv.Error):
         return False
-
-
-def _columns(table: Path) -> set[str]:
-    with table.open(newline="", encoding="utf-8-sig") as stream:
-        return set(next(csv.reader(stream), []))
 
 
 def list_gelsight_clips(folder: Path) -> list[Path]:

@@ -103,17 +103,22 @@ def read_frame_times(
 ) -> tuple[tuple[Path, ...], Float[np.ndarray, " frames"], list[str]]:
     """Images in the order they were taken, their times from a table with names of files and times, and notes."""
     text = open_table(table)
-    name_column, time_column = _name_column(text), guess_time_column(text)
+    name_column = next((name for name in text.header if name.lower().replace(" ", "_") in _NAME_COLUMNS), None)
+    if name_column is None:
+        raise RecordingError(
+            f"{table} has no column with the names of images among {', '.join(map(repr, text.header))}; call it file"
+        )
+    time_column = guess_time_column(text)
     stamps, listed = _stamps(text, name_column, time_column)
     found = []
     for image in images:
         row = stamps.get(image.name, stamps.get(image.stem))
         if row is None:
             raise RecordingError(f"{table} has no time for {image.name}; add a row for every image of the folder")
-        found.append((row[0], row[1], image))
-    found.sort(key=lambda row: row[0])
-    time = np.array([row[0] for row in found])
-    require_rising(time, [row[1] for row in found], path=table, column=time_column)
+        found.append((*row, image))
+    stamp, lines, ordered = zip(*sorted(found, key=lambda row: row[0]), strict=True)
+    time = np.array(stamp)
+    require_rising(time, lines, path=table, column=time_column)
     unit = unit_of(time_column, quantity="time", path=str(table))
     how = "by its name"
     if unit is None:
@@ -124,17 +129,7 @@ def read_frame_times(
     ]
     if listed > len(images):
         notes.append(f"{table.name}: {listed - len(images)} of {listed} rows name no image of the folder.")
-    return tuple(row[2] for row in found), time * UNITS["time"][unit][0], notes
-
-
-def _name_column(text: TextTable) -> str:
-    found = next((name for name in text.header if name.lower().replace(" ", "_") in _NAME_COLUMNS), None)
-    if found is None:
-        raise RecordingError(
-            f"{text.path} has no column with the names of images among {', '.join(map(repr, text.header))}; "
-            "call it file"
-        )
-    return found
+    return ordered, time * UNITS["time"][unit][0], notes
 
 
 def _stamps(text: TextTable, name_column: str, time_column: str) -> tuple[dict[str, tuple[float, int]], int]:
@@ -198,10 +193,8 @@ def read_image_folder(folder: Path, options: ReadOptions) -> Capture:
 
 
 def _numbers_in_names(paths: Sequence[Path]) -> Float[np.ndarray, " frames"]:
-    numbers = []
-    for path in paths:
-        found = re.findall(r"\d+(?:\.\d+)?", path.stem)
-        if not found:
-            raise RecordingError(f"{path} has no number in its name; give its time in a table (--times) instead")
-        numbers.append(float(found[-1]))
-    return np.array(numbers)
+    found = [re.findall(r"\d+(?:\.\d+)?", path.stem) for path in paths]
+    if [] in found:
+        path = paths[found.index([])]
+        raise RecordingError(f"{path} has no number in its name; give its time in a table (--times) instead")
+    return np.array([float(numbers[-1]) for numbers in found])

@@ -5,9 +5,9 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
-from math import floor, isfinite, prod
+from math import floor, prod
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any
+from typing import Annotated, Any
 
 import av
 import msgspec
@@ -64,10 +64,10 @@ class Layout:
     """What `meta/info.json` says."""
 
     folder: Path
-    fps: float
+    fps: Annotated[float, msgspec.Meta(gt=0)]
     features: dict[str, Feature]
     data_path: str
-    video_path: str | None
+    video_path: str | None = None
 
 
 def read_layout(folder: Path) -> Layout:
@@ -87,20 +87,10 @@ def read_layout(folder: Path) -> Layout:
             f"{folder} is a LeRobot data set of version {version}, v3.0 is needed; convert it with "
             "`python -m lerobot.scripts.convert_dataset_v21_to_v30`"
         )
-    fps = info.get("fps")
-    if not isinstance(fps, int | float) or not isfinite(fps) or fps <= 0:
-        raise RecordingError(f"{path} has fps {fps}; write a positive number of frames a second there")
     try:
-        features = msgspec.convert(info.get("features"), dict[str, Feature])
-    except msgspec.ValidationError:
-        raise RecordingError(f"{path} lacks features with dtype and shape; copy it again") from None
-    return Layout(
-        folder=folder,
-        fps=float(fps),
-        features=features,
-        data_path=str(info.get("data_path")),
-        video_path=None if info.get("video_path") is None else str(info["video_path"]),
-    )
+        return msgspec.convert({**info, "folder": folder}, Layout)
+    except msgspec.ValidationError as error:
+        raise RecordingError(f"{path} is not that of a LeRobot data set ({error}); copy it again") from None
 
 
 def read_episodes(layout: Layout, *, camera_key: str) -> list[Episode]:
@@ -264,7 +254,7 @@ def video_frames(
 
 
 def image_frames(episode: Episode, key: str) -> tuple[tuple[int, int], Callable[[], Iterator[Frame]]]:
-    """Find the height and width of the frames of an episode that lie in a Parquet file, and how they are read."""
+    """Size of the frames of an episode that lie in a Parquet file, and how they are read."""
     read = partial(_stored_images, episode.data_file, key, episode.index)
     first = next(read(frame_size=None), None)
     if first is None:
@@ -420,14 +410,10 @@ _TORQUE = re.compile(r"torque|moment|(?<![a-z])[tm]_?[xyz](?![a-z])", re.IGNOREC
 
 
 def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
-    """Read a data set, one trial an episode.
+    """Read a data set, one trial an episode; those that `write_lerobot` exported as they were, if no feature is named.
 
-    Frames and forces are rows of one table: each force was taken with its frame, and both have its time, in seconds
-    from the start of the episode. Frames of a video are those shown within half a frame of their row's time.
-
-    The camera is by default the only one, or the only one named like a tactile sensor; the force, 3 or 6 numbers that
-    begin with x, y, z, the only feature named like one. Trials that `write_lerobot` exported come back as they were,
-    with their labels; where a feature is named, like those of any data set.
+    Frames and forces are rows of one table and have its times. Frames of a video are those shown within half a frame of
+    their row's time.
     """
     layout = read_layout(folder)
     if options.camera_key is None and options.force_key is None and (kept := read_kept(layout)) is not None:

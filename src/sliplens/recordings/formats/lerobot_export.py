@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -46,44 +47,26 @@ Stats = dict[str, Any]
 """min, max, mean, std, count and quantiles, as JSON holds them."""
 
 
-class PixelCount:
-    """How often each channel has each of the 256 levels, from which all statistics of pixels follow."""
+def count_levels(frame: Frame) -> Int64[np.ndarray, "3 256"]:
+    """How often each channel of a frame has each of the 256 levels, from whose sums the statistics of pixels follow."""
+    return np.array([np.bincount(frame[..., channel].ravel(), minlength=256) for channel in range(3)], dtype=np.int64)
 
-    def __init__(self) -> None:
-        self.levels: Int64[np.ndarray, "3 256"] = np.zeros((3, 256), dtype=np.int64)
-        self.frames = 0
 
-    def add(self, frame: Frame) -> None:
-        """Count the pixels of a frame."""
-        self.levels += [np.bincount(frame[..., channel].ravel(), minlength=256) for channel in range(3)]
-        self.frames += 1
-
-    def join(self, other: "PixelCount") -> None:
-        """Count what another has counted."""
-        self.levels += other.levels
-        self.frames += other.frames
-
-    def stats(self) -> Stats:
-        """Statistics of each channel, in [0, 1]; a quantile is the lowest level that so many pixels do not exceed."""
-        level = np.arange(256) / 255
-        share = self.levels / self.levels.sum(axis=1, keepdims=True)
-        mean = share @ level
-        present = [level[counts > 0] for counts in self.levels]
-        below = self.levels.cumsum(axis=1)
-        found = {
-            "min": [levels.min() for levels in present],
-            "max": [levels.max() for levels in present],
-            "mean": mean,
-            "std": np.sqrt((share * (level - mean[:, None]) ** 2).sum(axis=1)),
-            **{
-                name: [level[np.searchsorted(counts, quantile * counts[-1])] for counts in below]
-                for name, quantile in _QUANTILES.items()
-            },
-        }
-        return {
-            **{name: np.reshape(values, (3, 1, 1)).tolist() for name, values in found.items()},
-            "count": [self.frames],
-        }
+def pixel_stats(counts: Int64[np.ndarray, "3 256"], frames: int) -> Stats:
+    """Statistics of each channel, in [0, 1]; a quantile is the lowest level that so many pixels do not exceed."""
+    level = np.arange(256) / 255
+    share = counts / counts.sum(axis=1, keepdims=True)
+    mean = share @ level
+    found = {
+        "min": [level[channel > 0].min() for channel in counts],
+        "max": [level[channel > 0].max() for channel in counts],
+        "mean": mean,
+        "std": np.sqrt((share * (level - mean[:, None]) ** 2).sum(axis=1)),
+    }
+    below = counts.cumsum(axis=1)
+    for name, quantile in _QUANTILES.items():
+        found[name] = [level[np.searchsorted(channel, quantile * channel[-1])] for channel in below]
+    return {**{name: np.reshape(values, (3, 1, 1)).tolist() for name, values in found.items()}, "count": [frames]}
 
 
 def number_stats(values: Shaped[np.ndarray, "frames numbers"]) -> Stats:
@@ -109,7 +92,6 @@ FILE_MB = 100
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
 _IMAGE = pa.struct({"bytes": pa.binary(), "path": pa.string()})
-_TYPES = {"image": _IMAGE, "float64": pa.float64(), "float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_()}
 
 
 class DataFiles:
@@ -122,17 +104,11 @@ class DataFiles:
         self.writer: pq.ParquetWriter | None = None
         self.paths: list[Path] = []
 
-    def __enter__(self) -> "DataFiles":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._close()
-
     def begin(self, frames: int) -> tuple[int, int]:
         """Choose the file of an episode: chunk and number in it."""
         size = self.paths[-1].stat().st_size if self.writer is not None else 0
         if self.writer is None or size + size / max(self.frames, 1) * frames >= self.limit:
-            self._close()
+            self.close()
             self.number, self.frames = self.number + 1, 0
             chunk, file = divmod(self.number, CHUNK_FILES)
             path = self.folder / DATA_PATH.format(chunk_index=chunk, file_index=file)
@@ -160,7 +136,8 @@ class DataFiles:
         flat = column.flatten() if pa.types.is_fixed_size_list(column.type) else column
         return flat.to_numpy(zero_copy_only=False).reshape(len(column), -1)
 
-    def _close(self) -> None:
+    def close(self) -> None:
+        """End the file that is being written."""
         if self.writer is not None:
             self.writer.close()
             self.writer = None
@@ -195,14 +172,13 @@ def _data_schema(features: Features) -> pa.Schema:
         kind, width = feature["dtype"], feature["shape"][0]
         value = {"dtype": kind, "_type": "Value"}
         if kind == "image":
-            fields.append(pa.field(name, _IMAGE))
-            told[name] = {"_type": "Image"}
+            column, told[name] = _IMAGE, {"_type": "Image"}
         elif width > 1:
-            fields.append(pa.field(name, pa.list_(_TYPES[kind], width)))
+            column = pa.list_(pa.type_for_alias(kind), width)
             told[name] = {"feature": value, "length": width, "_type": "List"}
         else:
-            fields.append(pa.field(name, _TYPES[kind]))
-            told[name] = value
+            column, told[name] = pa.type_for_alias(kind), value
+        fields.append(pa.field(name, column))
     return pa.schema(fields, {"huggingface": json.dumps({"info": {"features": told}})})
 
 
@@ -255,15 +231,9 @@ def write_lerobot(
 ) -> None:
     """Write trials as a LeRobot v3.0 data set, one episode a trial, without loss: `read_lerobot` gives them back.
 
-    Frames are PNG in Parquet, never a lossy video, which moves markers. `observation.force` is (F_t, 0, F_n) in
-    newtons: how strongly, not whither, the object is pulled. Contact states and reasons are numbers, whose words
-    `meta/info.json` lists. What is not known is NaN; statistics leave it out.
-
-    LeRobot knows one frame rate and counts time in frames of it: `fps` is the median rate, a whole number where that is
-    within 1 %, and `timestamp` is `frame_index / fps`. The true times stand in `observation.time_s`. Trials of a split
-    follow each other, for a split is a range of episodes. What LeRobot has no place for lies in `meta/sliplens`:
-    reference frames, samples of the force sensor, sensor, day, condition, object, and what the labels rest on. Of a
-    simulated trial the ground truth beyond its labels stays behind.
+    `observation.force` is (F_t, 0, F_n) in newtons: how strongly, not whither, the object is pulled. LeRobot knows one
+    frame rate and counts time in frames of it: the true times stand in `observation.time_s`. Trials of a split follow
+    each other, for a split is a range of episodes. What LeRobot has no place for lies in `meta/sliplens`.
     `data` and `meta` of an earlier attempt that came to no end are replaced.
 
     References
@@ -280,8 +250,8 @@ def write_lerobot(
     tasks: dict[str, int] = {}
     places: list[Place] = []
     stats: list[dict[str, Stats]] = []
-    pixels, first, total = PixelCount(), 0, sum(info.frames for info in chosen)
-    with DataFiles(folder, features) as files:
+    levels, first, total = np.zeros((3, 256), dtype=np.int64), 0, sum(info.frames for info in chosen)
+    with closing(DataFiles(folder, features)) as files:
         for episode, info in enumerate(chosen):
             capture = read_stored_trial(data, info)
             count = len(capture)
@@ -290,17 +260,16 @@ def write_lerobot(
             number = tasks.setdefault(task, len(tasks))
             columns = frame_columns(capture, fps=fps, reasons=reasons, first=first, episode=episode, task=number)
             chunk, file = files.begin(count)
-            shown, done = PixelCount(), 0
+            shown, done = np.zeros_like(levels), 0
             for batch, pngs in encode_batches(capture.read_frames()):
-                for frame in batch:
-                    shown.add(frame)
+                shown += sum(map(count_levels, batch))
                 some = {name: values[done : done + len(batch)] for name, values in columns.items()}
                 files.write(some, images=CAMERA, pngs=list(pngs), first=done)
                 done += len(batch)
                 if on_progress is not None:
                     on_progress(first + done, total)
             numbers = {name: number_stats(values.reshape(count, -1)) for name, values in columns.items()}
-            stats.append({CAMERA: shown.stats(), **numbers})
+            stats.append({CAMERA: pixel_stats(shown, count), **numbers})
             places.append(
                 {
                     "episode_index": episode,
@@ -312,9 +281,10 @@ def write_lerobot(
                     "dataset_to_index": first + count,
                 }
             )
-            pixels.join(shown)
+            levels += shown
             first += count
-    whole = {name: pixels.stats() if name == CAMERA else number_stats(files.column(name)) for name in features}
+    whole = {name: number_stats(files.column(name)) for name in features if name != CAMERA}
+    whole = {CAMERA: pixel_stats(levels, first), **whole}
     _fill_unknown(stats, whole)
     write_tasks(folder, list(tasks))
     write_episodes(folder, places, stats)

@@ -81,11 +81,8 @@ def write_mcap(
 ) -> None:
     """Write trials as `TRIAL.mcap`, without loss: `read_rosbag` gives each back as it is in the data set.
 
-    Messages are those of ROS 2 and two of ours; each file holds their definitions, so that it needs no ROS to be seen.
     Frames are PNG: on simulated frames those are 22 % smaller than raw images under the Zstandard of MCAP. Wrenches are
-    the samples of the force sensor where the data set keeps them, else the forces of the frames, (tangential, 0,
-    normal); their torques, which nobody kept, are 0. Of a simulated trial the ground truth beyond its labels stays
-    behind.
+    the samples of the force sensor where the data set keeps them, else the forces of the frames.
 
     Stamps are the times of the trial to the nanosecond. ROS takes a stamp of 0 for none and cannot write one before:
     where a trial begins before 1 s, stamps are later by the whole seconds that let it begin within [1 s, 2 s), which

@@ -359,9 +359,11 @@ def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[st
             "declare the right one with --force-unit"
         )
     found = "declared" if time_column is not None else "by its name"
+    told = "declared" if force_columns is not None else "by their names"
+    axes = "x, y, z" if len(names) == 3 else "normal (laid along z), tangential (laid along x)"
     notes = [
         f"{path.name}: times are those of column {time_name!r} ({found}), in {unit} ({how}).",
-        f"{path.name}: forces are those of {_listed(names, force_columns is not None)}, in {units}.",
+        f"{path.name}: forces are those of {', '.join(map(repr, names))} as {axes} ({told}), in {units}.",
     ]
     if decimal_comma:
         notes.append(f"{path.name}: commas were read as decimal points.")
@@ -433,8 +435,3 @@ def _force_scales(
     units = [unit or "N" for unit in named]
     how = "assumed, for the names give no unit" if None in named else "by their names"
     return np.array([UNITS["force"][unit][0] for unit in units]), f"{', '.join(dict.fromkeys(units))} ({how})"
-
-
-def _listed(names: Sequence[str], declared: bool) -> str:
-    axes = "x, y, z" if len(names) == 3 else "normal (laid along z), tangential (laid along x)"
-    return f"{', '.join(map(repr, names))} as {axes} ({'declared' if declared else 'by their names'})"

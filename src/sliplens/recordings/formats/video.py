@@ -31,17 +31,6 @@ _FROZEN = 0.75  # grey levels: no more than noise and coding change
 _WAKES = 1.015  # a camera that adapts its exposure when it is started grows brighter by more
 
 
-def stale_frames(frames: Iterable[Frame]) -> int:
-    """Count the frames at the start that belong to another scene.
-
-    A camera that was just started hands out dark frames, then what lay in its buffers: frozen frames of an earlier
-    moment, the last of them unlike every frame that follows. Of an object that slides all frames leap, or none does.
-    (Where the camera ran already, an object that is pressed all at once within the first 13 frames and never let go
-    cannot be told from a frozen start; do not ask there.)
-    """
-    return count_stale(small_copies(frames))
-
-
 def small_copies(frames: Iterable[Frame]) -> Float32[np.ndarray, "frames rows columns 3"]:
     """Reduce frames to the means of blocks, enough to tell scenes apart and small enough to keep."""
     copies = [_block_means(frame) for frame in islice(frames, HORIZON)]
@@ -49,7 +38,13 @@ def small_copies(frames: Iterable[Frame]) -> Float32[np.ndarray, "frames rows co
 
 
 def count_stale(copies: Float32[np.ndarray, "frames rows columns 3"]) -> int:
-    """Count the stale frames of `small_copies`."""
+    """Count the frames at the start of `small_copies` that belong to another scene.
+
+    A camera that was just started hands out dark frames, then what lay in its buffers: frozen frames of an earlier
+    moment, the last of them unlike every frame that follows. Of an object that slides all frames leap, or none does.
+    (Where the camera ran already, an object that is pressed all at once within the first 13 frames and never let go
+    cannot be told from a frozen start; do not ask there.)
+    """
     head = min(HEAD, len(copies) // 3)  # what follows must be seen long enough to compare with
     if not head:
         return 0
@@ -105,7 +100,6 @@ _ANY_ZERO = frozenset({"mpegts", "mpeg"})
 class VideoFile:
     """What the container says of its frames, without any being decoded."""
 
-    path: Path
     frames: int
     stamps: Int64[np.ndarray, " frames"] | None
     """In units of the stream, in the order the frames are shown; None where there are none."""
@@ -136,9 +130,7 @@ def inspect_video(path: Path) -> VideoFile:
                 "copy it again"
             )
         notes = _notes(container, video, path)
-    return VideoFile(
-        path=path, frames=len(found), stamps=stamps, time_s=time, counted=counted, frame_size=size, notes=notes
-    )
+    return VideoFile(frames=len(found), stamps=stamps, time_s=time, counted=counted, frame_size=size, notes=notes)
 
 
 def _read_stamps(
@@ -228,9 +220,9 @@ def _ends_early(
     return float(time_s[-1]) + 1.5 * max(steps) < container.duration / av.time_base
 
 
-def decode_video(file: VideoFile) -> Iterator[Frame]:
+def decode_video(path: Path, file: VideoFile) -> Iterator[Frame]:
     """Decode the frames in the order they are shown."""
-    path, count = file.path, 0
+    count = 0
     to_rgb = VideoReformatter()  # one for all: preparing it costs as much as a frame
     with open_video(path) as (container, video):
         video.thread_type = "AUTO"
@@ -278,7 +270,7 @@ def read_video(path: Path, options: ReadOptions) -> Capture:
     if skipped < 0:
         raise RecordingError(f"{skipped} frames cannot be skipped; give 0 or more")
     if options.skip_stale:
-        skipped = max(skipped, stale_frames(decode_video(file)))
+        skipped = max(skipped, count_stale(small_copies(decode_video(path, file))))
     if skipped >= file.frames:
         raise RecordingError(f"{path} has {file.frames} frames, {skipped} were to be skipped; skip fewer")
     if skipped:
@@ -288,7 +280,7 @@ def read_video(path: Path, options: ReadOptions) -> Capture:
         source=str(path),
         frame_time_s=time[skipped:],
         frame_size=file.frame_size,
-        read_frames=lambda: islice(decode_video(file), skipped, None),
+        read_frames=lambda: islice(decode_video(path, file), skipped, None),
         forces=samples,
         notes=tuple(notes),
     )
