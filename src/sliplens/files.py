@@ -162,29 +162,8 @@ def output_folder(
     The caller writes into a hidden folder beside the target (`.NAME.partial`). On success it gets `run.json` (stage,
     configuration and its hash, versions, machine, time) and takes the target's name. When the caller is interrupted the
     partial folder stays, and the next call with the same configuration finds it again, so that finished pieces need not
-    be made twice; a partial folder of another configuration is dropped.
-
-    Parameters
-    ----------
-    config
-        All that shapes the result: the recipe that decides whether a partial or complete folder is the same.
-    run_file
-        Where `run.json` goes in a folder of another format, below it: where that format's readers do not look.
-    resumable
-        Keep what is finished for the next call; a folder of another format begins empty every time.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from pathlib import Path
-    >>> from sliplens.files import output_folder
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     target = Path(folder) / "greeting"
-    ...     with output_folder(target, stage="greet", config={"to": "you"}) as output:
-    ...         _ = (output.folder / "hello.txt").write_text("hello")
-    ...         before = target.exists()
-    ...     before, sorted(path.name for path in target.iterdir())
-    (False, ['hello.txt', 'run.json'])
+    be made twice; a partial folder of another configuration is dropped. A folder of another format begins empty every
+    time (not `resumable`), and has its `run_file` where that format's readers do not look.
     """
     recipe = to_builtins(config)
     config_hash = hash_json({"stage": stage, "config": recipe, "sliplens": __version__})

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sliplens.errors import ModelError
 from sliplens.explainers.activations import Layer, capture, recall_layers
-from sliplens.explainers.contract import FrozenModel, Method, require_at_least_one
+from sliplens.explainers.contract import Comparison, Method, require_at_least_one
 from sliplens.explainers.explanation import Explanation, check_slopes
 from sliplens.explainers.maps import scale_to, spread
 from sliplens.progress import OnProgress
@@ -28,8 +28,13 @@ class _Cam(Method):
     """
 
     layer: str | None = None
+    """Name of the layer; by default the last one with a map, as `find_layers` finds it."""
     contrast: bool = True
+    """Take the reference's activations off. False gives the published map, which does not depend on the reference and
+    has no completeness gap; the reference then only decides what `saliency` shows."""
     relu: bool = False
+    """Keep the cells above zero alone, as published; their map is then scaled to add up to f(x) - f(b), so that the
+    order of its pixels is the published one. That is a convention, and says nothing of what one pixel contributes."""
     batch_size: int = 32
 
     method: ClassVar[str]
@@ -45,16 +50,16 @@ class _Cam(Method):
     def __post_init__(self) -> None:
         require_at_least_one(type(self).__name__, batch_size=self.batch_size)
 
-    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
-        layer = self._find_layer(frozen)
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
+        layer = self._find_layer(comparison)
         maps, predictions, reference_predictions = [], [], []
         empty = reference_prediction = torch.empty(0)
-        for part in torch.arange(len(frozen.images)).split(self.batch_size):
+        for part in torch.arange(len(comparison.images)).split(self.batch_size):
             # images and references in one pass; one reference for all is looked at once
-            shared = frozen.references[: 0 if maps else 1]
-            references = frozen.references[part] if len(frozen.references) > 1 else shared
+            shared = comparison.references[: 0 if maps else 1]
+            references = comparison.references[part] if len(comparison.references) > 1 else shared
             activations, gradients, prediction = _differentiate(
-                frozen, torch.cat([frozen.images[part], references]), count=len(part), layer=layer
+                comparison, torch.cat([comparison.images[part], references]), count=len(part), layer=layer
             )
             if len(references):
                 empty, reference_prediction = activations[len(part) :], prediction[len(part) :]
@@ -63,12 +68,12 @@ class _Cam(Method):
             sign = change.sign() if self.one_sided else torch.ones_like(change)
             cells = self.cells(activations - empty if self.contrast else activations, sign * gradients)
             cells = torch.relu(cells) if self.relu else sign[:, 0] * cells
-            maps.append(spread(cells, (frozen.images.shape[-2], frozen.images.shape[-1])))
+            maps.append(spread(cells, (comparison.images.shape[-2], comparison.images.shape[-1])))
             predictions.append(prediction)
             reference_predictions.append(reference_prediction.expand_as(prediction))
             if on_progress is not None:
-                on_progress(sum(map(len, maps)), len(frozen.images))
-        comparison = frozen.compared(torch.cat(predictions), torch.cat(reference_predictions))
+                on_progress(sum(map(len, maps)), len(comparison.images))
+        comparison = comparison.knowing(torch.cat(predictions), torch.cat(reference_predictions))
         relevance = scale_to(torch.cat(maps), total=comparison.change) if self.relu else torch.cat(maps)
         return comparison.explanation(
             relevance,
@@ -78,19 +83,19 @@ class _Cam(Method):
             warnings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=comparison.change.tolist()),
         )
 
-    def _find_layer(self, frozen: FrozenModel) -> Layer:
+    def _find_layer(self, comparison: Comparison) -> Layer:
         names = None if self.layer is None else (self.layer,)
         try:
-            return recall_layers(frozen.model, frozen.images[:1], names=names)[-1]
+            return recall_layers(comparison.model, comparison.images[:1], names=names)[-1]
         except ModelError:
-            frozen.compare()  # a model that gives no number has a greater fault than one without layers
+            _ = comparison.change  # a model that gives no number has a greater fault than one without layers
             raise
 
 
-def _differentiate(frozen: FrozenModel, batch: Tensor, *, count: int, layer: Layer) -> tuple[Tensor, Tensor, Tensor]:
+def _differentiate(comparison: Comparison, batch: Tensor, *, count: int, layer: Layer) -> tuple[Tensor, Tensor, Tensor]:
     """Activations, gradients of the first `count` predictions in them, and predictions of a batch."""
-    with capture(frozen.model, [layer.name], differentiable=True) as outputs:
-        predictions = frozen.predict(batch)
+    with capture(comparison.model, [layer.name], differentiable=True) as outputs:
+        predictions = comparison.predict(batch)
     if not predictions.requires_grad:
         raise ModelError(
             f"the output does not depend on layer {layer.name!r}; choose a layer on the path to the output"
@@ -106,17 +111,6 @@ class GradCam(_Cam):
     The relevance of a cell is sum over c of alpha_c (A_c(x) - A_c(b)), alpha_c the mean over space of df/dA_c at x,
     which for a head linear in the mean over space adds up to f(x) - f(b) exactly, whatever the bias. A regressor's
     negative evidence is evidence, so the ReLU of the published map is left out.
-
-    Parameters
-    ----------
-    layer
-        Name of the layer; by default the last one with a map, as `find_layers` finds it.
-    contrast
-        Take the reference's activations off. False gives the published map, which does not depend on the reference and
-        has no completeness gap; the reference then only decides what `saliency` shows.
-    relu
-        Keep the cells above zero alone, as published; their map is then scaled to add up to f(x) - f(b), so that the
-        order of its pixels is the published one. That is a convention, and says nothing of what one pixel contributes.
 
     References
     ----------

@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import torch
@@ -44,8 +45,11 @@ def frozen(model: nn.Module) -> Iterator[None]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrozenModel:
-    """A frozen network with checked images; made by `freeze` and valid inside it only."""
+class Comparison:
+    """Images compared with their references by a frozen network: f(x) less f(b), in margin units, which is explained.
+
+    Made by `freeze` and valid inside it only; predictions are made when they are first asked for.
+    """
 
     model: nn.Module
     images: Float[Tensor, "batch 3 height width"]
@@ -68,35 +72,27 @@ class FrozenModel:
             )
         return output.reshape(len(images))
 
+    @cached_property
+    def prediction(self) -> Float[Tensor, " batch"]:
+        """f(x), without gradients."""
+        return self._answers(self.images, "image")
+
+    @cached_property
+    def reference_prediction(self) -> Float[Tensor, " batch"]:
+        """f(b) of each image, without gradients."""
+        prediction = self.prediction  # whose faults are told first
+        return self._answers(self.references, "reference").expand_as(prediction)
+
     @torch.no_grad()
-    def compare(self) -> "Comparison":
-        """Predict the images and their references, without gradients."""
-        predictions = (
-            torch.cat([self.predict(part) for part in images.split(_FORWARD_BATCH)])
-            for images in (self.images, self.references)
-        )
-        return self.compared(*predictions)
+    def _answers(self, images: Tensor, what: str) -> Tensor:
+        return _require_finite(torch.cat([self.predict(part) for part in images.split(_FORWARD_BATCH)]), what)
 
-    def compared(
-        self, prediction: Float[Tensor, " batch"], reference_prediction: Float[Tensor, " batch_or_one"]
-    ) -> "Comparison":
-        """Comparison with these predictions, checked."""
-        for values, what in ((prediction, "image"), (reference_prediction, "reference")):
-            for index in torch.nonzero(~values.isfinite()).flatten().tolist():
-                raise ModelError(
-                    f"the model predicts {float(values[index])} for {what} {index}; train or load it again"
-                )
-        known: dict[str, Any] = {**vars(self), "prediction": prediction}
-        known["reference_prediction"] = reference_prediction.expand_as(prediction)
-        return Comparison(**known)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Comparison(FrozenModel):
-    """Images compared with their references: f(x) less f(b), in margin units, which is explained."""
-
-    prediction: Float[Tensor, " batch"]
-    reference_prediction: Float[Tensor, " batch"]
+    def knowing(self, prediction: Tensor, reference_prediction: Tensor) -> "Comparison":
+        """The same with predictions that are known already, checked."""
+        comparison = replace(self)
+        vars(comparison)["prediction"] = _require_finite(prediction, "image")
+        vars(comparison)["reference_prediction"] = _require_finite(reference_prediction, "reference")
+        return comparison
 
     @property
     def reference(self) -> Float[Tensor, "batch 3 height width"]:
@@ -146,7 +142,7 @@ class Comparison(FrozenModel):
 
 
 @contextmanager
-def freeze(model: nn.Module, images: Batch, *, reference: Batch | None) -> Iterator[FrozenModel]:
+def freeze(model: nn.Module, images: Batch, *, reference: Batch | None) -> Iterator[Comparison]:
     """Check the images and freeze the network, with gradients on and autocast off whatever the caller's mode."""
     _require_images(images)
     reference = _require_reference(reference, images=images)
@@ -159,7 +155,13 @@ def freeze(model: nn.Module, images: Batch, *, reference: Batch | None) -> Itera
         images, reference = (_like_model(model, tensor).detach().clone() for tensor in (images, reference))
         # differences of predictions are explained, of which half precision leaves two digits
         stack.enter_context(torch.autocast(images.device.type, enabled=False))
-        yield FrozenModel(model=model, images=images, references=reference)
+        yield Comparison(model=model, images=images, references=reference)
+
+
+def _require_finite(predictions: Tensor, what: str) -> Tensor:
+    for index in torch.nonzero(~predictions.isfinite()).flatten().tolist():
+        raise ModelError(f"the model predicts {float(predictions[index])} for {what} {index}; train or load it again")
+    return predictions
 
 
 def _require_images(images: Batch) -> None:
@@ -258,15 +260,15 @@ class Method(ABC):
     ) -> Explanation:
         """Explain a batch; see `Explainer` for the arguments and errors."""
         start = time.perf_counter()
-        with freeze(model, images, reference=reference) as frozen:
-            explanation = self._explain(frozen, on_progress=on_progress)
+        with freeze(model, images, reference=reference) as comparison:
+            explanation = self._explain(comparison, on_progress=on_progress)
         if explanation.relevance.is_cuda:
             torch.cuda.synchronize(explanation.relevance.device)
         return replace(explanation, seconds=time.perf_counter() - start)
 
     @abstractmethod
-    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
-        """Explain `frozen.images` (`Comparison.explanation`); gradients are on."""
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
+        """Explain the images (`Comparison.explanation`); gradients are on."""
 
 
 def require_at_least_one(name: str, **options: int) -> None:

@@ -154,17 +154,6 @@ def effect_rounding(
 
     An effect is the difference of four predictions, each known to a few units in the last place whoever adds up its
     sums; what is left of that in a map grows as the effects fall. `weights`: effects over f(x) - f(reference).
-
-    Examples
-    --------
-    >>> import torch
-    >>> from sliplens.explainers.explanation import effect_rounding
-    >>> strong, weak = (
-    ...     effect_rounding([torch.ones(4)], prediction=0.9 - change, reference_prediction=0.9)
-    ...     for change in (0.4, 0.0004)
-    ... )
-    >>> f"{strong:.0e}, {weak:.0e}"
-    '5e-06, 5e-03'
     """
     change, size = abs(prediction - reference_prediction), max(1.0, abs(prediction), abs(reference_prediction))
     largest = [change * float(shares.abs().max()) for shares in weights if len(shares) and shares.any()]

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.explainers.contract import FrozenModel, Method, freeze, require_at_least_one
+from sliplens.explainers.contract import Comparison, Method, freeze, require_at_least_one
 from sliplens.explainers.explanation import Explanation, check_slopes
 from sliplens.progress import OnProgress
 
@@ -36,19 +36,6 @@ class IntegratedGradients(Method):
     change of f from its start to its end. While the gaps add up to more than `tolerance` the pieces with the largest
     are halved: nodes spread over the whole line miss the sum of a trained network by percents.
 
-    Parameters
-    ----------
-    steps
-        Steps (Gauss-Legendre nodes) to start with, four to a piece.
-    max_steps
-        Most steps; an image that needs more keeps its gap and a warning. Equal to `steps` for one rule over the whole
-        line, as it was published.
-    tolerance
-        Completeness gap allowed, as a share of |f(x) - f(b)|.
-    black
-        Start from the black image instead, as published: relevance adds up to f(x) - f(black), and the reference only
-        decides what `saliency` shows.
-
     References
     ----------
     Sundararajan, Taly and Yan, *Axiomatic attribution for deep networks*, ICML 2017, eq. 1; each piece by Captum.
@@ -68,9 +55,15 @@ class IntegratedGradients(Method):
     """
 
     steps: int = 32
+    """Steps (Gauss-Legendre nodes) to start with, four to a piece."""
     max_steps: int = 1024
+    """Most steps; an image that needs more keeps its gap and a warning. Equal to `steps` for one rule over the whole
+    line, as it was published."""
     tolerance: float = 0.01
+    """Completeness gap allowed, as a share of |f(x) - f(b)|."""
     black: bool = False
+    """Start from the black image instead, as published: relevance adds up to f(x) - f(black), and the reference only
+    decides what `saliency` shows."""
     batch_size: int = 32
 
     def __post_init__(self) -> None:
@@ -84,9 +77,10 @@ class IntegratedGradients(Method):
         if not self.tolerance > 0:
             raise InputError(f"integrated gradients' tolerance is {self.tolerance}; give a share above 0")
 
-    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
-        comparison, slopes = frozen.compare(), []
-        black = replace(frozen, references=torch.zeros_like(frozen.references)).compare() if self.black else comparison
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
+        black, slopes = comparison, []
+        if self.black:
+            black = replace(comparison, references=torch.zeros_like(comparison.references))
         pairs = (black.images, black.reference, black.prediction, black.reference_prediction)
 
         def integral(index: int) -> Tensor:
@@ -104,7 +98,7 @@ class IntegratedGradients(Method):
 
     def integrate(
         self,
-        frozen: FrozenModel,
+        comparison: Comparison,
         image: Float[Tensor, "3 height width"],
         reference: Float[Tensor, "3 height width"],
         prediction: Float[Tensor, ""],
@@ -116,7 +110,7 @@ class IntegratedGradients(Method):
         allowed = max(self.tolerance * abs(change), _ROUNDING * max(abs(float(end)) for end in ends))
         fixed = self.steps == self.max_steps
         pieces, nodes = (1, self.steps) if fixed else (max(1, self.steps // _NODES), min(self.steps, _NODES))
-        path = _Path(frozen=frozen, image=image, reference=reference, nodes=nodes, batch_size=self.batch_size)
+        path = _Path(comparison=comparison, image=image, reference=reference, nodes=nodes, batch_size=self.batch_size)
         edges = torch.linspace(0, 1, pieces + 1, dtype=torch.float64, device=image.device)
         heights = torch.cat([ends[0][None], path.predict(edges[1:-1]), ends[1][None]]).double()
         starts, stops, rises = edges[:-1], edges[1:], heights.diff()
@@ -145,7 +139,7 @@ class IntegratedGradients(Method):
 class _Path:
     """The straight line from a reference to an image."""
 
-    frozen: FrozenModel
+    comparison: Comparison
     image: Tensor
     reference: Tensor
     nodes: int
@@ -157,12 +151,12 @@ class _Path:
     @torch.no_grad()
     def predict(self, times: Tensor) -> Tensor:
         """Predictions at some points, 0 the reference and 1 the image."""
-        parts = [self.frozen.predict(self._at(part)) for part in times.split(self.batch_size) if len(part)]
+        parts = [self.comparison.predict(self._at(part)) for part in times.split(self.batch_size) if len(part)]
         return torch.cat(parts) if parts else self.image.new_zeros(0)
 
     def integrate(self, starts: Tensor, stops: Tensor) -> Tensor:
         """Relevance (pieces, height, width) of each piece of the line."""
-        together, captum = max(1, self.batch_size // self.nodes), attr.IntegratedGradients(self.frozen.predict)
+        together, captum = max(1, self.batch_size // self.nodes), attr.IntegratedGradients(self.comparison.predict)
         pieces = []
         for start, stop in zip(starts.split(together), stops.split(together), strict=True):
             contributions = captum.attribute(
@@ -183,14 +177,6 @@ class ExpectedGradients(Method):
     points of the line at random; here the background is gone through and each line integrated until it is complete,
     which gives the same in the limit, without noise and without a seed.
 
-    Parameters
-    ----------
-    background
-        Frames without slip as the network takes them, float in [0, 1], shape (frames, 3, height, width); the call's
-        reference is then not used. Without one the call's reference is the whole background, and a warning says so.
-    integrated
-        How each line is integrated.
-
     References
     ----------
     Erion et al., *Improving performance of deep learning models with axiomatic attribution priors and expected
@@ -198,18 +184,20 @@ class ExpectedGradients(Method):
     """
 
     background: Float[Tensor, "frames 3 height width"] | None = None
+    """Frames without slip as the network takes them, float in [0, 1], shape (frames, 3, height, width); the call's
+    reference is then not used. Without one the call's reference is the whole background, and a warning says so."""
     integrated: IntegratedGradients = field(default_factory=IntegratedGradients)
+    """How each line is integrated."""
 
-    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
-        alone = frozen.compare()
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
         if self.background is None:
-            frames, heights = alone.reference[:, None], alone.reference_prediction[:, None]
+            frames, heights = comparison.reference[:, None], comparison.reference_prediction[:, None]
         else:
             # checked as images are, and brought to the network's type
-            with freeze(frozen.model, self.background, reference=None) as behind:
-                heights = behind.compare().prediction.expand(len(alone.images), -1)
-                frames = behind.images.expand(len(alone.images), -1, -1, -1, -1)
-        comparison = alone.compared(alone.prediction, heights.mean(dim=1))
+            with freeze(comparison.model, self.background, reference=None) as behind:
+                heights = behind.prediction.expand(len(comparison.images), -1)
+                frames = behind.images.expand(len(comparison.images), -1, -1, -1, -1)
+        comparison = comparison.knowing(comparison.prediction, heights.mean(dim=1))
 
         def mean_over(index: int) -> Tensor:
             image, prediction = comparison.images[index], comparison.prediction[index]
@@ -235,11 +223,6 @@ class SmoothGrad(Method):
     which was published, has another unit than the other maps and lights up where the image equals the reference. Only
     for a linear network it adds up to f(x) - f(b), so it has no completeness gap.
 
-    Parameters
-    ----------
-    noise
-        Standard deviation of the noise, in units of the input's range [0, 1]; the same draws for each image.
-
     References
     ----------
     Smilkov et al., *SmoothGrad: removing noise by adding noise*, 2017, section 3; computed by Captum.
@@ -247,6 +230,7 @@ class SmoothGrad(Method):
 
     samples: int = 32
     noise: float = 0.1
+    """Standard deviation of the noise, in units of the input's range [0, 1]; the same draws for each image."""
     batch_size: int = 32
     seed: int = 0
 
@@ -255,8 +239,8 @@ class SmoothGrad(Method):
         if not self.noise >= 0:
             raise InputError(f"SmoothGrad's noise is {self.noise}; give a standard deviation of at least 0")
 
-    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
-        comparison = frozen.compare()
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
+        change = comparison.change.tolist()
         tunnel = attr.NoiseTunnel(attr.Saliency(comparison.predict))
 
         def smoothed(index: int) -> Tensor:
@@ -280,5 +264,5 @@ class SmoothGrad(Method):
             method="smooth-grad",
             complete=False,
             target="the linear model of f at x",
-            warnings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=comparison.change.tolist()),
+            warnings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=change),
         )

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, fx, nn
 
-from sliplens.explainers.contract import FrozenModel, Method
+from sliplens.explainers.contract import Comparison, Method
 from sliplens.explainers.explanation import Explanation
 from sliplens.extras import require_packages
 from sliplens.models.backbones import HistogramRegressor
@@ -37,9 +37,9 @@ class Lrp(Method):
 
     batch_size: int = 32
 
-    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
         require_packages("zennit", extra="lrp", purpose="LRP")
-        comparison = frozen.compare()
+        prediction = comparison.prediction
         copy = fold_batch_norm(comparison.model)
         for module in copy.modules():
             if isinstance(module, fx.GraphModule):
@@ -50,7 +50,7 @@ class Lrp(Method):
             if on_progress is not None:
                 on_progress(sum(map(len, parts)), len(comparison.images))
         relevance = torch.cat(parts)
-        shares = (relevance.sum(dim=(1, 2)) / comparison.prediction).tolist()
+        shares = (relevance.sum(dim=(1, 2)) / prediction).tolist()
         return comparison.explanation(
             relevance,
             method="lrp",

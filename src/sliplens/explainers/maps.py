@@ -27,15 +27,6 @@ def spread(maps: Float[Tensor, "*maps rows columns"], size: tuple[int, int]) -> 
 
     Pixel p receives sum over cells i of B[p, i] m[i] / sum over p' of B[p', i], B the bilinear weights (corners not
     aligned); plain resizing would change the total where the sizes do not divide.
-
-    Examples
-    --------
-    >>> import torch
-    >>> from sliplens.explainers.maps import spread
-    >>> coarse = torch.tensor([[1.0, -0.5], [0.25, 0.25]])
-    >>> fine = spread(coarse, (8, 8))
-    >>> fine.shape, fine.sum()
-    (torch.Size([8, 8]), tensor(1.))
     """
     rows, columns = (_received(maps, axis=axis, pixels=pixels) for axis, pixels in zip((-2, -1), size, strict=True))
     return resize(maps / (rows[:, None] * columns), size)

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.explainers.contract import FrozenModel, Method, require_at_least_one
+from sliplens.explainers.contract import Comparison, Method, require_at_least_one
 from sliplens.explainers.explanation import Explanation
 from sliplens.markers import detect_markers
 from sliplens.progress import OnProgress
@@ -161,8 +161,7 @@ class Occlusion(RegionMethod):
     """
 
     @torch.no_grad()
-    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
-        comparison = frozen.compare()
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
         tiles = -(-comparison.images.shape[-2] // self.tile_px) * -(-comparison.images.shape[-1] // self.tile_px)
         engine = comparison.prepare(len(comparison.images) * tiles)  # markers are about as many
 

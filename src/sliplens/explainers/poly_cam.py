@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from sliplens.errors import InputError
 from sliplens.explainers.activations import Layer, capture, find_layers, find_published_layers
-from sliplens.explainers.contract import Comparison, FrozenModel, Method
+from sliplens.explainers.contract import Comparison, Method
 from sliplens.explainers.explanation import (
     Approximation,
     Explanation,
@@ -148,28 +148,6 @@ class PolyCam(Method):
     reference thereabouts, is the saliency; the relevance is that scaled to add up to f(x) - f(b), a convention that
     says nothing about how much one pixel contributes.
 
-    Parameters
-    ----------
-    variant
-        "+", "-" or "+/-"; the last costs two passes a channel, the others one.
-    score
-        What the masked predictions are turned into, a key of `SCORES`: `thesis` is what the public code did to a
-        network with one output, for comparison with old figures; it takes no reference, and explains nothing.
-    layers
-        Names of the layers; by default those that belong to the score.
-    level
-        Which level's map is the relevance, counted from the finest, 0; the thesis scored `level=5`. Layers finer than
-        that have no part in it, and cost no pass.
-    budget
-        Share of the channels to measure at first, in (0, 1]; 1 for the exact map. The other channels' weights are
-        estimated, and `Explanation.approximations` says what the map is expected to have in common with the exact one.
-    likeness
-        What that should be: channels are measured until it is expected. None to stop at the budget.
-    batch_size
-        Masked images in one pass; None for what suits the engine.
-    levels
-        Keep the saliency and the weights of each layer in the explanation, those finer than `level` too.
-
     References
     ----------
     Englebert, Cornu and De Vleeschouwer, *Poly-CAM: High resolution class activation map for convolutional neural
@@ -177,14 +155,25 @@ class PolyCam(Method):
     """
 
     variant: str = "+/-"
+    """One of "+", "-" and "+/-"; the last costs two passes a channel, the others one."""
     score: str = "regression"
+    """What the masked predictions are turned into, a key of `SCORES`: `thesis` is what the public code did to a network
+    with one output, for comparison with old figures; it takes no reference, and explains nothing."""
     layers: tuple[str, ...] | None = None
+    """Names of the layers; by default those that belong to the score."""
     level: int = 0
+    """Which level's map is the relevance, counted from the finest, 0; the thesis scored `level=5`. Layers finer than
+    that have no part in it, and cost no pass."""
     budget: float = 1.0
+    """Share of the channels to measure at first, in (0, 1]; 1 for the exact map. The other channels' weights are
+    estimated, and `Explanation.approximations` says what the map is expected to have in common with the exact one."""
     likeness: Likeness | None = Likeness()  # noqa: RUF009 (frozen)
+    """What that should be: channels are measured until it is expected. None to stop at the budget."""
     engine: str = "auto"
     batch_size: int | None = None
+    """Masked images in one pass; None for what suits the engine."""
     levels: bool = False
+    """Keep the saliency and the weights of each layer in the explanation, those finer than `level` too."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -198,9 +187,9 @@ class PolyCam(Method):
             raise InputError(f"Poly-CAM's budget is {self.budget}; give a share of the channels, above 0 and at most 1")
 
     @torch.no_grad()
-    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
         """Progress counts the channels of every image."""
-        comparison = frozen.compare()
+        change = comparison.change.tolist()
         layers = self._find_layers(comparison)
         channels = sum(layer.channels for layer in layers)
         done = 0
@@ -242,7 +231,7 @@ class PolyCam(Method):
             method="poly-cam",
             complete=True,
             warnings=(
-                *check_weights(names, weights, change=comparison.change.tolist()),
+                *check_weights(names, weights, change=change),
                 *check_approximations(approximations),
                 *check_rounding(self._roundings(comparison, weights)),
             ),

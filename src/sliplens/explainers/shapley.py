@@ -11,7 +11,7 @@ from scipy.special import comb
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.explainers.contract import FrozenModel
+from sliplens.explainers.contract import Comparison
 from sliplens.explainers.explanation import Explanation
 from sliplens.explainers.gradients import IntegratedGradients
 from sliplens.explainers.occlusion import RegionMethod
@@ -50,20 +50,7 @@ def shapley_values(
     asks for (empirical Bayes): a good guess saves most of the pairs, a poor one costs little, and both fade as pairs
     are added.
 
-    Parameters
-    ----------
-    value
-        Worth of coalitions, (coalitions, players) to (coalitions,); asked once for the whole and the empty one, and
-        once for all others.
-    pairs
-        Pairs of coalitions to ask; all of them, exactly, where the players have no more. At least twice the players.
-    guess
-        What the values may be like, in any unit.
-
-    Raises
-    ------
-    InputError
-        If there are too few pairs for the players.
+    `pairs` are asked, or all, exactly, where the players have no more; at least twice as many as the players.
 
     References
     ----------
@@ -71,16 +58,6 @@ def shapley_values(
     *Improving KernelSHAP: Practical Shapley Value Estimation via Linear Regression* (2021), section 4.2, pairs.
     Patterson and Thompson, *Recovery of inter-block information when block sizes are unequal* (1971), for how far to
     draw: restricted maximum likelihood.
-
-    Examples
-    --------
-    Two players who only gain together share alike:
-
-    >>> import numpy as np
-    >>> from sliplens.explainers.shapley import shapley_values
-    >>> together = lambda members: members.all(axis=1).astype(float)
-    >>> shapley_values(together, 2, pairs=4, rng=np.random.default_rng(0)).values
-    array([0.5, 0.5])
     """
     whole, empty = value(np.array([[True] * players, [False] * players])).tolist()
     if players == 1:
@@ -177,18 +154,6 @@ class Shapley(RegionMethod):
     ----------
     Shapley, *A Value for n-Person Games* (1953); Lundberg and Lee, *A Unified Approach to Interpreting Model
     Predictions* (2017). Estimated by `shapley_values`.
-
-    Examples
-    --------
-    >>> import torch
-    >>> from sliplens.explainers.shapley import Shapley
-    >>> mean_of_left = lambda images: images[:, :, :, :2].mean(dim=(1, 2, 3))
-    >>> model = torch.nn.Identity()
-    ... model.forward = mean_of_left
-    >>> explanation = Shapley(tile_px=2)(model, torch.ones(1, 3, 2, 4))
-    >>> explanation.relevance[0]
-    tensor([[0.2500, 0.2500, 0.0000, 0.0000],
-            [0.2500, 0.2500, 0.0000, 0.0000]])
     """
 
     tile_px: int = 28
@@ -196,15 +161,10 @@ class Shapley(RegionMethod):
     """Pairs of coalitions that are asked for each image, two passes of the network each."""
     seed: int = 0
 
-    def _explain(self, frozen: FrozenModel, *, on_progress: OnProgress | None) -> Explanation:
-        gradients = IntegratedGradients()._explain(frozen, on_progress=None).relevance.double().cpu()
-        with torch.no_grad():
-            return self._share_out(frozen, gradients, on_progress)
-
-    def _share_out(
-        self, frozen: FrozenModel, gradients: Float[Tensor, "batch height width"], on_progress: OnProgress | None
-    ) -> Explanation:
-        comparison = frozen.compare()
+    @torch.no_grad()
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
+        with torch.enable_grad():
+            gradients = IntegratedGradients()._explain(comparison, on_progress=None).relevance.double().cpu()
         engine = comparison.prepare(2 * self.pairs * len(comparison.images), batch_size=self.batch_size)
         unsure = []
 

@@ -111,18 +111,6 @@ def lead_over_controls(
     References
     ----------
     Berger, *Multiparameter hypothesis testing and acceptance sampling* (1982): intersection-union tests.
-
-    Examples
-    --------
-    A method that is no more than one of the controls does not lead:
-
-    >>> import numpy as np
-    >>> from sliplens.faithfulness.controls import lead_over_controls
-    >>> gains, trials = np.linspace(0.2, 0.7, 12), np.repeat(np.arange(6), 2)
-    >>> controls = {"edges": gains, "centre": gains / 2}
-    >>> lead = lead_over_controls(gains, controls, clusters=[trials], rng=np.random.default_rng(0))
-    >>> lead.control, lead.gap.high, lead.shows_something
-    ('edges', 0.0, False)
     """
     others = {**controls, CHANCE: np.zeros(len(own))}
     gaps = {name: paired_difference(own, other, clusters=clusters, rng=rng) for name, other in others.items()}

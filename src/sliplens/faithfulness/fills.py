@@ -35,18 +35,6 @@ def noisy_linear(
     ----------
     Rong et al., *A Consistent and Efficient Evaluation Strategy for Attribution Methods* (2022): ROAD, section 4 and
     appendix; weights of 1/6 for the four nearest and 1/12 for the diagonal neighbours.
-
-    Examples
-    --------
-    A hole in a ramp is filled by the ramp:
-
-    >>> import torch
-    >>> from sliplens.faithfulness.fills import noisy_linear
-    >>> ramp = torch.linspace(0, 1, 5).expand(1, 3, 5, 5)
-    >>> gone = torch.zeros(1, 5, 5, dtype=torch.bool)
-    >>> gone[0, 2, 2] = True
-    >>> noisy_linear(ramp, gone)[0, 0, 2]
-    tensor([0.0000, 0.2500, 0.5000, 0.7500, 1.0000])
     """
     # channels last: the small convolution of every step is six times as fast on a CPU; a mask for each colour, since
     # there a product with one for all of them takes six times as long

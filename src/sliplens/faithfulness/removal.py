@@ -61,18 +61,7 @@ def unit_means(values: Float[np.ndarray, "height width"], units: Units) -> Float
 def unit_order(
     influence: Float[np.ndarray, "_ _"], units: Units, *, least_first: bool = False
 ) -> Int[np.ndarray, " pixels"]:
-    """Flat pixel indices, unit by unit, by the mean of the map over each, from the most influential or the least on.
-
-    Examples
-    --------
-    The right tile is brighter on average: its pixels go first.
-
-    >>> import numpy as np
-    >>> from sliplens.faithfulness.removal import tile_units, unit_order
-    >>> influence = np.array([[0.9, 0.0, 0.5, 0.6], [0.0, 0.0, 0.5, 0.6]])
-    >>> unit_order(influence, tile_units((2, 4), size=2))
-    array([2, 3, 6, 7, 0, 1, 4, 5])
-    """
+    """Flat pixel indices, unit by unit, by the mean of the map over each, from the most influential or the least on."""
     require_saliency(influence, units.shape, where="the map to rank by")
     means = unit_means(influence, units)[units.ravel()]
     # units in order, the pixels of each in reading order: lexsort is stable, its last key counts first
