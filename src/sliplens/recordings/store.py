@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import msgspec
 import numpy as np
@@ -22,6 +22,8 @@ from sliplens.images import decode_png, encode_png
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.trial import OPTIONAL_LABELS, SIGNALS, ContactState, GroundTruth, Labels, Recording, TrialFacts
+
+Pixels: TypeAlias = UInt8[np.ndarray, "height width *channels"]
 
 SCHEMA_VERSION = 2
 CODEC = "rows+zstd"
@@ -48,7 +50,7 @@ def reading(path: Path, *, wrong: str = "is not a readable Parquet file") -> Ite
         raise RecordingError(f"{path} {wrong} ({one_line(error)}); make the data set again") from None
 
 
-def encode_pixels(pixels: UInt8[np.ndarray, "height width *channels"]) -> bytes:
+def encode_pixels(pixels: Pixels) -> bytes:
     """Bytes of an image; the size is kept elsewhere."""
     rows = pixels.copy()
     rows[1:] -= pixels[:-1]
@@ -56,7 +58,7 @@ def encode_pixels(pixels: UInt8[np.ndarray, "height width *channels"]) -> bytes:
     return pa.compress(rows, codec="zstd").to_pybytes()
 
 
-def encode_frames(frames: Iterable[UInt8[np.ndarray, "height width *channels"]]) -> Iterator[list[bytes]]:
+def encode_frames(frames: Iterable[Pixels]) -> Iterator[list[bytes]]:
     """Encode frames side by side while the next are made, and give them in chunks of a row group.
 
     Two frames a processor are held as pixels, however many there are.
@@ -67,9 +69,7 @@ def encode_frames(frames: Iterable[UInt8[np.ndarray, "height width *channels"]])
         yield from iter(lambda: list(islice(images, ROW_GROUP)), [])
 
 
-def _in_turn(
-    pool: ThreadPoolExecutor, frames: Iterable[UInt8[np.ndarray, "height width *channels"]], *, ahead: int
-) -> Iterator[bytes]:
+def _in_turn(pool: ThreadPoolExecutor, frames: Iterable[Pixels], *, ahead: int) -> Iterator[bytes]:
     waiting: deque[Future[bytes]] = deque()
     for frame in frames:
         waiting.append(pool.submit(encode_pixels, frame))
@@ -79,9 +79,7 @@ def _in_turn(
         yield waiting.popleft().result()
 
 
-def decode_pixels(
-    data: bytes | pa.Buffer, *, size: Sequence[int], where: str
-) -> UInt8[np.ndarray, "height width *channels"]:
+def decode_pixels(data: bytes | pa.Buffer, *, size: Sequence[int], where: str) -> Pixels:
     """Pixels of an image of known size (height, width, and channels if any)."""
     count = int(np.prod(size))
     try:

@@ -41,6 +41,13 @@ class ContactState(StrEnum):
     UNKNOWN = "unknown"
 
 
+def contact_states(margin: Float[np.ndarray, " frames"], *, without: ContactState) -> tuple[ContactState, ...]:
+    """States that safety margins tell, another one where there is no margin."""
+    states = (without, ContactState.FULL_SLIP, ContactState.CONTACT, ContactState.INCIPIENT_SLIP)
+    kinds = np.select([np.isnan(margin), margin <= 0, margin >= 1], [0, 1, 2], default=3)
+    return tuple(states[kind] for kind in kinds)
+
+
 LABEL_SIGNALS = ("normal_force_n", "tangential_force_n", "friction_coefficient", "safety_margin", "stick_ratio")
 """The numbers of `Labels`, in the order they are stored."""
 SIGNALS = ("time_s", *LABEL_SIGNALS)
@@ -116,15 +123,13 @@ def labels_of_margins(safety_margin: Float[np.ndarray, " frames"]) -> Labels:
     ['contact', 'incipient slip', 'full slip', 'unknown']
     """
     unknown = np.full(len(safety_margin), np.nan)
-    states = (ContactState.UNKNOWN, ContactState.FULL_SLIP, ContactState.CONTACT, ContactState.INCIPIENT_SLIP)
-    kinds = np.select([np.isnan(safety_margin), safety_margin <= 0, safety_margin >= 1], [0, 1, 2], default=3)
     return Labels(
         normal_force_n=unknown,
         tangential_force_n=unknown,
         friction_coefficient=unknown,
         safety_margin=safety_margin,
         stick_ratio=stick_ratio(safety_margin),
-        contact_state=tuple(states[kind] for kind in kinds),
+        contact_state=contact_states(safety_margin, without=ContactState.UNKNOWN),
         reason=tuple("" if known else "not labelled" for known in np.isfinite(safety_margin)),
     )
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -9,11 +10,13 @@ from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
 
 from sliplens.mechanics import normal_slope
-from sliplens.simulation.geometry import pixel_grid
+from sliplens.simulation.geometry import Point, Rays, pixel_grid
 from sliplens.simulation.loading import Loading
 from sliplens.simulation.motion import Motion, move_markers
 from sliplens.simulation.nuisances import Day, Grasp, Unit
 from sliplens.simulation.sensor import DrawnMarkers, Noise, Sensor, draw_look, mix_noise, pick_noise
+
+Planes: TypeAlias = Float32[np.ndarray, "3 height width"]
 
 _BATCHES = {"cpu": 4, "cuda": 512}
 """Frames drawn at once: few enough for a processor's caches, many enough for a GPU."""
@@ -44,16 +47,16 @@ class Film:
     """Blur of the untouched sensor, then of each frame."""
     noise_picks: Int[np.ndarray, "frames_and_reference 2 3"]
     """See `pick_noise`."""
-    rays: Float[np.ndarray, "height width 2"]
+    rays: Rays
     texture: Float32[np.ndarray, "3 markers side side"]
     """Grain of the print, of unit strength."""
-    light: Float32[np.ndarray, "3 height width"]
+    light: Planes
     """Brightness over the sensor's."""
-    empty: Float32[np.ndarray, "3 height width"]
+    empty: Planes
     """The untouched sensor without its markers, in grey levels."""
-    haze: Float32[np.ndarray, "3 height width"]
+    haze: Planes
     """Grey levels that full contact adds."""
-    relief: Float32[np.ndarray, "3 height width"] | None
+    relief: Planes | None
     """Relative change of brightness where the skin slopes by 1; None where slopes do not show."""
 
     def __len__(self) -> int:
@@ -230,7 +233,7 @@ def prepare_film(
     )
 
 
-def brightness(sensor: Sensor, *, day: Day) -> Float32[np.ndarray, "3 height width"]:
+def brightness(sensor: Sensor, *, day: Day) -> Planes:
     """Brightness of the untouched skin over the sensor's background.
 
     Gain, white balance, vignette, lamps, and a linear fall of brightness across the image.
@@ -247,9 +250,7 @@ def brightness(sensor: Sensor, *, day: Day) -> Float32[np.ndarray, "3 height wid
     return _planes(even)
 
 
-def empty_view(
-    sensor: Sensor, *, day: Day, light: Float32[np.ndarray, "3 height width"]
-) -> Float32[np.ndarray, "3 height width"]:
+def empty_view(sensor: Sensor, *, day: Day, light: Planes) -> Planes:
     """Untouched sensor without its markers, the lamps' glare included, in grey levels."""
     skin = np.asarray(sensor.background, dtype=np.float32)[:, None, None] * light
     glare = sensor.glare
@@ -262,7 +263,7 @@ def empty_view(
     return np.minimum(skin + _planes(day.glare * spots[..., None] * np.asarray(glare.colour)), np.float32(_WHITE))
 
 
-def relief(sensor: Sensor, *, contact_px: Float[np.ndarray, "2"]) -> Float32[np.ndarray, "3 height width"] | None:
+def relief(sensor: Sensor, *, contact_px: Point) -> Planes | None:
     """Relative change of brightness where the skin slopes by 1 away from a contact; None for a sensor without lamps.
 
     The dent is a hill to the camera inside: its flank towards a lamp brightens.
@@ -278,9 +279,7 @@ def relief(sensor: Sensor, *, contact_px: Float[np.ndarray, "2"]) -> Float32[np.
     return _planes(np.sum(lamps, axis=0))
 
 
-def haze(
-    sensor: Sensor, *, grasp: Grasp, contact_px: Float[np.ndarray, "2"], radius_px: float, rng: np.random.Generator
-) -> Float32[np.ndarray, "3 height width"]:
+def haze(sensor: Sensor, *, grasp: Grasp, contact_px: Point, radius_px: float, rng: np.random.Generator) -> Planes:
     """Grey levels that full contact adds: a veil, a glow where the object reflects the light, the grain of the skin.
 
     `contact_px`, `radius_px`: where the camera sees the contact's centre, and how large its radius in a nominal grasp.
@@ -303,7 +302,7 @@ def _smooth_noise(size: int, *, rng: np.random.Generator) -> Float[np.ndarray, "
     return windows(rows, len(kernel), axis=0) @ kernel
 
 
-def _planes(image: Float[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "3 height width"]:
+def _planes(image: Float[np.ndarray, "height width 3"]) -> Planes:
     return np.ascontiguousarray(np.moveaxis(image, -1, 0), dtype=np.float32)
 
 

@@ -12,10 +12,13 @@ from jaxtyping import Float, Float32
 
 from sliplens.errors import ContactError
 
+Frames: TypeAlias = Float[np.ndarray, " frames"]
+Point: TypeAlias = Float[np.ndarray, "2"]
+Rays: TypeAlias = Float[np.ndarray, "height width 2"]
+Maps: TypeAlias = Float32[np.ndarray, "frames height width"]
 
-def _squared_distance(
-    rays: Float[np.ndarray, "height width 2"], *, height: Float[np.ndarray, " frames"], centre: Float[np.ndarray, "2"]
-) -> Float32[np.ndarray, "frames height width"]:
+
+def _squared_distance(rays: Rays, *, height: Frames, centre: Point) -> Maps:
     """Squared distance |h u - c|^2 between a point c and where rays of slope u are at heights h."""
     slope, along = (rays**2).sum(axis=-1).astype(np.float32), (rays @ (2 * centre)).astype(np.float32)
     up = height.astype(np.float32)[:, None, None]
@@ -106,7 +109,7 @@ class Dome:
         direction = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
         return direction * (self.radius_m - depth_m)
 
-    def skin_point(self, sideways_m: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
+    def skin_point(self, sideways_m: Point) -> Float[np.ndarray, "3"]:
         """Point of the skin at rest at a distance (x, y) from the axis."""
         return np.append(sideways_m, np.sqrt(self.radius_m**2 - sideways_m @ sideways_m))
 
@@ -133,13 +136,7 @@ class Dome:
         angle = np.minimum(np.linalg.norm(away, axis=-1), 1.5)
         return away * (np.tan(angle) / np.where(angle > 0, angle, 1))[..., None]
 
-    def face_distance_squared(
-        self,
-        rays: Float[np.ndarray, "height width 2"],
-        *,
-        contact_centre_m: Float[np.ndarray, "2"],
-        indentation_m: Float[np.ndarray, " frames"],
-    ) -> Float32[np.ndarray, "frames height width"]:
+    def face_distance_squared(self, rays: Rays, *, contact_centre_m: Point, indentation_m: Frames) -> Maps:
         """Squared distance from the contact's centre at which each ray meets the object's face, in square metres.
 
         The face is the plane that Hertz's displacement makes of the sphere near its apex:
@@ -198,7 +195,7 @@ class FlatPad:
         across, down = np.meshgrid(x, y)
         return np.stack([across.ravel(), down.ravel(), np.full(self.markers, -depth_m)], axis=-1)
 
-    def skin_point(self, sideways_m: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
+    def skin_point(self, sideways_m: Point) -> Float[np.ndarray, "3"]:
         """Point of the skin at rest at a distance (x, y) from the axis."""
         return np.append(sideways_m, 0.0)
 
@@ -219,13 +216,7 @@ class FlatPad:
         """Slopes (x, y) of the pixels' lines of sight: metres sideways for each metre ahead."""
         return (pixels - np.asarray(self.centre_px)) / self.focal_px
 
-    def face_distance_squared(
-        self,
-        rays: Float[np.ndarray, "height width 2"],
-        *,
-        contact_centre_m: Float[np.ndarray, "2"],
-        indentation_m: Float[np.ndarray, " frames"],
-    ) -> Float32[np.ndarray, "frames height width"]:
+    def face_distance_squared(self, rays: Rays, *, contact_centre_m: Point, indentation_m: Frames) -> Maps:
         """Squared distance from the contact's centre at which each ray meets the ball, in square metres.
 
         The ball's face is taken at the depth of the contact's edge, delta / 2, where it matters.

@@ -6,6 +6,7 @@ the print's jitter move a marker and its place at rest alike: the reference fram
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,6 +16,8 @@ from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.motion import move_markers
 from sliplens.simulation.nuisances import Grasp, Nuisances, Range
 from sliplens.simulation.sensor import Sensor
+
+Jacobian: TypeAlias = Float[np.ndarray, "coordinates unknowns"]
 
 MARGIN = "margin"
 """The unknown that is asked for."""
@@ -140,11 +143,7 @@ def prior_sigma(nuisances: Nuisances, *, wet: bool) -> dict[str, float]:
 
 
 def reading_gain(
-    jacobian: Float[np.ndarray, "coordinates unknowns"],
-    unknowns: tuple[str, ...],
-    *,
-    noise_px: float,
-    prior: Mapping[str, float],
+    jacobian: Jacobian, unknowns: tuple[str, ...], *, noise_px: float, prior: Mapping[str, float]
 ) -> Float[np.ndarray, " coordinates"]:
     """Gain of the best linear estimator of the margin: how far its reading moves with each coordinate, per pixel.
 
@@ -158,10 +157,7 @@ def reading_gain(
 
 
 def observations(
-    jacobian: Float[np.ndarray, "coordinates unknowns"],
-    unknowns: tuple[str, ...],
-    noise_px: float,
-    prior: Mapping[str, float],
+    jacobian: Jacobian, unknowns: tuple[str, ...], noise_px: float, prior: Mapping[str, float]
 ) -> tuple[Float[np.ndarray, "rows kept"], Float[np.ndarray, " kept"]]:
     """Rows of the least squares, a prior being one more observation, and the length of each column.
 

@@ -1,17 +1,15 @@
 """The load on the fingertip through a trial: touch, press, hold, pull until it slips, slide on, let go."""
 
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from sliplens.errors import ContactError
 from sliplens.mechanics import safety_margin, stick_ratio
-from sliplens.recordings import ContactState
+from sliplens.recordings.trial import ContactState, contact_states
+from sliplens.simulation.geometry import Frames
 from sliplens.simulation.nuisances import Grasp
-
-Frames: TypeAlias = Float[np.ndarray, " frames"]
 
 _FALL_S = 0.06
 """Time in which friction falls from static to kinetic once the contact slips (assumed)."""
@@ -179,13 +177,8 @@ def _label(time_s: Frames, *, normal: Frames, static: Frames, friction: Friction
         carried_friction=carried,
         stick_margin=stick_margin,
         held_s=held_s,
-        contact_state=_states(margin),
+        contact_state=contact_states(margin, without=ContactState.NO_CONTACT),
     )
-
-
-def _states(margin: Frames) -> tuple[ContactState, ...]:
-    states = (ContactState.NO_CONTACT, ContactState.CONTACT, ContactState.INCIPIENT_SLIP, ContactState.FULL_SLIP)
-    return tuple(states[at] for at in np.select([np.isnan(margin), margin >= 1, margin > 0], [0, 1, 2], default=3))
 
 
 def with_friction(loading: Loading, friction: Frames) -> Loading:
@@ -208,7 +201,7 @@ def with_friction(loading: Loading, friction: Frames) -> Loading:
         stick_ratio=stick_ratio(stick_margin),
         carried_friction=np.where(same, loading.carried_friction, 0.0),
         stick_margin=stick_margin,
-        contact_state=_states(margin),
+        contact_state=contact_states(margin, without=ContactState.NO_CONTACT),
     )
 
 

@@ -124,7 +124,10 @@ def move_markers(
     # a tilted object pushes a little sideways
     moved = rest + outward[..., None] * np.append(from_centre, np.zeros((len(rest), 1)), axis=1)
     moved += inward[..., None] * np.append(np.tan(grasp.tilt_rad), -1)
-    for friction, margin in _tractions(loading):
+    stick, carried = np.nan_to_num(loading.stick_margin, nan=1.0)[:, None], loading.carried_friction[:, None]
+    # friction and margin of each Cattaneo-Mindlin contact whose sum the traction is
+    tractions = [(loading.friction_coefficient[:, None] - carried, stick), (carried, np.zeros_like(carried))]
+    for friction, margin in tractions[: 1 + carried.any()]:
         along, across, sunk = partial_slip_displacement(
             from_centre @ pull,
             from_centre @ athwart,
@@ -151,13 +154,3 @@ def move_markers(
         contact_radius_m=contact_m,
         stick_radius_m=np.asarray(stick_radius(contact_m, np.nan_to_num(loading.stick_margin, nan=0.0))),
     )
-
-
-def _tractions(loading: Loading) -> list[tuple[Float[np.ndarray, "frames 1"], Float[np.ndarray, "frames 1"]]]:
-    """Friction and margin of each Cattaneo-Mindlin contact whose sum the traction is."""
-    margin = np.nan_to_num(loading.stick_margin, nan=1.0)[:, None]
-    carried = loading.carried_friction[:, None]
-    tractions = [(loading.friction_coefficient[:, None] - carried, margin)]
-    if carried.any():
-        tractions.append((carried, np.zeros_like(carried)))
-    return tractions

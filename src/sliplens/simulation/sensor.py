@@ -11,9 +11,10 @@ from torch import Tensor
 
 from sliplens.errors import ContactError
 from sliplens.mechanics import reduced_modulus
-from sliplens.simulation.geometry import Dome, FlatPad, Geometry, require_positive
+from sliplens.simulation.geometry import Dome, FlatPad, Frames, Geometry, require_positive
 from sliplens.simulation.nuisances import Unit
 
+Sizes: TypeAlias = Float[np.ndarray, "frames markers"]
 Rgb: TypeAlias = tuple[float, float, float]
 _NONE: Rgb = (0.0, 0.0, 0.0)
 _FIELDS = 32
@@ -115,14 +116,7 @@ class DrawnMarkers:
 
 
 def draw_look(
-    look: MarkerLook,
-    *,
-    geometry: Geometry,
-    unit: Unit,
-    scale: Float[np.ndarray, "frames markers"],
-    pressure: Float[np.ndarray, "frames markers"],
-    touch: Float[np.ndarray, " frames"],
-    blur_px: Float[np.ndarray, " frames"],
+    look: MarkerLook, *, geometry: Geometry, unit: Unit, scale: Sizes, pressure: Sizes, touch: Frames, blur_px: Frames
 ) -> DrawnMarkers:
     """Look of the markers under a load, as a `Motion` tells it, and under the trial's own blur (a standard deviation).
 

@@ -1,6 +1,7 @@
 """Axes, sign, tare and noise of a force sensor, declared or inferred, and means of its samples."""
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -24,18 +25,19 @@ _DOUBTFUL = 0.6  # a second axis that departs by this share of the first makes t
 _MAD_TO_SIGMA = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 
 
-def typical_step(time_s: Float[np.ndarray, " samples"]) -> float:
+Axes: TypeAlias = Float[np.ndarray, "3"]
+Samples: TypeAlias = Float[np.ndarray, " samples"]
+Columns: TypeAlias = Float[np.ndarray, "samples *axes"]
+Times: TypeAlias = Float[np.ndarray, " times"]
+
+
+def typical_step(time_s: Samples) -> float:
     """Median time between samples, in seconds; 0 for one sample."""
     return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
 
 
 def mean_force(
-    time_s: Float[np.ndarray, " samples"],
-    force_n: Float[np.ndarray, "samples *axes"],
-    at_s: Float[np.ndarray, " times"],
-    *,
-    window_s: float,
-    until_s: float = np.inf,
+    time_s: Samples, force_n: Columns, at_s: Times, *, window_s: float, until_s: float = np.inf
 ) -> Float[np.ndarray, "times *axes"]:
     """Mean over a window about given times of the force, interpolated linearly between its samples.
 
@@ -54,15 +56,13 @@ def mean_force(
     return np.where(wide[:, None], mean, plain).reshape(len(at), *force_n.shape[1:])
 
 
-def half_window(
-    time_s: Float[np.ndarray, " samples"], at_s: Float[np.ndarray, " times"], *, window_s: float, until_s: float
-) -> Float[np.ndarray, " times"]:
+def half_window(time_s: Samples, at_s: Times, *, window_s: float, until_s: float) -> Times:
     """Half the length of the windows that `mean_force` takes its means over."""
     room = np.minimum(at_s - time_s[0], time_s[-1] - at_s)
     return np.clip(np.minimum(room, np.abs(at_s - until_s)), 0, window_s / 2)
 
 
-def noise_sigma(values: Float[np.ndarray, "samples *axes"]) -> Float[np.ndarray, "*axes"]:
+def noise_sigma(values: Columns) -> Float[np.ndarray, "*axes"]:
     """Standard deviation of the noise of each column, from second differences: what changes slowly leaves no trace.
 
     The median makes it blind to a few jumps. A column that hardly ever changes has a noise of 0.
@@ -143,9 +143,7 @@ def infer_axes(
     )
 
 
-def _read_tare(
-    still: Float[np.ndarray, "samples 3"], *, noise: Float[np.ndarray, "3"]
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+def _read_tare(still: Float[np.ndarray, "samples 3"], *, noise: Axes) -> tuple[Axes, Axes]:
     """Mean of the untouched samples, and its standard uncertainty."""
     # a spike must not move it, and a plain median of Gaussian samples would be less certain by a quarter
     middle = np.median(still, axis=0)
@@ -159,7 +157,7 @@ def _read_tare(
     return np.mean(still, axis=0, where=kept), sigma
 
 
-def _vector(values: Float[np.ndarray, "3"]) -> Vector:
+def _vector(values: Axes) -> Vector:
     x, y, z = values.tolist()
     return x, y, z
 
@@ -229,7 +227,7 @@ class ContactForces:
         # too few means tell no spread: the samples then have to
         return self._split(noise_sigma(means)) if len(means) >= _FEW_MEANS else self.noise_n
 
-    def _split(self, of_axes: Vector | Float[np.ndarray, "3"]) -> NormalTangential:
+    def _split(self, of_axes: Vector | Axes) -> NormalTangential:
         index = self.axes.normal_index
         return NormalTangential(
             normal=float(of_axes[index]), tangential=float(np.sqrt(np.mean(np.delete(of_axes, index) ** 2)))
@@ -247,9 +245,7 @@ def apply_axes(forces: Forces, axes: ForceAxes) -> ContactForces:
     )
 
 
-def magnitude(
-    tangential_n: Float[np.ndarray, "samples 2"], *, sigma_n: float | Float[np.ndarray, " samples"]
-) -> Float[np.ndarray, " samples"]:
+def magnitude(tangential_n: Float[np.ndarray, "samples 2"], *, sigma_n: float | Samples) -> Samples:
     """Length of a tangential force with this noise left in each component, the noise's share of it taken off.
 
     References

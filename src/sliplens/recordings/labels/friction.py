@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.labelling import Found, FrictionEstimate
-from sliplens.recordings.labels.axes import ContactForces, magnitude, mean_force, typical_step
+from sliplens.recordings.labels.axes import ContactForces, Samples, magnitude, mean_force, typical_step
 
 _REACH_S = 0.08  # how far the break may lie from the rough guess
 _TRIES = 41  # breaks tried over that reach
@@ -31,14 +31,7 @@ class Break:
     times_s: Float[np.ndarray, " draws"]
 
 
-def fit_break(
-    time_s: Float[np.ndarray, " samples"],
-    values: Float[np.ndarray, " samples"],
-    *,
-    about_s: float,
-    rng: np.random.Generator,
-    draws: int,
-) -> Break:
+def fit_break(time_s: Samples, values: Samples, *, about_s: float, rng: np.random.Generator, draws: int) -> Break:
     """Fit a parabola that at a break goes over into a fall and then a line, by least squares.
 
     Every break within reach and a few lengths of the fall are tried; the bootstrap draws blocks of the residuals anew
@@ -89,9 +82,7 @@ def _best(
     return chosen, levels
 
 
-def _blocks(
-    residuals: Float[np.ndarray, " samples"], *, draws: int, rng: np.random.Generator
-) -> Int[np.ndarray, "samples draws"]:
+def _blocks(residuals: Samples, *, draws: int, rng: np.random.Generator) -> Int[np.ndarray, "samples draws"]:
     """Indices that draw blocks of neighbours anew, a column a draw; white noise is drawn sample by sample."""
     count = len(residuals)
     power = max(float(residuals @ residuals), 1e-300)

@@ -1,6 +1,7 @@
 """The lag between camera and force sensor, from what both feel: the image moves when the force changes."""
 
 from collections.abc import Iterable
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -39,6 +40,7 @@ def measure_motion(frames: Iterable[Frame]) -> Float[np.ndarray, " frames"]:
     return np.array(motion, dtype=np.float64)
 
 
+Intervals: TypeAlias = Float[np.ndarray, " intervals"]
 _STEPS_A_FRAME = 16  # lags tried in the time of a frame; between them the peak is a parabola's
 _BLOCKS = 24  # stretches of a trial that are drawn anew: long enough to hold a slip whole, many enough to draw from
 _LEAST_INTERVALS = 2 * _BLOCKS
@@ -109,9 +111,7 @@ def estimate_lag(
     return Lag(lag_s=lag, sigma_s=sigma, correlation=correlation, doubt=_doubt(lag, sigma, correlation, lags))
 
 
-def _balance(
-    time_s: Float[np.ndarray, " intervals"], changes: Float[np.ndarray, " intervals"], release: tuple[float, float]
-) -> Float[np.ndarray, " intervals"]:
+def _balance(time_s: Intervals, changes: Intervals, release: tuple[float, float]) -> Intervals:
     """Weights that give press and release the same pull on the lag.
 
     Of two like peaks, the one of a rate r has a curvature as r^2 / T and errs as T, where T is how long it takes and
@@ -148,7 +148,7 @@ def _force_changes(time_s: Float[np.ndarray, " frames"], forces: Forces) -> Floa
 
 def _correlations(
     weights: Float[np.ndarray, "draws intervals"],
-    motion: Float[np.ndarray, " intervals"],
+    motion: Intervals,
     *,
     changes: Float[np.ndarray, "lags intervals"],
     covered: Bool[np.ndarray, "lags intervals"],

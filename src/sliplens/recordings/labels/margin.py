@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -27,6 +27,7 @@ from sliplens.recordings.labels.lag import estimate_lag
 from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.trial import ContactState, Labels
 
+Frames: TypeAlias = Float[np.ndarray, " frames"]
 _NO_FLAG = 1e-6  # rounding of a mean of flags that are all 0
 
 
@@ -34,12 +35,12 @@ _NO_FLAG = 1e-6  # rounding of a mean of flags that are all 0
 class FrameForces:
     """Forces at the times of frames."""
 
-    normal_n: Float[np.ndarray, " frames"]
-    tangential_n: Float[np.ndarray, " frames"]
+    normal_n: Frames
+    tangential_n: Frames
     """Length of the tangential force."""
-    normal_sigma_n: Float[np.ndarray, " frames"]
+    normal_sigma_n: Frames
     """Standard uncertainty, from noise and tare."""
-    tangential_sigma_n: Float[np.ndarray, " frames"]
+    tangential_sigma_n: Frames
     missing: Bool[np.ndarray, " frames"]
     """Whether the neighbouring samples are too far apart, or there are none on one side."""
     out_of_range: Bool[np.ndarray, " frames"]
@@ -47,13 +48,7 @@ class FrameForces:
 
 
 def interpolate_forces(
-    forces: ContactForces,
-    time_s: Float[np.ndarray, " frames"],
-    *,
-    window_s: float,
-    gap_s: float,
-    until_s: float,
-    force_range_n: float | None,
+    forces: ContactForces, time_s: Frames, *, window_s: float, gap_s: float, until_s: float, force_range_n: float | None
 ) -> FrameForces:
     """Interpolate the forces onto given times: the mean, over a window about each, of the line through the samples."""
     samples = forces.time_s
@@ -126,7 +121,7 @@ def contact_threshold(forces: ContactForces, *, window_s: float) -> float:
 
 
 def label_frames(
-    frame_time_s: Float[np.ndarray, " frames"],
+    frame_time_s: Frames,
     forces: ContactForces,
     *,
     friction: FrictionEstimate,
@@ -213,12 +208,12 @@ def label_frames(
     )
 
 
-def _used(at: FrameForces, friction: FrictionEstimate, threshold_n: float) -> Float[np.ndarray, " frames"]:
+def _used(at: FrameForces, friction: FrictionEstimate, threshold_n: float) -> Frames:
     """Share of the friction that is used, F_t / (mu F_n); of a lighter touch than the threshold, as if it were that."""
     return at.tangential_n / (friction.mu * np.maximum(at.normal_n, threshold_n))
 
 
-def _variance(at: FrameForces, friction: FrictionEstimate, threshold_n: float) -> Float[np.ndarray, " frames"]:
+def _variance(at: FrameForces, friction: FrictionEstimate, threshold_n: float) -> Frames:
     """Variance of the margin from that of the forces and of the friction."""
     normal, used = np.maximum(at.normal_n, threshold_n), _used(at, friction, threshold_n)
     return (
@@ -228,9 +223,7 @@ def _variance(at: FrameForces, friction: FrictionEstimate, threshold_n: float) -
     )
 
 
-def _remaining(
-    time_s: Float[np.ndarray, " frames"], contact: Bool[np.ndarray, " frames"], *, until_s: float
-) -> Float[np.ndarray, " frames"]:
+def _remaining(time_s: Frames, contact: Bool[np.ndarray, " frames"], *, until_s: float) -> Frames:
     """Share of the way from touch to slip that is still to go: 1 at the touch, 0 from the slip on."""
     if not contact.any():
         return np.zeros(len(time_s))
@@ -249,8 +242,8 @@ def _first_of(words: Sequence[_Word], *flags: Bool[np.ndarray, " frames"]) -> tu
 
 
 def label_trial(
-    frame_time_s: Float[np.ndarray, " frames"],
-    image_motion: Float[np.ndarray, " frames"],
+    frame_time_s: Frames,
+    image_motion: Frames,
     forces: Forces,
     *,
     settings: LabelSettings,
