@@ -29,7 +29,6 @@ from sliplens.simulation.geometry import Dome
 from sliplens.simulation.information import (
     MARGIN,
     Sensitivity,
-    Touch,
     marker_sensitivity,
     observations,
     prior_sigma,
@@ -37,7 +36,7 @@ from sliplens.simulation.information import (
 )
 from sliplens.simulation.loading import TRIAL_S, load_at_margins, load_grasp
 from sliplens.simulation.motion import move_markers
-from sliplens.simulation.nuisances import Grasp, draw_day, draw_grasp, draw_unit
+from sliplens.simulation.nuisances import Grasp, Touch, draw_day, draw_grasp, draw_unit
 
 MODELS = ("calibrated", "half-space")
 FRAMES = 50
@@ -90,14 +89,8 @@ def run_trial(plan: TrialPlan, model: str) -> Trial:
     grasp = draw_grasp(ranges, day=plan.day_draw, wet=plan.condition == "wet", rng=grasp_rng)
     loading = load_grasp(grasp, frames=FRAMES, rng=load_rng)
     unit = draw_unit(ranges, markers=sensor.geometry.markers, rng=np.random.default_rng(plan.unit_seed))
-    motion = move_markers(
-        LEAN,
-        loading=loading,
-        grasp=grasp,
-        displacement=model,
-        modulus_factor=plan.day_draw.modulus_factor,
-        marker_depth=unit.marker_depth,
-    )
+    touch = Touch(grasp=grasp, modulus_factor=plan.day_draw.modulus_factor, marker_depth=unit.marker_depth)
+    motion = move_markers(LEAN, touch, loading=loading, displacement=model)
     touching = np.flatnonzero(~np.isnan(loading.safety_margin))
     return Trial(
         plan=plan,
@@ -287,10 +280,8 @@ def posterior_errors(
     grasp = replace(trial.grasp, normal_force_n=float(trial.load_n[now]))
     margins = np.tile((1 - used) ** (1 / exponent), len(nodes))
     loading = replace(load_at_margins(margins, grasp=grasp), friction_coefficient=np.repeat(nodes, len(used)))
-    modulus = trial.plan.day_draw.modulus_factor
-    motion = move_markers(
-        LEAN, loading=loading, grasp=grasp, displacement=model, modulus_factor=modulus, marker_depth=trial.marker_depth
-    )
+    touch = Touch(grasp=grasp, modulus_factor=trial.plan.day_draw.modulus_factor, marker_depth=trial.marker_depth)
+    motion = move_markers(LEAN, touch, loading=loading, displacement=model)
     shift = (motion.centres_px - motion.rest_px)[:, SEEN].reshape(len(margins), -1) @ basis
     # the markers go evenly with friction and with 1 - Gamma^p: straight lines between the nodes will do
     fine = np.linspace(0, 1, 601)

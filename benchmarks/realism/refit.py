@@ -13,7 +13,7 @@ from realism.markers import fit_crescents, read_table, rms
 from realism.scene import MARGINS, PUBLISHED, SEEN, read_real
 from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.motion import DISPLACEMENTS, Displacement, move_markers
-from sliplens.simulation.nuisances import Grasp
+from sliplens.simulation.nuisances import Grasp, Touch
 from sliplens.simulation.sensor import CHROMATOUCH
 
 _KNOBS = ("layer", "local_friction", "clamp_exponent", "skin_shear", "normal_force_n", "shear_direction_rad",
@@ -65,7 +65,9 @@ def _motion(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     model = Displacement(**{name: knobs.pop(name) for name in _KNOBS[:4]})
     grasp = replace(Grasp(), contact_offset=(float(values[-2]), float(values[-1])), **knobs)
     with _calibrated(model):
-        motion = move_markers(CHROMATOUCH, loading=load_at_margins(MARGINS, grasp=grasp), grasp=grasp)
+        motion = move_markers(
+            CHROMATOUCH, Touch(grasp=grasp, marker_depth=0.0), loading=load_at_margins(MARGINS, grasp=grasp)
+        )
     return motion.rest_px, motion.centres_px[SEEN] - motion.rest_px
 
 

@@ -11,14 +11,13 @@ from sliplens.simulation import CHROMATOUCH, Nuisances, SimulationRecipe, plan_t
 from sliplens.simulation.information import (
     MARGIN,
     Sensitivity,
-    Touch,
     marker_sensitivity,
     prior_sigma,
     reading_gain,
     visible_markers,
 )
 from sliplens.simulation.intervention import NOISE_PX, FilmedTrial, marker_readings
-from sliplens.simulation.nuisances import Grasp
+from sliplens.simulation.nuisances import Grasp, Touch
 from sliplens.simulation.trials import prepare_trial
 
 NAMES = (MARGIN, "log_friction", "log_load")

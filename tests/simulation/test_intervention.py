@@ -140,13 +140,8 @@ def test_a_frames_touch_moves_its_markers_as_the_trial_did(trials):
             if trial.loading.carried_friction[frame] > 0:
                 continue
             touch = trial.touch(frame)
-            motion = move_markers(
-                trial.film.sensor,
-                loading=load_at_margins(margins[frame : frame + 1], grasp=touch.grasp),
-                grasp=touch.grasp,
-                modulus_factor=touch.modulus_factor,
-                marker_depth=touch.marker_depth,
-            )
+            loading = load_at_margins(margins[frame : frame + 1], grasp=touch.grasp)
+            motion = move_markers(trial.film.sensor, touch, loading=loading)
             np.testing.assert_allclose(motion.centres_px[0], trial.film.motion.centres_px[frame], atol=1e-9)
 
 

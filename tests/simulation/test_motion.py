@@ -12,7 +12,7 @@ from sliplens.simulation import CHROMATOUCH, FLAT_GEL
 from sliplens.simulation.geometry import FlatPad
 from sliplens.simulation.loading import load_at_margins, load_grasp
 from sliplens.simulation.motion import move_markers
-from sliplens.simulation.nuisances import Grasp
+from sliplens.simulation.nuisances import Grasp, Touch
 
 WAYS = [(CHROMATOUCH, "calibrated"), (CHROMATOUCH, "half-space"), (FLAT_GEL, "half-space")]
 CENTRED = Grasp(contact_offset=(0.0, 0.0), shear_direction_rad=0.0)
@@ -21,8 +21,11 @@ PAD = cast("FlatPad", FLAT_GEL.geometry)
 
 
 def moved(sensor, displacement, margins=(1.0, 0.8, 0.6, 0.4, 0.2, 0.0), grasp=CENTRED, **more):
-    loading = load_at_margins(np.array(margins), grasp=grasp)
-    return move_markers(sensor, loading=loading, grasp=grasp, displacement=displacement, **more)
+    loading, touch = (
+        load_at_margins(np.array(margins), grasp=grasp),
+        Touch(grasp=grasp, **{"marker_depth": 0.0, **more}),
+    )
+    return move_markers(sensor, touch, loading=loading, displacement=displacement)
 
 
 @pytest.mark.parametrize(("sensor", "displacement"), WAYS)
@@ -115,7 +118,7 @@ def test_a_pressed_gel_pushes_buried_markers_outwards():
 def test_kinetic_friction_lets_the_skin_spring_back():
     grasp = replace(CENTRED, kinetic_ratio=0.7)
     loading = load_grasp(grasp, frames=400, rng=np.random.default_rng(0))
-    motion = move_markers(FLAT_GEL, loading=loading, grasp=grasp)
+    motion = move_markers(FLAT_GEL, Touch(grasp=grasp, marker_depth=0.0), loading=loading)
     centre = np.argmin(np.linalg.norm(FLAT_GEL.geometry.marker_positions(), axis=-1))
     shift = motion.centres_px[:, centre, 0] - motion.rest_px[centre, 0]
     slip = int(np.argmax(loading.safety_margin == 0))
@@ -126,7 +129,7 @@ def test_kinetic_friction_lets_the_skin_spring_back():
 def test_restuck_skin_carries_on_from_where_it_slid():
     grasp = replace(CENTRED, kinetic_ratio=0.7, stick_slip_share=0.5, stick_slip_hz=2.0)
     loading = load_grasp(grasp, frames=8000, rng=np.random.default_rng(0))
-    motion = move_markers(FLAT_GEL, loading=loading, grasp=grasp)
+    motion = move_markers(FLAT_GEL, Touch(grasp=grasp, marker_depth=0.0), loading=loading)
     slip = int(np.argmax(loading.safety_margin == 0))
     step = np.abs(np.diff(motion.centres_px[slip:], axis=0)).max()
     # at 1000 frames/s nothing jumps: slip phases of 0.1 s carry the skin over by at most 0.15 of its full shift

@@ -13,7 +13,7 @@ from sliplens.mechanics import normal_slope
 from sliplens.simulation.geometry import Point, Rays, pixel_grid
 from sliplens.simulation.loading import Loading
 from sliplens.simulation.motion import Motion, move_markers
-from sliplens.simulation.nuisances import Day, Grasp, Unit
+from sliplens.simulation.nuisances import Day, Grasp, Touch, Unit
 from sliplens.simulation.sensor import DrawnMarkers, Noise, Sensor, draw_look, mix_noise, pick_noise
 
 Planes: TypeAlias = Float32[np.ndarray, "3 height width"]
@@ -192,14 +192,8 @@ def prepare_film(
 
     `noise`: the camera's noise; None films without it.
     """
-    motion = move_markers(
-        sensor,
-        loading=loading,
-        grasp=grasp,
-        displacement=displacement,
-        modulus_factor=day.modulus_factor,
-        marker_depth=unit.marker_depth,
-    )
+    touch = Touch(grasp=grasp, modulus_factor=day.modulus_factor, marker_depth=unit.marker_depth)
+    motion = move_markers(sensor, touch, loading=loading, displacement=displacement)
     geometry, frames = sensor.geometry, len(loading.time_s)
     # the camera of the day sits turned about the image of the skin's middle, and shifted
     cos, sin = np.cos(day.camera_rotation_rad), np.sin(day.camera_rotation_rad)

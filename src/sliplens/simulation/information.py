@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from sliplens.errors import ContactError
 from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.motion import move_markers
-from sliplens.simulation.nuisances import Grasp, Nuisances, Range
+from sliplens.simulation.nuisances import Nuisances, Range, Touch
 from sliplens.simulation.sensor import Sensor
 
 Jacobian: TypeAlias = Float[np.ndarray, "coordinates unknowns"]
@@ -23,16 +23,6 @@ MARGIN = "margin"
 """The unknown that is asked for."""
 _STEP = 1e-4
 """Step of the central differences: their error grows with its square, that of rounding (1e-12 px) over it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Touch:
-    """All that moves the markers of a frame, apart from the safety margin."""
-
-    grasp: Grasp
-    modulus_factor: float = 1.0
-    marker_depth: float = 0.03
-    """Depth of the markers under the skin, in radii of the contact's sphere."""
 
 
 def _grasp(field: str, axis: int | None = None) -> Callable[[Touch, float], Touch]:
@@ -94,14 +84,8 @@ def marker_sensitivity(
     seen, step = visible_markers(sensor), _STEP * np.minimum(margins, 1 - margins)
 
     def positions(margins: np.ndarray, touch: Touch) -> np.ndarray:
-        motion = move_markers(
-            sensor,
-            loading=load_at_margins(margins, grasp=touch.grasp),
-            grasp=touch.grasp,
-            displacement=displacement,
-            modulus_factor=touch.modulus_factor,
-            marker_depth=touch.marker_depth,
-        )
+        loading = load_at_margins(margins, grasp=touch.grasp)
+        motion = move_markers(sensor, touch, loading=loading, displacement=displacement)
         # from rest: a deeper marker also lies elsewhere at rest, and that the reference frame shows
         return (motion.centres_px - motion.rest_px)[:, seen].reshape(len(margins), -1)
 

@@ -17,14 +17,13 @@ from sliplens.simulation.filming import Film, batches
 from sliplens.simulation.information import (
     MARGIN,
     Sensitivity,
-    Touch,
     marker_sensitivity,
     prior_sigma,
     reading_gain,
     visible_markers,
 )  # fmt: skip
 from sliplens.simulation.loading import Loading
-from sliplens.simulation.nuisances import Nuisances
+from sliplens.simulation.nuisances import Nuisances, Touch
 from sliplens.simulation.plan import FrameTotals, SimulationRecipe, TrialPlan, plan_trials
 from sliplens.simulation.sensor import SENSORS
 from sliplens.simulation.trials import prepare_trial

@@ -15,7 +15,7 @@ from sliplens.mechanics import (
     stick_radius,
 )
 from sliplens.simulation.loading import Loading
-from sliplens.simulation.nuisances import Grasp
+from sliplens.simulation.nuisances import Grasp, Touch
 from sliplens.simulation.sensor import Sensor
 
 _FITTED_FRICTION = 0.775
@@ -69,33 +69,22 @@ class Motion:
     stick_radius_m: Float[np.ndarray, " frames"]
 
 
-def move_markers(
-    sensor: Sensor,
-    *,
-    loading: Loading,
-    grasp: Grasp,
-    displacement: str | None = None,
-    modulus_factor: float = 1.0,
-    marker_depth: float = 0.0,
-) -> Motion:
-    """Displace a sensor's markers by a loading.
+def move_markers(sensor: Sensor, touch: Touch, *, loading: Loading, displacement: str | None = None) -> Motion:
+    """Displace a sensor's markers by a loading; of the touch's grasp count contact offset, tilt, shear and creep.
 
-    `grasp`: contact offset, tilt, direction and exponent of the shear, creep; `displacement`: `calibrated` gives the
-    motion of the real ChromaTouch, whose stick zone is nominal; `half-space` gives exact contact mechanics. The
-    sensor's default if None; `modulus_factor`: stiffness of the gel over the sensor's nominal one; `marker_depth`:
-    depth of the markers under the skin, in radii of the contact's sphere.
+    `displacement`: a row of `DISPLACEMENTS`; the sensor's default if None.
     """
     name = sensor.displacements[0] if displacement is None else displacement
     if name not in sensor.displacements:
         raise ContactError(
             f"sensor {sensor.name} cannot be moved by {name!r}; choose {' or '.join(sensor.displacements)}"
         )
-    model = DISPLACEMENTS[name]
+    model, grasp = DISPLACEMENTS[name], touch.grasp
     modulus_pa = sensor.youngs_modulus_pa
     if name == "calibrated" and sensor.effective_modulus_pa is not None:
         modulus_pa = sensor.effective_modulus_pa
     geometry = sensor.geometry
-    sphere_m, depth_m = geometry.sphere_radius_m, marker_depth * geometry.sphere_radius_m
+    sphere_m, depth_m = geometry.sphere_radius_m, touch.marker_depth * geometry.sphere_radius_m
     rest = geometry.marker_positions(depth_m)
     creep = 1 + grasp.creep * (1 - np.exp(-loading.held_s / grasp.creep_time_s))
 
@@ -103,9 +92,9 @@ def move_markers(
         modulus = reduced_modulus(youngs_modulus_pa=modulus_pa * factor, poisson_ratio=sensor.poisson_ratio)
         return np.asarray(contact_radius(force_n, sphere_radius_m=sphere_m, reduced_modulus_pa=modulus))
 
-    contact_m = radius(loading.normal_force_n * creep, modulus_factor)
+    contact_m = radius(loading.normal_force_n * creep, touch.modulus_factor)
     nominal_m = radius(np.array([Grasp().normal_force_n]), 1.0)
-    touch = (contact_m / nominal_m) ** 2
+    sunken = (contact_m / nominal_m) ** 2
     clamp = geometry.slope_cosine(rest) ** model.clamp_exponent
     centre_m = np.asarray(grasp.contact_offset) * sphere_m
     from_centre = rest[:, :2] - centre_m
@@ -138,7 +127,7 @@ def move_markers(
             sphere_radius_m=sphere_m,
             poisson_ratio=sensor.poisson_ratio,
         )
-        skin = model.skin_shear * sphere_m * friction / _FITTED_FRICTION * touch[:, None]
+        skin = model.skin_shear * sphere_m * friction / _FITTED_FRICTION * sunken[:, None]
         along = (along + skin * (1 - margin**grasp.shear_exponent)) * clamp
         moved[..., :2] += along[..., None] * pull + (across * clamp)[..., None] * athwart
         moved[..., 2] -= sunk * clamp
@@ -146,7 +135,7 @@ def move_markers(
         rest_px=geometry.project(rest),
         centres_px=geometry.project(moved),
         scale=geometry.camera_distance(rest) / geometry.camera_distance(moved),
-        touch=touch,
+        touch=sunken,
         pressure=np.sqrt(np.maximum(contact_m[:, None] ** 2 - distance**2, 0)) / nominal_m,
         indentation_m=model.layer * np.asarray(indentation(contact_m, sphere_radius_m=sphere_m)),
         nominal_radius_m=float(nominal_m[0]),

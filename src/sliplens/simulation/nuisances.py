@@ -76,24 +76,22 @@ class Nuisances:
             low, high = value if isinstance(value, tuple) else (value, value)
             if not (np.isfinite(low) and np.isfinite(high) and low <= high):
                 raise ContactError(f"the range of {field.name} is {value}; give a finite low, then a high")
-            if field.name in _POSITIVE and low <= 0:
-                raise ContactError(f"{field.name} must be positive, got {low:.3g}; raise its lower end")
-            if field.name in _NOT_NEGATIVE and low < 0:
-                raise ContactError(f"{field.name} must not be negative, got {low:.3g}; raise its lower end")
-            if high > _UPPER.get(field.name, np.inf):
-                limit = _UPPER[field.name]
+            if (field.name in _POSITIVE and low <= 0) or (field.name in _NOT_NEGATIVE and low < 0):
+                must = "be positive" if field.name in _POSITIVE else "not be negative"
+                raise ContactError(f"{field.name} must {must}, got {low:.3g}; raise its lower end")
+            if high > (limit := _UPPER.get(field.name, np.inf)):
                 raise ContactError(f"{field.name} must be at most {limit:g}, got {high:.3g}; lower its upper end")
 
 
-_POSITIVE = frozenset(
-    {"dry_friction", "dry_friction_factor", "wet_friction", "kinetic_ratio", "normal_force_n", "modulus_factor",
-     "shear_exponent", "creep_time_s", "stick_slip_hz", "white_balance", "gain", "marker_radius", "marker_contrast"}
+_POSITIVE = (
+    "dry_friction", "dry_friction_factor", "wet_friction", "kinetic_ratio", "normal_force_n", "modulus_factor",
+     "shear_exponent", "creep_time_s", "stick_slip_hz", "white_balance", "gain", "marker_radius", "marker_contrast"
 )  # fmt: skip
 _UPPER = {"kinetic_ratio": 1.0, "stick_slip_share": 1.0, "contact_offset": 0.5, "marker_depth": 0.5,
           "illumination_gradient": 1.0, "normal_force_drift": 0.5, "wet_friction_drift": 0.5}  # fmt: skip
-_NOT_NEGATIVE = frozenset(
-    {"contact_offset", "marker_depth", "stick_slip_share", "creep", "illumination_gradient", "glare", "skin_grain",
-     "marker_jitter_px", "blur_px"}
+_NOT_NEGATIVE = (
+    "contact_offset", "marker_depth", "stick_slip_share", "creep", "illumination_gradient", "glare", "skin_grain",
+     "marker_jitter_px", "blur_px"
 )  # fmt: skip
 
 
@@ -148,6 +146,16 @@ class Grasp:
     veil: tuple[float, float, float] = (5.3, 4.8, 4.2)
     glow: tuple[float, float, float] = (4.0, 3.8, 2.6)
     skin_grain: float = 1.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Touch:
+    """All that moves the markers of a frame, apart from the safety margin."""
+
+    grasp: Grasp
+    modulus_factor: float = 1.0
+    marker_depth: float = 0.03
+    """Depth of the markers under the skin, in radii of the contact's sphere."""
 
 
 def draw_day(nuisances: Nuisances, *, quantile: float, rng: np.random.Generator) -> Day:
