@@ -182,7 +182,7 @@ def test_missing_or_damaged_samples_are_refused(exported):
     [
         ("observation.safety_margin", [1.5] * 2 * FRAMES, "safety_margin of frame 0 is 1.5, outside"),
         ("observation.safety_margin", ["1"] * 2 * FRAMES, "safety_margin of .* does not hold numbers"),
-        ("observation.time_s", [float("nan")] * 2 * FRAMES, "time_s of .* is not a number everywhere"),
+        ("observation.time_s", [float("nan")] * 2 * FRAMES, "episode 0 of .* has a time that is not a number; export"),
         ("observation.time_s", [1.0] * 2 * FRAMES, "time does not rise at sample 1"),
         ("observation.valid", [1] * 2 * FRAMES, "valid of .* does not hold true and false"),
         ("observation.contact_state", [5] * 2 * FRAMES, "contact_state of .* leads beyond the 5 values"),

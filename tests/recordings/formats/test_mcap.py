@@ -434,7 +434,7 @@ def damages() -> Iterator[Any]:
     )
     yield pytest.param(
         replace_bytes(LABELS, np.float64(-2.7).tobytes(), np.float64(np.nan).tobytes()),
-        "/tactile/labels of .* has a time that is not a number",
+        r"full of .* has a time that is not a number; export",
         id="time",
     )
     yield pytest.param(

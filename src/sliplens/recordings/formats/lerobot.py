@@ -318,13 +318,8 @@ NUMBERS = {
 VALID, STATE, REASON = "observation.valid", "observation.contact_state", "observation.invalid_reason"
 KEPT = Path("meta", "sliplens")
 """Folder of what LeRobot has no place for; its `trials.jsonl` has a line an episode."""
+KEPT_REFERENCE, KEPT_FORCES = "reference-{:06d}.png", "forces-{:06d}.parquet"
 _COLUMNS = [TIME, FORCE, *NUMBERS.values(), VALID, STATE, REASON]
-
-
-def kept_path(folder: Path, name: str, episode: int) -> Path:
-    """File of an episode with what LeRobot has no place for: "reference", or "forces" as the sensor sampled them."""
-    suffix = {"reference": "png", "forces": "parquet"}[name]
-    return folder / KEPT / f"{name}-{episode:06d}.{suffix}"
 
 
 def read_kept(layout: Layout) -> tuple[ExportedTrial, ...] | None:
@@ -337,7 +332,7 @@ def read_kept(layout: Layout) -> tuple[ExportedTrial, ...] | None:
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path} cannot be read ({error}); copy the data set again") from None
     trials = tuple(ExportedTrial.parse(line, where=f"line {number + 1} of {path}") for number, line in enumerate(lines))
-    if len({trial.trial for trial in trials}) < len(trials):
+    if len({trial.facts.trial for trial in trials}) < len(trials):
         raise RecordingError(f"{path} names a trial twice; copy the data set again")
     missing = [key for key in (CAMERA, *_COLUMNS) if key not in layout.features]
     if missing:
@@ -365,42 +360,33 @@ def kept_captures(layout: Layout, trials: tuple[ExportedTrial, ...]) -> list[Cap
 def _capture(rows: Rows, trial: ExportedTrial) -> Capture:
     folder, index = rows.layout.folder, rows.episode.index
     size, read_frames = image_frames(rows.episode, CAMERA)
-    source = f"{trial.trial}, episode {index} of {folder}"
-    time = rows.numbers(TIME)
-    if not np.isfinite(time).all():
-        raise RecordingError(f"{TIME} of {source} is not a number everywhere; copy the data set again")
-    path = kept_path(folder, "reference", index)
+    source = f"{trial.facts.trial}, episode {index} of {folder}"
+    path = folder / KEPT / KEPT_REFERENCE.format(index)
     try:
         png = path.read_bytes()
     except OSError as error:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); copy the data set again") from None
-    forces = load_forces(kept_path(folder, "forces", index)) if trial.force_samples else None
+    sampled = folder / KEPT / KEPT_FORCES.format(index)
+    forces = load_forces(sampled) if trial.force_samples else None
     if forces is not None and len(forces.time_s) != trial.force_samples:
         raise RecordingError(
-            f"{kept_path(folder, 'forces', index)} has {len(forces.time_s)} samples of {trial.trial}, "
-            f"{trial.force_samples} were exported; copy the data set again"
+            f"{sampled} has {len(forces.time_s)} samples of {trial.facts.trial}, {trial.force_samples} were exported; "
+            "copy the data set again"
         )
     force = rows.vectors(FORCE)
     if force.shape[1] != len(FORCE_AXES):
         raise RecordingError(f"{FORCE} of {source} has {force.shape[1]} numbers, not 3; copy the data set again")
-    numbers = {name: rows.numbers(key) for name, key in NUMBERS.items()}
-    return Capture(
-        **vars(trial.facts),
+    numbers = {name: rows.numbers(key) for name, key in {"time_s": TIME, **NUMBERS}.items()}
+    return trial.capture(
+        {**numbers, "tangential_force_n": force[:, 0].copy(), "normal_force_n": force[:, 2].copy()},
+        states=rows.words(STATE),
+        valid=rows.values(VALID, pa.types.is_boolean, "true and false"),
+        reasons=rows.words(REASON),
         source=source,
-        frame_time_s=time,
         frame_size=size,
         read_frames=read_frames,
         forces=forces,
-        labels=trial.labels(
-            {**numbers, "tangential_force_n": force[:, 0].copy(), "normal_force_n": force[:, 2].copy()},
-            states=rows.words(STATE),
-            valid=rows.values(VALID, pa.types.is_boolean, "true and false"),
-            reasons=rows.words(REASON),
-            source=source,
-        ),
         reference=decode_image(png, where=f"{path}"),
-        split=trial.split,
-        simulated=trial.simulated,
     )
 
 

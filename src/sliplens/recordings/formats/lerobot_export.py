@@ -23,12 +23,13 @@ from sliplens.recordings.formats.lerobot import (
     FORCE,
     FORCE_AXES,
     KEPT,
+    KEPT_FORCES,
+    KEPT_REFERENCE,
     NUMBERS,
     REASON,
     STATE,
     TIME,
     VALID,
-    kept_path,
 )
 from sliplens.recordings.formats.stored import (
     STATES,
@@ -182,9 +183,6 @@ def _data_schema(features: Features) -> pa.Schema:
     return pa.schema(fields, {"huggingface": json.dumps({"info": {"features": told}})})
 
 
-_STATES = list(STATES)
-
-
 def frame_features(height: int, width: int) -> Features:
     """Features of the frames, as `meta/info.json` lists them; the words of the reasons are added when all are known."""
     found: Features = {
@@ -193,7 +191,7 @@ def frame_features(height: int, width: int) -> Features:
         FORCE: {"dtype": "float64", "shape": [3], "names": list(FORCE_AXES)},
         **{key: {"dtype": "float64", "shape": [1], "names": [name]} for name, key in NUMBERS.items()},
         VALID: {"dtype": "bool", "shape": [1], "names": ["valid"]},
-        STATE: {"dtype": "int64", "shape": [1], "names": ["contact_state"], "info": {"values": _STATES}},
+        STATE: {"dtype": "int64", "shape": [1], "names": ["contact_state"], "info": {"values": list(STATES)}},
         REASON: {"dtype": "int64", "shape": [1], "names": ["invalid_reason"]},
         "timestamp": {"dtype": "float32", "shape": [1], "names": None},
     }
@@ -206,14 +204,14 @@ def frame_columns(
 ) -> dict[str, np.ndarray]:
     """Features of a labelled trial's frames, but for images; reasons not met before get a number."""
     assert capture.labels is not None
-    labels, numbers = exported_labels(capture.labels), np.arange(len(capture), dtype=np.int64)
+    labels, numbers, states = exported_labels(capture.labels), np.arange(len(capture), dtype=np.int64), list(STATES)
     force = labels["tangential_force_n"], np.zeros(len(capture)), labels["normal_force_n"]
     return {
         TIME: capture.frame_time_s,
         FORCE: np.stack(force, axis=1),
         **{key: labels[name] for name, key in NUMBERS.items()},
         VALID: labels["valid"],
-        STATE: np.array([_STATES.index(state) for state in labels["contact_state"]], dtype=np.int64),
+        STATE: np.array([states.index(state) for state in labels["contact_state"]], dtype=np.int64),
         REASON: np.array([reasons.setdefault(reason, len(reasons)) for reason in labels["reason"]], dtype=np.int64),
         "timestamp": (numbers / fps).astype(np.float32),
         "frame_index": numbers,
@@ -221,9 +219,6 @@ def frame_columns(
         "index": first + numbers,
         "task_index": np.full_like(numbers, task),
     }
-
-
-_RATE_WHERE_NONE = 30  # where every trial is one frame
 
 
 def write_lerobot(
@@ -342,7 +337,7 @@ def _make_room(folder: Path) -> None:
 def _frame_rate(data: Dataset, trials: Sequence[TrialInfo]) -> int | float:
     steps = {info.trial: np.diff(read_stored_trial(data, info).frame_time_s) for info in trials}
     if not any(map(len, steps.values())):
-        return _RATE_WHERE_NONE
+        return 30  # every trial is one frame
     rate = 1 / float(np.median(np.concatenate(list(steps.values()))))
     for trial, own in steps.items():
         if len(own) and abs(np.median(own) * rate - 1) > 0.1:
@@ -358,9 +353,9 @@ def _keep(folder: Path, episode: int, capture: Capture) -> None:
     labels, forces = capture.labels, capture.forces
     assert labels is not None
     assert capture.reference is not None
-    write_png(kept_path(folder, "reference", episode), capture.reference)
+    write_png(folder / KEPT / KEPT_REFERENCE.format(episode), capture.reference)
     if forces is not None:
-        save_forces(forces, kept_path(folder, "forces", episode))
+        save_forces(forces, folder / KEPT / KEPT_FORCES.format(episode))
     with (folder / KEPT / "trials.jsonl").open("a", encoding="utf-8", newline="\n") as lines:
         lines.write(ExportedTrial.of(capture).dump() + "\n")
 

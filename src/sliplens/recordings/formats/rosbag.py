@@ -307,28 +307,22 @@ def read_trial_bag(path: Path, topics: dict[str, str]) -> Capture | None:
         )
     found, size = _scan(path, needed, images=IMAGE, kinds=TOPICS)
     _require_whole(found, about, path)
-    assert size is not None
     numbers: dict[str, np.ndarray] = dict(zip(NUMBERS, found[LABELS].table(len(NUMBERS)).T.copy(), strict=True))
-    time_s = numbers.pop("time_s")
-    if not np.isfinite(time_s).all():
-        raise RecordingError(f"{LABELS} of {path} has a time that is not a number; export the trial again")
     valid, states, reasons = zip(*found[LABELS].words, strict=True)
-    source = f"{about.trial} of {path}"
-    return Capture(
-        **vars(about.facts),
-        source=source,
-        frame_time_s=time_s,
+    forces = None
+    if about.force_samples:
+        sampled_s = found[WRENCH_TIMES].table(1)[:, 0]
+        forces = Forces(time_s=sampled_s, force_n=found[WRENCH].table(3), source=about.force_source)
+    return about.capture(
+        numbers,
+        states=states,
+        valid=np.array(valid),
+        reasons=reasons,
+        source=f"{about.facts.trial} of {path}",
         frame_size=size,
         read_frames=partial(_read_frames, path, IMAGE, kinds=TOPICS),
-        forces=Forces(
-            time_s=found[WRENCH_TIMES].table(1)[:, 0], force_n=found[WRENCH].table(3), source=about.force_source
-        )
-        if about.force_samples
-        else None,
-        labels=about.labels(numbers, states=states, valid=np.array(valid), reasons=reasons, source=source),
+        forces=forces,
         reference=found[REFERENCE].image,
-        split=about.split,
-        simulated=about.simulated,
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -102,7 +103,6 @@ class ExportedTrial:
     force_samples: int
     """0 where no force is known."""
     force_source: str
-    """Topic, file or column names, for people."""
     optional: tuple[str, ...]
     """Those of `EXPORTED_OPTIONAL` that the labels have."""
     labelling: Labelling | None
@@ -112,11 +112,6 @@ class ExportedTrial:
             raise ValueError("no proper name of a trial")
         if self.frames <= 0 or self.force_samples < 0 or not set(self.optional) <= set(EXPORTED_OPTIONAL):
             raise ValueError("no proper counts of frames, force samples and labels")
-
-    @property
-    def trial(self) -> str:
-        """Name of the trial."""
-        return self.facts.trial
 
     @classmethod
     def of(cls, capture: Capture) -> "ExportedTrial":
@@ -158,7 +153,7 @@ class ExportedTrial:
         except InputError as error:
             raise RecordingError(str(error)) from None
 
-    def labels(
+    def capture(
         self,
         numbers: dict[str, Float[np.ndarray, " frames"]],
         *,
@@ -166,8 +161,12 @@ class ExportedTrial:
         valid: np.ndarray,
         reasons: tuple[str, ...],
         source: str,
-    ) -> Labels:
-        """Labels of the trial from the columns of another format, checked."""
+        **recorded: Any,
+    ) -> Capture:
+        """Trial as it was exported, its times and labels from the columns of another format, checked."""
+        time_s = numbers.pop("time_s")
+        if not np.isfinite(time_s).all():
+            raise RecordingError(f"{source} has a time that is not a number; export the trial again")
         for name in ("safety_margin", "stick_ratio"):
             require_unit_interval(numbers[name], name=name, trial=source)
         unknown = set(states) - set(STATES)
@@ -177,9 +176,11 @@ class ExportedTrial:
                 "export the trial again"
             )
         optional = {"safety_margin_sigma": numbers.pop("safety_margin_sigma"), "valid": valid, "reason": reasons}
-        return Labels(
+        labels = Labels(
             **numbers,
             contact_state=tuple(STATES[state] for state in states),
             **{name: values for name, values in optional.items() if name in self.optional},
             labelling=self.labelling,
         )
+        told = {**vars(self.facts), "split": self.split, "simulated": self.simulated, "source": source}
+        return Capture(**told, frame_time_s=time_s, labels=labels, **recorded)

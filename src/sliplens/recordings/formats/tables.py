@@ -135,6 +135,11 @@ def require_rising(time: Float[np.ndarray, " rows"], lines: Sequence[int], *, pa
         )
 
 
+def text_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Read the lines of a text file that are not empty, with their numbers."""
+    return _lines(path, _encoding(path))
+
+
 def _encoding(path: Path) -> str:
     try:
         with path.open("rb") as stream:
@@ -155,7 +160,6 @@ def _encoding(path: Path) -> str:
 
 
 def _lines(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
-    """Read the lines that are not empty, with their numbers."""
     try:
         with path.open(encoding=encoding) as stream:
             for number, text in enumerate(stream, start=1):
@@ -332,8 +336,7 @@ def require_trial_name(trial: str) -> None:
         )
 
 
-MOST_FORCE_N = 1e4
-"""No fingertip survives more; a larger number is in another unit."""
+_MOST_FORCE_N = 1e4  # no fingertip survives more; a larger number is in another unit
 
 
 def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[str, ...]]:
@@ -351,7 +354,7 @@ def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[st
     unit, how = _time_unit(table, time_name, options.time_unit, time)
     scales, units = _force_scales(table, names, options.force_unit)
     forces = values[:, 1:] * scales
-    large = np.abs(forces).max(axis=1) > MOST_FORCE_N
+    large = np.abs(forces).max(axis=1) > _MOST_FORCE_N
     if large.any():
         at = int(np.argmax(large))
         raise RecordingError(

@@ -11,25 +11,17 @@ from sliplens.errors import RecordingError
 from sliplens.images import natural_key
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.formats.images import common_size, read_frame
-from sliplens.recordings.formats.tables import evenly_spaced, trial_name
+from sliplens.recordings.formats.tables import evenly_spaced, text_lines, trial_name
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.trial import labels_of_margins, require_unit_interval
 
 
 def read_lines(path: Path) -> list[tuple[int, str]]:
     """Lines of a list that are neither empty nor comments, with their numbers in the file from 1."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise RecordingError(f"{path} does not exist; the lists of a set must lie in one folder") from None
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read ({error.strerror}); name a text file") from None
-    except UnicodeDecodeError:
-        text = "\0"
-    if "\0" in text:
-        raise RecordingError(f"{path} is not a text file; name a list with one entry a line")
-    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
-    lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
+    if not path.exists():
+        raise RecordingError(f"{path} does not exist; the lists of a set must lie in one folder")
+    lines = [(number, line.strip()) for number, line in text_lines(path)]
+    lines = [(number, line) for number, line in lines if not line.startswith("#")]
     if not lines:
         raise RecordingError(f"{path} is empty; list one entry a line")
     return lines

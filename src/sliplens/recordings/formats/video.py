@@ -21,10 +21,8 @@ from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.formats.tables import evenly_spaced, place_on_clock, trial_name
 from sliplens.recordings.options import ReadOptions
 
-HEAD = 13
-"""Frames at the start that may be stale."""
-HORIZON = 500
-"""Frames that the head is compared with; a longer video is read no further."""
+_HEAD = 13  # frames at the start that may be stale
+_HORIZON = 500  # frames that the head is compared with; a longer video is read no further
 _BLOCKS = 24, 32
 _LEAST_LEAP = 1.5  # grey levels, mean over the image: several times what noise and coding change
 _FROZEN = 0.75  # grey levels: no more than noise and coding change
@@ -33,7 +31,7 @@ _WAKES = 1.015  # a camera that adapts its exposure when it is started grows bri
 
 def small_copies(frames: Iterable[Frame]) -> Float32[np.ndarray, "frames rows columns 3"]:
     """Reduce frames to the means of blocks, enough to tell scenes apart and small enough to keep."""
-    copies = [_block_means(frame) for frame in islice(frames, HORIZON)]
+    copies = [_block_means(frame) for frame in islice(frames, _HORIZON)]
     return np.stack(copies) if copies else np.empty((0, *_BLOCKS, 3), dtype=np.float32)
 
 
@@ -45,7 +43,7 @@ def count_stale(copies: Float32[np.ndarray, "frames rows columns 3"]) -> int:
     (Where the camera ran already, an object that is pressed all at once within the first 13 frames and never let go
     cannot be told from a frozen start; do not ask there.)
     """
-    head = min(HEAD, len(copies) // 3)  # what follows must be seen long enough to compare with
+    head = min(_HEAD, len(copies) // 3)  # what follows must be seen long enough to compare with
     if not head:
         return 0
     flat = copies.reshape(len(copies), -1)
@@ -79,9 +77,7 @@ def _block_means(frame: Frame) -> Float32[np.ndarray, "rows columns 3"]:
     return (sums / (height * width)).astype(np.float32)
 
 
-MOST_PIXELS = 100_000_000
-"""Of a frame: a larger one is a damaged header, and would ask for gigabytes."""
-
+_MOST_PIXELS = 100_000_000  # a larger frame is a damaged header, and would ask for gigabytes
 # FFmpeg also plays text files and play lists, and would follow these to other files and hosts
 _OPTIONS = {
     "protocol_whitelist": "file",
@@ -117,7 +113,18 @@ def inspect_video(path: Path) -> VideoFile:
         size = require_size(path, video)
         # AVI counts frames; the presentation stamps made up from that are late where frames are reordered
         counted = container.format.name == "avi"
-        found, cut = _read_stamps(container, video, path=path, counted=counted)
+        found: list[int | None] = []
+        cut = False
+        try:
+            for packet in container.demux(video):
+                # packets to be discarded are decoded for those that need them, but never shown
+                if packet.size and not packet.is_discard:
+                    found.append(packet.dts if counted else packet.pts)
+                    cut = packet.is_corrupt
+        except FFmpegError as error:
+            raise RecordingError(_damaged(path, len(found), error.strerror)) from None
+        if not found:
+            raise RecordingError(f"{path} holds no frame; record it again")
         stamps = time = None
         if None not in found and video.time_base is not None:
             stamps = np.sort(np.array(found, dtype=np.int64))
@@ -131,25 +138,6 @@ def inspect_video(path: Path) -> VideoFile:
             )
         notes = _notes(container, video, path)
     return VideoFile(frames=len(found), stamps=stamps, time_s=time, counted=counted, frame_size=size, notes=notes)
-
-
-def _read_stamps(
-    container: InputContainer, video: VideoStream, *, path: Path, counted: bool
-) -> tuple[list[int | None], bool]:
-    """Stamps in the order of the file, and whether the last packet is cut off."""
-    found: list[int | None] = []
-    cut = False
-    try:
-        for packet in container.demux(video):
-            # packets to be discarded are decoded for those that need them, but never shown
-            if packet.size and not packet.is_discard:
-                found.append(packet.dts if counted else packet.pts)
-                cut = packet.is_corrupt
-    except FFmpegError as error:
-        raise RecordingError(_damaged(path, len(found), error.strerror)) from None
-    if not found:
-        raise RecordingError(f"{path} holds no frame; record it again")
-    return found, cut
 
 
 @contextmanager
@@ -174,7 +162,7 @@ def open_video(path: Path, *, missing: str = "name a video file") -> Iterator[tu
 def require_size(path: Path, video: VideoStream) -> tuple[int, int]:
     """Height and width of the frames as the header claims them, where they can be true."""
     size = video.codec_context.height, video.codec_context.width
-    if min(size) <= 0 or size[0] * size[1] > MOST_PIXELS:
+    if min(size) <= 0 or size[0] * size[1] > _MOST_PIXELS:
         raise RecordingError(
             f"{path} claims frames of {size[1]} x {size[0]} pixels; the file is damaged, copy or export it again"
         )
