@@ -31,14 +31,7 @@ _DAMAGE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)  # wh
 
 
 def read_image(path: Path, *, size: tuple[int, int] | None = None) -> UInt8[np.ndarray, "height width 3"]:
-    """Read an 8-bit RGB image.
-
-    Parameters
-    ----------
-    path
-        PNG, TIFF, JPEG or BMP.
-    size
-        Height and width that the image must have, in pixels; any size if None.
+    """Read an 8-bit RGB image (PNG, TIFF, JPEG or BMP), of a size (height, width) in pixels unless that is None.
 
     Raises
     ------

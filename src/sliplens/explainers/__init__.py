@@ -12,25 +12,7 @@ from sliplens.explainers.poly_cam_budget import Likeness
 from sliplens.explainers.table import EXPLAINERS, explain, get_explainer
 
 __all__ = [
-    "EXPLAINERS",
-    "Approximation",
-    "ExpectedGradients",
-    "Explainer",
-    "Explanation",
-    "GradCam",
-    "HiResCam",
-    "IntegratedGradients",
-    "Layer",
-    "LayerCam",
-    "Level",
-    "Likeness",
-    "Lrp",
-    "Occlusion",
-    "PolyCam",
-    "SmoothGrad",
-    "capture",
-    "explain",
-    "find_layers",
-    "find_markers",
-    "get_explainer",
-]
+    "EXPLAINERS", "Approximation", "ExpectedGradients", "Explainer", "Explanation", "GradCam", "HiResCam",
+    "IntegratedGradients", "Layer", "LayerCam", "Level", "Likeness", "Lrp", "Occlusion", "PolyCam", "SmoothGrad",
+    "capture", "explain", "find_layers", "find_markers", "get_explainer",
+]  # fmt: skip

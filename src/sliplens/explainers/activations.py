@@ -21,13 +21,9 @@ from sliplens.explainers.contract import frozen
 def capture(model: nn.Module, names: Sequence[str], *, differentiable: bool = False) -> Iterator[dict[str, Tensor]]:
     """Keep the output of each named module of every forward pass made inside, by name, and always take the hooks off.
 
-    Parameters
-    ----------
-    names
-        Modules, by their names in `model.named_modules()`. Of a module called twice the last output is kept.
-    differentiable
-        Start the graph anew at each kept output, so that the gradient of the prediction in it can be taken. With
-        several modules only the last one's gradient is whole.
+    Names are those of `model.named_modules()`; of a module called twice the last output is kept. `differentiable`
+    starts the graph anew at each kept output, so that the gradient of the prediction in it can be taken; with several
+    modules only the last one's gradient is whole.
     """
     outputs: dict[str, Tensor] = {}
     modules = dict(model.named_modules())
@@ -81,12 +77,8 @@ def find_layers(
     looking into plain `Sequential` containers, wrappers whose output is no map, and blocks that shrink the map by more
     than two, but not into blocks and their branches. Each resolution and width gives its last map; a layer without
     parameters (pooling) is left out, as are 1 x 1 maps. For TorchVision's ShuffleNetV2 these are conv1, stage2, stage3,
-    stage4 and conv5, for its ResNet-18 relu and layer1 to layer4.
-
-    Parameters
-    ----------
-    names
-        Take these modules instead, by their names in `model.named_modules()`.
+    stage4 and conv5, for its ResNet-18 relu and layer1 to layer4. With `names`, as `model.named_modules()` has them,
+    those modules are taken instead.
 
     Raises
     ------

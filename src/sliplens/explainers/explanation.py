@@ -1,6 +1,6 @@
 """An explanation, and the sentences that tell a reader when its maps should not be trusted."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import pyarrow as pa
@@ -160,10 +160,12 @@ def effect_rounding(
     return max((_ULPS * torch.finfo(weights[0].dtype).eps * size / one for one in largest if one > 0), default=0.0)
 
 
-def check_rounding(roundings: Sequence[float]) -> Iterator[str]:
-    """Where so little changes that a map depends on the order of sums (`effect_rounding` of each image)."""
-    for index, share in enumerate(roundings):
-        if share > EXACT:
+def check_rounding(
+    weights: Sequence[Sequence[Float[Tensor, " _channels"]]], *, predictions: Iterable[tuple[float, float]]
+) -> Iterator[str]:
+    """Where so little changes that a map depends on the order of sums; predictions are f(x) and f(b) of each image."""
+    for index, (shares, (high, low)) in enumerate(zip(weights, predictions, strict=False)):
+        if (share := effect_rounding(shares, prediction=high, reference_prediction=low)) > EXACT:
             yield (
                 f"image {index}: the effects are so small that rounding makes up to {share:.1g} of the strongest, so "
                 "another engine or machine may give another map"

@@ -19,7 +19,6 @@ from sliplens.explainers.explanation import (
     check_approximations,
     check_rounding,
     check_weights,
-    effect_rounding,
 )
 from sliplens.explainers.maps import combine, local_change, resize, scale_to, to_masks
 from sliplens.explainers.poly_cam_budget import ChannelSearch, GaussianProcess, Likeness, mask_kernel
@@ -226,6 +225,9 @@ class PolyCam(Method):
             )
             for depth, layer in enumerate(layers if self.levels else ())
         )
+        # weights as published are no effects
+        effects = [] if SCORES[self.score].as_published else weights
+        predictions = zip(comparison.prediction.tolist(), comparison.reference_prediction.tolist(), strict=True)
         return comparison.explanation(
             scale_to(torch.stack(shown), total=comparison.change),
             method="poly-cam",
@@ -233,18 +235,12 @@ class PolyCam(Method):
             warnings=(
                 *check_weights(names, weights, change=change),
                 *check_approximations(approximations),
-                *check_rounding(self._roundings(comparison, weights)),
+                *check_rounding(effects, predictions=predictions),
             ),
             levels=levels,
             approximations=tuple(approximations),
             engine=engine.name,
         )
-
-    def _roundings(self, comparison: Comparison, weights: list[list[Tensor]]) -> list[float]:
-        if SCORES[self.score].as_published:  # whose weights are no effects
-            return []
-        known = zip(weights, comparison.prediction.tolist(), comparison.reference_prediction.tolist(), strict=True)
-        return [effect_rounding(one, prediction=high, reference_prediction=low) for one, high, low in known]
 
     @property
     def _place(self) -> int:

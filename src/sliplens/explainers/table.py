@@ -74,11 +74,6 @@ def explain(
     options
         Options of the method, such as `budget=0.25` of `poly-cam`: the fields of its class.
 
-    Returns
-    -------
-    Explanation
-        Signed maps in margin units, and what a reader should know before trusting them.
-
     Raises
     ------
     InputError

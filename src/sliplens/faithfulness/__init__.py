@@ -6,16 +6,6 @@ from sliplens.faithfulness.removal import Faithfulness, RemovalCurves, removal_c
 from sliplens.faithfulness.scoring import score, score_by_deletion
 
 __all__ = [
-    "FILLS",
-    "DeletionCurves",
-    "Faithfulness",
-    "RemovalCurves",
-    "deletion_curves",
-    "deletion_order",
-    "deletion_score",
-    "get_fill",
-    "random_order",
-    "removal_curves",
-    "score",
-    "score_by_deletion",
-]
+    "FILLS", "DeletionCurves", "Faithfulness", "RemovalCurves", "deletion_curves", "deletion_order",
+    "deletion_score", "get_fill", "random_order", "removal_curves", "score", "score_by_deletion",
+]  # fmt: skip

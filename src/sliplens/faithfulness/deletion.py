@@ -113,16 +113,9 @@ def deletion_curves(
     batch_size: int = 128,
     on_progress: OnProgress | None = None,
 ) -> DeletionCurves:
-    """Answers of a network while pixels are removed in a given order.
+    """Answers of a network while pixels are removed in one order an image (`deletion_order`, `random_order`).
 
-    Parameters are those of `removal_curves`, but for these.
-
-    Parameters
-    ----------
-    orders
-        Flat pixel indices for each image, first to be removed first (`deletion_order`, `random_order`).
-    steps
-        Number of steps; the image's height if None, as in the thesis.
+    So many `steps`, the image's height if None, as in the thesis; all else is as for `removal_curves`.
 
     Examples
     --------

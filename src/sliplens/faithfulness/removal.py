@@ -256,16 +256,9 @@ def removal_curves(
 ) -> RemovalCurves:
     """Answers of a network while parts of its input are removed, in several orders each.
 
-    Parameters
-    ----------
-    images, references
-        Inputs in [0, 1], and those of the untouched sensor where the fill needs them.
-    orders
-        Flat pixel indices, first to be removed first (`unit_order`, `random_unit_order`).
-    areas
-        Shares of the image to remove, rising from 0 to 1.
-    batch_size
-        Images that are made and answered at a time: bounds the memory.
+    Inputs are in [0, 1], as the references, those of the untouched sensor, where the fill needs them. Orders are flat
+    pixel indices, first to be removed first (`unit_order`); areas are shares of the image, rising from 0 to 1.
+    `batch_size` images are made and answered at a time, which bounds the memory.
 
     Raises
     ------

@@ -123,16 +123,8 @@ def score_by_deletion(
 ) -> DeletionCurves:
     """Score maps as the thesis does: remove the most salient pixels step by step, beside a random order (`control`).
 
-    Kept to compare with published figures; `score` is the one to rely on (docs/deletion.md).
-
-    Parameters
-    ----------
-    run, frames, maps, reference
-        As `score` takes them.
-    fill
-        What removed pixels become, a row of `FILLS`.
-    steps
-        Steps until every pixel is gone; the image's height if None, as in the thesis.
+    Kept to compare with published figures; `score` is the one to rely on (docs/deletion.md). Arguments are those of
+    `score`, and `steps` until every pixel is gone; the image's height if None, as in the thesis.
 
     References
     ----------
