@@ -56,11 +56,8 @@ def paired_difference(
     whose spread has that of their trials in it. The ends come from the distribution of t among resampled clusters, or
     from Student's where clusters are fewer than eight. Of a single trial nothing is known but the estimate.
 
-    Parameters
-    ----------
-    clusters
-        Labels of each image, outermost first: `[networks, days, trials]`, the last of them, or none where images are
-        trials of their own. Equal labels are the same cluster: days that several networks saw count beside them.
+    `clusters` are labels of each image, outermost first: `[networks, days, trials]`, the last of them, or none where
+    images are trials of their own. Equal labels are the same cluster: days that several networks saw count beside them.
 
     References
     ----------

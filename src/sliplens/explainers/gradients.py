@@ -110,11 +110,32 @@ class IntegratedGradients(Method):
         allowed = max(self.tolerance * abs(change), _ROUNDING * max(abs(float(end)) for end in ends))
         fixed = self.steps == self.max_steps
         pieces, nodes = (1, self.steps) if fixed else (max(1, self.steps // _NODES), min(self.steps, _NODES))
-        path = _Path(comparison=comparison, image=image, reference=reference, nodes=nodes, batch_size=self.batch_size)
+        together, captum = max(1, self.batch_size // nodes), attr.IntegratedGradients(comparison.predict)
+
+        def at(times: Tensor) -> Tensor:
+            """Points of the line, 0 the reference and 1 the image."""
+            return reference + times.to(image.dtype)[:, None, None, None] * (image - reference)
+
+        @torch.no_grad()
+        def predict(times: Tensor) -> Tensor:
+            parts = [comparison.predict(at(part)) for part in times.split(self.batch_size) if len(part)]
+            return torch.cat(parts) if parts else image.new_zeros(0)
+
+        def integrals(starts: Tensor, stops: Tensor) -> Tensor:
+            """Relevance (pieces, height, width) of each piece of the line."""
+            pieces = []
+            for start, stop in zip(starts.split(together), stops.split(together), strict=True):
+                batch_size = max(len(start), min(self.batch_size, len(start) * nodes))
+                contributions = captum.attribute(
+                    at(stop), baselines=at(start), n_steps=nodes, internal_batch_size=batch_size
+                )
+                pieces.append(contributions.detach().sum(dim=1))
+            return torch.cat(pieces)
+
         edges = torch.linspace(0, 1, pieces + 1, dtype=torch.float64, device=image.device)
-        heights = torch.cat([ends[0][None], path.predict(edges[1:-1]), ends[1][None]]).double()
+        heights = torch.cat([ends[0][None], predict(edges[1:-1]), ends[1][None]]).double()
         starts, stops, rises = edges[:-1], edges[1:], heights.diff()
-        parts, used = path.integrate(starts, stops), pieces * nodes
+        parts, used = integrals(starts, stops), pieces * nodes
         while True:
             gaps = parts.sum(dim=(1, 2)).double() - rises
             rooms = (self.max_steps - used) // (2 * nodes)
@@ -127,46 +148,12 @@ class IntegratedGradients(Method):
             count = min(int((shares.cumsum(0) < shares.sum() / 2).sum()) + 1, rooms)
             split, kept = order[:count], order[count:]
             middles = (starts[split] + stops[split]) / 2
-            rise = path.predict(middles).double() - path.predict(starts[split]).double()
+            rise = predict(middles).double() - predict(starts[split]).double()
             new_starts, new_stops = torch.cat([starts[split], middles]), torch.cat([middles, stops[split]])
             starts, stops = torch.cat([starts[kept], new_starts]), torch.cat([stops[kept], new_stops])
             rises = torch.cat([rises[kept], rise, rises[split] - rise])
-            parts = torch.cat([parts[kept], path.integrate(new_starts, new_stops)])
+            parts = torch.cat([parts[kept], integrals(new_starts, new_stops)])
             used += 2 * nodes * count
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Path:
-    """The straight line from a reference to an image."""
-
-    comparison: Comparison
-    image: Tensor
-    reference: Tensor
-    nodes: int
-    batch_size: int
-
-    def _at(self, times: Tensor) -> Tensor:
-        return self.reference + times.to(self.image.dtype)[:, None, None, None] * (self.image - self.reference)
-
-    @torch.no_grad()
-    def predict(self, times: Tensor) -> Tensor:
-        """Predictions at some points, 0 the reference and 1 the image."""
-        parts = [self.comparison.predict(self._at(part)) for part in times.split(self.batch_size) if len(part)]
-        return torch.cat(parts) if parts else self.image.new_zeros(0)
-
-    def integrate(self, starts: Tensor, stops: Tensor) -> Tensor:
-        """Relevance (pieces, height, width) of each piece of the line."""
-        together, captum = max(1, self.batch_size // self.nodes), attr.IntegratedGradients(self.comparison.predict)
-        pieces = []
-        for start, stop in zip(starts.split(together), stops.split(together), strict=True):
-            contributions = captum.attribute(
-                self._at(stop),
-                baselines=self._at(start),
-                n_steps=self.nodes,
-                internal_batch_size=max(len(start), min(self.batch_size, len(start) * self.nodes)),
-            )
-            pieces.append(contributions.detach().sum(dim=1))
-        return torch.cat(pieces)
 
 
 @dataclass(frozen=True, kw_only=True)
