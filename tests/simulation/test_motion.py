@@ -21,10 +21,8 @@ PAD = cast("FlatPad", FLAT_GEL.geometry)
 
 
 def moved(sensor, displacement, margins=(1.0, 0.8, 0.6, 0.4, 0.2, 0.0), grasp=CENTRED, **more):
-    loading, touch = (
-        load_at_margins(np.array(margins), grasp=grasp),
-        Touch(grasp=grasp, **{"marker_depth": 0.0, **more}),
-    )
+    loading = load_at_margins(np.array(margins), grasp=grasp)
+    touch = Touch(grasp=grasp, **{"marker_depth": 0.0, **more})
     return move_markers(sensor, touch, loading=loading, displacement=displacement)
 
 

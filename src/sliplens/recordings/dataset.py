@@ -63,13 +63,7 @@ class Dataset:
         return sum(trial.frames for trial in self.trials)
 
     def find(self, trial: str) -> TrialInfo:
-        """Trial of a name.
-
-        Raises
-        ------
-        RecordingError
-            If there is none; the message lists what there is.
-        """
+        """Trial of a name; a `RecordingError` lists what there is if there is none."""
         for info in self.trials:
             if info.trial == trial:
                 return info
@@ -78,13 +72,7 @@ class Dataset:
         raise RecordingError(f"{self.folder} has no trial {trial}; it has {', '.join(names[:_NAMED])}{more}")
 
     def select(self, *, split: str | None = None, condition: str | None = None) -> tuple[TrialInfo, ...]:
-        """Trials of a split and a condition.
-
-        Raises
-        ------
-        RecordingError
-            If there is none; the message lists what there is.
-        """
+        """Trials of a split and a condition; a `RecordingError` lists what there is if there is none."""
         chosen = tuple(
             trial
             for trial in self.trials
@@ -112,11 +100,6 @@ _NAMED = 10  # trials named in a message before the rest is counted
 
 def load_dataset(folder: Path | str) -> Dataset:
     """Open a data set that `import_recordings` or `simulate` made; its trials are read when they are asked for.
-
-    Parameters
-    ----------
-    folder
-        Folder with `dataset.json`.
 
     Raises
     ------

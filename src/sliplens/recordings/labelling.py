@@ -24,13 +24,7 @@ class Found(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class ForceAxes:
-    """How to read a force sensor.
-
-    Raises
-    ------
-    RecordingError
-        If the axis or the sign is none.
-    """
+    """How to read a force sensor; an axis or a sign that is none is a `RecordingError`."""
 
     normal: str
     """x, y or z: the axis that presses."""
@@ -66,10 +60,7 @@ class ForceAxes:
 class FrictionEstimate:
     """Static friction of a trial, and when its contact slipped.
 
-    Raises
-    ------
-    RecordingError
-        If the coefficient is not positive or outside its interval.
+    A coefficient that is not positive or lies outside its interval is a `RecordingError`.
     """
 
     mu: float
@@ -107,10 +98,7 @@ class FrictionEstimate:
 class Lag:
     """Time by which the camera's stamps are later than the force sensor's, for the same event.
 
-    Raises
-    ------
-    RecordingError
-        If it is no finite number, or its uncertainty is negative.
+    One that is no finite number, or whose uncertainty is negative, is a `RecordingError`.
     """
 
     lag_s: float

@@ -9,10 +9,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from fnmatch import fnmatchcase
 from fractions import Fraction
-from functools import partial
 from glob import escape
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import msgspec
 
@@ -25,6 +24,7 @@ from sliplens.recordings.trial import TrialFacts
 
 FACTS = ("trial", "day", "object", "condition", "sensor")
 """What is known of a trial before it is looked at: what rules ask for, and trials are grouped by."""
+Item = TypeVar("Item")
 _SPLIT_NAME = re.compile(r"[a-z][a-z0-9_-]*")
 # shares are written with few digits: thirds as 0.3333 are to be mended by the one who wrote them
 _SUM_TOLERANCE = 1e-6
@@ -35,12 +35,7 @@ class SplitRule:
     """Which trials a rule fits, and the split they go to, or the splits they are dealt to.
 
     Texts may hold `*`, `?` and `[a-z]` and are compared with upper and lower case told apart. What is left empty fits
-    every trial.
-
-    Raises
-    ------
-    InputError
-        If the rule names a split and shares too, or neither, or its shares cannot be dealt.
+    every trial. It is an `InputError` to name a split and shares too, or neither, or shares that cannot be dealt.
     """
 
     trial: tuple[str, ...] = ()
@@ -92,13 +87,7 @@ class SplitRule:
 
 @dataclass(frozen=True, kw_only=True)
 class SplitPlan:
-    """Rules in order: the first that fits a trial decides.
-
-    Raises
-    ------
-    InputError
-        If there is no rule.
-    """
+    """Rules in order: the first that fits a trial decides; to have none is an `InputError`."""
 
     rules: tuple[SplitRule, ...]
     source: str = "the plan"
@@ -112,11 +101,7 @@ class SplitPlan:
 def read_splits(path: Path) -> SplitPlan:
     """Read the rules of a TOML file, as described in `docs/splits.md`.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read or is not TOML, has no rule, or a rule has a key or a value that it cannot have;
-        rules are counted from 1.
+    An `InputError` names what of the file or of which rule, counted from 1, is wrong.
     """
     try:
         # Windows editors put a mark before the text that TOML does not know
@@ -175,7 +160,10 @@ def _rule(row: Mapping[str, Any]) -> SplitRule:
     return SplitRule(**values)
 
 
-_VALIDATION_SHARE = 0.25
+def hold_out(candidates: Sequence[Item], share: float) -> list[Item]:
+    """Evenly spaced part of a list, one at least if there is any."""
+    count = max(1, round(share * len(candidates))) if candidates else 0
+    return [candidates[int((index + 0.5) * len(candidates) / count)] for index in range(count)]
 
 
 def thesis_plan(trials: Sequence[TrialFacts]) -> SplitPlan:
@@ -200,8 +188,7 @@ def thesis_plan(trials: Sequence[TrialFacts]) -> SplitPlan:
     # a first day of one dry trial has none to give up
     spare = first if len(first) > 1 else []
     candidates = sorted([one for day in days[1:-1] for one in _dry_of(trials, day)] or spare)
-    count = max(1, round(_VALIDATION_SHARE * len(candidates))) if candidates else 0
-    held_out = [candidates[int((index + 0.5) * len(candidates) / count)][2] for index in range(count)]
+    held_out = [name for _, _, name in hold_out(candidates, 0.25)]
     rules = [SplitRule(day=(days[-1],), name="test"), SplitRule(name="train")]
     if held_out:
         rules.insert(1, SplitRule(trial=tuple(escape(name) for name in held_out), name="validation"))
@@ -215,15 +202,15 @@ def _dry_of(trials: Sequence[TrialFacts], day: int) -> list[tuple[int, int, str]
     return [(place, day, name) for place, name in enumerate(sorted(names, key=lambda name: (natural_key(name), name)))]
 
 
-def _dealt_plan(trials: Sequence[TrialFacts], *, by: str) -> SplitPlan:  # noqa: ARG001 (as every preset takes them)
+def _dealt_plan(by: str) -> SplitPlan:
     share = {"train": 0.7, "validation": 0.15, "test": 0.15}
     return SplitPlan(rules=(SplitRule(share=share, by=by),), source=f"preset {by}s")
 
 
 PRESETS: dict[str, Callable[[Sequence[TrialFacts]], SplitPlan]] = {
     "thesis": thesis_plan,
-    "objects": partial(_dealt_plan, by="object"),
-    "trials": partial(_dealt_plan, by="trial"),
+    "objects": lambda _: _dealt_plan("object"),
+    "trials": lambda _: _dealt_plan("trial"),
 }
 """Plans worth a name, as functions of the trials there are. `objects` and `trials` deal 70 % to train and 15 % each to
 validation and test, by whole objects or by single trials."""

@@ -59,12 +59,7 @@ class Labels:
     """Forces and labels of a trial's frames, one value a frame; NaN where nothing is known.
 
     Forces are in newtons, the normal force positive when pressing. Without contact the safety margin has no meaning
-    and is NaN.
-
-    Raises
-    ------
-    RecordingError
-        If lengths disagree.
+    and is NaN. Lengths that disagree are a `RecordingError`.
     """
 
     # sizes that must agree are left open here and checked below, in the user's words
@@ -138,10 +133,7 @@ def labels_of_margins(safety_margin: Float[np.ndarray, " frames"]) -> Labels:
 class GroundTruth:
     """The truth behind a simulated trial; pixel coordinates are (x, y), pixel centres at whole numbers.
 
-    Raises
-    ------
-    RecordingError
-        If lengths disagree, or the stick zone is larger than the contact.
+    Lengths that disagree, or a stick zone larger than the contact, are a `RecordingError`.
     """
 
     recipe: str

@@ -18,12 +18,7 @@ class Nuisances:
 
     The friction is drawn apart from the normal force: were they tied, the lens of contact alone would tell the safety
     margin. Offsets and depths are in radii of the contact's sphere, angles in degrees, image lengths in pixels,
-    brightness in grey levels.
-
-    Raises
-    ------
-    ContactError
-        If a range is not finite, runs downwards, or holds a value that cannot occur.
+    brightness in grey levels. A range that is not finite, runs downwards or holds what cannot be is a `ContactError`.
     """
 
     dry_friction: Range = (0.5, 1.2)

@@ -10,6 +10,7 @@ import numpy as np
 from sliplens._version import __version__
 from sliplens.errors import InputError
 from sliplens.files import hash_json
+from sliplens.recordings.splits import hold_out
 from sliplens.simulation.loading import MINIMUM_FRAMES
 from sliplens.simulation.nuisances import Day, Nuisances, draw_day
 from sliplens.simulation.sensor import CHROMATOUCH, SENSORS, Sensor
@@ -32,12 +33,8 @@ class SimulationRecipe:
     """All that shapes a simulated data set; the same recipe gives the same bytes on the same machine.
 
     The days and splits follow the thesis: the first day and three quarters of the dry trials of the days between train,
-    the other quarter validates, the test day tests. Wet trials are all of the test day, or dealt to the test days.
-
-    Raises
-    ------
-    InputError
-        If a number is out of range, or the trials cannot fill every split.
+    the other quarter validates, the test day tests. Wet trials are all of the test day, or dealt to the test days. A
+    number out of range, or too few trials to fill every split, is an `InputError`.
     """
 
     dry_trials: int | tuple[int, ...] = 40
@@ -216,9 +213,7 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
     between = [(number, day) for day in dry if day not in (1, *tested) for number in range(1, dry[day] + 1)]
     # without days between, the first day has to give up some of its own
     candidates = sorted(between or [(number, 1) for number in range(1, dry[1] + 1)])
-    count = max(1, round(recipe.validation_share * len(candidates)))
-    evenly = (candidates[int((index + 0.5) * len(candidates) / count)] for index in range(count))
-    validation = {(day, number) for number, day in evenly}
+    validation = {(day, number) for number, day in hold_out(candidates, recipe.validation_share)}
 
     plans = []
     for day in range(1, recipe.days + 1):

@@ -175,12 +175,8 @@ class Glare:
 class Sensor:
     """A fingertip: its shape and camera, its gel, and how it looks.
 
-    Colours are grey levels (0 to 255) in the order of the image file.
-
-    Raises
-    ------
-    ContactError
-        If a modulus or the image size is not positive, or Poisson's ratio lies outside [0, 0.5].
+    Colours are grey levels (0 to 255) in the order of the image file. A modulus or an image size that is not positive,
+    or a Poisson's ratio outside [0, 0.5], is a `ContactError`.
     """
 
     name: str

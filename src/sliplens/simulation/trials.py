@@ -16,14 +16,11 @@ from sliplens.progress import OnProgress, counted, stage, wrote
 from sliplens.recordings import Dataset, GroundTruth, Recording
 from sliplens.recordings.dataset import load_dataset, trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import read_header, save_recording
+from sliplens.recordings.trial import SIGNALS
 from sliplens.simulation.filming import Film, batches, prepare_film
 from sliplens.simulation.loading import Loading, load_grasp, with_friction
 from sliplens.simulation.nuisances import draw_grasp, draw_unit
 from sliplens.simulation.plan import SimulationRecipe, TrialPlan, make_recipe, plan_trials
-
-_LABELS = ("time_s", "normal_force_n", "tangential_force_n", "friction_coefficient", "safety_margin", "stick_ratio",
-           "contact_state")  # fmt: skip
-"""What a recording takes from a loading."""
 
 
 def prepare_trial(plan: TrialPlan, *, friction: Float[np.ndarray, " frames"] | None = None) -> tuple[Loading, Film]:
@@ -62,7 +59,7 @@ def simulate_trial(
         condition=plan.condition,
         reference=reference,
         frames=frames,
-        **{name: getattr(loading, name) for name in _LABELS},
+        **{name: getattr(loading, name) for name in (*SIGNALS, "contact_state")},
         truth=GroundTruth(
             recipe=plan.recipe_hash,
             displacement=plan.recipe.resolved_displacement,

@@ -93,12 +93,7 @@ def infer_axes(
     The tare is the mean of the samples before the touch, spikes left out. The normal axis is the one that departs
     furthest from it, on average, in the first quarter of the contact, when the object is pressed and held but not yet
     pulled far; its sign makes that positive. A sensor that is pressed from the first sample on looks untouched: declare
-    its tare.
-
-    Raises
-    ------
-    RecordingError
-        If nothing is ever pressed, so that axis or sign cannot be inferred.
+    its tare. Where nothing is ever pressed, axis and sign cannot be inferred: that is a `RecordingError`.
     """
     noise = np.asarray(noise_sigma(forces.force_n))
     touch, until = _find_touch(forces, tare_n=tare_n)

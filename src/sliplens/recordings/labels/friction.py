@@ -131,17 +131,8 @@ def estimate_friction(
 
     The slip is the first sudden fall of F_t / F_n from its height so far. About it the ratio is fitted by a line that
     breaks off: rising until the onset, falling after it; mu_s is its value at the break. Where several falls compete,
-    the one that the image moves at wins.
-
-    Parameters
-    ----------
-    contact_threshold_n
-        Normal force below which the ratio means nothing.
-
-    Raises
-    ------
-    RecordingError
-        If the trial never slips: its friction is then unknown, only that it is larger than all that was seen.
+    the one that the image moves at wins. Below `contact_threshold_n`, a normal force in newtons, the ratio means
+    nothing. A trial that never slips is a `RecordingError`: its friction is larger than all that was seen, no more.
     """
     highest = 0.0
     for window_s in _WINDOWS_S:

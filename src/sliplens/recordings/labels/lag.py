@@ -68,17 +68,8 @@ def estimate_lag(
     trails it in a release; a release weighs no more than makes the two cancel. The uncertainty is the spread of the
     peak when stretches of the trial are drawn anew.
 
-    Parameters
-    ----------
-    image_motion
-        How much each frame differs from the one before it; see `measure_motion`. The first is not used.
-    longest_s
-        Longest lag tried, either way.
-
-    Raises
-    ------
-    RecordingError
-        If frames or overlap are too few to correlate.
+    `image_motion` is that of `measure_motion`, its first value not used; `longest_s` the longest lag tried, either way.
+    Too few frames to correlate, or too little overlap, are a `RecordingError`.
     """
     intervals = len(frame_time_s) - 1
     if intervals < _LEAST_INTERVALS:

@@ -133,17 +133,8 @@ def label_frames(
     The force of a frame is the mean over its time of the line through the samples; no window reaches over the onset of
     slip. Noise, tare, friction, lag and a change of the friction on the way to the slip all enter the uncertainty of
     the margin, as independent of each other. A lag that is known but not applied counts as an error of its size.
-
-    Parameters
-    ----------
-    friction
-        Static friction, estimated or given. Where it tells no onset, gross slip begins with the first frame whose
-        forces clearly lie outside the friction cone.
-
-    Raises
-    ------
-    RecordingError
-        If a lag is to be applied that is not known or doubtful.
+    Where the friction tells no onset, gross slip begins with the first frame whose forces clearly lie outside the
+    friction cone. A lag that is to be applied, but not known or doubtful, is a `RecordingError`.
     """
     apply_lag = settings.apply_lag or settings.lag_ms is not None
     if apply_lag and (lag is None or lag.doubt):
@@ -252,12 +243,8 @@ def label_trial(
 ) -> FoundLabels:
     """Label the frames of a trial: axes, lag, friction and margins, in that order.
 
-    The lag is estimated whether or not it is applied, and helps to tell at which fall of the force the image moves.
-
-    Parameters
-    ----------
-    lag
-        Lag that was measured otherwise, with its uncertainty; that of the settings, or estimated, if None.
+    The lag is estimated whether or not it is applied, and helps to tell at which fall of the force the image moves;
+    unless it was measured otherwise, or the settings give it.
 
     Raises
     ------

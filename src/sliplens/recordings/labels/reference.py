@@ -35,17 +35,8 @@ def choose_reference(
     image alike and should not decide. The least energy is the default, for the first frame of a recording often holds
     the hand that started it. Of a long stretch 200 frames are compared, evenly spread.
 
-    Parameters
-    ----------
-    untouched
-        Which frames have no contact, as the forces say.
-    index
-        The reference by hand; it may touch.
-
-    Raises
-    ------
-    RecordingError
-        If no frame is untouched and none is named, or the name or method is none.
+    `untouched`: frames without contact, as the forces say; `index`: the reference by hand, which may touch. To have
+    neither, or a number or method that is none, is a `RecordingError`.
     """
     if method not in REFERENCE_METHODS:
         raise RecordingError(f"the reference cannot be chosen by {method!r}; choose {' or '.join(REFERENCE_METHODS)}")
