@@ -52,7 +52,7 @@ from sliplens.report.plates import (
 )
 from sliplens.report.results import Results
 from sliplens.report.verdict import rank_methods
-from sliplens.results.explanation import Explained, Strip
+from sliplens.results.explanation import Explained, ExplainedFrame, Strip
 from sliplens.results.faithfulness import DeletionCurve, DeletionScores, is_control
 from sliplens.results.study import StateFrame, States, Truth
 
@@ -75,6 +75,9 @@ _SALIENCY_COLUMNS = (
 _SURE = 0.2  # confidence of a field below which it is a guess, as `plot_field` draws it
 _FEWEST_STILL_PX = 0.3
 _TRUTH_FRAMES = _TRUTH_METHODS = 3
+_EFFECT_COLUMNS = {name: name for name in ("frame_id", "marker", "x_px", "y_px")}
+_EFFECT_COLUMNS |= {"shapley_value": "shapley", "shapley_error": "shapley_error", "network_effect": "network"}
+_EFFECT_COLUMNS |= {"margin_effect": "margin", "state": "state"}
 _STATE_FIGURES = {"difference": "fig-15-methods-difference", "raw": "fig-16-methods-raw"}
 
 
@@ -90,14 +93,13 @@ def plate_methods(results: Results) -> Plate | None:
         own = explained.frames[frame.index]
         pictures, called = bright_pictures(explained, [frame.index])
         picture = pictures[frame.index]
-        cells = [Cell(picture=picture, words=_answer(explained, frame.index))]
+        cells = [Cell(picture=picture, words=_answer(own))]
         for method in methods:
             saliency = explained.saliency.get(method)
             cells.append(Cell(picture=saliency if saliency is None else show_map(picture, saliency[frame.index])))
             numbers += [] if saliency is None else [_measured(explained, method, frame)]
         rows.append((f"{short_input_name(name)}\n({called.lower()})", cells))
-        answer = f"true Γ {percent(own.safety_margin)}, read {percent(own.prediction)}"
-        told.append(f"{short_input_name(name).lower()} {own.id}, {answer}")
+        told.append(f"{short_input_name(name).lower()} {own.id}, {_answer(own).replace('true', 'true Γ')}")
     if not rows:
         return None
     heads = ["Input", *(method_name(method) for method in methods)]
@@ -117,15 +119,10 @@ def plate_states(results: Results, explained: Explained) -> Plate | None:
     """Draw every method across the states of one trial (thesis, Figs. 15 and 16); None without frames to show."""
     methods = [method for method in shown_methods(results) if method in explained.saliency]
     real = explained.source == "real"
-    name = f"real-{explained.input}" if real else f"methods-{explained.input}"
-    return _plate(
-        explained,
-        shown_frames(results, explained),
-        methods,
-        name=name if real else _STATE_FIGURES.get(explained.input, name),
-        what=f"Methods across the contact states, {input_name(explained.input).lower()}, "
-        f"{source_name(explained.source)}",
-    )
+    name = f"real-{explained.input}" if real else _STATE_FIGURES.get(explained.input, f"methods-{explained.input}")
+    of = f"{input_name(explained.input).lower()}, {source_name(explained.source)}"
+    what = f"Methods across the contact states, {of}"
+    return _plate(explained, shown_frames(results, explained), methods, name=name, what=what)
 
 
 def plate_strip(strip: Strip) -> Plate:
@@ -151,13 +148,8 @@ def plate_poly_cam(results: Results) -> Plate | None:
     explained = explained_of(results, "difference")
     if explained is None or "poly-cam" not in explained.saliency:
         return None
-    return _plate(
-        explained,
-        shown_frames(results, explained),
-        ["poly-cam"],
-        name="fig-11-poly-cam-difference",
-        what="Poly-CAM across the contact states, difference images",
-    )
+    name, what = "fig-11-poly-cam-difference", "Poly-CAM across the contact states, difference images"
+    return _plate(explained, shown_frames(results, explained), ["poly-cam"], name=name, what=what)
 
 
 def _plate(explained: Explained, frames: list[ShownFrame], methods: list[str], *, name: str, what: str) -> Plate | None:
@@ -165,7 +157,7 @@ def _plate(explained: Explained, frames: list[ShownFrame], methods: list[str], *
         return None
     trials = {explained.frames[one.index].trial for one in frames}
     pictures, called = bright_pictures(explained, [one.index for one in frames])
-    rows = [(called, [Cell(picture=pictures[one.index], words=_answer(explained, one.index)) for one in frames])]
+    rows = [(called, [Cell(picture=pictures[one.index], words=_answer(explained.frames[one.index])) for one in frames])]
     for method in methods:
         maps = explained.saliency[method]
         cells = [Cell(picture=show_map(pictures[one.index], maps[one.index])) for one in frames]
@@ -212,8 +204,7 @@ def _measured(explained: Explained, method: str, frame: ShownFrame) -> tuple[Any
     return explained.input, method, own.id, frame.level, label, own.prediction, above, right, down
 
 
-def _answer(explained: Explained, index: int) -> str:
-    frame = explained.frames[index]
+def _answer(frame: ExplainedFrame) -> str:
     return f"true {percent(frame.safety_margin)}, read {percent(frame.prediction)}"
 
 
@@ -316,7 +307,10 @@ def _illustrate(explained: Explained, scored: DeletionScores, method: str, index
         answer.grid(visible=False)
         lines = [*ax.lines, answer.lines[0]]
         ax.legend(handles=lines, loc="lower right", bbox_to_anchor=(1, 0.98), ncols=2, borderaxespad=0)
-    mean = float(curve.scores[row].mean())
+    mean, own_numbers = (
+        float(curve.scores[row].mean()),
+        {"prediction": curve.predictions[row], "score": curve.scores[row]},
+    )
     return Plate(
         name="fig-05-deletion",
         figure=grid.figure,
@@ -325,12 +319,7 @@ def _illustrate(explained: Explained, scored: DeletionScores, method: str, index
         f"({input_name(explained.input).lower()}, true Γ {percent(own.safety_margin)}). The most salient pixels become "
         f"{scored.fill} first; D = (1 \N{MINUS SIGN} |y \N{MINUS SIGN} y whole|)², mean over all steps {mean:.3f}. "
         f"Answers: {_tell_fall(explained, index, steps)}.",
-        numbers={
-            "pixels_removed": curve.pixels_removed,
-            "share_removed": share / 100,
-            "prediction": curve.predictions[row],
-            "score": curve.scores[row],
-        },
+        numbers={"pixels_removed": curve.pixels_removed, "share_removed": share / 100, **columns},
         pixels=True,
     )
 
@@ -432,7 +421,11 @@ def plate_contact_states(states: States) -> Plate | None:
         assert mappable is not None  # there is a field
         bar = place_axes(grid.figure, 1.25, grid.bottom_in + 0.05, 2.6, 0.12)
         grid.figure.colorbar(mappable, cax=bar, orientation="horizontal", label="Displacement (px)")
-    told = "; ".join(_tell_motion(frame, fields[frame.id]) for frame in chosen)
+    moves = ["unknown" if field is None else f"{_longest(field):.1f} px" for field in fields.values()]
+    told = "; ".join(
+        f"{move} at {frame.contact_state}, Γ {percent(frame.safety_margin)}"
+        for move, frame in zip(moves, chosen, strict=True)
+    )
     return Plate(
         name="fig-04-states",
         figure=grid.figure,
@@ -507,11 +500,6 @@ def _resized(saliency: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return np.clip(np.asarray(Image.fromarray(saliency).resize((size[1], size[0]), Image.Resampling.BILINEAR)), 0, 1)
 
 
-def _tell_motion(frame: StateFrame, field: DisplacementField | None) -> str:
-    told = "unknown" if field is None else f"{_longest(field):.1f} px"
-    return f"{told} at {frame.contact_state}, Γ {percent(frame.safety_margin)}"
-
-
 def _marker_numbers(frames: list[StateFrame]) -> dict[str, np.ndarray]:
     counts = [len(frame.rest_px) for frame in frames]
     rest, now = (np.concatenate([getattr(frame, name) for frame in frames]) for name in ("rest_px", "now_px"))
@@ -541,14 +529,14 @@ def plate_truth(results: Results, name: str) -> Plate | None:
         index, row = places[frame_id], truth.frame_ids.index(frame_id)
         picture, own = pictures[index], explained.frames[index]
         effects = (truth.shapley_maps[row], truth.network_maps[row], truth.margin_maps[row])
-        cells = [
-            Cell(picture=picture),
-            *(Cell(picture=paint_effects(picture, one), words=_points(one)) for one in effects),
-            *(
-                Cell(picture=paint_effects(picture, explained.relevance[method][index], full=FULL_COLOUR_PERCENTILE))
-                for method in methods
-            ),
+        largest = [f"up to {100 * np.abs(one).max():.1f} points" for one in effects]
+        cells = [Cell(picture=picture)]
+        cells += [
+            Cell(picture=paint_effects(picture, one), words=f"up to {100 * np.abs(one).max():.1f} points")
+            for one in effects
         ]
+        maps = [explained.relevance[method][index] for method in methods]
+        cells += [Cell(picture=paint_effects(picture, one, full=FULL_COLOUR_PERCENTILE)) for one in maps]
         rows.append((f"Γ {percent(own.safety_margin)}\nread {percent(own.prediction)}", cells))
     truths = ("Shapley values\nin the answer", "Put back alone:\nthe answer", "Put back alone:\nthe margin")
     heads = [called, *truths, *(method_name(one) for one in methods)]
@@ -562,14 +550,7 @@ def plate_truth(results: Results, name: str) -> Plate | None:
         "that marker put back where it rested), beside the best methods' maps. Orange lowers, blue raises; full colour "
         f"at the largest effect of each picture, and at a map's {FULL_COLOUR_PERCENTILE:g}th percentile. "
         f"{_tell_match(truth, methods)}",
-        numbers={
-            **{own: getattr(truth.effects, own) for own in ("frame_id", "marker", "x_px", "y_px")},
-            "shapley_value": truth.effects.shapley,
-            "shapley_error": truth.effects.shapley_error,
-            "network_effect": truth.effects.network,
-            "margin_effect": truth.effects.margin,
-            "state": truth.effects.state,
-        },
+        numbers={name: getattr(truth.effects, own) for name, own in _EFFECT_COLUMNS.items()},
         pixels=True,
     )
 
@@ -607,10 +588,6 @@ def _best_methods(results: Results, name: str, explained: Explained) -> list[str
     ranked = [] if faithful is None else [one.method for one in rank_methods(faithful)]
     known = methods_in_order(name for name in explained.saliency if not is_control(name))
     return [*(one for one in ranked if one in known), *(one for one in known if one not in ranked)][:_TRUTH_METHODS]
-
-
-def _points(effects: np.ndarray) -> str:
-    return f"up to {100 * np.abs(effects).max():.1f} points"
 
 
 def _tell_match(truth: Truth, methods: list[str]) -> str:

@@ -50,6 +50,16 @@ _LOOK_NAMES = {
     "frame_stability": "Stable between frames",
 }
 _REGION_NAMES = {"markers": "markers", "slip_annulus": "slip annulus", "edges": "marker edges"}
+_CORRELATIONS = ("With Shapley values", "Lead over controls", "With markers put back alone", "With the best reading")
+_TESTED = (
+    "Fill",
+    "Changes counted",
+    "Holds",
+    "SRG of the truth",
+    "SRG, damaged",
+    "Truth less damaged",
+    "SRG of |x - b|",
+)
 _TRUTHS = ("oracle", "degraded-oracle")
 
 
@@ -161,12 +171,8 @@ def table_seconds(results: Results) -> Table:
         "3060 Ti and did not wait for the GPU to finish, so its seconds show the order of magnitude only.",
         ("Method", *(f"{short_input_name(name)}, {source}" for name, source in keys), "Thesis"),
         [
-            (
-                method_name(method),
-                *(_seconds_of(one, method) for one in explained.values()),
-                _thesis_seconds(method, methods),
-            )
-            for method in methods_in_order(methods)
+            (method_name(one), *(_seconds_of(own, one) for own in explained.values()), _thesis_seconds(one, methods))
+            for one in methods_in_order(methods)
         ],
     )
 
@@ -192,13 +198,11 @@ def table_real(results: Results) -> Table:
 def table_training(results: Results) -> Table:
     """Tabulate how each network was trained."""
     runs = [results.trainings[name] for name in inputs_in_order(results.trainings)]
+    frames = [(one.train_frames, one.validation_frames) for one in runs]
     rows = (
         ("Backbone", *(one.backbone for one in runs)),
         ("Image side (camera)", *(f"{one.image_size} px ({' x '.join(map(str, one.frame_size))})" for one in runs)),
-        (
-            "Frames: training / validation",
-            *(f"{_whole(one.train_frames)} / {_whole(one.validation_frames)}" for one in runs),
-        ),
+        ("Frames: training / validation", *(" / ".join(map(_whole, counts)) for counts in frames)),
         ("Epochs", *(decimals(one.epochs, 1) for one in runs)),
         ("Minutes", *(decimals(one.minutes, 1) for one in runs)),
         ("Stopped by", *(one.stopped_by for one in runs)),
@@ -213,12 +217,8 @@ def table_scores(faithful: RemovalScores, scored: DeletionScores | None) -> Tabl
     """Tabulate the thesis's deletion score (its Table 2) beside the symmetric gain under every fill."""
     fills = settings(faithful)
     scores = {score.key: score for score in faithful.scores}
-    top = {
-        fill: max(
-            (one.srg.estimate for key, one in scores.items() if key[:2] == fill and not one.control), default=None
-        )
-        for fill in fills
-    }
+    gains = [(key[:2], one.srg.estimate) for key, one in scores.items() if not one.control]
+    top = {fill: max((gain for setting, gain in gains if setting == fill), default=None) for fill in fills}
     plain = {} if scored is None else scored.methods
     methods = {*(score.method for score in faithful.scores), *plain}
     lowest = min((one.mean for name, one in plain.items() if not is_control(name)), default=None)
@@ -250,9 +250,8 @@ def table_leads(faithful: RemovalScores) -> Table:
     def tell(lead: Lead | None) -> Cell | str:
         if lead is None:
             return UNKNOWN
-        return _best(
-            f"{tell_interval(lead.gap)}, {method_name(lead.control).removesuffix(' (control)')}", lead.shows_something
-        )
+        control = method_name(lead.control).removesuffix(" (control)")
+        return _best(f"{tell_interval(lead.gap)}, {control}", lead.shows_something)
 
     return make_table(
         f"{input_name(faithful.input)}: symmetric relevance gain of each method less that of the strongest map that "
@@ -283,9 +282,7 @@ def table_equal_areas(faithful: RemovalScores) -> Table | None:
     def lost(score: RemovalScore, area: float) -> Cell:
         return _best(decimals(score.at.get(area), 3), not score.control and score.at.get(area, np.nan) == top[area])
 
-    rows = [
-        (method_name(method), *(lost(scores[method], area) for area in areas)) for method in methods_in_order(scores)
-    ]
+    rows = [(method_name(one), *(lost(scores[one], area) for area in areas)) for one in methods_in_order(scores)]
     curve = next(curve for key, curve in faithful.curves.items() if key[:2] == (fill, unit))
     chance = (f"{faithful.random_orders} random orders", *(decimals(mean_at(curve, area)[1], 3) for area in areas))
     return make_table(
@@ -431,6 +428,13 @@ def table_localisation(truth: Truth) -> Table:
     """Tabulate where relevance lies, and how well maps rank the markers."""
     names = [*methods_in_order(set(truth.methods) - set(_TRUTHS)), *(one for one in _TRUTHS if one in truth.methods)]
     heads = [f"{what}, {_REGION_NAMES[region]}" for what in ("Mass", "Strongest") for region in REGIONS]
+    rows = []
+    for name in names:
+        found, lead = truth.methods[name], truth.methods[name].lead_over_controls
+        gaps = (found.shapley, lead and lead.gap, found.network, found.margin)
+        shares = [percent(own[region]) for own in (found.mass, found.rank) for region in REGIONS]
+        title = "Random map (control)" if name == CONTROL else method_name(name)  # here it is a map, not an order
+        rows.append((title, *shares, *map(_interval, gaps)))
     nothing = ("A map that knows nothing", *(percent(truth.areas[region]) for region in REGIONS * 2), *4 * ["0"])
     return make_table(
         f"{input_name(truth.input)}, {truth.frames} simulated frames: share of the relevance, and of the strongest "
@@ -440,28 +444,8 @@ def table_localisation(truth: Truth) -> Table:
         f"{tell_over(one.shapley for one in truth.methods.values())}). Lead: the first of these less that of the "
         "strongest map that knows nothing of what the network learned; a method whose lead is not above zero for sure "
         "has shown nothing about this network.",
-        (
-            "Method",
-            *heads,
-            "With Shapley values",
-            "Lead over controls",
-            "With markers put back alone",
-            "With the best reading",
-        ),
-        [
-            *(
-                (
-                    # here it is a map, not an order
-                    "Random map (control)" if name == CONTROL else method_name(name),
-                    *(percent(shares[region]) for shares in (found.mass, found.rank) for region in REGIONS),
-                    *(_interval(gap) for gap in (found.shapley, lead and lead.gap, found.network, found.margin)),
-                )
-                for name in names
-                for found in [truth.methods[name]]
-                for lead in [found.lead_over_controls]
-            ),
-            nothing,
-        ],
+        ("Method", *heads, *_CORRELATIONS),
+        [*rows, nothing],
     )
 
 
@@ -475,15 +459,7 @@ def table_meta(truth: Truth) -> Table | None:
         "judge methods, and the verdict leaves it out. Along the change asks what speaks for the answer and what "
         "against it; by size, maps ordered by |value|, asks what matters at all. Where |x - b|, which knows no "
         "network, comes near the truth, the setting mostly measures the input.",
-        (
-            "Fill",
-            "Changes counted",
-            "Holds",
-            "SRG of the truth",
-            "SRG, damaged",
-            "Truth less damaged",
-            "SRG of |x - b|",
-        ),
+        ("Fill", "Changes counted", "Holds", *_GAINS),
         [
             (
                 FILL_NAMES.get(one.fill, one.fill),

@@ -131,11 +131,10 @@ class Remedies:
     @cached_property
     def curves(self) -> dict[tuple[str, str], dict[str, DeletionCurve]]:
         """Curves by variant and method, then by frame: one that stops at a saliency has as many steps as it needs."""
+        groups = self.table.groups("variant", "method").items()
         return {
-            (variant, method): {
-                frame: _deletion_curve(own, method) for (frame,), own in rows.groups("frame_id").items()
-            }
-            for (variant, method), rows in self.table.groups("variant", "method").items()
+            (variant, name): {frame: _deletion_curve(own, name) for (frame,), own in rows.groups("frame_id").items()}
+            for (variant, name), rows in groups
         }
 
 
@@ -253,29 +252,16 @@ def _deletion_curve(rows: DeletionTable, name: str) -> DeletionCurve:
     pixels, scores, predictions = (
         values.reshape(len(ids), -1) for values in (ordered.pixels_removed, ordered.score, ordered.prediction)
     )
-    return DeletionCurve(
-        frame_ids=ids,
-        clusters=_clusters(ordered, len(ids)),
-        pixels_removed=pixels[0],
-        scores=scores,
-        predictions=predictions,
-    )
+    about: dict[str, Any] = {"frame_ids": ids, "clusters": _clusters(ordered, len(ids))}
+    return DeletionCurve(**about, pixels_removed=pixels[0], scores=scores, predictions=predictions)
 
 
 def _removal_curve(rows: RemovalTable, name: str) -> RemovalCurve:
     ids, ordered = _sort_by_frame(rows, rows.area, f"lacks areas of some frames under {name}")
-    areas, most, least, random = (
-        values.reshape(len(ids), -1)
-        for values in (ordered.area, ordered.most_first, ordered.least_first, ordered.random)
-    )
-    return RemovalCurve(
-        frame_ids=ids,
-        clusters=_clusters(ordered, len(ids)),
-        areas=areas[0],
-        most_first=most,
-        least_first=least,
-        random=random,
-    )
+    kinds = ("most_first", "least_first", "random")
+    changes = {kind: getattr(ordered, kind).reshape(len(ids), -1) for kind in kinds}
+    areas = ordered.area.reshape(len(ids), -1)[0]
+    return RemovalCurve(frame_ids=ids, clusters=_clusters(ordered, len(ids)), areas=areas, **changes)
 
 
 def _clusters(ordered: DeletionTable | RemovalTable, frames: int) -> Shaped[np.ndarray, "2 frames"]:

@@ -163,14 +163,8 @@ def show_states(choice: Choice, data: Dataset, *, on_progress: OnProgress | None
             untracked.append(f"{trial}: {error}")
         for frame in chosen:
             if frame.shown:
-                shown.append(
-                    ShownFrame(
-                        id=frame.id,
-                        level=frame.level,
-                        safety_margin=frame.safety_margin,
-                        contact_state=str(recording.contact_state[frame.frame]).replace("_", " "),
-                    )
-                )
+                state, margin = str(recording.contact_state[frame.frame]).replace("_", " "), frame.safety_margin
+                shown.append(ShownFrame(id=frame.id, level=frame.level, safety_margin=margin, contact_state=state))
                 raw.append(recording.frames[frame.frame])
                 difference.append(absolute_difference(raw[-1][None], recording.reference)[0])
     return States(

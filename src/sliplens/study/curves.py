@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -168,27 +169,25 @@ def judge_curves(
         gains = {name: curve.symmetric_gain for name, curve in own.items()}
         controls = {name: gain for name, gain in gains.items() if is_control(name)}
         for name, curve in own.items():
-            none = np.zeros_like(curve.symmetric_gain)
-            scores.append(
-                RemovalScore(
-                    fill=setting.fill,
-                    unit=setting.unit,
-                    method=name,
-                    control=is_control(name),
-                    srg=paired_difference(gains[name], none, clusters=clusters, rng=rng),
-                    gain_over_random=paired_difference(curve.gain_over_random, none, clusters=clusters, rng=rng),
-                    lead_over_controls=None
-                    if is_control(name)
-                    else lead_over_controls(gains[name], controls, clusters=clusters, rng=rng),
-                    most_first=float(curve.most_first.mean()),
-                    least_first=float(curve.least_first.mean()),
-                    random=float(curve.random.mean()),
-                    at={area: float(curve.at(area)[0].mean()) for area in EQUAL_AREAS if area in curve.areas},
-                )
+            zero = partial(paired_difference, second=np.zeros_like(gains[name]), clusters=clusters, rng=rng)
+            lead = partial(lead_over_controls, gains[name], controls, clusters=clusters, rng=rng)
+            orders: dict[str, Any] = {
+                order: float(getattr(curve, order).mean()) for order in ("most_first", "least_first", "random")
+            }
+            score = RemovalScore(
+                **vars(setting),
+                method=name,
+                control=is_control(name),
+                srg=zero(gains[name]),
+                gain_over_random=zero(curve.gain_over_random),
+                lead_over_controls=None if is_control(name) else lead(),
+                **orders,
+                at={area: float(curve.at(area)[0].mean()) for area in EQUAL_AREAS if area in curve.areas},
             )
+            scores.append(score)
         for first, second in combinations([name for name in own if not is_control(name)], 2):
             gap = paired_difference(gains[first], gains[second], clusters=clusters, rng=rng)
-            comparisons.append(Comparison(fill=setting.fill, unit=setting.unit, first=first, second=second, gap=gap))
+            comparisons.append(Comparison(**vars(setting), first=first, second=second, gap=gap))
     return tuple(scores), tuple(comparisons)
 
 
@@ -201,9 +200,8 @@ def compare_fills(curves: Curves) -> tuple[Agreement, ...]:
         names = [name for name in curves[first] if not is_control(name)]
         ranks = [[float(curves[setting][name].symmetric_gain.mean()) for name in names] for setting in (first, second)]
         tau = float(np.asarray(kendalltau(*ranks))[0]) if len(names) > 1 else float("nan")
-        agreement.append(
-            Agreement(unit=first.unit, first=first.fill, second=second.fill, tau=tau if np.isfinite(tau) else None)
-        )
+        known = tau if np.isfinite(tau) else None
+        agreement.append(Agreement(unit=first.unit, first=first.fill, second=second.fill, tau=known))
     return tuple(agreement)
 
 
@@ -223,25 +221,18 @@ def ranking_alarms(curves: Curves) -> list[str]:
 
 def _table(curves: Curves, explained: Explained) -> RemovalTable:
     frames, tables = explained.frames, []
-    margins = np.array([np.nan if frame.safety_margin is None else frame.safety_margin for frame in frames])
+    of_frames: dict[str, Any] = {"frame_id": [frame.id for frame in frames], "day": [frame.day for frame in frames]}
+    of_frames |= {"trial": [frame.trial for frame in frames]}
+    of_frames["safety_margin"] = [np.nan if frame.safety_margin is None else frame.safety_margin for frame in frames]
     for setting, own in curves.items():
         for name, curve in own.items():
             count, steps = curve.curves.shape[1:]
             if count != len(frames):
                 raise InputError(f"{count} curves of {name} for {len(frames)} frames; make the study again")
             most_first, least_first, random = curve.curves.reshape(3, -1)
-            table = RemovalTable(
-                fill=np.repeat(setting.fill, count * steps),
-                unit=np.repeat(setting.unit, count * steps),
-                method=np.repeat(name, count * steps),
-                frame_id=np.repeat([frame.id for frame in frames], steps),
-                day=np.repeat([frame.day for frame in frames], steps),
-                trial=np.repeat([frame.trial for frame in frames], steps),
-                safety_margin=np.repeat(margins, steps),
-                area=np.tile(curve.areas, count),
-                most_first=most_first,
-                least_first=least_first,
-                random=random,
-            )
-            tables.append(table)
+            known = {"fill": setting.fill, "unit": setting.unit, "method": name}
+            columns = {key: np.repeat(value, count * steps) for key, value in known.items()}
+            columns |= {key: np.repeat(values, steps) for key, values in of_frames.items()}
+            columns |= {"area": np.tile(curve.areas, count), "most_first": most_first, "least_first": least_first}
+            tables.append(RemovalTable(**columns, random=random))
     return RemovalTable.joined(tables)

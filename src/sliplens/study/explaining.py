@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby, islice, product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -164,16 +165,12 @@ def _take(
 
 
 def _join(parts: Sequence[ChosenFrames]) -> ChosenFrames:
-    return ChosenFrames(
-        ids=sum((part.ids for part in parts), ()),
-        day=sum((part.day for part in parts), ()),
-        trial=sum((part.trial for part in parts), ()),
-        condition=sum((part.condition for part in parts), ()),
-        safety_margin=np.concatenate([part.safety_margin for part in parts]),
-        images=torch.cat([part.images for part in parts]),
-        references=torch.cat([part.references for part in parts]),
-        source=parts[0].source,
-    )
+    told: dict[str, Any] = {
+        name: sum((getattr(part, name) for part in parts), ()) for name in ("ids", "day", "trial", "condition")
+    }
+    told |= {name: torch.cat([getattr(part, name) for part in parts]) for name in ("images", "references")}
+    margin = np.concatenate([part.safety_margin for part in parts])
+    return ChosenFrames(**told, safety_margin=margin, source=parts[0].source)
 
 
 def _label(path: Path) -> float:

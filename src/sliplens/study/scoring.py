@@ -126,43 +126,35 @@ def score_remedies(
             name: _inserted(delete(name, "grey", order[:, ::-1].copy()), explained) for name, order in orders.items()
         },
     }
-    grey_deletion: dict[str, Any] = {"fill": "grey", "mode": "deletion", "stop": None, "better": "lower"}
+    deletion: dict[str, Any] = {"fill": "grey", "mode": "deletion", "stop": None, "better": "lower"}
     about = {
-        "stop-at-half": grey_deletion
-        | {
-            "summary": "Grey fill; ends once every pixel with a saliency above 0.5 is gone, so that frames and methods "
-            "end at different areas. Random orders end at the median area of the methods.",
-            "stop": _STOP,
-        },
-        "background": grey_deletion
-        | {"summary": f"Removed pixels become {background}, and all of them go.", "fill": background},
-        "insertion": grey_deletion
-        | {
-            "summary": "From an image of nothing but grey, the most salient pixels come first; D against the answer on "
-            "the whole image, so that a faithful map rises early.",
-            "mode": "insertion",
-            "better": "higher",
-        },
+        "stop-at-half": deletion | {"stop": _STOP},
+        "background": deletion | {"fill": background},
+        "insertion": deletion | {"mode": "insertion", "better": "higher"},
     }
+    summaries = {
+        "stop-at-half": "Grey fill; ends once every pixel with a saliency above 0.5 is gone, so that frames and "
+        "methods end at different areas. Random orders end at the median area of the methods.",
+        "background": f"Removed pixels become {background}, and all of them go.",
+        "insertion": "From an image of nothing but grey, the most salient pixels come first; D against the answer on "
+        "the whole image, so that a faithful map rises early.",
+    }
+    each = [(name, curve) for name, by_method in curves.items() for own in by_method.values() for curve in own]
+    tables = [VariantTable(variant=np.repeat(name, len(curve)), **vars(curve)) for name, curve in each]
     return Remedies(
         input=explained.input,
         source=explained.source,
         steps=steps,
         variants={
-            name: Variant(**about[name], methods={method: _score(one) for method, one in own.items()})
+            name: Variant(
+                **about[name], summary=summaries[name], methods={method: _score(one) for method, one in own.items()}
+            )
             for name, own in curves.items()
         },
         alarms=tuple(
             f"{name}: {alarm}" for name in ("stop-at-half", "background") for alarm in _method_alarms(curves[name])
         ),
-        table=VariantTable.joined(
-            [
-                VariantTable(variant=np.repeat(name, len(curve)), **vars(curve))
-                for name, by_method in curves.items()
-                for own in by_method.values()
-                for curve in own
-            ]
-        ),
+        table=VariantTable.joined(tables),
     )
 
 
@@ -174,16 +166,10 @@ def _orders(explained: Explained, *, seed: int) -> dict[str, Int[np.ndarray, "fr
 
 
 def _curve(method: str, frame: ExplainedFrame, removed: np.ndarray, answers: np.ndarray, base: float) -> DeletionTable:
-    return DeletionTable(
-        method=np.repeat(method, len(answers)),
-        frame_id=np.repeat(frame.id, len(answers)),
-        day=np.repeat(frame.day, len(answers)),
-        trial=np.repeat(frame.trial, len(answers)),
-        step=np.arange(len(answers)),
-        pixels_removed=removed,
-        prediction=answers,
-        score=deletion_score(np.full(len(answers), base), answers),
-    )
+    told = {"method": method, "frame_id": frame.id, "day": frame.day, "trial": frame.trial}
+    columns = {name: np.repeat(value, len(answers)) for name, value in told.items()}
+    step, score = np.arange(len(answers)), deletion_score(np.full(len(answers), base), answers)
+    return DeletionTable(**columns, step=step, pixels_removed=removed, prediction=answers, score=score)
 
 
 def _split(method: str, curves: DeletionCurves, explained: Explained) -> list[DeletionTable]:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, Shaped, UInt8
@@ -123,17 +124,10 @@ def stage_frames(trained: Run, explained: Explained, data: Dataset) -> tuple[Sta
                 raise InputError(f"{name} is not the frame of {data.folder} that was explained; explain it again")
             truth = recording.truth
             assert truth is not None  # what was rebuilt has its truth
-            staged[row] = StagedFrame(
-                id=name,
-                day=infos[trial].day,
-                trial=trial,
-                number=number,
-                safety_margin=float(recording.safety_margin[number]),
-                scene=scene,
-                reference=recording.reference,
-                contact_map=truth.contact_map[number],
-                markers=visible_markers(scene.film.sensor),
-            )
+            own: dict[str, Any] = {"id": name, "day": infos[trial].day, "trial": trial, "number": number}
+            own |= {"safety_margin": float(recording.safety_margin[number]), "contact_map": truth.contact_map[number]}
+            markers = visible_markers(scene.film.sensor)
+            staged[row] = StagedFrame(**own, scene=scene, reference=recording.reference, markers=markers)
     return tuple(staged[row] for row in range(len(explained.frames)))
 
 
@@ -372,7 +366,7 @@ def judge_by_truth(
         DEGRADED: _paint(places, [own["shuffled"] for own in along]),
     }
     change = np.array([frame.prediction - frame.reference_prediction for frame in explained.frames])
-
+    painted = {name: _paint(places, [getattr(one, name) for one in effects]) for name in _EFFECTS}
     interval = partial(mean_interval, clusters=explained.clusters, seed=seed)
     truth = Truth(
         input=explained.input,
@@ -389,9 +383,7 @@ def judge_by_truth(
         meta=meta_test(effects, interval),
         summary="",
         effects=_table(frames, places, effects),
-        shapley_maps=_paint(places, [one.shapley for one in effects]).astype(np.float32),
-        network_maps=_paint(places, [one.network for one in effects]).astype(np.float32),
-        margin_maps=_paint(places, [one.margin for one in effects]).astype(np.float32),
+        **{f"{name}_maps": values.astype(np.float32) for name, values in painted.items()},
     )
     return replace(truth, summary=_summarise(truth))
 
@@ -439,25 +431,14 @@ def _judge(
 
 
 def _table(frames: Sequence[StagedFrame], places: Sequence[Places], effects: Sequence[FrameEffects]) -> MarkerEffects:
-    return MarkerEffects.joined(
-        [
-            MarkerEffects(
-                frame_id=np.repeat(frame.id, len(frame.markers)),
-                day=np.repeat(frame.day, len(frame.markers)),
-                trial=np.repeat(frame.trial, len(frame.markers)),
-                safety_margin=np.full(len(frame.markers), frame.safety_margin),
-                marker=frame.markers.astype(np.int64),
-                x_px=place.now_px[:, 0],
-                y_px=place.now_px[:, 1],
-                shapley=own.shapley,
-                shapley_error=own.shapley_error,
-                network=own.network,
-                margin=own.margin,
-                state=place.state,
-            )
-            for frame, place, own in zip(frames, places, effects, strict=True)
-        ]
-    )
+    pieces = []
+    for frame, place, own in zip(frames, places, effects, strict=True):
+        told = {name: getattr(frame, name) for name in ("day", "trial", "safety_margin")} | {"frame_id": frame.id}
+        columns = {name: np.repeat(value, len(frame.markers)) for name, value in told.items()}
+        columns |= {name: getattr(own, name) for name in ("shapley", "shapley_error", "network", "margin")}
+        columns |= {"x_px": place.now_px[:, 0], "y_px": place.now_px[:, 1]}
+        pieces.append(MarkerEffects(**columns, marker=frame.markers.astype(np.int64), state=place.state))
+    return MarkerEffects.joined(pieces)
 
 
 def true_curves(

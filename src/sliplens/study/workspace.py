@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -105,16 +105,9 @@ def explain_source(
         with stage(on_progress, title) as count:
             return explain(on_progress=count)
     images = chosen.images.numpy().tobytes() + chosen.references.numpy().tobytes()
-    recipe = {
-        "weights_sha256": trained.manifest.weights_sha256,
-        "input": trained.manifest.input,
-        "source": chosen.source,
-        "ids": chosen.ids,
-        "images_sha256": hashlib.sha256(images).hexdigest(),
-        "method": tuple(methods),
-        "budget": budget,
-        "colours": colours,
-    }
+    recipe: dict[str, Any] = {"weights_sha256": trained.manifest.weights_sha256, "input": trained.manifest.input}
+    recipe |= {"source": chosen.source, "ids": chosen.ids, "images_sha256": hashlib.sha256(images).hexdigest()}
+    recipe |= {"method": tuple(methods), "budget": budget, "colours": colours}
     what = f"{len(methods)} maps of each of {len(chosen.ids)} frames, panel.png"
     with output_folder(out, stage="explain", config=recipe, overwrite=overwrite) as output:
         if not output.complete:
@@ -123,8 +116,7 @@ def explain_source(
             shutil.rmtree(output.folder / "parts")
             draw_explained(explained, output.folder, colours=colours)
             save_result(explained, output.folder)
-            warnings = dict.fromkeys(warning for notes in explained.methods.values() for warning in notes.warnings)
-            for warning in warnings:
+            for warning in dict.fromkeys(one for notes in explained.methods.values() for one in notes.warnings):
                 warned = [method for method, notes in explained.methods.items() if warning in notes.warnings]
                 note(on_progress, f"{', '.join(warned)}: {warning}")
     wrote(on_progress, out, what, kept=output.complete)
@@ -164,15 +156,9 @@ def score_explained(
     if out is None:
         with stage(on_progress, title) as count:
             return score(on_progress=count)
-    recipe = {
-        "weights_sha256": trained.manifest.weights_sha256,
-        "maps_sha256": hashlib.sha256(b"".join(maps.tobytes() for maps in explained.saliency.values())).hexdigest(),
-        "input": explained.input,
-        "source": explained.source,
-        "fill": fill,
-        "steps": steps,
-        "seed": seed,
-    }
+    maps = hashlib.sha256(b"".join(maps.tobytes() for maps in explained.saliency.values())).hexdigest()
+    recipe: dict[str, Any] = {"weights_sha256": trained.manifest.weights_sha256, "maps_sha256": maps}
+    recipe |= {"input": explained.input, "source": explained.source, "fill": fill, "steps": steps, "seed": seed}
     with output_folder(out, stage="score", config=recipe, overwrite=overwrite) as output:
         if not output.complete:
             with stage(on_progress, title) as count:
@@ -215,11 +201,8 @@ def _choose_explainers(
     """The explainers with the options that these frames allow."""
     free = [index for index, margin in enumerate(chosen.safety_margin) if margin >= _FULL_STICK]
     background = trained.encoding.normalise(chosen.images[free]) if free else None
-    own: dict[str, Explainer] = {
-        "poly-cam": get_explainer("poly-cam", budget=budget),
-        "expected-gradients": ExpectedGradients(background=background),
-    }
-    inputs = trained.encoding.normalise(chosen.images)
+    own: dict[str, Explainer] = {"expected-gradients": ExpectedGradients(background=background)}
+    own["poly-cam"], inputs = get_explainer("poly-cam", budget=budget), trained.encoding.normalise(chosen.images)
     named = {name: own.get(name) or EXPLAINERS[name] for name in methods}
     return with_markers(named, inputs, lambda: _find_markers(trained, chosen, source, reference=reference))
 
@@ -273,21 +256,13 @@ def explain_trial(
     explanation = explainer(
         run.model, inputs[list(shown)], reference=reference.expand(len(shown), -1, -1, -1), on_progress=on_progress
     )
-    return Strip(
-        trial=recording.trial,
-        condition=recording.condition,
-        source=source,
-        input=run.manifest.input,
-        method=method,
-        readings=StripReadings(
-            time_s=recording.time_s.astype(np.float64),
-            contact_state=np.array([str(state) for state in recording.contact_state]),
-            safety_margin=margin.astype(np.float64),
-            prediction=estimate.margin.astype(np.float64),
-            low=low.astype(np.float64),
-            high=high.astype(np.float64),
-        ),
-        shown=shown,
-        pictures=recording.frames[list(shown)],
-        relevance=explanation.relevance.to(torch.float32).cpu().numpy(),
+    read = {"safety_margin": margin, "prediction": estimate.margin, "low": low, "high": high}
+    readings = StripReadings(
+        time_s=recording.time_s.astype(np.float64),
+        contact_state=np.array([str(state) for state in recording.contact_state]),
+        **{name: values.astype(np.float64) for name, values in read.items()},
     )
+    maps, pictures = explanation.relevance.to(torch.float32).cpu().numpy(), recording.frames[list(shown)]
+    of_trial = {"trial": recording.trial, "condition": recording.condition, "source": source, "method": method}
+    own: dict[str, Any] = {"readings": readings, "shown": shown, "pictures": pictures, "relevance": maps}
+    return Strip(**of_trial, input=run.manifest.input, **own)
