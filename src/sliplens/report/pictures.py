@@ -307,10 +307,7 @@ def _illustrate(explained: Explained, scored: DeletionScores, method: str, index
         answer.grid(visible=False)
         lines = [*ax.lines, answer.lines[0]]
         ax.legend(handles=lines, loc="lower right", bbox_to_anchor=(1, 0.98), ncols=2, borderaxespad=0)
-    mean, own_numbers = (
-        float(curve.scores[row].mean()),
-        {"prediction": curve.predictions[row], "score": curve.scores[row]},
-    )
+    mean, columns = curve.scores[row].mean(), {"prediction": curve.predictions[row], "score": curve.scores[row]}
     return Plate(
         name="fig-05-deletion",
         figure=grid.figure,
@@ -529,7 +526,6 @@ def plate_truth(results: Results, name: str) -> Plate | None:
         index, row = places[frame_id], truth.frame_ids.index(frame_id)
         picture, own = pictures[index], explained.frames[index]
         effects = (truth.shapley_maps[row], truth.network_maps[row], truth.margin_maps[row])
-        largest = [f"up to {100 * np.abs(one).max():.1f} points" for one in effects]
         cells = [Cell(picture=picture)]
         cells += [
             Cell(picture=paint_effects(picture, one), words=f"up to {100 * np.abs(one).max():.1f} points")

@@ -51,15 +51,7 @@ _LOOK_NAMES = {
 }
 _REGION_NAMES = {"markers": "markers", "slip_annulus": "slip annulus", "edges": "marker edges"}
 _CORRELATIONS = ("With Shapley values", "Lead over controls", "With markers put back alone", "With the best reading")
-_TESTED = (
-    "Fill",
-    "Changes counted",
-    "Holds",
-    "SRG of the truth",
-    "SRG, damaged",
-    "Truth less damaged",
-    "SRG of |x - b|",
-)
+_GAINS = ("SRG of the truth", "SRG, damaged", "Truth less damaged", "SRG of |x - b|")
 _TRUTHS = ("oracle", "degraded-oracle")
 
 
