@@ -117,9 +117,7 @@ def test_markers_are_found_in_camera_frames_only(
     raw_run: Path, difference_run: Path, difference_folder: Path, tmp_path: Path, monkeypatch
 ):
     words = ("-o", tmp_path / "maps", "--method", "occlusion-marker")
-    refused(
-        "occlusion-marker finds the markers in camera frames", difference_run, "--frames", difference_folder, *words
-    )
+    refused("markers are found in camera frames", difference_run, "--frames", difference_folder, *words)
     assert not (tmp_path / "maps").exists()
     seen = []
 

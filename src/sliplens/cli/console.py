@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from textwrap import wrap
+from textwrap import TextWrapper
 from threading import RLock
 from typing import NamedTuple
 
@@ -134,7 +134,8 @@ def _column(name: str, cells: Sequence[str], *, names: bool) -> _Column:
     longest, widest = (max(map(len, texts), default=0) for texts in (name.split(), cells))
     # names are as wide as they are, up to a third of 80 columns
     width = max(longest, min(widest, 26) if names else widest)
-    head, *broken = ("\n".join(wrap(text, width, break_long_words=False)) for text in (name, *cells))
+    fit = TextWrapper(width, break_long_words=False, break_on_hyphens=False)
+    head, *broken = ("\n".join(fit.wrap(text)) for text in (name, *cells))
     return _Column(escape(head), broken, max(longest, *(len(line) for cell in broken for line in cell.split("\n")), 0))
 
 
