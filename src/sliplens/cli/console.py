@@ -132,10 +132,9 @@ class _Column(NamedTuple):
 def _column(name: str, cells: Sequence[str], *, names: bool) -> _Column:
     """Fit a column to its cells; a column of names may be broken at spaces, numbers may not."""
     longest, widest = (max(map(len, texts), default=0) for texts in (name.split(), cells))
-    # names are as wide as they are, up to a third of 80 columns
-    width = max(longest, min(widest, 26) if names else widest)
-    fit = TextWrapper(width, break_long_words=False, break_on_hyphens=False)
-    head, *broken = ("\n".join(fit.wrap(text)) for text in (name, *cells))
+    width = max(longest, min(widest, 26) if names else widest)  # names: up to a third of 80 columns
+    fit = TextWrapper(width, break_long_words=False, break_on_hyphens=False).wrap
+    head, *broken = map("\n".join, map(fit, (name, *cells)))
     return _Column(escape(head), broken, max(longest, *(len(line) for cell in broken for line in cell.split("\n")), 0))
 
 
