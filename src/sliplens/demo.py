@@ -17,6 +17,7 @@ from sliplens.results.explanation import Strip
 from sliplens.simulation.trials import simulate
 from sliplens.study import explain_source, explain_trial, run_study, score_explained
 from sliplens.study.curves import Setting
+from sliplens.study.scoring import STEPS
 from sliplens.training import evaluate, train
 
 INPUTS = ("difference", "raw")
@@ -28,7 +29,7 @@ _SETTINGS = (Setting(fill="reference", unit="pixel"), Setting(fill="noisy-linear
 _TESTS = ("score", "faithfulness")
 _BUDGET = 0.15
 """Share of the channels that Poly-CAM measures at first."""
-_RANDOM_ORDERS = 10
+_RANDOM_ORDERS = 6
 _TRIALS = 2
 """Trials that are explained: too few to decide anything, as the page says, but there within minutes."""
 DEMO_SEED = 20261122
@@ -121,8 +122,9 @@ def run_demo(
             on_progress=on_progress,
         )  # fmt: skip
         score_explained(
-            networks["difference"], explanations, out=folder / "score-real", seed=seed, on_progress=on_progress
-        )
+            networks["difference"], explanations, out=folder / "score-real", steps=STEPS, seed=seed,
+            on_progress=on_progress,
+        )  # fmt: skip
     return show()
 
 

@@ -85,8 +85,10 @@ def figure_picture(figure: Figure, *, alt: str, pixels: bool = False) -> Picture
     buffer = io.BytesIO()
     with drawing_style():
         if pixels:
-            figure.savefig(buffer, format="png", dpi=_DOTS_PER_INCH)
-            buffer = _fewer_colours(buffer)
+            # as bare pixels: a PNG made only to be read again takes as long as the drawing
+            figure.savefig(buffer, format="rgba", dpi=_DOTS_PER_INCH)
+            size = tuple(int(side * _DOTS_PER_INCH) for side in figure.get_size_inches())
+            buffer = _fewer_colours(Image.frombytes("RGBA", size, buffer.getvalue()))
         else:
             # no date: the same results make the same page
             figure.savefig(buffer, format="svg", dpi=200, metadata={"Date": None, "Creator": None})
@@ -95,13 +97,12 @@ def figure_picture(figure: Figure, *, alt: str, pixels: bool = False) -> Picture
     return Picture(uri=uri, alt=alt, width=width, height=height)
 
 
-def _fewer_colours(png: io.BytesIO) -> io.BytesIO:
+def _fewer_colours(image: Image.Image) -> io.BytesIO:
     """Same picture in 256 colours, a fourth of the size: the PDF beside the page holds all of them."""
     smaller = io.BytesIO()
-    with Image.open(png) as image:
-        # by octree: evenly spread colours, where the median cut would give most of them to the noise of a map
-        reduced = image.convert("RGB").quantize(_COLOURS, method=Image.Quantize.FASTOCTREE)
+    # by octree: evenly spread colours, where the median cut would give most of them to the noise of a map
+    reduced = image.convert("RGB").quantize(_COLOURS, method=Image.Quantize.FASTOCTREE)
     # each colour is the mean of its like: paper would be not quite white
     reduced.putpalette([_WHITE if level > _NEARLY_WHITE else level for level in reduced.getpalette() or []])
-    reduced.save(smaller, "png", optimize=True)
+    reduced.save(smaller, "png")
     return smaller
