@@ -19,8 +19,7 @@ from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 @pytest.fixture(scope="module")
 def trial() -> Recording:
     """A simulated trial at 30 frames a second, of every other pixel: its motion is seen all the same."""
-    recipe = replace(PRESETS["small"], series="")
-    whole = simulate_trial(replace(plan_trials(recipe)[0], frames=240))
+    whole = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=240))
     return replace(whole, frames=whole.frames[:, ::2, ::2].copy(), reference=whole.reference[::2, ::2].copy())
 
 

@@ -111,6 +111,23 @@ def test_force_samples_are_kept_and_labels_made_anew_from_them_are_the_same(
     assert (last.source, last.notes) == (first.source, first.notes)
 
 
+def test_a_trial_of_the_default_simulation_is_labelled_though_its_frames_tell_no_lag(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    trial = simulate_trial(plan_trials(PRESETS["small"])[0])
+    path = trial_path(tmp_path / "data", trial.trial)
+    save_recording(trial, path)
+    write_dataset_table(tmp_path / "data", [trial_info(path, split="train")], simulated=True)
+    assert run("label", tmp_path / "data", "-o", tmp_path / "out", "--no-audit") == 0
+    assert "not told" in capsys.readouterr().out
+    back = load_recording(trial_path(tmp_path / "out", trial.trial))
+    assert back.valid is not None
+    # six frames a second: the slip is known to a sixth of a second, in which the margin changes by some 0.02
+    error = (back.safety_margin - trial.safety_margin)[back.valid]
+    assert len(error) > 35
+    assert np.sqrt(np.mean(error**2)) < 0.02
+
+
 def test_labels_that_were_not_found_are_not_overwritten(simulated: Path, capsys: pytest.CaptureFixture[str]):
     before = (simulated / "dataset.json").read_bytes()
     assert "did not come from its forces and would be lost" in refused(capsys, "label", simulated)

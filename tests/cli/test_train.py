@@ -17,7 +17,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sliplens.cli import main
 from sliplens.models import load_checkpoint
 from sliplens.recordings import Dataset
-from sliplens.recordings.dataset import trial_path, write_dataset_table
+from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.store import save_recording
 
 SMALL = ("--image-size", "32", "--epochs", "3", "--batch-size", "11", "--head", "point", "--untouched-share", "0")
 
@@ -210,3 +211,19 @@ def test_a_network_to_start_from_must_fit(finished: Path, small_dataset: Dataset
     assert "has the input difference, and raw is to be trained" in line
     line = refused(capsys, small_dataset.folder, tmp_path / "run", "--start-from", str(tmp_path / "none"))
     assert "none does not exist; check the path" in line
+
+
+def test_labels_that_are_all_the_same_are_refused(
+    tmp_path: Path, small_dataset: Dataset, capsys: pytest.CaptureFixture[str]
+):
+    table = []
+    for info in small_dataset.trials:
+        recording = small_dataset.load(info)
+        margin = np.where(recording.labelled, 1.0, np.nan)
+        path = trial_path(tmp_path / "data", info.trial)
+        save_recording(replace(recording, safety_margin=margin), path)
+        table.append(trial_info(path, split=info.split))
+    write_dataset_table(tmp_path / "data", table)
+    line = refused(capsys, tmp_path / "data", tmp_path / "run")
+    assert "all 44 labels that" in line
+    assert "has to train on are 100 %, and of a constant there is nothing to learn" in line

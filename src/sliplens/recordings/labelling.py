@@ -143,6 +143,17 @@ class Clip:
     """Frames left out at the start."""
 
 
+class Reason(StrEnum):
+    """Why a frame has no valid label; empty where it has one."""
+
+    NONE = ""
+    MISSING_SAMPLES = "missing samples"
+    OUT_OF_RANGE = "outside the force sensor's range"
+    NO_CONTACT = "no contact"
+    AFTER_GROSS_SLIP = "after gross slip"
+    TOO_UNCERTAIN = "too uncertain"
+
+
 @dataclass(frozen=True, kw_only=True)
 class LabelBasis:
     """Estimates and thresholds behind labels that were found from forces."""

@@ -82,7 +82,7 @@ def train(
     InputError
         If the data, the recipe, the start or the machine does not allow it.
     RecordingError
-        If there is no labelled trial to train or to validate on.
+        If there is no labelled trial to train or to validate on, or all labels to train on are the same.
     ModelError
         If the network to start from is of another kind, or the loss is no longer finite.
     """
@@ -94,6 +94,7 @@ def train(
         require_same_kind(start, config, input)
     data = data if isinstance(data, Dataset) else load_dataset(data)
     encoding, trials = get_encoding(input), _choose_trials(data, condition)
+    _require_varied_labels(data, trials[0])
     # what shapes the result besides the recipe
     origin = {"input": encoding.name, "condition": condition, "data_hash": data.hash}
     if start is not None:
@@ -175,6 +176,18 @@ def _choose_trials(data: Dataset, condition: str | None) -> tuple[tuple[TrialInf
         shown = " and ".join(f"{height} x {width}" for height, width in sizes)
         raise RecordingError(f"{data.folder} mixes frames of {shown} pixels; train on one sensor at a time")
     return train, validation
+
+
+def _require_varied_labels(data: Dataset, trials: Sequence[TrialInfo]) -> None:
+    """Check that the safety margin to be learnt is not the same in every frame."""
+    labels = [data.read_labels(info) for info in trials]
+    margins = np.concatenate([one.safety_margin[one.labelled] for one in labels])
+    # rounding of margins that were computed from constant forces
+    if len(margins) and np.ptp(margins) < 1e-6:
+        raise RecordingError(
+            f"all {len(margins)} labels that {data.folder} has to train on are {100 * margins[0]:.0f} %, and of a "
+            "constant there is nothing to learn; check that its forces hold the pull, and record trials until they slip"
+        )
 
 
 @torch.no_grad()

@@ -150,6 +150,8 @@ def test_what_was_assumed_is_told(tmp_path: Path):
         ("when,fx,fy,fz\n0,1,2,3\n", "no column that looks like the time among 'when', 'fx', 'fy', 'fz'; name it with"),
         ("time,stamp,fx,fy,fz\n0,0,1,2,3\n", "the time could be any of 'time', 'stamp'; name the right one with"),
         ("time,fx,fy\n0,1,2\n", "no columns that look like forces"),
+        ("time,fz\n0,1\n", r"has a normal force \('fz'\) but no tangential force"),
+        ("time,fn,temperature\n0,1,2\n", r"has a normal force \('fn'\) but no tangential force"),
         ("time,fx,fx,fy,fz\n0,1,2,3,4\n", r"the force \(x\) could be any of 'fx', 'fx'"),
         ("time,fx,fy,fz\n0,1,2,3\n1,1,much,3\n", r"line 3, 'fy' is 'much', not a number"),
         ("time,fx,fy,fz\n0,1,2,3\n1,1,,3\n", r"line 3, 'fy' is empty"),

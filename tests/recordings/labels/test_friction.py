@@ -115,3 +115,17 @@ def test_friction_that_cannot_be_is_refused():
         FrictionEstimate(mu=0.0, low=0.0, high=0.0)
     with pytest.raises(RecordingError, match=r"0\.5 lies outside its interval 0\.6 to 0\.7; give low, mu, high"):
         FrictionEstimate(mu=0.5, low=0.6, high=0.7)
+
+
+def test_samples_too_few_to_fit_a_fall_tell_the_break_between_two_of_them(rng: np.random.Generator):
+    # six samples a second, the last two after the slip
+    time = np.arange(0, 2, 1 / 6)
+    values = np.where(time < 1.6, 0.1 + 0.2 * time, 0.3)
+    found = fit_break(time, values, about_s=1.6, rng=rng, draws=400)
+    last, following = time[time < 1.6][-1], time[time > 1.6][0]
+    assert last < found.time_s < following
+    # the line is known, and where on it the contact slips is not
+    assert found.level == pytest.approx(0.1 + 0.2 * found.time_s)
+    assert (found.levels.min(), found.levels.max()) == pytest.approx(
+        (0.1 + 0.2 * last, 0.1 + 0.2 * following), abs=1e-3
+    )

@@ -88,6 +88,26 @@ def test_a_frame_is_valid_exactly_where_it_has_no_reason_not_to_be(trial: Trial)
     assert np.all(np.isnan(labels.safety_margin_sigma[~labels.valid]))
 
 
+def test_a_contact_that_is_not_pulled_is_no_incipient_slip_however_exact_the_forces(trial: Trial):
+    labels = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION)
+    held = (trial.frame_time_s > TOUCH_S + 0.1) & (trial.frame_time_s < PULL_S - 0.1)
+    # a margin of 100 % with no uncertainty but rounding
+    assert np.all(labels.safety_margin_sigma[held] < 1e-12)
+    assert {state for state, here in zip(labels.contact_state, held, strict=True) if here} == {ContactState.CONTACT}
+
+
+def test_a_margin_that_tells_full_stick_hardly_from_slip_is_not_valid(trial: Trial):
+    # a friction known to a third: 1 - Gamma is then known to a third, which passes 0.2 at 0.6
+    friction = replace(FRICTION, low=STATIC * 2 / 3, high=STATIC * 4 / 3)
+    labels = label_frames(trial.frame_time_s, trial.contact(), friction=friction)
+    used = ratio(trial.frame_time_s) / STATIC
+    unsure = np.array([reason == Reason.TOO_UNCERTAIN for reason in labels.reason])
+    before = trial.frame_time_s < SLIP_S
+    assert np.all(unsure[before & (used > 0.62)])
+    assert not unsure[used < 0.58].any()
+    assert labels.safety_margin_sigma[labels.valid].max() <= 0.2
+
+
 def test_frames_without_samples_have_no_label(trial: Trial):
     forces = trial.forces()
     kept = (forces.time_s < 3.0) | (forces.time_s > 3.2)

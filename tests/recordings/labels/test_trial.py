@@ -1,5 +1,6 @@
 """From recorded forces to labels in one go."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -56,6 +57,25 @@ def test_a_trial_that_never_slips_needs_its_friction_by_hand(trial_without_slip:
     trial = trial_without_slip
     with pytest.raises(RecordingError, match="give the coefficient of friction by hand"):
         label_trial(trial.frame_time_s, trial.motion, trial.forces(), settings=LabelSettings(), rng=rng)
+
+
+@pytest.mark.parametrize("mu", [None, STATIC])
+def test_without_a_tangential_force_there_is_no_margin(trial: Trial, rng: np.random.Generator, mu: float | None):
+    pressed = replace(trial, contact_n=trial.contact_n * np.array([1, 0, 0]))
+    forces = pressed.forces(tare_n=TARE)
+    with pytest.raises(RecordingError, match=r"sensor has no tangential force .* name the columns of all axes"):
+        label_trial(trial.frame_time_s, trial.motion, forces, settings=LabelSettings(mu=mu), rng=rng)
+
+
+def test_few_frames_are_labelled_without_a_lag(trial: Trial, rng: np.random.Generator):
+    few = slice(None, None, 4)
+    time, motion = trial.frame_time_s[few], trial.motion[few]
+    labels = label_trial(time, motion, trial.forces(noise_n=0.02, rng=rng), settings=LabelSettings(), rng=rng)
+    assert labels.basis.lag is not None
+    assert "too few to tell a lag" in labels.basis.lag.doubt
+    truth = 1 - ratio(time) / STATIC
+    # windows are four times as long as at the full rate, so kinks err by four times as much
+    np.testing.assert_allclose(labels.safety_margin[labels.valid], truth[labels.valid], atol=0.05)
 
 
 def test_the_same_seed_gives_the_same_labels(trial: Trial):

@@ -267,6 +267,13 @@ def guess_force_columns(table: TextTable) -> tuple[str, ...]:
             return tuple(
                 _only(found[axis], table=table, what=f"the force ({axis})", option="--force-columns") for axis in axes
             )
+    alone = [name for axis in ("z", "normal") for name in found[axis]]
+    if alone and not any(found[axis] for axis in ("x", "y", "tangential")):
+        raise RecordingError(
+            f"{table.path} has a normal force ({alone[0]!r}) but no tangential force that is known by its name, and a "
+            "safety margin needs both; name its columns with --force-columns, or go without margins: sliplens track "
+            "follows the markers"
+        )
     raise RecordingError(
         f"{table.path} has no columns that look like forces (fx, fy, fz or fn, ft) among "
         f"{', '.join(map(repr, table.header))}; name them with --force-columns"

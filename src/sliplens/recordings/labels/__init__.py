@@ -1,10 +1,10 @@
 """Labels from force samples and frames: axes, lag, friction, safety margins with uncertainty, the reference frame."""
 
-from sliplens.recordings.labelling import ForceAxes, Found, FrictionEstimate, Lag
+from sliplens.recordings.labelling import ForceAxes, Found, FrictionEstimate, Lag, Reason
 from sliplens.recordings.labels.axes import ContactForces, apply_axes, infer_axes
 from sliplens.recordings.labels.friction import ImageMotion, estimate_friction
 from sliplens.recordings.labels.lag import estimate_lag, measure_motion
-from sliplens.recordings.labels.margin import FoundLabels, Reason, contact_threshold, label_frames, label_trial
+from sliplens.recordings.labels.margin import FoundLabels, contact_threshold, label_frames, label_trial
 from sliplens.recordings.labels.reference import choose_reference
 from sliplens.recordings.options import LabelSettings
 

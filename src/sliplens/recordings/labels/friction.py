@@ -14,6 +14,7 @@ _TRIES = 41  # breaks tried over that reach
 # lengths of the fall that are tried, from a sudden drop to that of a soft fingertip
 _FALLS_S = (0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056, 0.08)
 _LEAST_BEFORE, _LEAST_AFTER = 6, 3  # samples that the two sides of a break need
+_LEAST_LINE = 4  # samples that a line up to a break needs
 _PARAMETERS = 7  # what a fit takes from the noise: five numbers, and where the break and the end of the fall lie
 _MEMORY = 0.2  # residuals that correlate by more are drawn together
 _LONGEST_BLOCK = 0.1  # longest block, as a share of the samples
@@ -35,7 +36,8 @@ def fit_break(time_s: Samples, values: Samples, *, about_s: float, rng: np.rando
     """Fit a parabola that at a break goes over into a fall and then a line, by least squares.
 
     Every break within reach and a few lengths of the fall are tried; the bootstrap draws blocks of the residuals anew
-    and fits the break anew with each.
+    and fits the break anew with each. Samples too few for that tell the break as a line up to somewhere between two of
+    them.
     """
     tried = [
         (moment, fall)
@@ -44,10 +46,7 @@ def fit_break(time_s: Samples, values: Samples, *, about_s: float, rng: np.rando
         if np.sum(time_s < moment) >= _LEAST_BEFORE and np.sum(time_s > moment + fall) >= _LEAST_AFTER
     ]
     if not tried:
-        raise RecordingError(
-            f"only {np.sum(time_s < about_s)} samples before the slip at {about_s:.2f} s and "
-            f"{np.sum(time_s > about_s)} after it can be used; record the forces faster or give the friction by hand"
-        )
+        return _bracket_break(time_s, values, about_s=about_s, rng=rng, draws=draws)
     moments, falls = np.array(tried).T
     since = time_s - moments[:, None]
     before, after = np.minimum(since, 0), np.maximum(since, 0)
@@ -62,6 +61,26 @@ def fit_break(time_s: Samples, values: Samples, *, about_s: float, rng: np.rando
     drawn = fitted[:, None] + residuals[_blocks(residuals, draws=draws, rng=rng)]
     chosen, levels = _best(bases, triangles, drawn)
     return Break(time_s=float(moments[index]), level=float(level), levels=levels, times_s=moments[chosen])
+
+
+def _bracket_break(time_s: Samples, values: Samples, *, about_s: float, rng: np.random.Generator, draws: int) -> Break:
+    """Lengthen the line through the last samples before a break to anywhere before the next sample."""
+    # the break itself is rough: what lies half a step beyond may still be before it
+    near = np.flatnonzero(time_s <= about_s + typical_step(time_s) / 2)
+    before = near[max(0, len(near) - _LEAST_BEFORE) : np.argmax(values[near]) + 1] if len(near) else near
+    if len(before) < _LEAST_LINE or before[-1] + 1 == len(time_s):
+        raise RecordingError(
+            f"only {np.sum(time_s < about_s)} samples before the slip at {about_s:.2f} s and "
+            f"{np.sum(time_s > about_s)} after it can be used; record the forces faster or give the friction by hand"
+        )
+    last_s, next_s = time_s[before[-1] : before[-1] + 2]
+    line = np.polynomial.Polynomial.fit(time_s[before], values[before], 1)
+    noise = np.std(values[before] - line(time_s[before]), ddof=2)
+    times = rng.uniform(last_s, next_s, draws)
+    middle = float(last_s + next_s) / 2
+    return Break(
+        time_s=middle, level=float(line(middle)), levels=line(times) + rng.normal(0, noise, draws), times_s=times
+    )
 
 
 def _best(
@@ -105,6 +124,7 @@ _PULLED_SHARE = 0.5  # a slip is looked for where the ratio is this share of its
 _PRESSED_SHARE = 0.25
 _STEP_S = 0.06  # time over which the ratio before and after a fall is compared to place it
 _BEFORE_S, _AFTER_S = 0.6, 0.2  # what of the ratio is fitted, before and after its break
+_BEFORE_STEPS, _AFTER_STEPS = 12, 6  # and of slow samples at least so many
 _BAND = (0.16, 0.84)  # quantiles that hold 68 %
 _SEEN_SIGMAS = 3.0  # an image that moves by so many standard deviations more than before sees the slip
 _QUIET_S = 0.5  # time before the onset that tells how much the image moves without slip
@@ -147,7 +167,9 @@ def estimate_friction(
     # a slip that the image does not see is a knock at the force sensor, unless no fall is seen
     seen = [rough for rough in candidates if (_image_sigmas(image, rough) or 0) >= _SEEN_SIGMAS]
     rough = (seen or candidates)[0]
-    near = (forces.time_s >= rough - _BEFORE_S) & (forces.time_s <= rough + _AFTER_S)
+    step = typical_step(forces.time_s)
+    near = forces.time_s >= rough - max(_BEFORE_S, _BEFORE_STEPS * step)
+    near &= forces.time_s <= rough + max(_AFTER_S, _AFTER_STEPS * step)
     near &= forces.normal_n > contact_threshold_n
     pull = forces.tangential_n[near & (forces.time_s <= rough)].mean(axis=0)
     # along the direction of the pull: a projection is not biased by noise

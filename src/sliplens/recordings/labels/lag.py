@@ -69,14 +69,13 @@ def estimate_lag(
     peak when stretches of the trial are drawn anew.
 
     `image_motion` is that of `measure_motion`, its first value not used; `longest_s` the longest lag tried, either way.
-    Too few frames to correlate, or too little overlap, are a `RecordingError`.
+    Of too few frames to correlate no lag is told: it is 0, and its doubt says why. Too little overlap is a
+    `RecordingError`.
     """
     intervals = len(frame_time_s) - 1
     if intervals < _LEAST_INTERVALS:
-        raise RecordingError(
-            f"{len(frame_time_s)} frames are too few to estimate a lag from, {_LEAST_INTERVALS + 1} are needed; "
-            "record longer or give the lag by hand"
-        )
+        doubt = f"{len(frame_time_s)} frames are too few to tell a lag from, {_LEAST_INTERVALS + 1} are needed"
+        return Lag(lag_s=0.0, sigma_s=0.0, doubt=doubt)
     step = typical_step(frame_time_s) / _STEPS_A_FRAME
     reach = int(np.ceil(longest_s / step))
     lags = np.arange(-reach, reach + 1) * step

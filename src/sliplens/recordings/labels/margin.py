@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import partial
 from typing import TypeAlias, TypeVar
 
@@ -12,7 +11,7 @@ from jaxtyping import Bool, Float
 from sliplens.errors import RecordingError
 from sliplens.mechanics import safety_margin, stick_ratio
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labelling import FrictionEstimate, LabelBasis, Lag
+from sliplens.recordings.labelling import FrictionEstimate, LabelBasis, Lag, Reason
 from sliplens.recordings.labels.axes import (
     ContactForces,
     apply_axes,
@@ -82,19 +81,11 @@ def interpolate_forces(
 _CONTACT_SIGMAS = 8.0  # least normal force of a contact, in standard deviations of its noise
 _CONTACT_SHARE = 0.05  # and as a share of the trial's largest: of a lighter touch the margin would be all noise
 _GAP_STEPS = 4.0  # samples further apart than so many typical steps miss others between them
+LARGEST_SIGMA = 0.2
+"""Largest standard uncertainty of a margin that is valid: beyond, it tells full stick hardly from slip."""
 _STUCK_SIGMAS = 2.0  # a margin nearer to 1 than so many standard deviations cannot be told from full stick
 # frames on either side from which it is read how fast the margin changes: fewer would show the noise's changes
 _RATE_STEPS = 3.0
-
-
-class Reason(StrEnum):
-    """Why a frame has no valid label; empty where it has one."""
-
-    NONE = ""
-    MISSING_SAMPLES = "missing samples"
-    OUT_OF_RANGE = "outside the force sensor's range"
-    NO_CONTACT = "no contact"
-    AFTER_GROSS_SLIP = "after gross slip"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,7 +161,7 @@ def label_frames(
     slipped = time >= (np.inf if slip_s is None else slip_s)
     margin = safety_margin(np.where(contact, at.normal_n, 0.0), at.tangential_n, friction.mu)
     margin = np.where(at.missing | at.out_of_range, np.nan, np.where(slipped & contact, 0.0, margin))
-    valid = reliable & ~slipped
+    valid = reliable & ~slipped & (sigma <= LARGEST_SIGMA)
     holds = np.where(slipped & contact & (at.tangential_n > 0), used * friction.mu, friction.mu)
     return FoundLabels(
         force_time_s=time,
@@ -180,10 +171,10 @@ def label_frames(
         safety_margin=margin,
         safety_margin_sigma=np.where(valid, sigma, np.nan),
         stick_ratio=stick_ratio(margin),
-        contact_state=_first_of(_STATES, ~contact, slipped, used < _STUCK_SIGMAS * sigma),
+        contact_state=_first_of(_STATES, ~contact, slipped, used <= _STUCK_SIGMAS * sigma),
         valid=valid,
         # a frame without samples cannot be known to touch
-        reason=_first_of(_REASONS, at.missing, at.out_of_range, ~contact, slipped),
+        reason=_first_of(_REASONS, at.missing, at.out_of_range, ~contact, slipped, ~valid),
         basis=LabelBasis(
             axes=forces.axes,
             friction=friction,
@@ -223,7 +214,10 @@ def _remaining(time_s: Frames, contact: Bool[np.ndarray, " frames"], *, until_s:
 
 
 _STATES = (ContactState.NO_CONTACT, ContactState.FULL_SLIP, ContactState.CONTACT, ContactState.INCIPIENT_SLIP)
-_REASONS = (Reason.MISSING_SAMPLES, Reason.OUT_OF_RANGE, Reason.NO_CONTACT, Reason.AFTER_GROSS_SLIP, Reason.NONE)
+_REASONS = (
+    Reason.MISSING_SAMPLES, Reason.OUT_OF_RANGE, Reason.NO_CONTACT, Reason.AFTER_GROSS_SLIP, Reason.TOO_UNCERTAIN,
+    Reason.NONE,
+)  # fmt: skip
 _Word = TypeVar("_Word", ContactState, Reason)
 
 
@@ -249,10 +243,18 @@ def label_trial(
     Raises
     ------
     RecordingError
-        If nothing touches, the trial never slips and no friction is given, or a doubtful lag is to be applied.
+        If nothing touches, no tangential force was recorded, the trial never slips and no friction is given, or a
+        doubtful lag is to be applied.
     """
     axes = infer_axes(forces, normal=settings.normal_axis, sign=settings.normal_sign, tare_n=settings.tare)
     contact = apply_axes(forces, axes)
+    if not np.ptp(contact.tangential_n, axis=0).any():
+        # a sensor that measures it has noise, a simulated pull changes
+        raise RecordingError(
+            f"{forces.source} has no tangential force (both axes but {axes.normal} never change), and a safety margin "
+            "needs it; name the columns of all axes with --force-columns, or go without margins: sliplens track "
+            "follows the markers"
+        )
     if lag is None and settings.lag_ms is not None:
         lag = Lag(lag_s=settings.lag_ms / 1e3, sigma_s=0.0)
     elif lag is None:
