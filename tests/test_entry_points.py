@@ -9,6 +9,7 @@ from sliplens.errors import InputError
 from sliplens.explainers import EXPLAINERS
 from sliplens.extras import Table
 from sliplens.faithfulness import FILLS
+from sliplens.live.sources import SOURCES
 from sliplens.models.backbones import BACKBONES
 from sliplens.models.encodings import ENCODINGS
 from sliplens.models.engines import ENGINES
@@ -23,6 +24,7 @@ TABLES = {
     "sliplens.explainers": EXPLAINERS,
     "sliplens.fills": FILLS,
     "sliplens.formats": FORMATS,
+    "sliplens.sources": SOURCES,
     "sliplens.augmentations": AUGMENTATIONS,
     "sliplens.recipes": RECIPES,
 }

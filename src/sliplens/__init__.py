@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from sliplens.errors import SliplensError
     from sliplens.explainers.table import explain
     from sliplens.faithfulness.scoring import score
+    from sliplens.live.loop import LiveReader, read_live
     from sliplens.markers.tracking import track
     from sliplens.models.checkpoint import load
     from sliplens.models.onnx import export_onnx
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 # where each name lives: importing sliplens alone imports neither torch nor NumPy
 _MODULES = {
+    "LiveReader": "sliplens.live.loop",
     "SliplensError": "sliplens.errors",
     "check_dataset": "sliplens.recordings.check",
     "compare_datasets": "sliplens.simulation.sharing",
@@ -44,6 +46,7 @@ _MODULES = {
     "load_dataset": "sliplens.recordings.dataset",
     "plot": "sliplens.plots.figure",
     "predict": "sliplens.models.predictions",
+    "read_live": "sliplens.live.loop",
     "run_study": "sliplens.study.run",
     "score": "sliplens.faithfulness.scoring",
     "simulate": "sliplens.simulation.trials",
@@ -54,6 +57,7 @@ _MODULES = {
 }
 
 __all__ = [
+    "LiveReader",
     "SliplensError",
     "__version__",
     "check_dataset",
@@ -70,6 +74,7 @@ __all__ = [
     "load_dataset",
     "plot",
     "predict",
+    "read_live",
     "run_study",
     "score",
     "simulate",

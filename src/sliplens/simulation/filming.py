@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -75,6 +76,22 @@ class Film:
         )
         picks, blur_px = self.noise_picks[first], self.blur_px[first]
         return replace(self, motion=motion, marker_px=self.marker_rest_px[None], blur_px=blur_px, noise_picks=picks)
+
+    def under(self, loading: Loading, *, rng: np.random.Generator) -> "Film":
+        """Film of another loading of the same grasp, by the same camera on the same day, its noise drawn anew.
+
+        The model that moves the markers is the sensor's default; the grasp's offset, direction and haze stay.
+        """
+        touch = Touch(grasp=self.grasp, modulus_factor=self.day.modulus_factor, marker_depth=self.unit.marker_depth)
+        motion, frames = move_markers(self.sensor, touch, loading=loading), len(loading.time_s)
+        see = partial(_see, centre_px=np.asarray(self.sensor.geometry.centre_px), day=self.day)
+        return replace(
+            self,
+            motion=motion,
+            marker_px=see(motion.centres_px + self.unit.marker_jitter_px),
+            blur_px=np.append(self.blur_px[:1], np.full(frames, self.grasp.blur_px)),
+            noise_picks=np.concatenate([self.noise_picks[:1], pick_noise(frames, rng=rng)]),
+        )
 
     def draw_reference(self, *, device: str | torch.device = "cpu") -> UInt8[Tensor, "height width 3"]:
         """Draw the untouched sensor."""
@@ -195,14 +212,8 @@ def prepare_film(
     touch = Touch(grasp=grasp, modulus_factor=day.modulus_factor, marker_depth=unit.marker_depth)
     motion = move_markers(sensor, touch, loading=loading, displacement=displacement)
     geometry, frames = sensor.geometry, len(loading.time_s)
-    # the camera of the day sits turned about the image of the skin's middle, and shifted
-    cos, sin = np.cos(day.camera_rotation_rad), np.sin(day.camera_rotation_rad)
-    turn, middle, shift = np.array([[cos, sin], [-sin, cos]]), np.asarray(geometry.centre_px), day.camera_shift_px
-
-    def see(points_px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Pixels of this camera for pixels of one that sits as drawn."""
-        return (points_px - middle) @ turn + middle + np.asarray(shift)
-
+    middle = np.asarray(geometry.centre_px)
+    see = partial(_see, centre_px=middle, day=day)
     contact_px = see(geometry.project(geometry.skin_point(motion.contact_centre_m)))
     edge, apex = (geometry.project(geometry.skin_point(np.array([x, 0.0]))) for x in (motion.nominal_radius_m, 0.0))
     light, grain = brightness(sensor, day=day), np.random.default_rng((unit.texture_seed, 1))
@@ -218,13 +229,25 @@ def prepare_film(
         # drawn before the noise, so that a clean film differs in its noise alone
         blur_px=grasp.blur_px * rng.uniform(0.8, 1.2, frames + 1),
         noise_picks=pick_noise(frames + 1, rng=rng),
-        rays=geometry.rays((pixel_grid(sensor.image_size_px) - middle - np.asarray(shift)) @ turn.T + middle),
+        rays=geometry.rays(
+            (pixel_grid(sensor.image_size_px) - middle - np.asarray(day.camera_shift_px)) @ _turn(day).T + middle
+        ),
         texture=draw_texture(geometry.markers, rng=np.random.default_rng(unit.texture_seed)),
         light=light,
         empty=empty_view(sensor, day=day, light=light),
         haze=haze(sensor, grasp=grasp, contact_px=contact_px, radius_px=float(edge[0] - apex[0]), rng=grain),
         relief=relief(sensor, contact_px=contact_px),
     )
+
+
+def _turn(day: Day) -> Float[np.ndarray, "2 2"]:
+    cos, sin = np.cos(day.camera_rotation_rad), np.sin(day.camera_rotation_rad)
+    return np.array([[cos, sin], [-sin, cos]])
+
+
+def _see(points_px: Float[np.ndarray, "*batch 2"], *, centre_px: Point, day: Day) -> Float[np.ndarray, "*batch 2"]:
+    """Pixels of the day's camera, which sits turned about the image of the skin's middle, and shifted."""
+    return (points_px - centre_px) @ _turn(day) + centre_px + np.asarray(day.camera_shift_px)
 
 
 def brightness(sensor: Sensor, *, day: Day) -> Planes:

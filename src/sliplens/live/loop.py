@@ -1,0 +1,468 @@
+"""The loop of a running sensor: one thread captures, one reads, and what is too late is dropped and counted."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from pathlib import Path
+from threading import Condition, Event, Thread
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from sliplens.errors import InputError
+from sliplens.images import read_image
+from sliplens.live.reading import Check, Latency, LiveFrame, Reading, SlipState
+from sliplens.live.sources import Images, LiveSource, SourceOptions, open_live
+from sliplens.markers import Tracker
+from sliplens.models.checkpoint import Run, load
+from sliplens.models.engines import Engine, make_engine
+from sliplens.models.predictions import LEVEL
+from sliplens.recordings.capture import Capture, Frame
+from sliplens.recordings.labels.lag import soften
+from sliplens.recordings.trial import ContactState, contact_states
+
+Item = TypeVar("Item")
+Subscriber = Callable[[Reading, LiveFrame | None], None]
+"""Called with each reading and its frame, in the thread that reads; None where there is no frame to it."""
+
+
+class HealthWatch(Protocol):
+    """Judges frames against the reference that it was made for."""
+
+    def check(self, frame: LiveFrame, /) -> tuple[Check, ...]:
+        """Check a frame; a check that is not fine withholds its margin."""
+        ...
+
+
+class SlipWatch(Protocol):
+    """Tells slip from the motion of the markers, frame after frame."""
+
+    def update(self, positions_px: Float[np.ndarray, "markers 2"], time_s: float, /) -> SlipState:
+        """Take the markers of a frame, NaN where one is not seen."""
+        ...
+
+
+class _Newest(Generic[Item]):
+    """Place for the newest of what a thread makes; what nobody took in time is gone."""
+
+    def __init__(self) -> None:
+        self._changed, self._item, self._closed = Condition(), None, False
+
+    def put(self, item: Item) -> None:
+        with self._changed:
+            self._item = item
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    @property
+    def closed(self) -> bool:
+        return self._closed
+
+    def take(self, timeout_s: float | None = None) -> Item | None:
+        """Wait for the newest; None where none came in time, or none will come any more."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._item is not None or self._closed, timeout_s)
+            item, self._item = self._item, None
+            return item
+
+
+_MOST_FRAMES = 10**6
+_STILL_S = 0.3
+_STILL_FRAMES = 5
+_STILL_GREY = 0.75
+_DARK, _BRIGHT = 8.0, 247.0
+
+
+class _ReferenceTaker:
+    """Looks for a moment in which the picture is still and well exposed, and keeps a frame of it."""
+
+    def __init__(self) -> None:
+        self._since: LiveFrame | None = None
+        self._soft: np.ndarray | None = None
+        self._frames = 0
+
+    def offer(self, frame: LiveFrame) -> Frame | None:
+        """Take the next frame; gives the reference once the picture was still for long enough."""
+        soft = soften(frame.image)
+        moved = self._soft is None or float(np.abs(soft - self._soft).mean()) > _STILL_GREY
+        if moved or self._since is None:
+            self._since, self._soft, self._frames = frame, soft, 1
+            return None
+        self._frames += 1
+        if self._frames < _STILL_FRAMES or frame.time_s - self._since.time_s < _STILL_S:
+            return None
+        brightness = float(soft.mean())
+        if not _DARK < brightness < _BRIGHT:
+            return None
+        return frame.image
+
+
+class LowPass:
+    """Exponential filter of values that come at any times; it delays slow changes by its time constant."""
+
+    def __init__(self, *, time_constant_s: float) -> None:
+        self.time_constant_s = time_constant_s
+        self._before: tuple[Float[np.ndarray, " values"], float] | None = None
+
+    def forget(self) -> None:
+        """Begin anew with the next values."""
+        self._before = None
+
+    def update(self, values: Float[np.ndarray, " values"], time_s: float) -> Float[np.ndarray, " values"]:
+        """Filtered values at a time; the values themselves where the time constant is 0."""
+        if self.time_constant_s > 0 and self._before is not None:
+            before, then_s = self._before
+            values = before + (values - before) * -np.expm1(-max(0.0, time_s - then_s) / self.time_constant_s)
+        self._before = values, time_s
+        return values
+
+
+class LiveReader:
+    """Readings of a running sensor; a context manager that captures and reads while it is entered.
+
+    One thread captures and one reads, with a place for the newest frame only between them: a network that is slower
+    than the camera drops frames, counts them, and never lags behind.
+
+    Parameters
+    ----------
+    source
+        As `open_live` takes it: `simulated`, a path, frames, or a source.
+    network
+        Network, its folder, or the name of one that comes with sliplens; None for markers and health alone.
+    reference
+        The sensor untouched, as an image or its path; what the source brings if None, else it is taken when the picture
+        is still at first: leave the sensor untouched until then.
+    options
+        Wishes for the source.
+    engine
+        Row of `ENGINES`; `auto` for the fastest at hand that pays for `seconds`, or for hours where that is None, and
+        that may take seconds to be made.
+    device
+        Device of a network that is loaded here: cpu or cuda.
+    smoothing_s
+        Time constant of a low-pass on margin and interval, in seconds; `Reading.lag_s` tells the delay. 0 for none.
+    seconds
+        Time after which it ends; with the source if None.
+    stall_s
+        Time without a frame after which a reading says so, in seconds.
+    health
+        Called with each new reference and the network, gives what checks the frames; None for no checks.
+    slip
+        Called with each new reference, gives what tells slip from the markers; None for not following them.
+
+    Raises
+    ------
+    InputError
+        If the source or the network is not there, or an option cannot be used.
+    ImageError
+        If the frames are of another size than those of the network's sensor.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sliplens as sl
+    >>> frames = np.full((20, 224, 224, 3), 128, dtype=np.uint8)
+    >>> with sl.LiveReader(frames, "chromatouch-difference", reference=frames[0], engine="eager") as reader:
+    ...     readings = list(reader.readings())
+    >>> len(readings) + readings[-1].dropped
+    20
+    """
+
+    def __init__(
+        self,
+        source: "str | Path | Images | Capture | LiveSource" = "simulated",
+        network: Run | Path | str | None = None,
+        *,
+        reference: Path | str | Frame | None = None,
+        options: SourceOptions | None = None,
+        engine: str = "auto",
+        device: str = "cpu",
+        smoothing_s: float = 0.0,
+        seconds: float | None = None,
+        stall_s: float = 1.0,
+        health: Callable[[Frame, Run | None], HealthWatch] | None = None,
+        slip: Callable[[Frame], SlipWatch] | None = None,
+    ) -> None:
+        if not smoothing_s >= 0:
+            raise InputError(f"--smoothing must be 0 or more seconds, got {smoothing_s:g}")
+        if seconds is not None and not seconds > 0:
+            raise InputError(f"--seconds must be positive, got {seconds:g}")
+        self.source = open_live(source, options=options)
+        self.network = load(network, device=device) if isinstance(network, Path | str) else network
+        self.reference: Frame | None = None
+        """The sensor untouched, as the next frame is compared with it."""
+        self.engine: Engine | None = None
+        """What runs the network, while it is entered."""
+        self._named = read_image(Path(reference)) if isinstance(reference, Path | str) else reference
+        self._engine_name, self._seconds, self._stall_s = engine, seconds, stall_s
+        self._smooth = LowPass(time_constant_s=smoothing_s)
+        self._make_health, self._make_slip = health, slip
+        self._health: HealthWatch | None = None
+        self._slip: SlipWatch | None = None
+        self._tracker: Tracker | None = None
+        self._frames: _Newest[LiveFrame] = _Newest()
+        self._listening: list[_Newest[Reading]] = []
+        self._subscribers: list[Subscriber] = []
+        self._latest: Reading | None = None
+        self._taker: _ReferenceTaker | None = None
+        self._asked, self._stopped, self._over = Event(), Event(), Event()
+        self._error: BaseException | None = None
+        self._last: LiveFrame | None = None
+        self._dropped = 0
+        self._threads: list[Thread] = []
+        self._stack = ExitStack()
+
+    def __enter__(self) -> "LiveReader":
+        with ExitStack() as stack:
+            stack.enter_context(self.source)
+            if self.network is not None:
+                self.network.require_frame_size(self.source.size, what=f"the frames of {self.source.name}")
+                self.engine = self._make_engine(self.network)
+            untouched = self.source.reference if self._named is None else self._named
+            if untouched is None:
+                self._taker = _ReferenceTaker()
+            else:
+                self._set_reference(untouched)
+            self._stack = stack.pop_all()
+        self._threads = [Thread(target=self._run, args=(job,), daemon=True) for job in (self._capture, self._infer)]
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop capturing and reading; those who wait for readings are told that there are no more."""
+        self._stopped.set()
+        self.source.close()
+        self._frames.close()
+        for thread in self._threads:
+            thread.join()
+        self._stack.close()
+
+    def readings(self) -> Iterator[Reading]:
+        """Readings as they come; who asks late gets the newest, and `Reading.number` tells what was left out.
+
+        Raises
+        ------
+        SliplensError
+            If the source breaks off for good, or a frame cannot be read.
+        """
+        place: _Newest[Reading] = _Newest()
+        self._listening.append(place)
+        if self._over.is_set():
+            place.close()
+        try:
+            while (reading := place.take()) is not None:
+                yield reading
+        finally:
+            self._listening.remove(place)
+        if self._error is not None:
+            raise self._error
+
+    def latest(self) -> Reading | None:
+        """Newest reading; None before the first."""
+        return self._latest
+
+    def subscribe(self, callback: Subscriber) -> Callable[[], None]:
+        """Have every reading and its frame told, none left out; gives what ends it.
+
+        The callback is called in the thread that reads, which waits for it: hand on what takes long.
+        """
+        self._subscribers.append(callback)
+
+        def end() -> None:
+            with suppress(ValueError):
+                self._subscribers.remove(callback)
+
+        return end
+
+    def take_reference(self) -> None:
+        """Take a new reference as soon as the picture is still; the old one holds until then."""
+        self._asked.set()
+
+    def _make_engine(self, network: Run) -> Engine:
+        """The engine that was named, or the fastest that pays for the frames to come."""
+        rate_hz, seconds = self.source.rate_hz or 30.0, self._seconds or np.inf
+        frames = min(self.source.count or np.inf, rate_hz * seconds, _MOST_FRAMES)
+        # before any thread runs: torch's tracing changes what every thread calls
+        return make_engine(self._engine_name, network, frames=round(frames), batch_size=1, streams=1)
+
+    def _run(self, job: Callable[[], None]) -> None:
+        try:
+            job()
+        except BaseException as error:
+            self._error = self._error or error
+            self._stopped.set()
+            self.source.close()
+            self._frames.close()
+
+    def _capture(self) -> None:
+        ends_s = None if self._seconds is None else time.monotonic() + self._seconds
+        for frame in self.source.frames():
+            if self._stopped.is_set() or (ends_s is not None and time.monotonic() >= ends_s):
+                break
+            self._frames.put(frame)
+        self._frames.close()
+
+    def _infer(self) -> None:
+        try:
+            while True:
+                frame = self._frames.take(self._stall_s)
+                if frame is not None:
+                    self._tell(self._read(frame), frame)
+                elif self._frames.closed:
+                    break
+                else:
+                    self._tell(self._missing(), None)
+        finally:
+            self._over.set()
+            for place in tuple(self._listening):
+                place.close()
+
+    def _tell(self, reading: Reading, frame: LiveFrame | None) -> None:
+        self._latest = reading
+        for place in tuple(self._listening):
+            place.put(reading)
+        for callback in tuple(self._subscribers):
+            callback(reading, frame)
+
+    def _missing(self) -> Reading:
+        """Reading where no frame came."""
+        last = self._last
+        return Reading(
+            number=-1 if last is None else last.number,
+            time_s=np.nan if last is None else last.time_s,
+            captured_s=np.nan if last is None else last.captured_s,
+            withheld=f"{self.source.name} has given no frame for {self._stall_s:g} s; check its cable or connection",
+            dropped=self._dropped,
+        )
+
+    def _set_reference(self, image: Frame) -> None:
+        self.reference = image
+        self._smooth.forget()
+        self._health = None if self._make_health is None else self._make_health(image, self.network)
+        if self._make_slip is not None:
+            self._tracker, self._slip = Tracker(image), self._make_slip(image)
+
+    def _look_for_reference(self, frame: LiveFrame) -> None:
+        if self._asked.is_set():
+            self._asked.clear()
+            self._taker = _ReferenceTaker()
+        if self._taker is not None and (image := self._taker.offer(frame)) is not None:
+            self._taker = None
+            self._set_reference(image)
+
+    def _read(self, frame: LiveFrame) -> Reading:
+        last, self._last = self._last, frame
+        self._dropped += 0 if last is None else max(0, frame.number - last.number - 1)
+        self._look_for_reference(frame)
+        begin = Reading(
+            number=frame.number,
+            time_s=frame.time_s,
+            captured_s=frame.captured_s,
+            dropped=self._dropped,
+            true_margin=frame.safety_margin,
+        )
+        if self.reference is None:
+            latency = Latency(decode_ms=frame.decode_ms, total_ms=_since_ms(frame.captured_s))
+            still = "the picture must be still for a moment: leave the sensor untouched"
+            return replace(begin, withheld=f"there is no reference frame yet; {still}", latency=latency)
+        slip = None
+        if self._tracker is not None and self._slip is not None:
+            places = self._tracker.update(frame.image).position_px[: len(self._tracker.rest)]
+            slip = self._slip.update(places, frame.time_s)
+        health = () if self._health is None else self._health.check(frame)
+        withheld = next((check.sentence for check in health if not check.ok), None)
+        reading = replace(begin, slip=slip, health=health, withheld=withheld)
+        if self.network is None or withheld is not None:
+            self._smooth.forget()
+            latency = Latency(decode_ms=frame.decode_ms, total_ms=_since_ms(frame.captured_s))
+            return replace(reading, latency=latency)
+        return self._estimate(reading, frame)
+
+    def _estimate(self, reading: Reading, frame: LiveFrame) -> Reading:
+        assert self.network is not None
+        assert self.engine is not None
+        assert self.reference is not None
+        begun = time.perf_counter()
+        inputs = self.network.encode(frame.image[None], self.reference)
+        encoded = time.perf_counter()
+        estimate = self.engine.estimate(self.network, inputs)
+        done = time.perf_counter()
+        interval = estimate.interval(LEVEL)
+        values = [estimate.margin] if interval is None else [estimate.margin, *interval]
+        margin, *ends = np.clip(np.concatenate(values), 0, 1)
+        margin, *ends = self._smooth.update(np.array([margin, *ends]), frame.time_s).tolist()
+        [state] = contact_states(np.array([margin]), without=ContactState.UNKNOWN)
+        latency = Latency(
+            decode_ms=frame.decode_ms,
+            encode_ms=1e3 * (encoded - begun),
+            network_ms=1e3 * (done - encoded),
+            total_ms=_since_ms(frame.captured_s),
+        )
+        low, high = ends or (None, None)
+        return replace(
+            reading,
+            margin=margin,
+            low=low,
+            high=high,
+            contact_state=state,
+            lag_s=self._smooth.time_constant_s,
+            latency=latency,
+        )
+
+
+def _since_ms(captured_s: float) -> float:
+    return 1e3 * (time.monotonic() - captured_s)
+
+
+def read_live(
+    source: str | Path | Images | Capture | LiveSource = "simulated",
+    network: Run | Path | str | None = None,
+    *,
+    reference: Path | str | Frame | None = None,
+    options: SourceOptions | None = None,
+    engine: str = "auto",
+    device: str = "cpu",
+    smoothing_s: float = 0.0,
+    seconds: float | None = None,
+) -> Iterator[Reading]:
+    """Readings of a running sensor, one after another; who is slow gets the newest.
+
+    Parameters are those of `LiveReader`, which also takes a new reference while it runs, and tells every reading to
+    whoever subscribes.
+
+    Raises
+    ------
+    SliplensError
+        If the source or the network is not there, does not fit, or breaks off.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> reading = next(sl.read_live("simulated"))
+    >>> reading.margin is None, reading.true_margin is None  # no network, no touch yet
+    (True, True)
+    """
+    with LiveReader(
+        source,
+        network,
+        reference=reference,
+        options=options,
+        engine=engine,
+        device=device,
+        smoothing_s=smoothing_s,
+        seconds=seconds,
+    ) as reader:
+        yield from reader.readings()
+
+
+__all__ = ["HealthWatch", "LiveReader", "SlipWatch", "Subscriber", "read_live"]

@@ -1,0 +1,104 @@
+"""What a running sensor gives: frames, and for each a reading with its health."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from sliplens.recordings.capture import Forces, Frame
+from sliplens.recordings.trial import ContactState
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveFrame:
+    """One frame of a running source."""
+
+    image: Frame
+    number: int
+    """Count of the source itself, so that a gap tells of frames that were lost before they came here."""
+    time_s: float
+    """On the clock of the source."""
+    captured_s: float
+    """When it was captured, as `time.monotonic` counts."""
+    decode_ms: float = 0.0
+    """Time that decoding took, in milliseconds."""
+    forces: Forces | None = None
+    """Samples of a force sensor since the frame before, on the clock of the source; None where there is none."""
+    safety_margin: float | None = None
+    """True margin, where the source knows it: a simulated fingertip, or a labelled trial."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width, in pixels."""
+        return self.image.shape[0], self.image.shape[1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Latency:
+    """Where the time between a frame and its reading went, in milliseconds."""
+
+    decode_ms: float = 0.0
+    """From the bytes of the camera to pixels; a replayed frame is decoded before it is due."""
+    encode_ms: float = 0.0
+    """From pixels to the network's input."""
+    network_ms: float = 0.0
+    total_ms: float = 0.0
+    """From the capture to the reading, waiting included."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """One number of a frame's health, in pixels, grey levels, seconds or as a share, against its limit."""
+
+    name: str
+    value: float
+    """What was measured, in its unit: pixels, grey levels, seconds, or a share."""
+    limit: float
+    """Bound of the healthy values, in the same unit."""
+    ok: bool
+    sentence: str
+    """What is wrong, with the cure; what was measured where nothing is wrong."""
+
+
+class SlipState(StrEnum):
+    """What the motion of the markers tells."""
+
+    SLIP = "slip"
+    STICKING = "sticking"
+    CANNOT_TELL = "cannot tell"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """What a running sensor tells at one frame; margins are from 0 to 1, 1 sticks fully, 0 slips.
+
+    `margin`, `low` and `high` are None without a network, and where `withheld` says why they are not to be believed.
+    """
+
+    number: int
+    """Frame, as its source counts; -1 where none has come yet."""
+    time_s: float
+    """Time of the frame on the clock of its source."""
+    captured_s: float
+    """When the frame was captured, as `time.monotonic` counts."""
+    margin: float | None = None
+    low: float | None = None
+    """Lower end of the interval that holds the true margin with 90 % confidence, in margin units; None of a network
+    that was never calibrated."""
+    high: float | None = None
+    """Upper end of it, in margin units."""
+    lag_s: float = 0.0
+    """Delay of margin and interval by smoothing; 0 without."""
+    contact_state: ContactState = ContactState.UNKNOWN
+    slip: SlipState | None = None
+    """What the markers tell; None where they are not followed."""
+    health: tuple[Check, ...] = ()
+    """Checks of the frame; empty where health is not watched."""
+    withheld: str | None = None
+    """Why there is no margin, with the cure; None where there is one."""
+    latency: Latency = Latency()
+    dropped: int = 0
+    """Frames since the start that were captured, or counted by the source, and never read."""
+    true_margin: float | None = None
+    """Where the source knows it, to compare with."""
+
+
+__all__ = ["Check", "Latency", "LiveFrame", "Reading", "SlipState"]

@@ -1,0 +1,366 @@
+"""Sources of running frames: replayed trials, videos and bags, and a simulated fingertip to press and pull."""
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Event, Lock
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import UInt8
+
+from sliplens.errors import InputError
+from sliplens.extras import Table
+from sliplens.live.reading import LiveFrame
+from sliplens.recordings.capture import Capture, Forces, Frame
+from sliplens.recordings.options import ReadOptions
+from sliplens.recordings.source import open_source
+from sliplens.simulation.filming import Film, prepare_film
+from sliplens.simulation.loading import load_at_margins
+from sliplens.simulation.nuisances import Day, Grasp, Nuisances, draw_unit
+from sliplens.simulation.sensor import SENSORS
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceOptions:
+    """Wishes of a user for a source; each takes those that it understands and refuses the others."""
+
+    rate_hz: float | None = None
+    """Frames a second; the source's own if None."""
+    speed: float | None = None
+    """Ratio of the recorded time to that of the replay: 2 is twice as fast; 1 if None."""
+    trial: str | None = None
+    """Trial of a data set or bag; the first if None."""
+
+    def require_only(self, *names: str, what: str) -> None:
+        """Refuse wishes that a source does not understand."""
+        for name, value in vars(self).items():
+            if value is not None and name not in names:
+                raise InputError(f"{what} takes no --{name.removesuffix('_hz')}; leave it out")
+            if isinstance(value, float) and not value > 0:
+                raise InputError(f"--{name.removesuffix('_hz')} must be positive, got {value:g}")
+
+
+class LiveSource(ABC):
+    """Running source of frames; a context manager that holds a device, file or connection while it is open."""
+
+    name: str
+    """What it is, for people."""
+    size: tuple[int, int]
+    """Height and width of its frames, in pixels; known when it is open."""
+    rate_hz: float | None = None
+    """Frames a second that it gives, as far as it knows."""
+    reference: Frame | None = None
+    """The sensor untouched, where the source brings its image."""
+    count: int | None = None
+    """Frames that it will give; None where nobody knows."""
+
+    def __enter__(self) -> "LiveSource":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @abstractmethod
+    def frames(self) -> Iterator[LiveFrame]:
+        """Frames as they come; it ends when the source does, or soon after `close`."""
+
+    def close(self) -> None:  # noqa: B027 (most have nothing to give back)
+        """Stop giving frames and give back what is held; may be called from another thread, and again."""
+
+
+class _Pace:
+    """Waits until frames are due, and no longer than until the source is closed."""
+
+    def __init__(self, closed: Event) -> None:
+        self._closed, self._start_s = closed, time.monotonic()
+
+    def wait(self, due_s: float) -> bool:
+        """Wait until so many seconds after the start; False if the source was closed.
+
+        What comes late moves the start: a source that is slow falls behind once, and does not hurry afterwards.
+        """
+        left_s = self._start_s + due_s - time.monotonic()
+        if left_s > 0:
+            return not self._closed.wait(left_s)
+        self._start_s -= left_s
+        return not self._closed.is_set()
+
+
+class ReplaySource(LiveSource):
+    """Trial of a data set, video or bag replayed at its own pace, over and over if asked to.
+
+    Parameters
+    ----------
+    capture
+        What `open_source` gave.
+    speed
+        Ratio of the recorded time to that of the replay: 2 is twice as fast.
+    rate_hz
+        Frames a second in place of the recorded times.
+    repeat
+        Begin anew at the end; times and numbers go on.
+    """
+
+    def __init__(
+        self, capture: Capture, *, speed: float = 1.0, rate_hz: float | None = None, repeat: bool = False
+    ) -> None:
+        self._capture, self._repeat, self._closed = capture, repeat, Event()
+        self.name = f"{capture.name} of {capture.opened}"
+        self.size = capture.frame_size
+        self.count = None if repeat else len(capture)
+        known = capture.time_s if rate_hz is None else None
+        step_s = 1 / (rate_hz or capture.frame_rate_hz)
+        self._time_s = np.arange(len(capture)) * step_s if known is None else known - known[0]
+        self._length_s = float(self._time_s[-1]) + step_s
+        self._speed = speed
+        self.rate_hz = speed / step_s
+        read_reference = capture.read_reference
+        self.reference = None if read_reference is None else read_reference()
+
+    def frames(self) -> Iterator[LiveFrame]:
+        """Frames at their times, of the first pass and of those after it."""
+        pace, number, begun_s = _Pace(self._closed), 0, 0.0
+        capture = self._capture
+        first_s = 0.0 if capture.time_s is None else float(capture.time_s[0])
+        while True:
+            images = capture.read_frames()
+            forces_s = -np.inf
+            for at, offset_s in enumerate(self._time_s.tolist()):
+                before = time.perf_counter()
+                image = next(images)
+                decode_ms = 1e3 * (time.perf_counter() - before)
+                time_s = begun_s + offset_s
+                if not pace.wait(time_s / self._speed):
+                    return
+                margins = capture.safety_margin
+                label = None if margins is None or np.isnan(margins[at]) else float(margins[at])
+                yield LiveFrame(
+                    image=image,
+                    number=number,
+                    time_s=time_s,
+                    captured_s=time.monotonic(),
+                    decode_ms=decode_ms,
+                    forces=self._forces_until(forces_s, offset_s + first_s, shift_s=begun_s - first_s),
+                    safety_margin=label,
+                )
+                number, forces_s = number + 1, offset_s + first_s
+            if not self._repeat:
+                return
+            begun_s += self._length_s
+
+    def _forces_until(self, after_s: float, until_s: float, *, shift_s: float) -> Forces | None:
+        forces = self._capture.forces
+        if forces is None:
+            return None
+        first, last = np.searchsorted(forces.time_s, (after_s, until_s), side="right")
+        if first == last:
+            return None
+        return Forces(
+            time_s=forces.time_s[first:last] + shift_s, force_n=forces.force_n[first:last], source=forces.source
+        )
+
+    def close(self) -> None:
+        """Stop at the next frame."""
+        self._closed.set()
+
+
+_GRIP_S = 10.0
+"""Length of the grip that the simulated fingertip repeats until somebody takes it in hand."""
+_GRIP_TIMES_S = (0.0, 1.0, 2.0, 2.5, 7.5, 8.5, 9.0, _GRIP_S)
+_GRIP_PRESS = (0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0)
+_GRIP_PULL = (0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0)
+
+
+class SimulatedSource(LiveSource):
+    """Fingertip of the simulator that can be pressed and pulled while it runs.
+
+    Until `load` is called it repeats a grip by itself: touch, press, pull until it slips, let go.
+
+    Parameters
+    ----------
+    sensor
+        Row of `SENSORS`.
+    friction
+        Coefficient of friction of the object.
+    rate_hz
+        Frames a second.
+    seed
+        Of the unit's print and the camera's noise.
+
+    Examples
+    --------
+    >>> from sliplens.live import SimulatedSource
+    >>> with SimulatedSource(rate_hz=200.0) as source:
+    ...     source.load(normal_force_n=1.5, tangential_force_n=0.6)
+    ...     frame = next(source.frames())
+    >>> frame.size, round(frame.safety_margin, 2)
+    ((224, 224), 0.48)
+    """
+
+    def __init__(
+        self, sensor: str = "chromatouch", *, friction: float = 0.775, rate_hz: float = 30.0, seed: int = 0
+    ) -> None:
+        if sensor not in SENSORS:
+            raise InputError(f"there is no simulated sensor named {sensor!r}; choose one of {', '.join(SENSORS)}")
+        self.name, self.rate_hz = f"a simulated {sensor}", rate_hz
+        self._rng = np.random.default_rng(seed)
+        self._grasp, self._closed, self._lock = Grasp(friction=friction), Event(), Lock()
+        self._held: tuple[float, float] | None = None
+        chosen = SENSORS[sensor]
+        self.size = chosen.image_size_px, chosen.image_size_px
+        self._film: Film = prepare_film(
+            chosen,
+            loading=load_at_margins(np.array([np.nan]), grasp=self._grasp),
+            grasp=self._grasp,
+            day=Day(friction=friction),
+            unit=draw_unit(Nuisances(), markers=chosen.geometry.markers, rng=self._rng),
+            rng=self._rng,
+            noise=chosen.noise,
+        )
+        self.reference = self._film.draw_reference().numpy()
+
+    def load(self, *, normal_force_n: float, tangential_force_n: float) -> None:
+        """Press and pull by so many newtons from the next frame on.
+
+        More pull than friction holds makes the contact slip, and what friction holds remains.
+        """
+        if not (0 <= normal_force_n < np.inf and 0 <= tangential_force_n < np.inf):
+            raise InputError(
+                f"a fingertip cannot be pressed by {normal_force_n:g} N and pulled by {tangential_force_n:g} N; "
+                "give forces of 0 or more"
+            )
+        with self._lock:
+            self._held = normal_force_n, tangential_force_n
+
+    def let_go(self) -> None:
+        """Repeat the grip again."""
+        with self._lock:
+            self._held = None
+
+    def frames(self) -> Iterator[LiveFrame]:
+        """Frames of the load that holds when each is due."""
+        pace, number = _Pace(self._closed), 0
+        rate_hz = self.rate_hz or 30.0
+        while pace.wait(number / rate_hz):
+            captured_s, time_s = time.monotonic(), number / rate_hz
+            normal_n, pull_n = self._forces_at(time_s)
+            friction, known = self._grasp.friction, normal_n > 0
+            held_n = min(pull_n, friction * normal_n)
+            margin = 1 - held_n / (friction * normal_n) if known else np.nan
+            grasp = replace(self._grasp, normal_force_n=normal_n)
+            film = self._film.under(load_at_margins(np.array([margin]), grasp=grasp), rng=self._rng)
+            yield LiveFrame(
+                image=film.draw(slice(0, 1)).numpy()[0],
+                number=number,
+                time_s=time_s,
+                captured_s=captured_s,
+                decode_ms=1e3 * (time.monotonic() - captured_s),
+                forces=Forces(
+                    time_s=np.array([time_s]),
+                    force_n=np.array([[held_n, 0.0, normal_n]]),
+                    source="the simulated fingertip",
+                ),
+                safety_margin=float(margin) if known else None,
+            )
+            number += 1
+
+    def _forces_at(self, time_s: float) -> tuple[float, float]:
+        with self._lock:
+            held = self._held
+        if held is not None:
+            return held
+        normal_n = 1.5 * float(np.interp(time_s % _GRIP_S, _GRIP_TIMES_S, _GRIP_PRESS))
+        return normal_n, float(np.interp(time_s % _GRIP_S, _GRIP_TIMES_S, _GRIP_PULL)) * self._grasp.friction * 1.5
+
+    def close(self) -> None:
+        """Stop at the next frame."""
+        self._closed.set()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceKind:
+    """How a running source is recognised and opened."""
+
+    words: str
+    """What it is, for people."""
+    recognises: Callable[[str], bool]
+    """Told by the name that the user gave, without opening anything."""
+    open: Callable[[str, SourceOptions], LiveSource]
+    """Nothing runs before the source is entered."""
+
+
+def _open_simulated(name: str, options: SourceOptions) -> LiveSource:
+    options.require_only("rate_hz", what="the simulated fingertip")
+    _, _, sensor = name.partition(":")
+    return SimulatedSource(sensor or "chromatouch", rate_hz=options.rate_hz or 30.0)
+
+
+def _open_replay(name: str, options: SourceOptions) -> LiveSource:
+    options.require_only("rate_hz", "speed", "trial", what=f"replaying {name}")
+    capture, *_ = open_source(Path(name), trial=options.trial, options=ReadOptions(), whole=True)
+    return ReplaySource(capture, speed=options.speed or 1.0, rate_hz=options.rate_hz)
+
+
+_ROWS = {
+    "simulated": SourceKind(
+        words="simulated fingertip (simulated, or simulated:flat-gel)",
+        recognises=lambda name: name.partition(":")[0] == "simulated",
+        open=_open_simulated,
+    ),
+    "replay": SourceKind(
+        words="video, bag or trial of a data set, replayed",
+        recognises=lambda name: Path(name).exists(),
+        open=_open_replay,
+    ),
+}
+SOURCES = Table("source", "sliplens.sources", _ROWS)
+"""Running sources by kind; an installed package adds its own by the entry point `sliplens.sources`."""
+
+Images: TypeAlias = UInt8[np.ndarray, "frames height width 3"]
+
+
+def open_live(
+    source: str | Path | Images | Capture | LiveSource = "simulated", *, options: SourceOptions | None = None
+) -> LiveSource:
+    """Find the source of a name; a device is opened when the source is entered.
+
+    Parameters
+    ----------
+    source
+        `simulated`, or the path of a video, a bag or a data set; or uint8 RGB frames, what `open_source` gave, or a
+        source.
+    options
+        Wishes for it.
+
+    Raises
+    ------
+    InputError
+        If the name is that of no source, or the source does not take an option.
+
+    Examples
+    --------
+    >>> from sliplens.live import open_live
+    >>> open_live("simulated").name
+    'a simulated chromatouch'
+    """
+    options = options or SourceOptions()
+    if isinstance(source, LiveSource):
+        options.require_only(what=source.name)
+        return source
+    if isinstance(source, Capture | np.ndarray):
+        options.require_only("rate_hz", "speed", what="a replay")
+        capture = source if isinstance(source, Capture) else open_source(source)[0]
+        return ReplaySource(capture, speed=options.speed or 1.0, rate_hz=options.rate_hz)
+    name = str(source)
+    added = [row for row in SOURCES if row not in _ROWS]
+    for row in (*added, *_ROWS):
+        if SOURCES[row].recognises(name):
+            return SOURCES[row].open(name, options)
+    known = "; ".join(SOURCES[row].words for row in SOURCES)
+    raise InputError(f"{name} is no source that is known, nor a path that exists; name a {known}")
+
+
+__all__ = ["SOURCES", "LiveSource", "ReplaySource", "SimulatedSource", "SourceKind", "SourceOptions", "open_live"]

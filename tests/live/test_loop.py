@@ -1,0 +1,216 @@
+"""The loop: what is read is what `predict` reads, what is not is counted, and nobody waits."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from threading import Semaphore
+
+import numpy as np
+import pytest
+
+import sliplens as sl
+from sliplens.errors import ImageError, InputError
+from sliplens.live.loop import LowPass
+from sliplens.live.reading import Check, LiveFrame, Reading, SlipState
+from sliplens.live.sources import LiveSource
+from sliplens.models import Run
+from sliplens.recordings import Dataset, Recording
+
+
+class Burst(LiveSource):
+    """Frames given as fast as they are taken, numbered as told."""
+
+    name, rate_hz = "a burst", 1000.0
+
+    def __init__(self, images: np.ndarray, numbers: list[int], *, wait_s: float = 0.0) -> None:
+        self.images, self.numbers, self.wait_s, self.size = images, numbers, wait_s, images.shape[1:3]
+
+    def frames(self) -> Iterator[LiveFrame]:
+        for number, image in zip(self.numbers, self.images, strict=True):
+            time.sleep(self.wait_s)
+            yield LiveFrame(image=image, number=number, time_s=0.05 * number, captured_s=time.monotonic())
+
+
+class Patient(Burst):
+    """A burst in which each frame waits until the one before it was read."""
+
+    def __init__(self, images: np.ndarray, numbers: list[int]) -> None:
+        super().__init__(images, numbers)
+        self.read = Semaphore(1)
+
+    def frames(self) -> Iterator[LiveFrame]:
+        for frame in super().frames():
+            assert self.read.acquire(timeout=10)
+            yield replace(frame, captured_s=time.monotonic())
+
+    def all_readings(self, reader: sl.LiveReader) -> list[Reading]:
+        heard: list[Reading] = []
+
+        def next_one(reading: Reading, _: LiveFrame | None) -> None:
+            heard.append(reading)
+            self.read.release()
+
+        reader.subscribe(next_one)
+        with reader:
+            list(reader.readings())
+        return heard
+
+
+@pytest.fixture
+def recording(small_dataset: Dataset) -> Recording:
+    return small_dataset.load(small_dataset.trials[0])
+
+
+def test_a_reading_is_what_predict_says_of_the_frame(recording: Recording, difference_run: Path):
+    table = sl.predict(difference_run, recording.frames, reference=recording.reference).frame()
+    told = table.column("prediction").to_numpy()
+    source = Patient(recording.frames, list(range(12)))
+    readings = source.all_readings(
+        sl.LiveReader(source, difference_run, reference=recording.reference, engine="eager", stall_s=10.0)
+    )
+    assert len(readings) == 12
+    for reading in readings:
+        assert reading.withheld is None
+        # one frame at a time or many: float32 sums in another order
+        assert reading.margin == pytest.approx(np.clip(told[reading.number], 0, 1), abs=1e-4)
+
+
+@pytest.mark.parametrize("wait_s", [0.0, 0.01])
+def test_every_frame_is_read_or_counted_as_dropped(recording: Recording, wait_s: float):
+    heard: list[Reading] = []
+
+    def slowly(reading: Reading, _: LiveFrame | None) -> None:
+        time.sleep(0.004)
+        heard.append(reading)
+
+    source = Burst(recording.frames, list(range(len(recording.frames))), wait_s=wait_s)
+    with sl.LiveReader(source, reference=recording.reference) as reader:
+        reader.subscribe(slowly)
+        for _ in reader.readings():
+            pass
+    numbers = [reading.number for reading in heard]
+    assert numbers == sorted(set(numbers))
+    assert numbers[-1] == len(recording.frames) - 1  # the newest is never the one that is dropped
+    # those before the first that is read were put in its place: they count from the second reading on
+    assert len(heard) + heard[-1].dropped + numbers[0] == len(recording.frames)
+
+
+def test_frames_that_the_camera_lost_count_as_dropped(recording: Recording):
+    source = Patient(recording.frames[:3], [0, 4, 5])
+    readings = source.all_readings(sl.LiveReader(source, reference=recording.reference))
+    assert [reading.dropped for reading in readings] == [0, 3, 3]
+
+
+def test_a_slow_reader_gets_the_newest(recording: Recording):
+    source = Burst(recording.frames, list(range(12)), wait_s=0.01)
+    with sl.LiveReader(source, reference=recording.reference) as reader:
+        readings = reader.readings()
+        next(readings)
+        assert reader._over.wait(timeout=10)
+        assert [reading.number for reading in readings] == [11]
+
+
+def test_a_late_listener_is_not_left_waiting(recording: Recording):
+    with sl.LiveReader(Burst(recording.frames[:2], [0, 1]), reference=recording.reference) as reader:
+        list(reader.readings())
+        assert list(reader.readings()) == []
+
+
+def test_without_a_reference_the_first_still_picture_is_taken(recording: Recording, rng: np.random.Generator):
+    moving = rng.integers(0, 255, (6, 48, 48, 3), dtype=np.uint8)
+    still = np.repeat(recording.reference[None] + np.uint8(40), 10, axis=0)
+    source = Burst(np.concatenate([moving, still]), list(range(16)), wait_s=0.005)
+    with sl.LiveReader(source) as reader:
+        readings = list(reader.readings())
+    assert "no reference frame yet" in str(readings[0].withheld)
+    assert readings[-1].withheld is None
+    np.testing.assert_array_equal(reader.reference, still[0])
+
+
+def test_a_black_picture_is_no_reference(recording: Recording):
+    with sl.LiveReader(Burst(np.zeros_like(recording.frames), list(range(12)), wait_s=0.005)) as reader:
+        list(reader.readings())
+    assert reader.reference is None
+
+
+def test_a_new_reference_is_taken_on_request(recording: Recording):
+    light = recording.reference + np.uint8(60)
+    source = Burst(np.repeat(light[None], 30, axis=0), list(range(30)), wait_s=0.005)
+    with sl.LiveReader(source, reference=recording.reference) as reader:
+        readings = reader.readings()
+        next(readings)
+        np.testing.assert_array_equal(reader.reference, recording.reference)
+        reader.take_reference()
+        list(readings)
+    np.testing.assert_array_equal(reader.reference, light)
+
+
+class Strict:
+    """Health that lets frames pass whose number is even."""
+
+    def __init__(self, reference: np.ndarray, network: Run | None) -> None:
+        assert reference.shape == (48, 48, 3)
+        assert network is not None
+
+    def check(self, frame: LiveFrame) -> tuple[Check, ...]:
+        odd = frame.number % 2
+        return (Check(name="even", value=float(odd), limit=0.0, ok=not odd, sentence="odd; wait for the next"),)
+
+
+def test_a_margin_is_withheld_where_a_check_fails(recording: Recording, difference_run: Path):
+    source = Patient(recording.frames, list(range(12)))
+    readings = source.all_readings(
+        sl.LiveReader(
+            source, difference_run, reference=recording.reference, engine="eager", health=Strict, stall_s=10.0
+        )
+    )
+    assert {(reading.number % 2 == 1, reading.margin is None, bool(reading.withheld)) for reading in readings} == {
+        (False, False, False),
+        (True, True, True),
+    }
+
+
+def test_markers_are_followed_for_whoever_tells_slip(trials: dict[str, Recording]):
+    trial, seen = trials["chromatouch"], []
+
+    class Watch:
+        def __init__(self, reference: np.ndarray) -> None:
+            np.testing.assert_array_equal(reference, trial.reference)
+
+        def update(self, positions_px: np.ndarray, time_s: float) -> SlipState:
+            seen.append(positions_px)
+            assert time_s >= 0
+            return SlipState.STICKING
+
+    source = Patient(trial.frames[:3], [0, 1, 2])
+    readings = source.all_readings(sl.LiveReader(source, reference=trial.reference, slip=Watch, stall_s=10.0))
+    assert [reading.slip for reading in readings] == [SlipState.STICKING] * 3
+    assert trial.truth is not None
+    # markers of the untouched sensor, seen within a pixel
+    nearest = np.linalg.norm(trial.truth.marker_px[0][:, None] - seen[0][None], axis=-1).min(axis=0)
+    assert np.nanmax(nearest) < 1
+
+
+def test_a_network_of_another_sensor_is_refused_before_anything_runs(difference_run: Path):
+    with pytest.raises(ImageError, match=r"224 x 224 pixels but the network was trained on 48 x 48"):
+        sl.LiveReader("simulated", difference_run).__enter__()
+
+
+def test_options_that_cannot_be_are_told():
+    with pytest.raises(InputError, match="--smoothing must be 0 or more seconds, got -1"):
+        sl.LiveReader("simulated", smoothing_s=-1.0)
+    with pytest.raises(InputError, match="--seconds must be positive, got 0"):
+        sl.LiveReader("simulated", seconds=0.0)
+
+
+def test_a_low_pass_delays_a_ramp_by_its_time_constant(rng: np.random.Generator):
+    smooth, time_s = LowPass(time_constant_s=0.2), np.cumsum(rng.uniform(0.0005, 0.0015, 4000))
+    values = [smooth.update(np.array([3.0 * now]), now)[0] for now in time_s.tolist()]
+    # a sampled filter lags up to a sample less than a continuous one
+    assert values[-1] == pytest.approx(3.0 * (time_s[-1] - 0.2), abs=3.0 * 0.0015)
+
+
+def test_a_low_pass_of_no_time_constant_changes_nothing():
+    smooth = LowPass(time_constant_s=0.0)
+    assert [smooth.update(np.array([value]), 0.1)[0] for value in (0.3, 0.9)] == [0.3, 0.9]

@@ -1,0 +1,129 @@
+"""Running sources: each frame at its time, and the simulated fingertip under the load that it is given."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sliplens.errors import InputError
+from sliplens.live import ReplaySource, SimulatedSource, SourceOptions, open_live
+from sliplens.mechanics import safety_margin
+from sliplens.recordings import Dataset, Recording
+from sliplens.recordings.source import open_source
+from sliplens.simulation.filming import prepare_film
+from sliplens.simulation.loading import load_at_margins
+from sliplens.simulation.nuisances import Day, Grasp, Nuisances, draw_unit
+from sliplens.simulation.sensor import CHROMATOUCH
+
+
+def test_a_trial_is_replayed_whole_with_its_labels_and_forces(small_dataset: Dataset):
+    info = small_dataset.trials[0]
+    recording = small_dataset.load(info)
+    source = open_live(small_dataset.folder, options=SourceOptions(trial=info.trial, speed=20.0))
+    frames = list(source.frames())
+    assert source.count == len(frames) == len(recording.frames)
+    np.testing.assert_array_equal([frame.image for frame in frames], recording.frames)
+    np.testing.assert_array_equal(source.reference, recording.reference)
+    np.testing.assert_allclose([frame.time_s for frame in frames], recording.time_s - recording.time_s[0])
+    told = [np.nan if frame.safety_margin is None else frame.safety_margin for frame in frames]
+    np.testing.assert_array_equal(told, recording.safety_margin)
+    samples = np.concatenate([frame.forces.force_n[:, 2] for frame in frames if frame.forces is not None])
+    np.testing.assert_array_equal(samples, recording.normal_force_n)
+
+
+@pytest.mark.parametrize("speed", [1.0, 4.0])
+def test_no_frame_comes_before_its_time(small_dataset: Dataset, speed: float):
+    source = open_live(small_dataset.folder, options=SourceOptions(speed=speed))
+    frames = list(source.frames())
+    spans = [(frame.captured_s - frames[0].captured_s) * speed for frame in frames]
+    # clocks of the system tick in steps
+    assert all(span >= frame.time_s - 1e-3 for span, frame in zip(spans, frames, strict=True))
+
+
+def test_a_repeated_trial_goes_on_counting(recording: Recording):
+    capture = open_source(recording.frames)[0]
+    with ReplaySource(capture, rate_hz=1000.0, repeat=True) as source:
+        frames = [frame for frame, _ in zip(source.frames(), range(30), strict=False)]
+    assert [frame.number for frame in frames] == list(range(30))
+    assert np.all(np.diff([frame.time_s for frame in frames]) > 0)
+    np.testing.assert_array_equal(frames[13].image, recording.frames[1])
+
+
+def test_a_closed_source_ends_soon(recording: Recording):
+    source = open_live(recording.frames, options=SourceOptions(rate_hz=0.1))
+    frames = source.frames()
+    next(frames)
+    source.close()
+    begun = time.monotonic()
+    assert list(frames) == []
+    assert time.monotonic() - begun < 5  # the next frame is due after 10 s
+
+
+@pytest.mark.parametrize(("normal_n", "pull_n"), [(1.5, 0.0), (1.0, 0.3), (2.0, 1.2), (1.0, 5.0)])
+def test_a_simulated_fingertip_has_the_margin_of_its_load(normal_n: float, pull_n: float):
+    source = SimulatedSource(friction=0.6)
+    source.load(normal_force_n=normal_n, tangential_force_n=pull_n)
+    frame = next(source.frames())
+    assert frame.safety_margin == pytest.approx(float(safety_margin(normal_n, pull_n, 0.6)))
+    assert frame.forces is not None
+    held_n, _, pressed_n = frame.forces.force_n[0]
+    assert pressed_n == normal_n
+    assert held_n == pytest.approx(min(pull_n, 0.6 * normal_n))
+
+
+def test_an_untouched_simulated_fingertip_shows_its_reference():
+    source = SimulatedSource()
+    source.load(normal_force_n=0.0, tangential_force_n=1.0)
+    frame = next(source.frames())
+    assert frame.safety_margin is None
+    # nothing but the camera's noise, 2 grey levels in the background
+    assert np.abs(frame.image.astype(int) - source.reference).mean() < 6
+
+
+def test_the_grip_that_repeats_touches_slips_and_lets_go():
+    source = SimulatedSource(rate_hz=30.0)
+    loads = [source._forces_at(time_s) for time_s in (0.5, 2.2, 8.0, 9.5, 10.5)]
+    margins = [1 - pull / (source._grasp.friction * press) if press else None for press, pull in loads]
+    assert margins == [None, 1.0, 0.0, None, None]
+
+
+@pytest.mark.parametrize("load", [(-1.0, 0.0), (1.0, -0.1), (np.nan, 0.0), (1.0, np.inf)])
+def test_a_load_that_cannot_be_is_refused(load: tuple[float, float]):
+    with pytest.raises(InputError, match="give forces of 0 or more"):
+        SimulatedSource().load(normal_force_n=load[0], tangential_force_n=load[1])
+
+
+def test_a_film_under_another_load_is_one_that_was_prepared_for_it(rng: np.random.Generator):
+    grasp, day = Grasp(blur_px=0.4), Day(camera_shift_px=(2.0, -1.0), camera_rotation_rad=0.03, modulus_factor=0.9)
+    unit = draw_unit(Nuisances(), markers=CHROMATOUCH.geometry.markers, rng=rng)
+    facts = {"grasp": grasp, "day": day, "unit": unit, "rng": rng, "noise": None}
+    untouched, pulled = (load_at_margins(np.array(margins), grasp=grasp) for margins in ([np.nan], [0.7, 0.2]))
+    film = prepare_film(CHROMATOUCH, loading=untouched, **facts).under(pulled, rng=rng)
+    whole = prepare_film(CHROMATOUCH, loading=pulled, **facts)
+    np.testing.assert_allclose(film.marker_px, whole.marker_px)
+    whole = replace(whole, blur_px=film.blur_px)  # drawn anew for every frame
+    np.testing.assert_array_equal(film.draw(slice(0, 2)), whole.draw(slice(0, 2)))
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "words"),
+    [
+        ("nowhere.mp4", SourceOptions(), "nowhere.mp4 is no source that is known, nor a path that exists"),
+        ("simulated", SourceOptions(speed=2.0), "the simulated fingertip takes no --speed; leave it out"),
+        (
+            "simulated:thumb",
+            SourceOptions(),
+            "no simulated sensor named 'thumb'; choose one of chromatouch, flat-gel",
+        ),
+        ("simulated", SourceOptions(rate_hz=-3.0), "--rate must be positive, got -3"),
+    ],
+)
+def test_what_cannot_be_opened_is_told(source: str, options: SourceOptions, words: str):
+    with pytest.raises(InputError, match=words):
+        open_live(source, options=options)
+
+
+def test_a_path_is_replayed_by_its_text_too(small_dataset: Dataset):
+    assert open_live(str(small_dataset.folder)).name == open_live(Path(small_dataset.folder)).name
