@@ -106,7 +106,7 @@ def run_trial(plan: TrialPlan, model: str) -> Trial:
 
 
 def plan_many(days: int, *, trials: int) -> list[TrialPlan]:
-    """Lay out fresh days of the thesis preset, dry and wet trials on each, with its two sensors."""
+    """Lay out fresh days of the thesis preset, dry and wet trials on each, with its sensor."""
     recipe = replace(THESIS, days=days + 4, dry_trials=trials * (days + 4), wet_trials=0, frame_totals=None)
     # the preset's own days are kept aside: they test
     dry = [plan for plan in plan_trials(recipe) if plan.day > 4]

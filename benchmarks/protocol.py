@@ -1,4 +1,4 @@
-"""The protocol of the thesis on simulated touch: both inputs trained by one recipe, tested on a day never seen.
+"""The protocol of the thesis on simulated touch: both inputs trained by one recipe, tested on another day.
 
 With its defaults it is the whole of it: 128,043 training frames of 224 x 224 pixels, 25 epochs, difference and raw:
 minutes on a data-centre GPU, a day on two processors. The options make it smaller, and say so in what is printed.

@@ -4,7 +4,7 @@ The network that comes with the package by default; the images are those of `SLI
 files are named as `image_433_20.png`, with the safety margin in percent at the end. Five frames of one trial say
 little, the less as the simulator was fitted to them: so each answer is told with its interval, the error also where the
 frames are moved a little (2 px, 2 degrees and 3 % of their size at most, drawn evenly), and with `--refit` what the
-simulator's markers do in a frame that its fit has not seen. Nothing is to be chosen by these figures.
+simulator's markers do in a frame that its fit left out. Nothing is to be chosen by these figures.
 """
 
 import argparse

@@ -1,8 +1,8 @@
 """Do maps rank the markers as the simulator knows they count? Signed, against Shapley values and single effects.
 
-Frames of simulated trials whose seed no preset and no study has; both networks of the package unless `--network` names
-others. Beside the methods stand the controls of a study, which know nothing of what the network learned. `--json` ends
-with one line of JSON.
+Frames of simulated trials whose seed no preset and no study has, but on which methods were tried out: no test of these
+unless `--data` names other trials. Both networks of the package unless `--network` names others. Beside the methods
+stand the controls of a study, which know nothing of what the network learned. `--json` ends with one line of JSON.
 """
 
 import argparse
