@@ -11,7 +11,7 @@ from readers import read_video
 
 from sliplens.errors import RecordingError
 from sliplens.images import write_png
-from sliplens.recordings.formats.gelsight import list_gelsight_clips, read_gelsight_clip
+from sliplens.recordings.formats.gelsight import is_gelsight, list_gelsight_clips, read_gelsight_clip
 from sliplens.recordings.formats.video import count_stale, least_contact, small_copies
 from sliplens.recordings.labelling import Clip
 
@@ -324,6 +324,17 @@ def test_a_video_can_leave_out_its_stale_frames(tmp_path: Path, rng: np.random.G
     capture = read_video(write_video(tmp_path / "a.mkv", list(frames)), skip_stale=True)
     np.testing.assert_array_equal(list(capture.read_frames()), frames[3:])
     assert capture.notes == ("a.mkv: the first 3 of 40 frames were left out.",)
+
+
+def test_gelsight_clips_are_told_by_the_header_of_their_table_alone(tmp_path: Path):
+    table, grasp = tmp_path / "labels.csv", tmp_path / "slip" / "cup__exp_num_1"
+    grasp.mkdir(parents=True)
+    table.write_bytes(b"file,slip_label,object,n_frames\n" + 9000 * b"slip/cup,1,cup,40\n" + b"\xff\x00\n")
+    assert is_gelsight(tmp_path)
+    assert is_gelsight(grasp)
+    assert is_gelsight(grasp / "camera_0.avi")
+    table.write_text("file,time_s\na.png,0.0\n")
+    assert not is_gelsight(tmp_path)
 
 
 @pytest.fixture(scope="session")

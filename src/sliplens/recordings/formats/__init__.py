@@ -30,7 +30,7 @@ class Reader:
     words: str
     """What it reads, for people."""
     recognises: Callable[[Path], bool]
-    """Told by names alone, without reading."""
+    """Told by names, or by the header of a table; no frame is read."""
     takes: tuple[str, ...]
     """Fields of `ReadOptions` that it understands."""
     read: Callable[[Path, ReadOptions], Capture | list[Capture]]

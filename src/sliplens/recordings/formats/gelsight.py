@@ -8,7 +8,7 @@ import numpy as np
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.formats.tables import trial_name
+from sliplens.recordings.formats.tables import open_table, trial_name
 from sliplens.recordings.formats.video import count_stale, least_contact, read_video, small_copies
 from sliplens.recordings.labelling import Clip
 from sliplens.recordings.options import ReadOptions
@@ -76,10 +76,14 @@ def read_gelsight(path: Path, options: ReadOptions) -> list[Capture]:
 def is_gelsight(path: Path) -> bool:
     """Whether a path is a clip of the data set, the folder of a grasp, or the data set; told by its `labels.csv`."""
     tables = [folder / LABELS_FILE for folder in (path, *path.absolute().parents[1:3])]
+    return any(_lists_clips(table) for table in tables if table.is_file())
+
+
+def _lists_clips(table: Path) -> bool:
+    """Whether a table has the header of the data set's own; its rows are not read."""
     try:
-        heads = [table.read_text(encoding="utf-8-sig").partition("\n")[0] for table in tables if table.is_file()]
-        return any({"file", "slip_label"} <= set(*csv.reader([head])) for head in heads)
-    except (OSError, UnicodeDecodeError, csv.Error):
+        return {"file", "slip_label"} <= set(open_table(table).header)
+    except RecordingError:
         return False
 
 
