@@ -56,7 +56,8 @@ def test_however_it_is_laid_out_the_table_says_the_same(tmp_path: Path, text: st
 @pytest.mark.parametrize("encoding", ["utf-16", "cp1252", "utf-8"])
 def test_a_micro_sign_is_read_in_any_encoding(tmp_path: Path, encoding: str):
     text = "t [\u00b5s];fx [mN];fy [mN];fz [mN]\n0;1;2;3\n1000;4;5;6\n"
-    forces, _ = read_force_table(write(tmp_path, text, encoding=encoding))
+    forces, notes = read_force_table(write(tmp_path, text, encoding=encoding))
+    assert any("was read as Windows-1252" in note for note in notes) == (encoding == "cp1252")
     np.testing.assert_allclose(forces.time_s, [0, 1e-3])
     np.testing.assert_allclose(forces.force_n, [[1e-3, 2e-3, 3e-3], [4e-3, 5e-3, 6e-3]])
 

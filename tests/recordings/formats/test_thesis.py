@@ -126,6 +126,17 @@ def test_margins_are_read_in_percent_or_as_fractions(data: Path, lines: list[str
     np.testing.assert_allclose(margins_of(trial), [1, 0.6, 0.2])
 
 
+def test_a_list_whose_encoding_was_guessed_is_told(data: Path):
+    (data / "trial77").rename(data / "Prüfling")
+    frames, references = ([name.replace("trial77", "Prüfling") for name in names] for names in (FRAMES, REFERENCE))
+    lists = write_lists(data, frames, references, MARGINS)
+    (read,) = read_thesis(lists)
+    assert not any("Windows" in note for note in read.notes)
+    lists.write_text("\n".join(frames) + "\n", encoding="cp1252")
+    (guessed,) = read_thesis(lists)
+    assert guessed.notes == (f"{lists.name}: the text is not UTF-8 and was read as Windows-1252.", *read.notes)
+
+
 def test_a_margin_may_be_missing(data: Path):
     (trial,) = read_thesis(write_lists(data, FRAMES, REFERENCE, ["nan", "0.6", "0.2"]))
     np.testing.assert_array_equal(margins_of(trial), [np.nan, 0.6, 0.2])

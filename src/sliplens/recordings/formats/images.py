@@ -21,6 +21,7 @@ from sliplens.recordings.formats.tables import (
     evenly_spaced,
     guess_time_column,
     guess_time_unit,
+    guessed_encodings,
     open_table,
     place_on_clock,
     require_rising,
@@ -124,8 +125,9 @@ def read_frame_times(
     if unit is None:
         unit, how = guess_time_unit(time), "guessed from its steps"
     notes = [
+        *guessed_encodings(table),
         f"{table.name}: times of images are those of column {time_column!r}, in {unit} ({how}), "
-        f"their names those of {name_column!r}."
+        f"their names those of {name_column!r}.",
     ]
     if listed > len(images):
         notes.append(f"{table.name}: {listed - len(images)} of {listed} rows name no image of the folder.")

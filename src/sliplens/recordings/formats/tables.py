@@ -20,6 +20,7 @@ from sliplens.recordings.options import ReadOptions
 _SEPARATORS = ("\t", ";", ",")  # a comma may be a decimal one where another separator is there
 _COMMENTS = ("#", "%")
 _PROBED_BYTES = 65536
+_OLD = "cp1252"
 _CONTROLS = frozenset(range(32)) - frozenset(b"\t\n\r\f\x1a\x1b")
 
 
@@ -140,6 +141,12 @@ def text_lines(path: Path) -> Iterator[tuple[int, str]]:
     return _lines(path, _encoding(path))
 
 
+def guessed_encodings(*paths: Path) -> tuple[str, ...]:
+    """Tell of text files whose encoding was guessed: characters beyond ASCII may be others than were meant."""
+    guessed = [path.name for path in paths if _encoding(path) == _OLD]
+    return tuple(f"{name}: the text is not UTF-8 and was read as Windows-1252." for name in guessed)
+
+
 def _encoding(path: Path) -> str:
     try:
         with path.open("rb") as stream:
@@ -155,7 +162,7 @@ def _encoding(path: Path) -> str:
     try:
         codecs.getincrementaldecoder("utf-8")().decode(start)
     except UnicodeDecodeError:
-        return "cp1252"  # the micro sign of an older logger on Windows
+        return _OLD  # the micro sign of an older logger on Windows
     return "utf-8-sig"
 
 
@@ -372,6 +379,7 @@ def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[st
     told = "declared" if force_columns is not None else "by their names"
     axes = "x, y, z" if len(names) == 3 else "normal (laid along z), tangential (laid along x)"
     notes = [
+        *guessed_encodings(path),
         f"{path.name}: times are those of column {time_name!r} ({found}), in {unit} ({how}).",
         f"{path.name}: forces are those of {', '.join(map(repr, names))} as {axes} ({told}), in {units}.",
     ]

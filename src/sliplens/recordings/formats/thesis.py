@@ -11,7 +11,7 @@ from sliplens.errors import RecordingError
 from sliplens.images import natural_key
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.formats.images import common_size, read_frame
-from sliplens.recordings.formats.tables import evenly_spaced, text_lines, trial_name
+from sliplens.recordings.formats.tables import evenly_spaced, guessed_encodings, text_lines, trial_name
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.trial import labels_of_margins, require_unit_interval
 
@@ -107,16 +107,10 @@ def read_thesis(path: Path, options: ReadOptions) -> list[Capture]:
         found = find(frame, f"{frames_list}, line {number}")
         rows.setdefault(untouched, []).append((found, margin))
     base, digits = trial_name(stem or "thesis"), len(str(len(rows)))
-    return [
-        _trial(
-            base if len(rows) == 1 else f"{base}-{number:0{digits}d}",
-            *one,
-            str(frames_list),
-            notes=(*notes, times),
-            rate=rate,
-        )
-        for number, one in enumerate(rows.items(), start=1)
-    ]
+    names = [base] if len(rows) == 1 else [f"{base}-{number:0{digits}d}" for number in range(1, len(rows) + 1)]
+    notes = (*guessed_encodings(*lists), *notes, times)
+    named = zip(names, rows.items(), strict=True)
+    return [_trial(name, *row, str(frames_list), notes=notes, rate=rate) for name, row in named]
 
 
 def is_thesis_list(path: Path) -> bool:
