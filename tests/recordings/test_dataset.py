@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -122,6 +123,19 @@ def test_an_empty_stored_trial_is_refused(tmp_path: Path, recording: Recording):
     save_recording(recording, path)
     pq.write_table(pq.read_table(path).slice(0, 0), path)
     with pytest.raises(RecordingError, match="trial trial has no frames"):
+        load_recording(path)
+
+
+@pytest.mark.parametrize(("column", "value"), [("contact_state", "flying"), ("safety_margin", "half")])
+def test_a_stored_trial_with_labels_that_no_trial_has_is_refused(
+    tmp_path: Path, recording: Recording, column: str, value: str
+):
+    path = tmp_path / "a.parquet"
+    save_recording(recording, path)
+    table = pq.read_table(path)
+    place = table.column_names.index(column)
+    pq.write_table(table.set_column(place, column, pa.array([value] * table.num_rows)), path)
+    with pytest.raises(RecordingError, match=rf"a\.parquet holds labels that no trial has \(.*{value}.*\); make"):
         load_recording(path)
 
 

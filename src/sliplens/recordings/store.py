@@ -232,14 +232,16 @@ def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Re
     if table.num_rows == 0:
         raise RecordingError(f"trial {header.trial} has no frames; leave it out or record it again")
     size = reference.shape
-    labels = {name: table.column(name).to_numpy() for name in OPTIONAL_LABELS if name in table.column_names}
-    if "reason" in labels:
-        labels["reason"] = tuple(str(reason) for reason in labels["reason"])
+    labels: dict[str, Any] = {}
+    with reading(path, wrong="holds labels that no trial has"):
+        labels |= {name: table.column(name).to_numpy() for name in OPTIONAL_LABELS if name in table.column_names}
+        if "reason" in labels:
+            labels["reason"] = tuple(str(reason) for reason in labels["reason"])
+        labels |= {name: table.column(name).to_numpy().astype(np.float64) for name in SIGNALS}
+        labels["contact_state"] = tuple(map(ContactState, table.column("contact_state").to_pylist()))
     return Recording(
         **_facts(header),
-        **{name: table.column(name).to_numpy().astype(np.float64) for name in SIGNALS},
         **labels,
-        contact_state=tuple(ContactState(state) for state in table.column("contact_state").to_pylist()),
         labelling=header.labelling,
         reference=reference,
         frames=_decode(table.column("image"), size=size, where=f"of {path}")
