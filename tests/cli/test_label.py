@@ -128,6 +128,16 @@ def test_a_trial_of_the_default_simulation_is_labelled_though_its_frames_tell_no
     assert np.sqrt(np.mean(error**2)) < 0.02
 
 
+def test_labels_made_anew_tell_how_the_reference_was_chosen(tmp_path: Path, trial: Recording, relabelled: Path):
+    assert run("label", relabelled, "-o", tmp_path / "data", "--no-audit", "--reference-frame", 2) == 0
+    chosen = read_header(trial_path(tmp_path / "data", trial.trial)).labelling
+    assert run("label", tmp_path / "data", "--no-audit", "--mu", 1.6) == 0
+    anew = read_header(trial_path(tmp_path / "data", trial.trial)).labelling
+    assert chosen is not None
+    assert anew is not None
+    assert (anew.reference.index, anew.reference) == (2, chosen.reference)
+
+
 def test_labels_that_were_not_found_are_not_overwritten(simulated: Path, capsys: pytest.CaptureFixture[str]):
     before = (simulated / "dataset.json").read_bytes()
     assert "did not come from its forces and would be lost" in refused(capsys, "label", simulated)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.labelling import Clip
+from sliplens.recordings.labelling import Clip, ReferenceChoice
 from sliplens.recordings.trial import Labels, TrialFacts
 
 Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
@@ -64,6 +64,8 @@ class Capture(TrialFacts):
     """Image of the untouched sensor, where it was recorded apart from the frames."""
     reference_index: int | None = None
     """Frame that a source, or its reader, takes for the untouched one."""
+    reference_choice: ReferenceChoice | None = None
+    """How the image of the untouched sensor was chosen; None where that is not told."""
     clip: Clip | None = None
     """Knowledge of the whole recording."""
     split: str = ""
@@ -100,7 +102,7 @@ class Capture(TrialFacts):
 
     @property
     def frames(self) -> int:
-        """How many there are."""
+        """Number of frames."""
         return len(self)
 
     @property

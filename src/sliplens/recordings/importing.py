@@ -127,6 +127,8 @@ def label_dataset(
 
     Parameters
     ----------
+    data
+        Data set that keeps its force samples, or its folder.
     out
         Folder to make. The data set's own gets the new labels once all of them are there.
     labelling
@@ -212,8 +214,9 @@ def _fingerprint(path: Path) -> list[object]:
 def _without_labels(capture: Capture) -> Capture:
     """A stored trial as if it came from where it was recorded, with what was noted then."""
     kept = capture.labels.labelling if capture.labels else None
-    noted = {} if kept is None else {"source": kept.source, "notes": kept.notes}
-    return replace(capture, labels=None, **noted)
+    if kept is None:
+        return replace(capture, labels=None)
+    return replace(capture, labels=None, source=kept.source, notes=kept.notes, reference_choice=kept.reference)
 
 
 def _write_trials(
@@ -285,7 +288,8 @@ def _label(capture: Capture, settings: LabelSettings, rng: np.random.Generator) 
         motion = measure_motion(_frames(capture))
         labels = found = label_trial(capture.frame_time_s, motion, capture.forces, settings=settings, rng=rng)
     if image is not None and index is None:
-        choice = ReferenceChoice(method="recorded apart from the frames" if found else "came with the recording")
+        method = "recorded apart from the frames" if found else "came with the recording"
+        choice = capture.reference_choice or ReferenceChoice(method=method)
     elif found is not None:
         untouched = np.array([reason is Reason.NO_CONTACT for reason in found.reason])
         choice = choose_reference(capture.read_frames, untouched, index=index, method=settings.reference)
