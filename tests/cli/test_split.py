@@ -91,6 +91,15 @@ def test_a_dry_run_writes_nothing(folder: Path, rules: Path, capsys: pytest.Capt
     assert "nothing is written" in out
 
 
+def test_names_with_brackets_are_shown_as_they_are(folder: Path, rules: Path, capsys: pytest.CaptureFixture[str]):
+    table = json.loads((folder / "dataset.json").read_text())
+    for trial in table["trials"]:
+        trial["object"] = "mug [blue]"
+    (folder / "dataset.json").write_text(json.dumps(table))
+    assert run("split", folder, "--rules", rules, "--dry-run") == 0
+    assert {row[4] for row in cells(capsys.readouterr().out) if len(row) == 6} == {"mug [blue]"}
+
+
 def test_a_preset_splits_and_leaks_are_told(folder: Path, capsys: pytest.CaptureFixture[str]):
     assert run("split", folder, "--preset", "trials") == 0
     # 5.6, 1.2 and 1.2 of eight trials

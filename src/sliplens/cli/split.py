@@ -7,8 +7,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rich.markup import escape
-
 from sliplens.cli.command import Data
 from sliplens.cli.console import print_table, say, wrote
 from sliplens.errors import InputError
@@ -85,7 +83,7 @@ def _show_moves(moved: "Sequence[tuple[TrialInfo, str]]") -> None:
     names = defaultdict(list)
     for info, to in moved:
         names[info.split, to].append(info.trial)
-    rows = [(escape(old), to, str(len(those)), _some(those)) for (old, to), those in sorted(names.items())]
+    rows = [(old, to, str(len(those)), _some(those)) for (old, to), those in sorted(names.items())]
     print_table("Moves", ("from", "to", "trials", "which"), rows)
 
 
@@ -95,7 +93,7 @@ def _some(names: Iterable[str]) -> str:
     ordered = sorted(names, key=natural_key)
     rest = len(ordered) - _SHOWN
     shown = ordered if rest < 2 else [*ordered[:_SHOWN], f"{rest} more"]
-    return escape(", ".join(shown)) or "-"
+    return ", ".join(shown) or "-"
 
 
 def _ranges(numbers: Iterable[int]) -> str:
