@@ -10,10 +10,13 @@ from sliplens.explainers import EXPLAINERS
 from sliplens.extras import Table
 from sliplens.faithfulness import FILLS
 from sliplens.live.sources import SOURCES
+from sliplens.markers import KINDS
+from sliplens.markers.estimators import ESTIMATORS
 from sliplens.models.backbones import BACKBONES
 from sliplens.models.encodings import ENCODINGS
 from sliplens.models.engines import ENGINES
 from sliplens.recordings.formats import FORMATS
+from sliplens.simulation import PRESETS, SENSORS
 from sliplens.training import RECIPES
 from sliplens.training.data import AUGMENTATIONS
 
@@ -27,6 +30,10 @@ TABLES = {
     "sliplens.sources": SOURCES,
     "sliplens.augmentations": AUGMENTATIONS,
     "sliplens.recipes": RECIPES,
+    "sliplens.markers": KINDS,
+    "sliplens.estimators": ESTIMATORS,
+    "sliplens.sensors": SENSORS,
+    "sliplens.presets": PRESETS,
 }
 
 

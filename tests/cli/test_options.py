@@ -9,8 +9,10 @@ from types import ModuleType
 from typing import get_args
 
 import pytest
+from command_line import refused
 
 from sliplens.cli import Command, command
+from sliplens.recordings import Dataset
 
 BASE = Path(command.__file__).read_text()
 
@@ -45,3 +47,29 @@ def test_an_option_that_nobody_reads_is_noticed() -> None:
     found = heeded("from sliplens import predict\nself.call(predict, out=self.output)")
     assert {"output", "batch_size", "run"} <= found
     assert "forgotten" not in found
+
+
+@pytest.mark.parametrize(
+    ("option", "noun"),
+    [("--recipe", "recipe"), ("--input", "input"), ("--augmentation", "augmentation")],
+)
+def test_the_library_says_which_rows_there_are_to_train_with(
+    option: str, noun: str, small_dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = refused(capsys, "train", small_dataset.folder, "-o", tmp_path / "run", option, "other")
+    assert f"there is no {noun} named 'other'; choose one of " in line
+
+
+@pytest.mark.parametrize(("option", "noun"), [("--preset", "preset"), ("--sensor", "sensor")])
+def test_the_library_says_which_rows_there_are_to_simulate(
+    option: str, noun: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = refused(capsys, "simulate", tmp_path / "data", option, "other")
+    assert f"there is no {noun} named 'other'; choose one of " in line
+
+
+def test_the_library_says_which_engines_there_are(
+    small_dataset: Dataset, difference_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("predict", difference_run, small_dataset.folder, "-o", tmp_path / "margins.parquet", "--engine", "other")
+    assert "there is no engine named 'other'; choose one of " in refused(capsys, *words)

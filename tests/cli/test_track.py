@@ -75,7 +75,7 @@ def test_what_cannot_be_followed_is_refused_and_leaves_no_file(folder, tmp_path,
     output = tmp_path / "tracks.parquet"
     with pytest.raises(InputError, match=r"does not end in \.parquet"):
         Track(source=folder, output=tmp_path / "tracks.csv").run()
-    with pytest.raises(InputError, match="markers 'digit' are not known"):
+    with pytest.raises(InputError, match="there is no kind of markers named 'digit'"):
         Track(source=folder, output=output, markers="digit").run()
     with pytest.raises(InputError, match="named twice"):
         Track(source=folder, output=output, reference=tmp_path / "untouched.png", reference_frame=1).run()

@@ -101,7 +101,7 @@ def test_noise_is_not_taken_for_markers(rng):
 
 
 def test_kinds_that_cannot_be_are_refused(dots, grid):
-    with pytest.raises(InputError, match="choose chromatouch, gelsight-mini, tactip, auto"):
+    with pytest.raises(InputError, match="choose one of chromatouch, gelsight-mini, tactip, auto"):
         detect_markers(dots(grid()), "digit")
     with pytest.raises(InputError, match="radii from 5 to 2"):
         MarkerKind(name="mine", contrasts=("dark",), radius_px=(5.0, 2.0))

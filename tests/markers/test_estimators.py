@@ -201,7 +201,7 @@ def test_tracked_markers_give_a_trial(trials):
 
 def test_what_cannot_be_fitted_is_refused(made):
     trial = made[0][1]
-    with pytest.raises(InputError, match="estimator 'magic' is not known"):
+    with pytest.raises(InputError, match="there is no estimator named 'magic'"):
         get_estimator("magic")
     with pytest.raises(InputError, match="was not fitted"):
         get_estimator("constant").estimate(trial)

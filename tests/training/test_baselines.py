@@ -241,9 +241,9 @@ def test_what_was_followed_before_an_interruption_is_not_followed_again(
 
 def test_what_cannot_be_compared_is_refused_at_once(data: Dataset, network: Path, tmp_path: Path, capsys, monkeypatch):
     command = ("evaluate", network, data.folder, "-o", tmp_path / "out", "--baselines")
-    assert "estimator 'magic' is not known" in refused(capsys, *command, "magic")
+    assert "there is no estimator named 'magic'" in refused(capsys, *command, "magic")
     assert "0 training trials are too few" in refused(capsys, *command, "all", "--baseline-trials", "0")
-    assert "markers 'digit' are not known" in refused(capsys, *command, "all", "--markers", "digit")
+    assert "there is no kind of markers named 'digit'" in refused(capsys, *command, "all", "--markers", "digit")
     alone = Dataset(folder=data.folder, trials=data.select(split="test"))
     monkeypatch.setattr("sliplens.training.evaluation.load_dataset", lambda _: alone)
     assert "has no training trials to fit baselines on" in refused(capsys, *command, "all")

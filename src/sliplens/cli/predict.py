@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
@@ -21,12 +21,12 @@ class Predict(SourceCommand):
     model: Network
     source: Source
     output: TableFile
-    engine: Literal["auto", "eager", "folded", "compiled", "onnxruntime", "openvino"] = "auto"
-    """What runs the network; auto is the fastest at hand."""
+    engine: str = "auto"
+    """What runs the network: eager, folded, compiled, onnxruntime or openvino; auto takes the fastest at hand."""
     onnx: Annotated[Path | None, tyro.conf.arg(metavar="FILE.onnx")] = None
-    """The network as `sliplens export` wrote it, which onnxruntime and openvino otherwise wait for."""
+    """The network as `sliplens export` wrote it; without it onnxruntime and openvino convert the network first."""
     batch_size: int = 8
-    """Frames predicted together; on a processor more are slower, their layers no longer fit its cache."""
+    """Frames predicted together; on a CPU more are slower, as they no longer fit its cache."""
     device: Device = "cpu"
 
     def run(self) -> None:

@@ -27,11 +27,11 @@ class Simulate(Command):
 
     output: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[OUT]")] = None
     """Folder to make. Not needed for --preview and --video alone."""
-    preset: Literal["small", "thesis", "varied"] = "small"
+    preset: str = "small"
     """small: 104 short trials on 12 days, for a laptop. thesis: the days, splits and 160,757 frames of the thesis, some
     14 GB. varied: 2,520 short trials on 820 days, 200 sensors and objects from slippery to rough, for a network that is
     to meet others. The options below change it."""
-    sensor: Literal["chromatouch", "flat-gel"] = "chromatouch"
+    sensor: str = "chromatouch"
     """chromatouch: a dome with a fisheye inside, fitted to real images. flat-gel: a flat gel with dots, lit from three
     sides, like a GelSight; not fitted to one device."""
     displacement: Literal["calibrated", "half-space"] | None = None

@@ -18,12 +18,12 @@ class Train(Command):
     data: Data
     output: Output
     """Folder to make: weights, manifest, learning curve."""
-    recipe: Literal["default", "thesis"] = "default"
+    recipe: str = "default"
     """default: a distribution over the margin, AdamW. thesis: as the thesis trained, one output and Ranger21. The
     options below change it."""
-    input: Literal["difference", "raw", "signed", "amplitude"] = "difference"
-    """What the network sees: |T_n - T_0| divided by its own maximum, the frame itself, T_n - T_0, or |T_n - T_0| with
-    its amplitude."""
+    input: str = "difference"
+    """What the network sees of a frame T_n and of the untouched sensor T_0. difference: |T_n - T_0|, each image divided
+    by its own maximum. raw: T_n. signed: T_n - T_0. amplitude: |T_n - T_0| as strong as it is."""
     start_from: Path | None = None
     """Network whose weights to start from, a run or one that comes with sliplens: to teach it your own sensor, or to go
     on at another image size. Its input, backbone and head must be those asked for."""
@@ -36,19 +36,19 @@ class Train(Command):
     image_size: int | None = None
     """Height and width of the network's input, in pixels."""
     epochs: int | None = None
-    """Most passes over the training frames."""
+    """Passes over the training frames, at most."""
     max_minutes: float | None = None
     """Stop after this time; the learning rate falls with it."""
     batch_size: int | None = None
     """Images a step, over all devices: each takes its share."""
     optimizer: Literal["adamw", "ranger21"] | None = None
-    """With its own schedule of the learning rate."""
+    """Optimizer, each with a schedule of the learning rate of its own; the recipe's if not given."""
     learning_rate: float | None = None
     """Peak learning rate."""
     untouched_share: float | None = None
-    """Share of images that show the untouched sensor as full stick: what explanations are measured against."""
-    augmentation: Literal["default", "thesis", "none"] | None = None
-    """Slight rotations, noise and blur; by default shifts and colour too."""
+    """Images of the untouched sensor, as full stick, for each labelled frame: explanations are measured against it."""
+    augmentation: str | None = None
+    """Random changes of training images. thesis: slight rotations, noise and blur. default: shifts and colour too."""
     seed: int = 0
     """Seed of weights, order and augmentation."""
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from sliplens.errors import ImageError, InputError
-from sliplens.extras import import_cv2
+from sliplens.extras import Table, import_cv2
 
 Contrast: TypeAlias = Literal["dark", "light", "colour"]
 
@@ -45,7 +45,7 @@ class Appearance:
     """Median over the markers, in weighted grey levels."""
 
 
-KINDS = {
+_KINDS = {
     "chromatouch": MarkerKind(
         name="chromatouch",
         contrasts=("dark",),
@@ -56,15 +56,14 @@ KINDS = {
     "tactip": MarkerKind(name="tactip", contrasts=("light",), channels=(1.0, 1.0, 1.0)),
     "auto": MarkerKind(name="auto", contrasts=("dark", "light", "colour")),
 }
+KINDS = Table("kind of markers", "sliplens.markers", _KINDS)
 """Presets by name: the magenta dots of the ChromaTouch, the black ones of a GelSight Mini, the white pins of a TacTip;
 `auto` looks for whatever is round and stands out alike in many places."""
 
 
 def get_kind(name: str) -> MarkerKind:
-    """Preset of a name."""
-    if name not in KINDS:
-        raise InputError(f"markers {name!r} are not known; choose {', '.join(KINDS)}")
-    return KINDS[name]
+    """Look up a kind of markers by name."""
+    return KINDS.pick(name)
 
 
 FEWEST = 4

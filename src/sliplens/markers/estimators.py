@@ -9,16 +9,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sliplens.errors import InputError
+from sliplens.extras import Table
 from sliplens.markers.tracks import Tracks
 
 _FEWEST = 6
 _PRESSED_SHARE = 0.9  # of the trial's own largest spread: from here on the press is done, creep aside
 _PULL_PX = 0.2  # of the inner markers' mean motion: several times its noise
 _INNER_SHARE = 1 / 3  # of the markers: what surely touches
-
-
-__all__ = ["ESTIMATORS", "FieldTrial", "MarginEstimator", "affine_parts", "field_trial", "find_hold", "find_holds",
-           "get_estimator"]  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -407,7 +404,7 @@ def _hertz(ratio: Margins, full: float) -> Margins:
     return np.clip(1 - ratio / full, 0, 1) ** _HERTZ
 
 
-ESTIMATORS: dict[str, Callable[[Trials, Margins], Reader]] = {
+_ROWS: dict[str, Callable[[Trials, Margins], Reader]] = {
     "constant": _learn_mean,
     "mean-shear": partial(_learn_features, mean_shear),
     "shear-over-divergence": partial(_learn_features, shear_over_divergence),
@@ -420,6 +417,7 @@ ESTIMATORS: dict[str, Callable[[Trials, Margins], Reader]] = {
     "khamis-edge-centre": partial(_learn_features, edge_over_centre),
     "helmholtz-hodge": partial(_learn_features, helmholtz_hodge),
 }
+ESTIMATORS = Table("estimator", "sliplens.estimators", _ROWS)
 """What each estimator learns from trials and their margins: the first four trivial, the others named for papers.
 
 What is causal says of a frame what it and those before it tell; the others need the hold of the trial as a whole."""
@@ -427,6 +425,10 @@ What is causal says of a frame what it and those before it tell; the others need
 
 def get_estimator(name: str) -> MarginEstimator:
     """Unfitted estimator of a name, a row of `ESTIMATORS`."""
-    if name not in ESTIMATORS:
-        raise InputError(f"estimator {name!r} is not known; choose {', '.join(ESTIMATORS)}")
-    return MarginEstimator(ESTIMATORS[name])
+    return MarginEstimator(ESTIMATORS.pick(name))
+
+
+__all__ = [
+    "ESTIMATORS", "FieldTrial", "MarginEstimator", "affine_parts", "field_trial", "find_hold", "find_holds",
+    "get_estimator",
+]  # fmt: skip

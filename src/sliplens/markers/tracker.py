@@ -171,12 +171,21 @@ def track_markers(
     lead to where its own marker was). After a jump the pattern is found anew by its shape as a whole; where a regular
     grid fits in two ways, all markers are LOST until it can be told again.
 
-    `frames` are T_1 to T_n, RGB, of the reference's size; `kind` is a row of `KINDS`, or a kind of one's own.
+    Parameters
+    ----------
+    frames
+        T_1 to T_n, uint8 RGB (height, width, 3), of the reference's size.
+    reference
+        The untouched sensor T_0.
+    kind
+        Row of `KINDS`, or a kind of one's own.
 
     Raises
     ------
     ImageError
         If the reference is over- or underexposed or shows fewer than 4 whole markers, or a frame has another size.
+    RecordingError
+        If there is no frame.
     """
     tracker = Tracker(reference, kind)
     tracked = [tracker.update(frame) for frame in frames]

@@ -9,6 +9,7 @@ import numpy as np
 
 from sliplens._version import __version__
 from sliplens.errors import InputError
+from sliplens.extras import Table
 from sliplens.files import hash_json
 from sliplens.recordings.splits import hold_out
 from sliplens.simulation.loading import MINIMUM_FRAMES
@@ -177,17 +178,14 @@ def make_recipe(
     >>> make_recipe("thesis", days=6).dry_trials
     191
     """
-    for what, name, table in (("preset", preset, PRESETS), ("sensor", sensor, SENSORS)):
-        if name is not None and name not in table:
-            raise InputError(f"there is no {what} named {name!r}; choose one of {', '.join(table)}")
-    start = PRESETS[preset]
+    start = PRESETS.pick(preset)
     changes = {name: value for name, value in changes.items() if value is not None}
     if "days" in changes and "dry_trials" not in changes:
         changes["dry_trials"] = int(np.sum(start.dry_trials))
     if changes.keys() & {"dry_trials", "wet_trials", "days", "test_days", "frames_per_trial"}:
         changes["frame_totals"] = None
     if sensor is not None:
-        changes["sensor"] = SENSORS[sensor]
+        changes["sensor"] = SENSORS.pick(sensor)
     if dry_friction is not None:
         changes["nuisances"] = replace(start.nuisances, dry_friction=dry_friction)
     return replace(start, **changes)
@@ -294,7 +292,7 @@ def _seed(recipe: SimulationRecipe, *branch: int) -> int:
     return int(np.random.SeedSequence(recipe.seed, spawn_key=key).generate_state(2, np.uint64)[0])
 
 
-PRESETS = {
+_ROWS = {
     "small": SimulationRecipe(dry_trials=96, wet_trials=8, frames_per_trial=48, days=12, series="small"),
     "thesis": SimulationRecipe(
         # 160 training, 20 validation and 21 test trials of about 800 frames
@@ -308,6 +306,7 @@ PRESETS = {
         sensors=200, nuisances=Nuisances(dry_friction=(0.15, 1.2)),
     ),
 }  # fmt: skip
+PRESETS = Table("preset", "sliplens.presets", _ROWS)
 """`small` fits a laptop and shows many days; `thesis` has the days, splits and number of frames of the thesis: Polak,
 *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning*. It does not say how many trials it
 had, nor how dry and wet shared the test day: that is assumed, from about 800 frames a trial. `varied` is for networks

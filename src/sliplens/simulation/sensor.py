@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sliplens.errors import ContactError
+from sliplens.extras import Table
 from sliplens.mechanics import reduced_modulus
 from sliplens.simulation.geometry import Dome, FlatPad, Frames, Geometry, require_positive
 from sliplens.simulation.nuisances import Unit
@@ -264,5 +265,5 @@ FLAT_GEL = Sensor(
 """A flat gel like that of a GelSight Mini with dots: a square grid under an opaque skin lit from three sides. Its
 numbers are typical (assumed), not fitted to one device."""
 
-SENSORS = {sensor.name: sensor for sensor in (CHROMATOUCH, FLAT_GEL)}
+SENSORS = Table("sensor", "sliplens.sensors", {sensor.name: sensor for sensor in (CHROMATOUCH, FLAT_GEL)})
 """Sensors by name."""
