@@ -25,13 +25,17 @@ METHODS = ("grad-cam-thesis", "integrated-gradients-thesis", "poly-cam-thesis", 
 """The three methods of the thesis as they were run there, and Poly-CAM for a regressor."""
 STRIP_METHOD = "poly-cam"
 """Method of the first picture: the one whose maps are quickest to read."""
-_SETTINGS = (Setting(fill="reference", unit="pixel"), Setting(fill="noisy-linear", unit="pixel"))
-_TESTS = ("score", "faithfulness")
 _BUDGET = 0.15
 """Share of the channels that Poly-CAM measures at first."""
-_RANDOM_ORDERS = 6
-_TRIALS = 2
-"""Trials that are explained: too few to decide anything, as the page says, but there within minutes."""
+_STUDY: dict[str, Any] = {
+    "methods": METHODS,
+    "trials": 2,
+    "budget": _BUDGET,
+    "tests": ("score", "faithfulness"),
+    "settings": (Setting(fill="reference", unit="pixel"), Setting(fill="noisy-linear", unit="pixel")),
+    "random_orders": 6,
+}
+"""The study of a first look: too few trials to decide anything, as the page says, but there within minutes."""
 DEMO_SEED = 20261122
 """No seed of the data that the networks of the package were trained on."""
 _FIRST_LOOK: dict[str, Any] = {"dry_trials": 8, "wet_trials": 4, "frames_per_trial": 40, "days": 4, "test_days": 3}
@@ -101,30 +105,19 @@ def run_demo(
         minutes = max(_SHORTEST_TRAINING, (train_minutes - _OTHER_MINUTES) / len(INPUTS))
         for name in INPUTS:
             networks[name] = str(folder / f"train-{name}")
-            train(
-                data, networks[name], input=name, image_size=image_size, epochs=60, max_minutes=minutes, seed=seed,
-                on_progress=on_progress,
-            )  # fmt: skip
-    _make_strip(folder / "strip", data, networks["difference"], on_progress=on_progress)
+            recipe: dict[str, Any] = {"image_size": image_size, "epochs": 60, "max_minutes": minutes, "seed": seed}
+            train(data, networks[name], input=name, **recipe, on_progress=on_progress)
+    difference, raw = networks["difference"], networks["raw"]
+    _make_strip(folder / "strip", data, difference, on_progress=on_progress)
     show(*later)
     for name in INPUTS:
         evaluate(networks[name], data, folder / f"evaluate-{name}", on_progress=on_progress)
     show(*later[1:])
-    run_study(
-        data, out=folder, difference=networks["difference"], raw=networks["raw"], methods=METHODS, trials=_TRIALS,
-        budget=_BUDGET, tests=_TESTS, settings=_SETTINGS, random_orders=_RANDOM_ORDERS, jobs=jobs, seed=seed,
-        on_progress=on_progress,
-    )  # fmt: skip
+    run_study(data, out=folder, difference=difference, raw=raw, **_STUDY, jobs=jobs, seed=seed, on_progress=on_progress)
     if real is not None:
-        explanations = folder / "explain-real"
-        explain_source(
-            networks["difference"], real, labels_in_names=True, budget=_BUDGET, out=explanations,
-            on_progress=on_progress,
-        )  # fmt: skip
-        score_explained(
-            networks["difference"], explanations, out=folder / "score-real", steps=STEPS, seed=seed,
-            on_progress=on_progress,
-        )  # fmt: skip
+        maps = folder / "explain-real"
+        explain_source(difference, real, labels_in_names=True, budget=_BUDGET, out=maps, on_progress=on_progress)
+        score_explained(difference, maps, out=folder / "score-real", steps=STEPS, seed=seed, on_progress=on_progress)
     return show()
 
 

@@ -17,10 +17,9 @@ def _small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SLIPLENS_REFERENCE", str(tmp_path / "nothing"))
     monkeypatch.setattr(sliplens.demo, "_FIRST_LOOK", SMALL)
     monkeypatch.setattr(sliplens.demo, "_TO_TRAIN", {**SMALL, "dry_trials": 8})
-    monkeypatch.setattr(sliplens.demo, "METHODS", ("grad-cam", "integrated-gradients"))
+    study = {"methods": ("grad-cam", "integrated-gradients"), "trials": 1, "random_orders": 2}
+    monkeypatch.setattr(sliplens.demo, "_STUDY", {**sliplens.demo._STUDY, **study})
     monkeypatch.setattr(sliplens.demo, "STRIP_METHOD", "grad-cam")
-    monkeypatch.setattr(sliplens.demo, "_TRIALS", 1)
-    monkeypatch.setattr(sliplens.demo, "_RANDOM_ORDERS", 2)
     monkeypatch.setattr(sliplens.demo, "_SHORTEST_TRAINING", 0.01)
 
 

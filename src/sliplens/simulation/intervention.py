@@ -21,7 +21,7 @@ from sliplens.simulation.information import (
     prior_sigma,
     reading_gain,
     visible_markers,
-)  # fmt: skip
+)
 from sliplens.simulation.loading import Loading
 from sliplens.simulation.nuisances import Nuisances, Touch
 from sliplens.simulation.plan import FrameTotals, SimulationRecipe, TrialPlan, plan_trials

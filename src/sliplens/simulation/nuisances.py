@@ -78,16 +78,15 @@ class Nuisances:
                 raise ContactError(f"{field.name} must be at most {limit:g}, got {high:.3g}; lower its upper end")
 
 
-_POSITIVE = (
-    "dry_friction", "dry_friction_factor", "wet_friction", "kinetic_ratio", "normal_force_n", "modulus_factor",
-     "shear_exponent", "creep_time_s", "stick_slip_hz", "white_balance", "gain", "marker_radius", "marker_contrast"
-)  # fmt: skip
-_UPPER = {"kinetic_ratio": 1.0, "stick_slip_share": 1.0, "contact_offset": 0.5, "marker_depth": 0.5,
-          "illumination_gradient": 1.0, "normal_force_drift": 0.5, "wet_friction_drift": 0.5}  # fmt: skip
-_NOT_NEGATIVE = (
-    "contact_offset", "marker_depth", "stick_slip_share", "creep", "illumination_gradient", "glare", "skin_grain",
-     "marker_jitter_px", "blur_px"
-)  # fmt: skip
+_POSITIVE = {"dry_friction", "dry_friction_factor", "wet_friction", "kinetic_ratio", "normal_force_n", "modulus_factor"}
+_POSITIVE |= {"shear_exponent", "creep_time_s", "stick_slip_hz", "white_balance", "gain", "marker_radius"}
+_POSITIVE |= {"marker_contrast"}
+_NOT_NEGATIVE = {"contact_offset", "marker_depth", "stick_slip_share", "creep", "illumination_gradient", "glare"}
+_NOT_NEGATIVE |= {"skin_grain", "marker_jitter_px", "blur_px"}
+_UPPER: dict[str, float] = dict.fromkeys(
+    ("contact_offset", "marker_depth", "normal_force_drift", "wet_friction_drift"), 0.5
+)
+_UPPER |= {"kinetic_ratio": 1.0, "stick_slip_share": 1.0, "illumination_gradient": 1.0}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,6 +5,7 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -80,7 +81,7 @@ def train(
     Raises
     ------
     InputError
-        If the data, the recipe, the start or the machine does not allow it.
+        If there is no such recipe, input or network to start from, a setting is out of range, or a device is missing.
     RecordingError
         If there is no labelled trial to train or to validate on, or all labels to train on are the same.
     ModelError
@@ -104,20 +105,11 @@ def train(
         folder: Path, *, scratch: Path, logger: Logger | None = None, on_progress: OnProgress | None = None
     ) -> Training:
         """Read the frames and fit: what every process does alike."""
+        read = partial(load_frames, data, encoding=encoding, image_size=config.image_size, scratch=scratch)
         frames = []
         for what, some, share in zip(("training", "validation"), trials, (config.untouched_share, 0.0), strict=True):
             with stage(on_progress, f"Reading {what} trials ({encoding.name})") as count:
-                frames.append(
-                    load_frames(
-                        data,
-                        some,
-                        encoding=encoding,
-                        image_size=config.image_size,
-                        untouched_share=share,
-                        scratch=scratch,
-                        on_progress=count,
-                    )
-                )
+                frames.append(read(some, untouched_share=share, on_progress=count))
         info = trials[0][0]
         training = fit(
             config,
