@@ -47,7 +47,7 @@ class SourceCommand(Command):
     reference_frame: int | None = None
     """Number of the frame that shows the untouched sensor, in place of --reference."""
     split: str | None = None
-    """Trials of a data set; all if not given."""
+    """Split of a data set to read, such as test; all if not given."""
     format: str | None = None
     """rosbag, lerobot, thesis, gelsight, images or video; recognised if not given."""
     frame_rate: float | None = None

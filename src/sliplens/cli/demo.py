@@ -28,8 +28,8 @@ class Demo:
     image_size: int = 96
     """With --train: height and width of the networks' input; the frames are 224 x 224 pixels."""
     real_frames: Path | None = None
-    """Folder of real difference images named ..._GG.png with the safety margin in percent; found by itself where
-    SLIPLENS_REFERENCE (or ../shared/reference) holds the public ChromaTouch images."""
+    """Folder of real difference images whose names end in the safety margin in percent, as image_433_20.png. If not
+    given, the public ChromaTouch images where the environment's SLIPLENS_REFERENCE names the folder that holds them."""
     seed: int | None = None
     """Seed of the simulation and of the random orders."""
 

@@ -12,8 +12,8 @@ class Diagnose(Command):
     """Find out where a network fails, and why.
 
     Half of the trials tell in which slices the error is large: condition, friction, force, place of contact, day. The
-    other half tests them. In simulation the network's use of each marker is held against the best reading's, and the
-    same press and pull is filmed anew with other frictions. Ends in sentences, and a page.
+    other half tests them. In simulation what the network makes of each marker is compared with the best linear
+    reading, and the same press and pull is filmed anew with other frictions. Ends in sentences, and a page.
     """
 
     model: Network
@@ -25,10 +25,10 @@ class Diagnose(Command):
     trials: int = 8
     """Trials of each condition that are explained, three frames each."""
     pairs: int = 120
-    """Pairs of coalitions of markers that are asked for each of these frames."""
+    """Pairs of random sets of markers from which the Shapley values of each of these frames are estimated."""
     device: Device = "cpu"
     seed: int = 0
-    """Seed of the halves and of the coalitions."""
+    """Seed of the halves and of the random sets."""
 
     def run(self) -> None:
         """Diagnose, say what was found and draw the page."""

@@ -39,7 +39,7 @@ class Explain(Command):
     """Share of the channels that poly-cam measures at first; below 1 it is faster. It goes on where the map is not
     expected to be like the exact one, and tells how far it is."""
     colours: Literal["inferno", "jet"] = "inferno"
-    """Of the pictures: perceptually uniform, or as the thesis's figures have them."""
+    """Colours of the pictures: inferno is perceptually uniform, jet is that of the thesis's figures."""
     split: str = "test"
     """Trials of the data set to take frames from."""
     condition: str = "dry"

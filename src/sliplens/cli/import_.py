@@ -39,9 +39,9 @@ class Import(Command):
     object: str | None = None
     """What was held; as the source tells, else nothing."""
     validation_trials: int | None = None
-    """So many of the last trials, before those that test, validate the training."""
+    """How many trials validate the training: the last before those that test."""
     test_trials: int | None = None
-    """So many of the last trials test; all others train. Trials are never split."""
+    """How many trials test, the last ones; all others train. Trials are never split."""
     splits: Path | None = None
     """File of rules that deal the trials to splits (TOML; see docs/splits.md), in place of the two numbers above."""
     format: str | None = None

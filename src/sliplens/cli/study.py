@@ -33,7 +33,7 @@ class Study(Command):
     difference: str = "chromatouch-difference"
     """Network on difference images: a folder, or a name of one that comes with sliplens; none to leave it out."""
     raw: str = "chromatouch-raw"
-    """The same on raw images."""
+    """Network on raw images: a folder, or a name of one that comes with sliplens; none to leave it out."""
     preset: Literal["thesis"] | None = None
     """Simulate the data set first: the days and trials of the thesis, 80 frames each, some 1.5 GB. The networks of the
     package never saw its trials, so the training trials are chosen from, as in the thesis."""

@@ -24,7 +24,7 @@ class Track(SourceCommand):
     source: Source
     output: TableFile
     markers: str = "auto"
-    """What they look like: chromatouch, gelsight-mini, tactip, or auto."""
+    """What the markers look like: chromatouch, gelsight-mini, tactip, or auto."""
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE.mp4")] = None
     """Also write a clip with rings and arrows, of one trial."""
     trial: str | None = None

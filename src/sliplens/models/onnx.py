@@ -44,11 +44,18 @@ _COMPARED = {
 
 
 def export_onnx(run: Run | Path | str, out: Path | str, *, overwrite: bool = False) -> Path:
-    """Write a network, or that of a folder or name, as NAME.onnx; it appears when ONNX Runtime gives the same answers.
+    """Write a network as an ONNX file, which appears once ONNX Runtime gives the same answers as the network.
 
     Input `image` is float32 (batch, 3, size, size), encoded and normalised; outputs are `margin` (batch,) and, for a
     histogram, `probabilities` (batch, bins). The batch may be of any size. Properties of the model, as JSON:
     `sliplens.manifest`, `sliplens.input` (how frames become an input) and `sliplens.output` (edges of the bins).
+
+    Parameters
+    ----------
+    run
+        The network, its folder, or the name of one that comes with sliplens.
+    out
+        File to write; its name ends in `.onnx`.
 
     Raises
     ------

@@ -57,8 +57,17 @@ def export_mcap(
 ) -> Export:
     """Write trials as `TRIAL.mcap`, files of ROS 2 messages, without loss; see `write_mcap`.
 
-    Arguments and errors are those of `export_lerobot`; besides, the extra `ros` must be installed (`InputError`), and
-    the times of a trial must fit into stamps (`RecordingError`), while frames may be of any size and rate.
+    Parameters
+    ----------
+    data, out, trials
+        As `export_lerobot` takes them; frames may be of any size and rate.
+
+    Raises
+    ------
+    InputError
+        If `out` holds something else, there is no such trial, or the extra `ros` is not installed.
+    RecordingError
+        If a trial is damaged, or its times do not fit into stamps of ROS (2**31 seconds).
     """
     return _export("mcap", data, Path(out), trials=trials, overwrite=overwrite, on_progress=on_progress)
 

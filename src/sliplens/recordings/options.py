@@ -3,9 +3,10 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias, get_args
 
-REFERENCE_METHODS = ("least contact energy", "first still")
+ReferenceMethod: TypeAlias = Literal["least contact energy", "first still"]
+REFERENCE_METHODS: tuple[str, ...] = get_args(ReferenceMethod)
 
 
 def spoken(names: Iterable[str]) -> str:
@@ -35,11 +36,11 @@ class ReadOptions:
     name_unit: str | None = None
     """Unit (s, ms, us, ns) of the last number in the names of images, which is then their time."""
     skip_frames: int | None = None
-    """So many frames at the start of a video are left out."""
+    """How many frames to leave out at the start of a video."""
     skip_stale: bool = False
     """Leave out the dark or frozen frames that a camera hands out when it was just started."""
     start_s: float | None = None
-    """When the first frame was taken, on the clock of the forces."""
+    """When the first frame was taken, in seconds on the clock of the forces."""
     image_topic: str | None = None
     """Topic of the images; the only one if not given."""
     wrench_topic: str | None = None
@@ -49,9 +50,9 @@ class ReadOptions:
     force_key: str | None = None
     """Feature of a LeRobot data set with the forces."""
     image_root: Path | None = None
-    """Folder under which the images that a list names lie now."""
+    """Folder that now holds the images whose old paths a list of the thesis names."""
     margin_unit: Literal["fraction", "percent"] | None = None
-    """Unit of a list's safety margins; told by their size if not given."""
+    """Unit of the safety margins in a list of the thesis; told by their size if not given."""
 
     def given(self) -> tuple[str, ...]:
         """Names of the options that were said."""
@@ -63,14 +64,14 @@ class LabelSettings:
     """How labels are found from forces; what is not given is found out."""
 
     mu: float | None = None
-    """Static coefficient of friction, if you know it; estimated at the onset of slip otherwise."""
+    """Static coefficient of friction, if you know it; estimated where the contact begins to slip otherwise."""
     friction_change: float = 0.0
     """Relative standard deviation by which friction may change from touch to slip; on wet objects some 0.1 to 0.2. It
     widens the uncertainty."""
     tare: tuple[float, float, float] | None = None
-    """What the force sensor reads untouched (x y z), in newtons; found if not given."""
+    """What the untouched force sensor reads (x y z), in newtons; found if not given."""
     lag_ms: float | None = None
-    """Thousandths of seconds by which the camera's clock is late, if you know them; the lag is then applied."""
+    """Milliseconds by which the camera's clock is late, if you know them; the forces are then shifted by them."""
     apply_lag: bool = False
     """Shift the forces by the lag that was found between camera and force sensor; it is always shown."""
     normal_axis: Literal["x", "y", "z"] | None = None
@@ -81,9 +82,9 @@ class LabelSettings:
     """Least normal force of a contact, in newtons; chosen from the noise if not given."""
     force_range: float | None = None
     """What each axis of the force sensor can measure, in newtons; frames beyond are not valid."""
-    reference: Literal["least contact energy", "first still"] = "least contact energy"
+    reference: ReferenceMethod = "least contact energy"
     """How to choose the untouched frame among those before the contact, where the source does not tell it."""
     reference_frame: int | None = None
     """Number of the untouched frame, by hand."""
     seed: int = 0
-    """Seed of the bootstraps behind the uncertainties."""
+    """Seed of the random draws behind the uncertainties."""

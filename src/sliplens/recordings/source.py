@@ -45,8 +45,16 @@ def open_source(
         Trials of a data set, or the name of one; all if None.
     format
         Row of `FORMATS`; recognised if None.
+    options
+        What is known of a source that is no data set.
     whole
         With the samples of forces that a data set keeps; images must then have times.
+
+    Raises
+    ------
+    InputError
+        If something named is missing, damaged or does not fit the source; of an image an `ImageError`, of a recording a
+        `RecordingError`.
 
     Examples
     --------

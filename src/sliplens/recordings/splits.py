@@ -215,10 +215,6 @@ PRESETS: dict[str, Callable[[Sequence[TrialFacts]], SplitPlan]] = {
 """Plans worth a name, as functions of the trials there are. `objects` and `trials` deal 70 % to train and 15 % each to
 validation and test, by whole objects or by single trials."""
 
-__all__ = [
-    "PRESETS", "SPLITS_FILE", "SplitPlan", "SplitResult", "SplitRule", "assign_splits", "read_splits",
-    "split_dataset"
-]  # fmt: skip
 
 SPLITS_FILE = "splits.json"
 """Keeps, in the folder of a data set, the rules that its splits come from."""
@@ -306,6 +302,8 @@ def split_dataset(data: Dataset | Path | str, rules: SplitPlan | Path | str, *, 
 
     Parameters
     ----------
+    data
+        Data set, or its folder.
     rules
         Rules, their file (TOML), or the name of a preset (`PRESETS`).
     dry_run
@@ -413,3 +411,8 @@ def _names(names: Sequence[str]) -> str:
 
 def _are(things: Sequence[object]) -> str:
     return "are" if len(things) > 1 else "is"
+
+
+__all__ = [
+    "PRESETS", "SPLITS_FILE", "SplitPlan", "SplitResult", "SplitRule", "assign_splits", "read_splits", "split_dataset",
+]  # fmt: skip

@@ -44,6 +44,8 @@ def evaluate(
     ----------
     run
         The network, its folder, or the name of one that comes with sliplens.
+    data
+        Data set with labels, or its folder.
     out
         Folder to write, with `result.json` and `predictions.parquet`; nothing is written if None.
     split
@@ -146,9 +148,19 @@ def evaluate_frames(
     batch_size: int = 64,
     on_progress: OnProgress | None = None,
 ) -> Evaluation:
-    """Predict frames, which must be in the network's encoding and size, and score each condition, day and trial.
+    """Predict frames, and score the answers for each condition, day and trial.
 
-    `split` is what they are called in the result; `RecordingError` if there is none.
+    Parameters
+    ----------
+    frames
+        Labelled frames in the network's encoding and size, as `load_frames` gives them.
+    split
+        What they are called in the result.
+
+    Raises
+    ------
+    RecordingError
+        If there is no frame.
     """
     count = len(frames)
     if not count:
