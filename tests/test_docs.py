@@ -16,9 +16,14 @@ PAGE = pytest.mark.parametrize(
 )
 
 
-NO_MODULES = {f"sliplens.{name}" for name in ("fills", "formats", "encodings", "backbones", "engines")} | {
-    f"sliplens.{name}" for name in ("manifest", "input", "output", "recipes", "augmentations", "sources")
-}
+NO_MODULES = (
+    {f"sliplens.{name}" for name in ("fills", "formats", "encodings", "backbones", "engines")}
+    | {
+        f"sliplens.{name}"
+        for name in ("manifest", "input", "output", "recipes", "augmentations", "sources", "estimators")
+    }
+    | {"sliplens.sensors", "sliplens.presets"}
+)
 """Groups of entry points, and keys in the metadata of an ONNX file."""
 _CODE = re.compile(r"^```(\w*)\n(.*?)^```", flags=re.MULTILINE | re.DOTALL)
 
