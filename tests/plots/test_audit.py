@@ -282,6 +282,17 @@ def test_ratio_of_a_light_touch_does_not_squeeze_the_rest():
     assert MU < ratio.get_ylim()[1] < 4 * MU
 
 
+def test_a_touch_that_does_not_press_has_no_ratio():
+    trial = make_trial()
+    normal = trial.normal_force_n.copy()
+    normal[4:6] = 0.0, -0.01
+    trial = replace(trial, normal_force_n=normal, tangential_force_n=np.abs(trial.tangential_force_n) + 0.01)
+
+    (line,) = [one for one in charts(draw_audit(trial, make_labelling()))[1].lines if "contact" in str(one.get_label())]
+
+    assert np.isnan(np.asarray(line.get_ydata())[4:6]).all()
+
+
 @pytest.mark.parametrize("changes", [{}, {"lowest": 0.4}, {"pull": 700}, {"pull": 2}])
 def test_six_pictures_are_the_reference_and_five_frames_in_the_order_of_time(changes):
     trial = make_trial(**changes)

@@ -8,7 +8,7 @@ from textwrap import wrap
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -154,6 +154,7 @@ def _three(values: Sequence[float], write: Callable[..., str] = decimals) -> str
 
 
 _HIGHEST = 2.5  # times mu_s: where hardly anything presses, F_t / F_n goes anywhere
+_HIGHEST_UNKNOWN = 2.0  # where mu_s is not known
 
 
 def plot_contact_forces(recording: Recording, threshold_n: float | None, *, ax: Axes) -> None:
@@ -170,17 +171,33 @@ def plot_contact_forces(recording: Recording, threshold_n: float | None, *, ax: 
         _leave_empty(ax, "no forces were recorded")
 
 
+def force_ratio(recording: Recording) -> Float[np.ndarray, " frames"]:
+    """F_t / F_n where something touches and presses, NaN elsewhere."""
+    normal = recording.normal_force_n
+    touches = (normal > 0) & np.array([state != ContactState.NO_CONTACT for state in recording.contact_state])
+    return np.divide(recording.tangential_force_n, normal, where=touches, out=np.full(len(recording), np.nan))
+
+
+def end_of_ratio(ratio: Float[np.ndarray, " frames"], mu: float, *, above: float = 0.0) -> float:
+    """Where to end a chart of F_t / F_n: a little above what there is, friction and what else is drawn included.
+
+    A light touch does not stretch it; `mu` is 0 where friction is not known.
+    """
+    least, largest = max(mu, above), float(np.max(ratio, where=np.isfinite(ratio), initial=0))
+    highest = max(_HIGHEST * mu, least) if mu else _HIGHEST_UNKNOWN
+    return 1.12 * max(least, min(largest, highest)) or 1.0
+
+
 def plot_force_ratio(recording: Recording, friction: FrictionEstimate | None, *, ax: Axes) -> None:
     """Draw F_t / F_n of the frames in contact, and the static friction with its interval.
 
     Where friction came with the frames (None), that of each frame is drawn.
     """
-    touches = np.array([state != ContactState.NO_CONTACT for state in recording.contact_state])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(touches, recording.tangential_force_n / recording.normal_force_n, np.nan)
+    ratio = force_ratio(recording)
     drawn = {"color": BLUE, "linewidth": _width(recording), "marker": _marker(recording)}
     ax.plot(recording.time_s, ratio, label="$F_t/F_n$ in contact" if np.isfinite(ratio).any() else "_", **drawn)
     mu, low, high = (friction.mu, friction.low, friction.high) if friction else (None, None, None)
+    touches = np.array([state != ContactState.NO_CONTACT for state in recording.contact_state])
     own = np.where(touches, recording.friction_coefficient, np.nan)
     if friction is None and np.isfinite(own).any():
         ax.plot(recording.time_s, own, color=GREEN, linewidth=1.1, label=r"$\mu$ that came with the frames")
@@ -189,10 +206,7 @@ def plot_force_ratio(recording: Recording, friction: FrictionEstimate | None, *,
         ax.axhspan(low, high, color=GREEN, alpha=0.35, linewidth=0, label="its 68 % interval")
     if mu is not None and friction is not None:
         ax.axhline(mu, color=GREEN, linewidth=1.1, label=f"$\\mu_s$ = {mu:.3g}")
-    largest = float(np.max(ratio, where=np.isfinite(ratio), initial=0))
-    known = [value for value in (mu, high) if value is not None]
-    ceiling = max(_HIGHEST * mu, *known) if mu else 2.0
-    ax.set(ylabel="$F_t/F_n$", xmargin=0, ylim=(0, 1.12 * max([min(largest, ceiling), *known]) or 1))
+    ax.set(ylabel="$F_t/F_n$", xmargin=0, ylim=(0, end_of_ratio(ratio, mu or 0.0, above=high or 0.0)))
     if not np.isfinite(ratio).any():
         _leave_empty(ax, "F_t / F_n is not known")
 

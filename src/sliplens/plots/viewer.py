@@ -24,12 +24,12 @@ from matplotlib.colors import to_rgba
 from sliplens.errors import InputError
 from sliplens.extras import require_packages
 from sliplens.images import absolute_difference, encode_png
-from sliplens.plots.audit import Fact, audit_facts
+from sliplens.plots.audit import Fact, audit_facts, end_of_ratio, force_ratio
 from sliplens.plots.contact_sheet import STATE_COLOURS, TIMES, brighten, brightening
 from sliplens.plots.layout import written_whole
 from sliplens.plots.style import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
 from sliplens.progress import OnProgress
-from sliplens.recordings import ContactState, Dataset, Recording, TrialInfo
+from sliplens.recordings import Dataset, Recording, TrialInfo
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.dataset import trial_path
 from sliplens.recordings.labelling import LabelBasis
@@ -233,13 +233,6 @@ def rgba(colour: str) -> list[int]:
     return [round(255 * part) for part in to_rgba(colour)]
 
 
-def force_ratio(trial: Recording) -> Float[np.ndarray, " frames"]:
-    """F_t / F_n where something touches, NaN elsewhere."""
-    normal = trial.normal_force_n
-    touches = (normal > 0) & np.array([state != ContactState.NO_CONTACT for state in trial.contact_state])
-    return np.divide(trial.tangential_force_n, normal, where=touches, out=np.full(len(trial), np.nan))
-
-
 def log_numbers(stream: "RecordingStream", trial: Recording, static_friction: Float[np.ndarray, " _"] | None) -> None:
     """Log forces, their ratio where something touches, and labels: a line each."""
     rerun = require_rerun()
@@ -370,7 +363,6 @@ def _stored_rows(path: Path) -> Iterator[pa.RecordBatch]:
 
 _APPLICATION = "sliplens"
 _SAMPLED = 32  # frames that are looked at for the brightness of all
-_HIGHEST = 2.5  # times mu_s: where hardly anything presses, F_t / F_n goes anywhere
 
 
 def write_rrd(data: Dataset, info: TrialInfo, path: Path, *, on_progress: OnProgress | None = None) -> None:
@@ -405,7 +397,8 @@ def log_trial(
     friction = _static_friction(path, trial, truth, basis)
     some = read_frames(path, range(0, len(trial), -(-len(trial) // _SAMPLED)))
     size, factor = trial.reference.shape[:2], brightening([absolute_difference(some, trial.reference)])
-    highest = _highest_ratio(trial, friction)
+    frictions = trial.friction_coefficient if friction is None else friction
+    highest = end_of_ratio(force_ratio(trial), float(np.max(frictions, where=np.isfinite(frictions), initial=0)))
     stream.send_recording_name(info.trial)
     stream.send_blueprint(
         lay_out(size=size, factor=factor, highest_ratio=highest, truth=truth is not None, sensor=sensor)
@@ -441,13 +434,6 @@ def _static_friction(
         return None if basis is None else np.full(len(trial), basis.friction.mu)
     with reading(path):
         return pq.read_table(path, columns=["static_friction"])["static_friction"].to_numpy().astype(np.float64)
-
-
-def _highest_ratio(trial: Recording, static_friction: Float[np.ndarray, " frames"] | None) -> float:
-    """Where to end the chart of F_t / F_n: a little above what there is."""
-    friction, ratio = trial.friction_coefficient if static_friction is None else static_friction, force_ratio(trial)
-    mu, most = (float(np.max(values, where=np.isfinite(values), initial=0)) for values in (friction, ratio))
-    return 1.12 * max(mu, min(most, _HIGHEST * mu)) or 1.0
 
 
 def _new_stream() -> "RecordingStream":
