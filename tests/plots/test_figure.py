@@ -49,7 +49,7 @@ def test_records_of_a_workspace_have_a_figure_each(results):
         assert figure.axes[0].get_xlabel() == label
 
 
-def test_what_raises_is_blue_and_what_lowers_is_red(explanation):
+def test_what_raises_is_blue_and_what_lowers_is_orange(explanation):
     ax = sl.plot(explanation, index=1).axes[0]
 
     pixels = np.asarray(ax.images[0].get_array())

@@ -1,15 +1,44 @@
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from sliplens.errors import SaliencyError
-from sliplens.plots.saliency import overlay_saliency, plot_colour_bar, stretch_saliency
+from sliplens.plots.saliency import full_colour, overlay_relevance, overlay_saliency, plot_colour_bar, stretch_saliency
+from sliplens.plots.style import ORANGE, SKY
 
 
 def test_overlay_has_the_size_of_its_picture(rng):
     picture = rng.integers(0, 256, (20, 30, 3)).astype(np.uint8)
 
     assert overlay_saliency(picture, rng.random((20, 30))).shape == (20, 30, 3)
+
+
+def test_relevance_is_orange_below_zero_and_blue_above():
+    relevance = np.zeros((4, 4), dtype=np.float32)
+    relevance[0, 0], relevance[3, 3] = -0.2, 0.2
+
+    painted = overlay_relevance(np.full((4, 4, 3), 100, dtype=np.uint8), relevance / full_colour(relevance))
+
+    np.testing.assert_allclose(painted[0, 0] / 255, to_rgb(ORANGE), atol=1 / 255)
+    np.testing.assert_allclose(painted[3, 3] / 255, to_rgb(SKY), atol=1 / 255)
+    # where nothing happens the picture is grey
+    assert len(set(painted[1, 1].tolist())) == 1
+
+
+def test_relevance_of_another_size_is_laid_on_its_places():
+    painted = overlay_relevance(np.zeros((8, 8, 3), dtype=np.uint8), np.array([[1.0, 0.0], [0.0, 0.0]]))
+
+    assert painted[:4, :4].any(axis=-1).all()
+    assert not painted[4:].any()
+    assert not painted[:, 4:].any()
+
+
+def test_the_full_colour_is_seen_however_few_pixels_speak():
+    alone = np.zeros((100, 100))
+    assert full_colour(alone) == 1
+    alone[3, 4] = -0.01
+    assert full_colour(alone) == 0.01
 
 
 def test_without_saliency_the_picture_shines_through_in_grey(rng):

@@ -40,7 +40,7 @@ def test_colours_tell_the_sign_and_nothing_is_coloured_where_nothing_speaks(stri
     empty, mapped = (np.asarray(ax.images[0].get_array()) for ax in draw_strip(strip).axes[:2])
     assert np.ptp(empty, axis=2).max() < 1e-6  # grey all over
     lowers, raises = mapped[0, 0], mapped[2, 2]
-    assert lowers[0] > lowers[2]  # red
+    assert lowers[0] > lowers[2]  # orange
     assert raises[2] > raises[0]  # blue
 
 

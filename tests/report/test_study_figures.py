@@ -4,14 +4,12 @@ import csv
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from sliplens.errors import InputError
 from sliplens.faithfulness.deletion import deletion_order
-from sliplens.plots.style import ORANGE, SKY
 from sliplens.report import load_results
-from sliplens.report.pictures import paint_effects, plate_removal
+from sliplens.report.pictures import plate_removal
 from sliplens.report.plates import (
     Cell,
     Plate,
@@ -19,6 +17,7 @@ from sliplens.report.plates import (
     draw_grid,
     explained_of,
     gone,
+    picture_brightness,
     shown_frames,
     told_frame,
     write_plates,
@@ -87,25 +86,13 @@ def test_differences_are_made_brighter_all_alike_and_raw_frames_never(results):
     np.testing.assert_array_equal(brighter[0], np.minimum(np.round(np.float32(factor) * difference.pictures[0]), 255))
 
 
-def test_effects_are_orange_below_zero_and_blue_above():
-    picture = np.full((4, 4, 3), 100, dtype=np.uint8)
-    effects = np.zeros((4, 4), dtype=np.float32)
-    effects[0, 0], effects[3, 3] = -0.2, 0.2
+def test_only_pictures_on_black_are_brightened(rng):
+    dark, middle = (np.full((1, 8, 8, 3), level, dtype=np.uint8) for level in (20, 128))
 
-    painted = paint_effects(picture, effects)
-
-    np.testing.assert_allclose(painted[0, 0] / 255, to_rgb(ORANGE), atol=1 / 255)
-    np.testing.assert_allclose(painted[3, 3] / 255, to_rgb(SKY), atol=1 / 255)
-    # where nothing happens the picture is grey
-    assert len(set(painted[1, 1].tolist())) == 1
-
-
-def test_effects_of_another_size_are_laid_on_their_places():
-    painted = paint_effects(np.zeros((8, 8, 3), dtype=np.uint8), np.array([[1.0, 0.0], [0.0, 0.0]], dtype=np.float32))
-
-    assert painted[:4, :4].any(axis=-1).all()
-    assert not painted[4:].any()
-    assert not painted[:, 4:].any()
+    assert picture_brightness("difference", dark) == (12.8, "Input \N{MULTIPLICATION SIGN}\N{NO-BREAK SPACE}12.8")
+    assert picture_brightness("amplitude", dark)[0] == 12.8
+    # no change is mid-grey in signed differences: twice as bright it would be white
+    assert picture_brightness("signed", middle) == picture_brightness("raw", middle) == (1.0, "Input")
 
 
 def test_removed_pixels_are_as_many_as_the_caption_says(results):

@@ -13,13 +13,13 @@ from sliplens.plots.layout import place_axes, place_text, require_picture_path, 
 from sliplens.plots.style import (
     BLACK,
     BLUE,
+    CONDITION_COLOURS,
     CONTROL,
     GREEN,
     GREY,
     INPUT_COLOURS,
     METHOD_COLOURS,
     METHOD_LINES,
-    ORANGE,
     PURPLE,
     VERMILLION,
     conditions_in_order,
@@ -125,7 +125,6 @@ def _limits(prediction: np.ndarray) -> tuple[float, float]:
     return min(-5.0, 100 * float(prediction.min()) - 3), max(105.0, 100 * float(prediction.max()) + 3)
 
 
-_COLOURS = {"dry": ORANGE, "wet": BLUE}
 _WIDTH, _HEIGHT, _LEFT, _TOP, _GAP, _CHART = 12.0, 7.5, 0.75, 1.25, 0.95, (3.05, 2.25)
 _MOST_DOTS = 4000
 _READER = 0.36  # inches a reader of the margin
@@ -148,7 +147,7 @@ def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
         charts = [place_axes(figure, left, top, *_CHART) for top in tops for left in lefts]
         predictions = evaluation.predictions
         plot_answers(predictions, conditions, ax=charts[0])
-        bins = [(name, _COLOURS.get(name, GREEN), evaluation.conditions[name].bins) for name in conditions]
+        bins = [(name, CONDITION_COLOURS.get(name, GREEN), evaluation.conditions[name].bins) for name in conditions]
         _draw_bins(bins, ax=charts[1])
         charts[1].set(xlabel="True Γ, lower edge of the bin (%)", ylabel=_MSE_LABEL, title="Error by margin")
         charts[1].set_xticks(range(10), [str(10 * one) for one in range(10)])
@@ -170,7 +169,7 @@ def plot_answers(predictions: Predictions, conditions: list[str], *, ax: Axes) -
         rows = np.flatnonzero(predictions.condition == name)
         rows = rows[:: max(1, len(rows) // _MOST_DOTS)]
         label, read = 100 * predictions.safety_margin[rows], 100 * predictions.prediction[rows]
-        ax.scatter(label, read, s=5, alpha=0.35, color=_COLOURS.get(name, GREEN), label=name, **_DOTS)
+        ax.scatter(label, read, s=5, alpha=0.35, color=CONDITION_COLOURS.get(name, GREEN), label=name, **_DOTS)
     ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="perfect")
     ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103), title="Answers")
     ax.legend(markerscale=2.5, fontsize=8, loc="upper left")
@@ -182,7 +181,7 @@ def _plot_trials(predictions: Predictions, conditions: list[str], *, ax: Axes) -
         error = 100 * (shown.prediction - shown.safety_margin)
         biases = [float(error[shown.trial == trial].mean()) for trial in np.unique(shown.trial)]
         spread = np.linspace(-0.25, 0.25, len(biases)) if len(biases) > 1 else np.zeros(1)
-        ax.scatter(np.sort(biases), place + spread, s=14, color=_COLOURS.get(name, GREEN), linewidths=0)
+        ax.scatter(np.sort(biases), place + spread, s=14, color=CONDITION_COLOURS.get(name, GREEN), linewidths=0)
     ax.axvline(0, color=BLACK, linewidth=1, linestyle="--")
     ax.set(xlabel="Mean of predicted less true Γ (points)", title="Bias of each trial")
     ax.set_ylim(len(conditions) - 0.5, -0.5)
@@ -193,7 +192,7 @@ def _plot_coverage(reliability: Mapping[str, Reliability], conditions: list[str]
     known = {name: reliability[name].coverage for name in conditions if reliability[name].coverage}
     for name, shares in known.items():
         promised, held = zip(*sorted((100 * float(level), 100 * share) for level, share in shares.items()), strict=True)
-        ax.plot(promised, held, label=name, color=_COLOURS.get(name, GREEN), marker="o", markersize=4)
+        ax.plot(promised, held, label=name, color=CONDITION_COLOURS.get(name, GREEN), marker="o", markersize=4)
     ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="as promised")
     ax.set(xlabel="Promised (% of the frames)", ylabel="Held (%)", xlim=(40, 100), ylim=(0, 102), title="Intervals")
     if not known:
@@ -212,7 +211,7 @@ def _plot_uncertainty(predictions: Predictions, conditions: list[str], auroc: fl
     for name in conditions:
         shown = sigma[predictions.condition == name]
         weights = np.full(len(shown), 100 / len(shown))
-        ax.hist(shown, bins=edges, weights=weights, color=_COLOURS.get(name, GREEN), alpha=0.6, label=name)
+        ax.hist(shown, bins=edges, weights=weights, color=CONDITION_COLOURS.get(name, GREEN), alpha=0.6, label=name)
     ax.legend(fontsize=8)
 
 
@@ -245,7 +244,7 @@ def _plot_readers(
         r2 = np.array([np.nan if one.r2 is None else one.r2 for one in scores])
         mae = np.array([100 * one.mae for one in scores])
         for ax, values, digits in ((first, r2, 2), (second, mae, 1)):
-            ax.barh(at, np.maximum(values, _LOWEST_R2), height=thick, color=_COLOURS.get(name, GREEN), label=name)
+            ax.barh(at, np.maximum(values, _LOWEST_R2), height=thick, color=CONDITION_COLOURS.get(name, GREEN), label=name)
             for place, value in zip(at, values, strict=True):
                 if np.isfinite(value):
                     # -0.00 would look like less than nothing

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from sliplens.codec import Columns
 from sliplens.errors import InputError
 from sliplens.plots.errors import MARGIN_LABEL, plot_answers, plot_faithfulness, plot_learning_curves
-from sliplens.plots.saliency import overlay_saliency, stretch_saliency
-from sliplens.plots.strip import overlay_relevance, plot_readings
+from sliplens.plots.saliency import full_colour, overlay_relevance, overlay_saliency, stretch_saliency
+from sliplens.plots.strip import plot_readings
 from sliplens.plots.style import (
     BLACK,
     BLUE,
@@ -86,14 +86,13 @@ def _explanation(explanation: Any, ax: Axes, index: int) -> None:
     image, relevance = (
         _array(values)[_of(len(values), index)] for values in (explanation.images, explanation.relevance)
     )
-    limit = float(np.percentile(np.abs(relevance), 99.5)) or 1.0
     picture = np.round(255 * np.clip(image, 0, 1)).astype(np.uint8).transpose(1, 2, 0)
     read, compared = (
         percent(float(_array(values)[index])) for values in (explanation.prediction, explanation.reference_prediction)
     )
-    ax.imshow(overlay_relevance(picture, relevance / limit))
+    ax.imshow(overlay_relevance(picture, relevance / full_colour(relevance)))
     ax.set_axis_off()
-    ax.set_title(f"{method_name(explanation.method)}: why {read} rather than {compared}\nred lowers, blue raises")
+    ax.set_title(f"{method_name(explanation.method)}: why {read} rather than {compared}\norange lowers, blue raises")
 
 
 def _explained(explained: Explained, ax: Axes, index: int) -> None:
@@ -149,7 +148,8 @@ def _predictions(predictions: Any, ax: Axes, index: int) -> None:
     across = _column(shown, "time_s" if timed else "frame")
     if "low_90" in shown.column_names:
         low, high = 100 * _column(shown, "low_90"), 100 * _column(shown, "high_90")
-        ax.fill_between(across, low, high, color=BLUE, alpha=0.18, linewidth=0, label="90 % interval")
+        if np.isfinite(low).any():  # a network that was never calibrated tells none
+            ax.fill_between(across, low, high, color=BLUE, alpha=0.18, linewidth=0, label="90 % interval")
     ax.plot(across, 100 * _column(shown, "prediction"), color=BLUE, label="read")
     if "safety_margin" in shown.column_names:
         ax.plot(across, 100 * _column(shown, "safety_margin"), color=BLACK, linestyle="--", label="true")

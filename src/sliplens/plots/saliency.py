@@ -6,10 +6,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from matplotlib.figure import Figure
 
 from sliplens.arrays import require_saliency
-from sliplens.plots.style import in_order
+from sliplens.plots.style import ORANGE, SKY, in_order
 from sliplens.results.explanation import ExplainedFrame
 
 # perceptually uniform, rises in lightness, and read alike under every common colour blindness
@@ -45,6 +46,32 @@ def plot_colour_bar(*, ax: Axes) -> Axes:
     ax.set(xlabel="Saliency (share of its own picture's 99.5th percentile)", yticks=[], xticks=[0, 0.25, 0.5, 0.75, 1])
     ax.grid(visible=False)
     return ax
+
+
+LOWERS, RAISES = ORANGE, SKY
+"""Colours of what lowers an answer and of what raises it: bright on dark, and told apart by everyone."""
+SIGN_COLOURS = LinearSegmentedColormap.from_list("sign", [LOWERS, (DIM / 2,) * 3, RAISES])
+"""Both over a mid-grey picture, from -1 to 1."""
+
+
+def full_colour(relevance: Float[np.ndarray, "*any"], *, percentile: float = FULL_COLOUR_PERCENTILE) -> float:
+    """Size of signed values that gets the full colour; 1 where all are zero."""
+    sizes = np.abs(relevance)
+    return float(np.percentile(sizes, percentile)) or float(sizes.max()) or 1.0
+
+
+def overlay_relevance(
+    picture: UInt8[np.ndarray, "height width 3"], share: Float[np.ndarray, "rows columns"]
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Picture in dimmed grey under a signed map in [-1, 1]: orange lowers, blue raises, the stronger the less grey.
+
+    A map of another height and width than the picture's is repeated.
+    """
+    places = [np.arange(side) * count // side for side, count in zip(picture.shape, share.shape, strict=False)]
+    value = np.clip(share[np.ix_(*places)].astype(np.float64), -1, 1)[..., None]
+    colour = np.where(value < 0, to_rgb(LOWERS), to_rgb(RAISES))
+    mixed = (1 - np.abs(value)) * (DIM * lightness(picture))[..., None] + np.abs(value) * colour
+    return np.round(255 * mixed).astype(np.uint8)
 
 
 def lightness(picture: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:

@@ -1,35 +1,31 @@
 """A grip from stick to slip on one picture: camera, map, and the margin that was true and read."""
 
 import numpy as np
-from jaxtyping import Float, UInt8
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from sliplens.plots.layout import place_axes, place_text
+from sliplens.plots.saliency import SIGN_COLOURS, full_colour, overlay_relevance
 from sliplens.plots.style import BLACK, BLUE, INPUT_NAMES, SOURCE_NAMES, VERMILLION, drawing_style, method_name
 from sliplens.results.explanation import Strip
 
 _WIDTH_IN, _MARGIN_IN, _GAP_IN, _CHART_IN = 10.0, 0.75, 0.08, 2.2
-_COLOURS = "RdBu"
-"""Red lowers the margin, blue raises it: told apart under every common colour blindness."""
-_FULL_COLOUR_PERCENTILE = 99.5
 
 
 def draw_strip(strip: Strip) -> Figure:
     """Draw a trial from stick to slip.
 
     Above, what the camera saw at a few moments with the map over it, on one scale for all: blue where a pixel raises
-    the read margin, red where it lowers it. Below, the true and the read margin over time, with the 90 % interval.
+    the read margin, orange where it lowers it. Below, the true and the read margin over time, with the 90 % interval.
     """
     count = len(strip.shown)
     cell = (_WIDTH_IN - _MARGIN_IN - 1.0 - _GAP_IN * (count - 1)) / count
     height = 1.05 + cell + 0.45 + _CHART_IN + 0.6
     # the map's own units are too small to read: points of the margin for every hundredth of the picture
     points = strip.relevance * strip.relevance[0].size
-    limit = float(np.percentile(np.abs(points), _FULL_COLOUR_PERCENTILE)) or 1.0
+    limit = full_colour(points)
     with drawing_style():
         figure = Figure(figsize=(_WIDTH_IN, height))
         head = f"A {strip.condition} grip from stick to slip ({SOURCE_NAMES[strip.source]})"
@@ -43,7 +39,7 @@ def draw_strip(strip: Strip) -> Figure:
             words = f"{number + 1}: {read} read\n{true} true"
             ax.set_title(words, fontsize=9.5, loc="center", fontweight="normal")
         bar = place_axes(figure, _WIDTH_IN - 0.9, 1.05, 0.13, cell)
-        figure.colorbar(ScalarMappable(Normalize(-limit, limit), _COLOURS), cax=bar)
+        figure.colorbar(ScalarMappable(Normalize(-limit, limit), SIGN_COLOURS), cax=bar)
         bar.set_ylabel("points of margin\nper 1 % of the image", fontsize=8)
         bar.tick_params(labelsize=8)
         chart = place_axes(figure, _MARGIN_IN, 1.05 + cell + 0.4, _WIDTH_IN - _MARGIN_IN - 1.0, _CHART_IN)
@@ -59,7 +55,8 @@ def plot_readings(strip: Strip, *, ax: Axes) -> Axes:
     read, low, high = (
         np.where(touched, 100 * value, np.nan) for value in (readings.prediction, readings.low, readings.high)
     )
-    ax.fill_between(time_s, low, high, color=BLUE, alpha=0.18, linewidth=0, label="90 % interval")
+    if np.isfinite(low).any():  # a network that was never calibrated tells none
+        ax.fill_between(time_s, low, high, color=BLUE, alpha=0.18, linewidth=0, label="90 % interval")
     ax.plot(time_s, read, color=BLUE, label="read from the image")
     ax.plot(time_s, 100 * readings.safety_margin, color=BLACK, linestyle="--", label="true")
     for number, frame in enumerate(strip.shown, start=1):
@@ -78,23 +75,9 @@ def _subtitle(strip: Strip) -> str:
     network = INPUT_NAMES.get(strip.input, strip.input).lower()
     return (
         f"Camera frames under the map of {method_name(strip.method)}, for the network on {network}: "
-        "red lowers the margin that it reads, blue raises it"
+        "orange lowers the margin that it reads, blue raises it"
     )
 
 
 def _percent(value: float) -> str:
     return f"{100 * value:.0f} %" if np.isfinite(value) else "-"
-
-
-def overlay_relevance(
-    picture: UInt8[np.ndarray, "height width 3"], share: Float[np.ndarray, "rows columns"]
-) -> Float[np.ndarray, "height width 3"]:
-    """Picture in grey under a signed map in [-1, 1]; the stronger a pixel, the more colour."""
-    height, width = picture.shape[:2]
-    rows, columns = (
-        np.arange(side) * length // side for side, length in zip((height, width), share.shape, strict=True)
-    )
-    value = np.clip(share[np.ix_(rows, columns)], -1, 1)
-    grey = (picture @ np.array([0.299, 0.587, 0.114]) / 255)[..., None]
-    opacity = np.clip(np.abs(value) * 1.2, 0, 0.85)[..., None]
-    return (1 - opacity) * grey + opacity * colormaps[_COLOURS]((value + 1) / 2)[..., :3]

@@ -20,6 +20,7 @@ UNKNOWN = "\N{EN DASH}"
 """Stands for a number that is not there."""
 INPUT_NAMES = {"raw": "Raw images", "difference": "Difference images"}
 INPUT_COLOURS = {"raw": ORANGE, "difference": BLUE}
+CONDITION_COLOURS = {"dry": ORANGE, "wet": BLUE}
 SOURCE_NAMES = {"simulated": "simulated touch", "real": "real touch"}
 
 CONTROL = CHANCE

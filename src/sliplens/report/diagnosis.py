@@ -4,19 +4,24 @@ from collections.abc import Iterable
 from dataclasses import fields
 
 import numpy as np
-from matplotlib import colormaps
 
-from sliplens.plots.contact_sheet import TIMES, brighten, brightening
+from sliplens.plots.contact_sheet import brighten
 from sliplens.plots.layout import place_axes
-from sliplens.plots.style import BLACK, BLUE, GREY, ORANGE, decimals, drawing_style, input_name, percent, signed
+from sliplens.plots.saliency import SIGN_COLOURS, full_colour, overlay_relevance
+from sliplens.plots.style import (
+    BLACK,
+    CONDITION_COLOURS,
+    GREY,
+    decimals,
+    drawing_style,
+    input_name,
+    percent,
+    signed,
+)
 from sliplens.report.charts import make_charts
-from sliplens.report.plates import Cell, Plate, draw_grid, named_columns, rows_of
+from sliplens.report.plates import Cell, Plate, draw_grid, named_columns, picture_brightness, rows_of
 from sliplens.report.tables import Table, make_table
 from sliplens.results.diagnosis import Diagnosis, FrictionTable
-
-_DIVERGING = "PuOr"
-"""Colours of two signs that every common colour blindness tells apart."""
-_COLOURS = {"dry": ORANGE, "wet": BLUE}
 
 
 def show_diagnosis(diagnosis: Diagnosis) -> Iterable[Table | Plate]:
@@ -59,7 +64,7 @@ def plate_frictions(diagnosis: Diagnosis) -> Plate:
         for ax, ((condition,), own) in zip(axes, groups.items(), strict=True):
             ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1)
             for rows in own.groups("frame_id").values():
-                line = {"color": _COLOURS.get(condition, GREY), "alpha": 0.7, "linewidth": 1.2, "markersize": 3}
+                line = {"color": CONDITION_COLOURS.get(condition, GREY), "alpha": 0.7, "linewidth": 1.2, "markersize": 3}
                 ax.plot(100 * rows.safety_margin, 100 * rows.prediction, marker="o", **line)
             ax.set_title(f"{condition.capitalize()}: {told.get(condition, 'no slope')}", parse_math=False)
             ax.set(xlabel="True Γ with that friction (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103))
@@ -77,7 +82,8 @@ def plate_frictions(diagnosis: Diagnosis) -> Plate:
 def plate_refilmed(diagnosis: Diagnosis) -> Plate:
     """Show one frame with each of its frictions."""
     own = diagnosis.frictions.where(diagnosis.frictions.frame_id == diagnosis.shown_frame)
-    pictures, name = _bright(diagnosis, diagnosis.other_frictions)
+    factor, name = picture_brightness(diagnosis.input, diagnosis.pictures)
+    pictures = brighten(diagnosis.other_frictions, factor)
     rows = rows_of(own.friction, own.safety_margin, own.prediction)
     words = [f"Γ {percent(margin)}, read {percent(answer)}" for _, margin, answer in rows]
     cells = [Cell(picture=picture, words=below) for picture, below in zip(pictures, words, strict=True)]
@@ -95,9 +101,8 @@ def plate_refilmed(diagnosis: Diagnosis) -> Plate:
 def plate_kinds(diagnosis: Diagnosis) -> Plate:
     """Show the frames most like each kind of explanation beside their maps, in one scale of colours."""
     table, maps = diagnosis.explained, diagnosis.maps
-    pictures, name = _bright(diagnosis, diagnosis.pictures)
-    top = float(np.percentile(np.abs(maps), 99.5)) or 1.0
-    colours = (255 * colormaps[_DIVERGING]((np.clip(maps / top, -1, 1) + 1) / 2)[..., :3]).astype(np.uint8)
+    factor, name = picture_brightness(diagnosis.input, diagnosis.pictures)
+    pictures, top = brighten(diagnosis.pictures, factor), full_colour(maps)
     rows, shown, columns = [], [], ("kind", "frames", "trials", "error", "bias", "safety_margin", "friction")
     for kind in np.unique(table.cluster).tolist():
         own = table.where(table.cluster == kind)
@@ -108,13 +113,16 @@ def plate_kinds(diagnosis: Diagnosis) -> Plate:
             one = own.where(own.example == example)
             ((margin, answer, condition),) = rows_of(one.safety_margin, one.prediction, one.condition)
             words = f"Γ {percent(margin)}, read {percent(answer)}"
-            cells += [Cell(picture=pictures[example], words=words), Cell(picture=colours[example], words=condition)]
+            picture = pictures[example]
+            painted = overlay_relevance(picture, maps[example] / top)
+            cells += [Cell(picture=picture, words=words), Cell(picture=painted, words=condition)]
         shown.append((f"Kind {kind + 1}: {len(own)} frames, off by {100 * means[0]:.1f} points", cells))
     heads = [name, "parts"] * (max(len(cells) for _, cells in shown) // 2)
     grid = draw_grid(shown, heads=heads, below_in=0.6)
     with drawing_style():
         bar = place_axes(grid.figure, 1.25, grid.bottom_in + 0.12, 4.2, 0.14)
-        bar.imshow(np.linspace(-1, 1, 256)[None], cmap=_DIVERGING, extent=(-100 * top, 100 * top, 0, 1), aspect="auto")
+        ends = (-100 * top, 100 * top, 0, 1)
+        bar.imshow(np.linspace(-1, 1, 256)[None], cmap=SIGN_COLOURS, extent=ends, aspect="auto")
         bar.set(yticks=[], xlabel="Part in the answer (percentage points of Γ): lowers it, raises it")
     return Plate(
         name=f"diagnosis-kinds-{diagnosis.input}",
@@ -125,9 +133,3 @@ def plate_kinds(diagnosis: Diagnosis) -> Plate:
         numbers=named_columns(columns, rows),
         pixels=True,
     )
-
-
-def _bright(diagnosis: Diagnosis, pictures: np.ndarray) -> tuple[np.ndarray, str]:
-    """Pictures, brightened alike where they are differences, and what to call them."""
-    factor = 1.0 if diagnosis.input == "raw" else brightening([diagnosis.pictures])
-    return brighten(pictures, factor), "Input" if factor == 1 else f"Input {TIMES}\N{NO-BREAK SPACE}{factor:g}"

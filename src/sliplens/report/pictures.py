@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
 from PIL import Image
 
 from sliplens.errors import InputError
@@ -15,13 +14,11 @@ from sliplens.plots.contact_sheet import TIMES, brighten, brightening
 from sliplens.plots.errors import MARGIN_LABEL
 from sliplens.plots.layout import place_axes
 from sliplens.plots.markers import ARROWS, MarkedFrame, draw_fields_beside_saliency, plot_arrows, plot_field
-from sliplens.plots.saliency import DIM, FULL_COLOUR_PERCENTILE, lightness
+from sliplens.plots.saliency import FULL_COLOUR_PERCENTILE, full_colour, overlay_relevance
 from sliplens.plots.strip import draw_strip
 from sliplens.plots.style import (
     BLUE,
     GREY,
-    ORANGE,
-    SKY,
     VERMILLION,
     drawing_style,
     input_name,
@@ -528,11 +525,11 @@ def plate_truth(results: Results, name: str) -> Plate | None:
         effects = (truth.shapley_maps[row], truth.network_maps[row], truth.margin_maps[row])
         cells = [Cell(picture=picture)]
         cells += [
-            Cell(picture=paint_effects(picture, one), words=f"up to {100 * np.abs(one).max():.1f} points")
+            Cell(picture=_painted(picture, one, percentile=100), words=f"up to {100 * np.abs(one).max():.1f} points")
             for one in effects
         ]
         maps = [explained.relevance[method][index] for method in methods]
-        cells += [Cell(picture=paint_effects(picture, one, full=FULL_COLOUR_PERCENTILE)) for one in maps]
+        cells += [Cell(picture=_painted(picture, one, percentile=FULL_COLOUR_PERCENTILE)) for one in maps]
         rows.append((f"Γ {percent(own.safety_margin)}\nread {percent(own.prediction)}", cells))
     truths = ("Shapley values\nin the answer", "Put back alone:\nthe answer", "Put back alone:\nthe margin")
     heads = [called, *truths, *(method_name(one) for one in methods)]
@@ -551,23 +548,10 @@ def plate_truth(results: Results, name: str) -> Plate | None:
     )
 
 
-def paint_effects(
-    picture: UInt8[np.ndarray, "height width 3"], effects: Float[np.ndarray, "rows columns"], *, full: float = 100
+def _painted(
+    picture: UInt8[np.ndarray, "height width 3"], values: Float[np.ndarray, "rows columns"], *, percentile: float
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Lay signed effects over a picture in dimmed grey: orange below zero, blue above, the stronger the less grey.
-
-    Effects of another height and width than the picture's are repeated. Colour is full at a percentile of their sizes.
-    """
-    places = [np.arange(side) * count // side for side, count in zip(picture.shape, effects.shape, strict=False)]
-    fitted = effects[np.ix_(*places)].astype(np.float64)
-    size = np.percentile(np.abs(fitted), full)
-    value = np.clip(fitted / size, -1, 1) if size > 0 else fitted
-    grey = (DIM * lightness(picture))[..., None]
-    alpha = np.abs(value)[..., None]
-    # bright on dark, and told apart under every common colour blindness
-    colour = np.where(value[..., None] < 0, to_rgb(ORANGE), to_rgb(SKY))
-    mixed = (1 - alpha) * grey + alpha * colour
-    return np.round(255 * mixed).astype(np.uint8)
+    return overlay_relevance(picture, values / full_colour(values, percentile=percentile))
 
 
 def _spread_out(ids: list[str], explained: Explained, places: dict[str, int]) -> list[str]:

@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -207,12 +207,15 @@ def bright_pictures(
     explained: Explained, indices: Sequence[int]
 ) -> tuple[dict[int, UInt8[np.ndarray, "height width 3"]], str]:
     """Pictures of some frames, and what to call them; differences are made brighter all alike, to be seen."""
-    pictures = {index: explained.pictures[index] for index in indices}
-    if explained.input != "difference":
-        return pictures, "Input"
-    factor = brightening([one[None] for one in pictures.values()])
-    name = "Input" if factor == 1 else f"Input {TIMES}\N{NO-BREAK SPACE}{factor:g}"
-    return {index: brighten(one, factor) for index, one in pictures.items()}, name
+    factor, name = picture_brightness(explained.input, [explained.pictures[index] for index in indices])
+    return {index: brighten(explained.pictures[index], factor) for index in indices}, name
+
+
+def picture_brightness(name: str, pictures: Iterable[UInt8[np.ndarray, "height width 3"]]) -> tuple[float, str]:
+    """By how much to brighten pictures of an input, all alike, and what to call them then."""
+    # where no change is black; elsewhere the ground would turn white
+    factor = brightening([one[None] for one in pictures]) if name in {"difference", "amplitude"} else 1.0
+    return factor, "Input" if factor == 1 else f"Input {TIMES}\N{NO-BREAK SPACE}{factor:g}"
 
 
 def told_frame(explained: Explained, curves: dict[str, DeletionCurve]) -> int | None:
