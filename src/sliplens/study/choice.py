@@ -14,7 +14,8 @@ from sliplens.models import Run
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset, Recording
 from sliplens.results.study import Choice, ChosenFrame, ChosenTrial, MarkedFrame, MarkerTable, ShownFrame, States
-from sliplens.study.explaining import DEFAULT_LEVELS, nearest_frame, require_levels
+from sliplens.study.explaining import DEFAULT_LEVELS as LEVELS
+from sliplens.study.explaining import nearest_frame
 
 SCORED_LEVELS = (0.4, 0.2, 0.0)
 """Margins at which the thesis scores: near slip, where there is much to explain."""
@@ -30,17 +31,13 @@ def choose_frames(
     condition: str = "dry",
     trials: int = 14,
     tolerance: float = 0.03,
-    levels: Sequence[float] = DEFAULT_LEVELS,
-    scored_levels: Sequence[float] = SCORED_LEVELS,
-    shown_trials: int = 1,
     on_progress: OnProgress | None = None,
 ) -> Choice:
     """Choose trials in which every network reads the frames along the margin within a tolerance, in margin units.
 
     An explanation of a wrong answer explains the error. Where fewer trials qualify than are wanted, those whose worst
     error is smallest are taken too; where more do, the first of them in the data set's order. In each the frames
-    nearest to the levels are taken: those at scored levels, and all where the panels show the trial, the best read
-    first.
+    nearest to `LEVELS` are taken: those at `SCORED_LEVELS`, and all of the trial that the panels show, the best read.
 
     References
     ----------
@@ -52,17 +49,15 @@ def choose_frames(
         raise InputError(f"a study of {trials} trials is impossible; ask for 1 or more")
     if not 0 <= tolerance <= 1:
         raise InputError(f"the tolerance is {tolerance:g}; give a share of the margin between 0 and 1")
-    known, scored = (", ".join(f"{level:g}" for level in some) for some in (require_levels(levels), scored_levels))
-    if not scored_levels or not set(scored_levels) <= set(levels):
-        raise InputError(f"scored levels must be some of the levels {known}, got {scored or 'none'}")
     infos = data.select(split=split, condition=condition)
     candidates: list[tuple[ChosenTrial, list[tuple[int, float]]]] = []
     errors: dict[str, dict[str, Float[np.ndarray, " levels"]]] = {}
+    scored = [level in SCORED_LEVELS for level in LEVELS]
     for info in counted(infos, on_progress):
         recording = data.load(info, truth=False)
         margin = np.where(recording.labelled, recording.safety_margin, np.nan)
-        rows = [nearest_frame(margin, level) for level in levels] if np.isfinite(margin).any() else []
-        near = bool(rows) and all(abs(margin[row] - level) <= _REACH for row, level in zip(rows, levels, strict=True))
+        rows = [nearest_frame(margin, level) for level in LEVELS] if np.isfinite(margin).any() else []
+        near = bool(rows) and all(abs(margin[row] - level) <= _REACH for row, level in zip(rows, LEVELS, strict=True))
         if near and len(set(rows)) == len(rows):
             own = errors[info.trial] = {}
             for name, trained in networks.items():
@@ -74,28 +69,28 @@ def choose_frames(
     if not candidates:
         raise RecordingError(
             f"none of the {len(infos)} {condition} trials of split {split!r} has a labelled frame within {_REACH:.0%} "
-            f"of each of {', '.join(f'{level:.0%}' for level in levels)}; choose other levels or another split"
+            f"of each of {', '.join(f'{level:.0%}' for level in LEVELS)}; choose another split or condition, or trials "
+            "with more frames from full stick to full slip"
         )
     days = {info.trial: info.day for info in infos}
     # sorting is stable: those that qualify keep the data set's order, so that none is picked for its looks
     taken = sorted(candidates, key=lambda item: 0.0 if item[0].qualified else item[0].worst)[:trials]
-    shown = {trial.trial for trial, _ in sorted(taken, key=lambda item: item[0].worst)[:shown_trials]}
+    shown = min((trial for trial, _ in taken), key=lambda trial: trial.worst).trial
     frames = tuple(
         ChosenFrame(
             id=f"{trial.trial}-f{row:04d}",
             trial=trial.trial,
             day=days[trial.trial],
             frame=row,
-            level=float(level),
+            level=level,
             safety_margin=label,
-            scored=level in scored_levels,
-            shown=trial.trial in shown,
+            scored=level in SCORED_LEVELS,
+            shown=trial.trial == shown,
         )
         for trial, rows in taken
-        for level, (row, label) in zip(levels, rows, strict=True)
-        if level in scored_levels or trial.trial in shown
+        for level, (row, label) in zip(LEVELS, rows, strict=True)
+        if level in SCORED_LEVELS or trial.trial == shown
     )
-    counts = [level in scored_levels for level in levels]
     choice = Choice(
         trials_wanted=trials,
         tolerance=tolerance,
@@ -105,14 +100,14 @@ def choose_frames(
             name: sum(trial.worst_error[name] <= tolerance for trial, _ in candidates) for name in networks
         },
         mean_error={
-            name: float(np.mean([errors[trial.trial][name][counts] for trial, _ in taken])) for name in networks
+            name: float(np.mean([errors[trial.trial][name][scored] for trial, _ in taken])) for name in networks
         },
         summary="",
         source=data.source,
         condition=condition,
         inputs=tuple(networks),
-        levels=tuple(float(level) for level in levels),
-        scored_levels=tuple(float(level) for level in scored_levels),
+        levels=LEVELS,
+        scored_levels=SCORED_LEVELS,
         trials=tuple(trial for trial, _ in taken),
         frames=frames,
     )
@@ -121,7 +116,7 @@ def choose_frames(
 
 def _summarise(choice: Choice, trials: int) -> str:
     networks, taken, wanted = len(choice.inputs), choice.trials, choice.trials_wanted
-    who = "the network reads" if networks == 1 else "both networks read" if networks == 2 else "all networks read"
+    who = "the network reads" if networks == 1 else "both networks read"
     summary = (
         f"Of {trials} {choice.condition} trials {choice.considered} have a frame near every level, and in "
         f"{choice.qualified} of those {who} every such frame within {choice.tolerance:.0%}."

@@ -18,13 +18,14 @@ from sliplens.errors import InputError, RecordingError
 from sliplens.explainers import EXPLAINERS, Explainer
 from sliplens.explainers.table import network_images
 from sliplens.models import Run
+from sliplens.plots.saliency import NOMINAL_MARGINS
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.source import open_source
 from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
 
-DEFAULT_LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
+DEFAULT_LEVELS = NOMINAL_MARGINS
 """Safety margins at which the thesis explains frames (section 4)."""
 
 _LABEL = re.compile(r"_(0|[1-9]\d?|100)$")
