@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jaxtyping import Float32, Float64, Int64
 
-from sliplens.codec import Columns, load_record, load_result, save_record, save_result
+from sliplens.codec import Columns, keep_part, load_record, load_result, save_record, save_result
 from sliplens.errors import InputError
 
 
@@ -101,6 +101,35 @@ def test_a_file_that_is_missing_or_no_such_file_is_told(tmp_path, name, damage):
         (tmp_path / name).write_bytes(b"garbage")
     with pytest.raises(InputError, match=name):
         load_result(tmp_path, Found, command="sliplens x")
+
+
+def test_arrays_damaged_inside_are_told(tmp_path, rng):
+    @dataclass(frozen=True, kw_only=True)
+    class Noise:
+        noise: Float64[np.ndarray, " values"]
+
+    save_result(Noise(noise=rng.normal(size=1000)), tmp_path)
+    path = tmp_path / "arrays.npz"
+    whole = path.read_bytes()
+    # the head of the compressed stream, and the middle
+    for at in (whole.index(b"noise.npy") + len(b"noise.npy") + 20, len(whole) // 2):
+        path.write_bytes(whole[:at] + bytes(64) + whole[at + 64 :])
+        with pytest.raises(InputError, match="cannot be read as arrays"):
+            load_result(tmp_path, Noise, command="sliplens x")
+
+
+def test_a_part_is_made_once_and_again_where_it_is_damaged(tmp_path):
+    made = []
+
+    def make() -> Part:
+        made.append("part")
+        return Part(name="a", error=0.5, curve=(1.0,))
+
+    assert keep_part(None, Part, make) == keep_part(tmp_path / "a", Part, make) == keep_part(tmp_path / "a", Part, make)
+    assert len(made) == 2  # once for none, which keeps nothing
+    (tmp_path / "a" / "result.json").write_bytes(b"")
+    assert keep_part(tmp_path / "a", Part, make) == make()
+    assert load_result(tmp_path / "a", Part, command="sliplens x") == make()
 
 
 def test_a_column_of_another_type_is_told(tmp_path):

@@ -5,7 +5,9 @@ not finite is told in one sentence with its place and its cure, by msgspec for J
 """
 
 import zipfile
+import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass
 from pathlib import Path
@@ -184,10 +186,12 @@ def keep_part(part: Path | None, kind: type[Record], make: Callable[[], Record])
     """Make a piece of long work, or read it from its folder where an interrupted run has made it; None keeps none."""
     if part is None:
         return make()
-    if not (part / RESULT_FILE).is_file():
-        piece = make()
-        part.mkdir(parents=True, exist_ok=True)
-        save_result(piece, part)
+    if (part / RESULT_FILE).is_file():
+        with suppress(InputError):  # damaged as the machine went down: nobody could make this part alone again
+            return load_result(part, kind, command="sliplens")
+    piece = make()
+    part.mkdir(parents=True, exist_ok=True)
+    save_result(piece, part)
     return load_result(part, kind, command="sliplens")
 
 
@@ -257,7 +261,7 @@ def _load_arrays(path: Path, declared: Mapping[str, Any], cure: str) -> dict[str
             arrays = {name: archive[name] for name in archive}
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; {cure}") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path} cannot be read as arrays ({_one_line(error)}); {cure}") from None
     given = {}
     with jaxtyped("context"):  # "frames" of one array are as many as "frames" of another

@@ -113,7 +113,7 @@ def explain_source(
         if not output.complete:
             with stage(on_progress, title) as count:
                 explained = explain(parts=output.folder / "parts", on_progress=count)
-            shutil.rmtree(output.folder / "parts")
+            shutil.rmtree(output.folder / "parts", ignore_errors=True)
             draw_explained(explained, output.folder, colours=colours)
             save_result(explained, output.folder)
             for warning in dict.fromkeys(one for notes in explained.methods.values() for one in notes.warnings):
