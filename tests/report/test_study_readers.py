@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,17 @@ def test_every_stage_is_read(study):
         found.truth,
     ):
         assert set(table) == {"raw"}
+
+
+def test_maps_of_real_touch_do_not_stand_for_the_studys_own(study):
+    real = shutil.copytree(study / "explain-raw", study / "explain-real")
+    change(real / "result.json", ("source",), "real")
+    change(real / "run.json", ("finished",), "2026-11-22T00:00:00+00:00")
+
+    results = load_results(study)
+
+    assert set(results.explanations) == {("raw", "simulated"), ("raw", "real")}
+    assert results.study.explanations["raw"].source == results.study.deletion["raw"].source == "simulated"
 
 
 def test_curves_and_scores_tell_the_same(study):

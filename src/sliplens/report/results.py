@@ -12,7 +12,7 @@ from sliplens.results.diagnosis import Diagnosis
 from sliplens.results.evaluation import Evaluation
 from sliplens.results.explanation import Explained, Strip, load_explained
 from sliplens.results.faithfulness import DeletionScores
-from sliplens.results.study import STAGES, TABLES, Study
+from sliplens.results.study import STAGES, TABLES, Choice, Study
 from sliplens.results.training import Simulation, Training, describe_simulation
 
 _OF_A_COMMAND: dict[str, type] = {
@@ -22,6 +22,10 @@ _OF_A_COMMAND: dict[str, type] = {
     "score": DeletionScores,
     "strip": Strip,
 }
+
+
+_BY_SOURCE = ("explain", "score")
+"""Stages of which a workspace may hold two, of simulated and of real touch."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +88,8 @@ def load_results(workspace: Path) -> Results:
         else:
             continue
         name = getattr(result, "input", "")
-        key = (run.stage, name, getattr(result, "source", "") if name else "")
+        # frames of a real sensor are explained beside a study's own
+        key = (run.stage, name, getattr(result, "source", "") if run.stage in _BY_SOURCE else "")
         if key in found:
             notes.append(
                 f"Two folders hold a result of “{' '.join(filter(None, key))}”: {folder.name} finished last and is "
@@ -99,6 +104,12 @@ def load_results(workspace: Path) -> Results:
     def of(stage: str) -> dict[str, Any]:
         return {name: value for (own, name, _), value in found.items() if own == stage}
 
+    choice: Choice | None = of("choice").get("")
+    of_study = {stage: of(stage) for stage in TABLES}
+    if choice is not None:
+        for stage in _BY_SOURCE:
+            own = {name: value for (one, name, source), value in found.items() if (one, source) == (stage, choice.source)}
+            of_study[stage] = own
     return Results(
         workspace=workspace,
         runs={folder.name: run for folder, run in runs.items()},
@@ -111,9 +122,9 @@ def load_results(workspace: Path) -> Results:
         strip=next(iter(of("strip").values()), None),
         study=Study(
             folder=workspace,
-            choice=of("choice").get(""),
+            choice=choice,
             states=of("states").get(""),
-            **{table: of(stage) for stage, table in TABLES.items()},  # pyright: ignore[reportArgumentType]
+            **{table: of_study[stage] for stage, table in TABLES.items()},  # pyright: ignore[reportArgumentType]
         ),
         notes=tuple(notes),
     )
