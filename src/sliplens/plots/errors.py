@@ -244,7 +244,9 @@ def _plot_readers(
         r2 = np.array([np.nan if one.r2 is None else one.r2 for one in scores])
         mae = np.array([100 * one.mae for one in scores])
         for ax, values, digits in ((first, r2, 2), (second, mae, 1)):
-            ax.barh(at, np.maximum(values, _LOWEST_R2), height=thick, color=CONDITION_COLOURS.get(name, GREEN), label=name)
+            ax.barh(
+                at, np.maximum(values, _LOWEST_R2), height=thick, color=CONDITION_COLOURS.get(name, GREEN), label=name
+            )
             for place, value in zip(at, values, strict=True):
                 if np.isfinite(value):
                     # -0.00 would look like less than nothing

@@ -64,7 +64,12 @@ def plate_frictions(diagnosis: Diagnosis) -> Plate:
         for ax, ((condition,), own) in zip(axes, groups.items(), strict=True):
             ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1)
             for rows in own.groups("frame_id").values():
-                line = {"color": CONDITION_COLOURS.get(condition, GREY), "alpha": 0.7, "linewidth": 1.2, "markersize": 3}
+                line = {
+                    "color": CONDITION_COLOURS.get(condition, GREY),
+                    "alpha": 0.7,
+                    "linewidth": 1.2,
+                    "markersize": 3,
+                }
                 ax.plot(100 * rows.safety_margin, 100 * rows.prediction, marker="o", **line)
             ax.set_title(f"{condition.capitalize()}: {told.get(condition, 'no slope')}", parse_math=False)
             ax.set(xlabel="True Γ with that friction (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103))

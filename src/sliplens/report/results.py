@@ -108,8 +108,7 @@ def load_results(workspace: Path) -> Results:
     of_study = {stage: of(stage) for stage in TABLES}
     if choice is not None:
         for stage in _BY_SOURCE:
-            own = {name: value for (one, name, source), value in found.items() if (one, source) == (stage, choice.source)}
-            of_study[stage] = own
+            of_study[stage] = {key[1]: found[key] for key in found if key[::2] == (stage, choice.source)}
     return Results(
         workspace=workspace,
         runs={folder.name: run for folder, run in runs.items()},
