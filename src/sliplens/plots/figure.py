@@ -1,6 +1,8 @@
 """One figure of a result, whatever it is."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from textwrap import fill as wrap
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ from matplotlib.figure import Figure
 
 from sliplens.codec import Columns
 from sliplens.errors import InputError
+from sliplens.intervals import Difference
 from sliplens.plots.errors import MARGIN_LABEL, plot_answers, plot_faithfulness, plot_learning_curves
 from sliplens.plots.saliency import full_colour, overlay_relevance, overlay_saliency, stretch_saliency
 from sliplens.plots.strip import plot_readings
@@ -26,9 +29,10 @@ from sliplens.plots.style import (
     methods_in_order,
     percent,
 )
+from sliplens.results.diagnosis import Diagnosis
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionScores, RemovalScores, is_control
-from sliplens.results.study import Study
+from sliplens.results.study import Study, Truth
 
 __all__ = ["plot"]
 
@@ -38,12 +42,13 @@ def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
 
     An evaluation shows answers against labels; a training its learning curve; an explanation the map over the image;
     scores of explanations their curves or gains; predictions the margin over time; tracked markers how far they moved;
-    a study the gain of each method with its 95 % interval. Margins are in percent, gains in margin units.
+    a study the gain of each method with its 95 % interval; a diagnosis where the error is larger than elsewhere.
+    Margins are in percent, gains in margin units.
 
     Parameters
     ----------
     result
-        What `evaluate`, `train`, `explain`, `score`, `predict`, `track` or `run_study` gave, or a record of
+        What `evaluate`, `train`, `explain`, `score`, `predict`, `track`, `run_study` or `diagnose` gave, or a record of
         `sliplens.results`.
     ax
         Axes to draw on; a figure of its own if not given.
@@ -122,16 +127,41 @@ def _removal(scores: RemovalScores, ax: Axes, _: int) -> None:
     if not scores.scores:
         raise InputError("these scores hold no method; score some explanations first")
     fill, unit = scores.scores[0].fill, scores.scores[0].unit
-    own = {score.method: score for score in scores.scores if (score.fill, score.unit) == (fill, unit)}
-    names = methods_in_order(own)[::-1]
-    for place, name in enumerate(names):
-        gap, colour = own[name].srg, GREY if is_control(name) else BLUE
+    own = {score.method: score.srg for score in scores.scores if (score.fill, score.unit) == (fill, unit)}
+    names = methods_in_order(own)
+    _plot_gaps([(method_name(name), own[name], GREY if is_control(name) else BLUE) for name in names], ax)
+    ax.set(xlabel=f"Symmetric gain, {fill_name(fill, unit)} (margin units, 95 % interval)")
+    ax.set_title(input_name(scores.input))
+
+
+def _truth(truth: Truth, ax: Axes, _: int) -> None:
+    own = {name: found.shapley for name, found in truth.methods.items() if found.shapley is not None}
+    rows = [(method_name(name), own[name], GREY if is_control(name) else BLUE) for name in methods_in_order(own)]
+    _plot_gaps(rows, ax)
+    ax.set(xlabel="Signed rank correlation with the markers' Shapley values (95 % interval)")
+    ax.set_title(input_name(truth.input))
+
+
+def _diagnosis(diagnosis: Diagnosis, ax: Axes, _: int) -> None:
+    if not diagnosis.slices:
+        raise InputError("this diagnosis tested no slice of the trials; diagnose a network on more trials")
+    rows = []
+    for one in diagnosis.slices:
+        ends = {name: 100 * getattr(one.excess, name) for name in ("estimate", "low", "high")}
+        rows.append((wrap(one.name, 32), replace(one.excess, **ends), BLUE if one.holds else GREY))
+    _plot_gaps(rows, ax)
+    ax.set(xlabel="Mean |error| less elsewhere (points of Γ, 95 % interval)")
+    ax.set_title(f"{input_name(diagnosis.input)}: where the error is")
+
+
+def _plot_gaps(rows: Sequence[tuple[str, Difference, str]], ax: Axes) -> None:
+    """Draw estimates with their intervals, each with its name and colour, the first on top."""
+    for place, (_, gap, colour) in enumerate(rows):
         ax.plot([gap.low, gap.high], [place, place], color=colour)
         ax.plot([gap.estimate], [place], color=colour, marker="o")
     ax.axvline(0, color=BLACK, linewidth=0.8, linestyle=":")
-    ax.set_yticks(range(len(names)), [method_name(name) for name in names])
-    ax.set(xlabel=f"Symmetric gain, {fill_name(fill, unit)} (margin units, 95 % interval)")
-    ax.set_title(input_name(scores.input))
+    ax.set_yticks(range(len(rows)), [name for name, _, _ in rows])
+    ax.invert_yaxis()
 
 
 def _study(study: Study, ax: Axes, index: int) -> None:
@@ -203,6 +233,8 @@ DRAWERS: dict[str, Callable[[Any, Axes, int], object]] = {
     "DeletionScores": _deletion,
     "RemovalScores": _removal,
     "Study": _study,
+    "Truth": _truth,
+    "Diagnosis": _diagnosis,
     "Predictions": _predictions,
     "Tracking": _tracking,
     "Strip": lambda result, ax, _: plot_readings(result, ax=ax),
