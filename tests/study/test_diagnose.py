@@ -83,6 +83,11 @@ def test_a_fault_of_all_trials_is_found_and_one_of_the_training_half_is_not(erro
     assert not any(one.holds for one in slices)
     assert say_slices(slices).startswith("No slice")
 
+    # half of a few trials tests nothing
+    few = everywhere.where(np.isin(everywhere.trial, [f"trial-{one:02d}" for one in range(8)]))
+    assert say_slices(find_slices(few, seed=3)[0]).startswith("Where the error is larger is not known")
+    assert say_slices(()) == say_slices(find_slices(few, seed=3)[0])
+
 
 def test_slices_are_named_for_what_their_frames_have_in_common(errors, rng):
     wet = replace(errors, prediction=errors.prediction + 0.5 * (errors.condition == "wet"))
@@ -218,6 +223,8 @@ def test_simulated_frames_are_explained_and_filmed_anew(simulated, tmp_path, mon
     rows, columns = np.nonzero(recording.truth.contact_map[found.errors.frame[0]])
     assert found.errors.contact_x[0] == pytest.approx((columns.mean() + 0.5) / 224)
     assert found.errors.contact_y[0] == pytest.approx((rows.mean() + 0.5) / 224)
+    labels = sl.plot(found).axes[0].get_yticklabels()
+    assert [label.get_text().replace("\n", " ") for label in labels] == [one.name for one in found.slices]
     # kept: the same call reads it
     monkeypatch.setattr(diagnosing, "find_contributions", None)
     assert sl.diagnose(network, data, tmp_path, trials=1).sentences == found.sentences

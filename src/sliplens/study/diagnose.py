@@ -448,6 +448,8 @@ def say_slices(slices: Sequence[ErrorSlice]) -> str:
         for one in slices
         if one.holds
     ]
+    if all(one.trials < FEWEST_UNITS for one in slices):
+        return f"Where the error is larger is not known: no slice has the {FEWEST_UNITS} held-out trials to test it on."
     if not texts:
         return "No slice found on half of the trials has a larger error on the other half beyond chance."
     return f"On held-out trials the error is larger than elsewhere where {'; where '.join(texts)}."
@@ -455,12 +457,12 @@ def say_slices(slices: Sequence[ErrorSlice]) -> str:
 
 def say_looked(table: ExplainedErrors, slices: Sequence[ErrorSlice], rng: np.random.Generator) -> list[str]:
     """Say how far the markers' parts are those of the best reading, in each condition and where the error is larger."""
-    groups = {f"{name} objects": table.condition == name for (name,) in table.groups("condition")}
-    groups["those slices"] = np.isin(table.slice, [at for at, one in enumerate(slices) if one.holds])
+    groups = {f"on {name} objects": table.condition == name for (name,) in table.groups("condition")}
+    groups["in the slices of larger error"] = np.isin(table.slice, [at for at, one in enumerate(slices) if one.holds])
     known = {name: table.where(rows & np.isfinite(table.agreement)) for name, rows in groups.items()}
     return [
-        f"In {_frames(own)} on {name} the markers' parts in the answer are ranked as in the best reading with a "
-        f"signed Spearman of {_gap(_mean(own.agreement, own, rng))}; of the parts in contact, "
+        f"In {_frames(own)} {name} the markers' parts in the answer rank as in the best reading, to a signed rank "
+        f"correlation (Spearman's) of {_gap(_mean(own.agreement, own, rng))}; of the parts in contact, "
         f"{100 * own.network_slipping.mean():.0f} % of the answer's and {100 * own.reading_slipping.mean():.0f} % of "
         "the best reading's are of slipping markers."
         for name, own in known.items()
