@@ -11,7 +11,7 @@ from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 
-from sliplens.intervals import Difference, paired_difference
+from sliplens.intervals import FEWEST_UNITS, Difference, paired_difference
 from sliplens.plots.style import decimals, fill_name, input_name, inputs_in_order, listed, method_name, percent
 from sliplens.report.comparisons import (
     compare_deletion,
@@ -277,6 +277,8 @@ def _no_better(faithful: RemovalScores, *, rng: np.random.Generator) -> Answer:
 
 def _noisiest(looks: MapQuality) -> Answer:
     subject, findings, outcomes, parts = input_name(looks.input), [], [], []
+    # stability has no interval: of too few trials it must not decide alone
+    enough = all(one.gap.units >= FEWEST_UNITS for one in looks.comparisons)
     for measure, (name, sign) in _MEASURES.items():
         values = {
             method: value
@@ -297,6 +299,8 @@ def _noisiest(looks: MapQuality) -> Answer:
         if gaps:
             outcome = all_of(judge_gap(gap) for gap in gaps.values())
             findings += _judged(name, gaps)
+        elif not enough:
+            outcome = "undecided"
         outcomes.append(outcome)
         others = listed([f"{method_name(method)} {decimals(value, 3)}" for method, value in values.items()])
         parts.append(f"{name} {decimals(own, 3)} ({others})")
@@ -317,8 +321,6 @@ def _looks_at_two(truth: Truth, *, rng: np.random.Generator) -> Answer:
     mass, gap = (None, None) if found is None else (found.mass["edges"], found.edges)
     on_edges, on_edges_told = judge_gap(gap), "No map of the thesis's Poly-CAM was held against the truth."
     if mass is not None:
-        if gap is None and area is not None:
-            on_edges = "holds" if mass > area else "does not hold"
         on_edges_told = (
             f"{method_name(POLY_CAM)} puts {percent(mass)} of its relevance on edges, which cover {percent(area)} of "
             "the image."
@@ -329,7 +331,6 @@ def _looks_at_two(truth: Truth, *, rng: np.random.Generator) -> Answer:
     massed = Finding(
         where="relevance mass",
         compared=f"on edges, less their {percent(area)} of the image",
-        value="" if gap is not None else percent(mass),
         gap=gap,
         outcome=on_edges,
     )
