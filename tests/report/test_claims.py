@@ -13,7 +13,7 @@ from sliplens.report.comparisons import compare_gain, share_of_strongest
 from sliplens.report.results import Results
 from sliplens.report.sections import build_sections
 from sliplens.report.tables import Table
-from sliplens.report.verdict import _tell_lead, judge, rank_methods
+from sliplens.report.verdict import _tell_lead, judge, rank_methods, tell_too_few
 
 from .study_results import (
     GAINS as OURS,
@@ -265,7 +265,7 @@ def test_without_truth_the_method_to_believe_is_the_one_that_beats_the_controls(
     [
         ({}, ("Believe Poly-CAM: of 4 methods its map tells best", "good")),
         # a lead of 0.04 is not off zero: intervals reach 0.05 either way
-        ({"grad-cam": 0.66}, ("None is shown to be the best: Poly-CAM comes first, and 1 of 3 others tie", "caution")),
+        ({"grad-cam": 0.66}, ("None is shown to be the best: Poly-CAM comes first, and 1 of 3 others tie", "plain")),
         # the control has 0.1
         (dict.fromkeys(SPEARMAN, -0.1) | {"poly-cam": 0.14}, ("None: no map is shown to tell", "caution")),
     ],
@@ -312,9 +312,11 @@ def test_the_claims_of_the_thesis_are_counted_by_outcome(judged, tmp_path, rng):
     found = {one.topic: one for one in judge(results, claims=claims, rng=rng)}["The thesis's claims"]
     counted = [{answer.outcome for answer in claim.answers} for claim in claims]
     assert found.text.startswith("Of the thesis's 5 claims ")
-    assert f"{counted.count({'holds'})} hold" in found.text
-    assert f"{counted.count({'does not hold'})} do not hold" in found.text
-    assert "These do not hold: Poly-CAM is the most faithful of the three methods" in found.text
+    hold, fail = (counted.count({outcome}) for outcome in ("holds", "does not hold"))
+    assert f" {hold} {'holds' if hold == 1 else 'hold'}: “" in found.text
+    assert (
+        f" {fail} {'does' if fail == 1 else 'do'} not hold: “Poly-CAM is the most faithful of the three" in found.text
+    )
     assert "Poly-CAM, is not borne out on raw images: Poly-CAM leads it, as the thesis ran it, by +0.50" in found.text
     assert "The thesis's claims" not in {one.topic for one in judge(results, rng=rng)}
 
@@ -369,6 +371,16 @@ def test_too_few_trials_believe_nothing(judged, tmp_path, rng):
     found = judge(load_results(tmp_path), rng=rng)[0]
 
     assert found.text.startswith("Not known: 3 trials are too few to tell a method from chance; 5 or more are needed.")
+
+
+def test_too_few_trials_decide_no_claim(judged, tmp_path):
+    # by means without an interval Integrated Gradients is the most stable, which speaks against being noisy
+    stable = {**MAP_MEASURES["integrated-gradients-thesis"], "noise_stability": 0.99}
+
+    answers = judged(thesis(trials=3, looks=MAP_MEASURES | {"integrated-gradients-thesis": stable}))
+
+    assert {answer.outcome for answer in answers.values()} == {"undecided"}
+    assert tell_too_few(load_results(tmp_path)).startswith("This study explains 3 trials, and fewer than 5 decide")
 
 
 def test_a_fill_counts_once_whatever_the_units(judged, tmp_path):

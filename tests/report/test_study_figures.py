@@ -1,15 +1,17 @@
 """What the figures of a study are made of."""
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+import sliplens as sl
 from sliplens.errors import InputError
 from sliplens.faithfulness.deletion import deletion_order
 from sliplens.report import load_results
-from sliplens.report.pictures import plate_removal
+from sliplens.report.pictures import plate_removal, plate_truth
 from sliplens.report.plates import (
     Cell,
     Plate,
@@ -24,7 +26,7 @@ from sliplens.report.plates import (
 )
 from sliplens.report.tables import table_scores
 
-from .study_results import METHODS, Made, write_choice, write_faithfulness
+from .study_results import METHODS, SPEARMAN, Made, write_choice, write_faithfulness
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +88,26 @@ def test_differences_are_made_brighter_all_alike_and_raw_frames_never(results):
     np.testing.assert_array_equal(brighter[0], np.minimum(np.round(np.float32(factor) * difference.pictures[0]), 255))
 
 
-def test_only_pictures_on_black_are_brightened(rng):
+def test_the_truth_stands_beside_the_maps_that_match_it_best(results):
+    study, truth = results.study, results.study.truth["raw"]
+    turned = {"grad-cam": truth.methods["poly-cam"], "poly-cam": truth.methods["grad-cam"]}
+    study = replace(study, truth={"raw": replace(truth, methods=truth.methods | turned)})
+
+    plate = plate_truth(replace(results, study=study), "raw")
+
+    assert plate is not None
+    assert "maps of Grad-CAM, Integrated Gradients and Poly-CAM" in plate.alt
+
+
+def test_the_truth_alone_is_a_figure(results):
+    (ax,) = sl.plot(results.study.truth["raw"]).axes
+
+    row = [label.get_text() for label in ax.get_yticklabels()].index("Poly-CAM")
+    assert np.asarray(ax.lines[2 * row + 1].get_xdata()).item() == SPEARMAN["poly-cam"]
+    assert ax.yaxis_inverted()  # the thesis's methods on top
+
+
+def test_only_pictures_on_black_are_brightened():
     dark, middle = (np.full((1, 8, 8, 3), level, dtype=np.uint8) for level in (20, 128))
 
     assert picture_brightness("difference", dark) == (12.8, "Input \N{MULTIPLICATION SIGN}\N{NO-BREAK SPACE}12.8")

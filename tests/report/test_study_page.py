@@ -252,6 +252,20 @@ def test_a_stage_alone_makes_a_page_that_names_the_others(pristine_study, tmp_pa
     assert "<h2>Verdict</h2>" in page
 
 
+def test_too_few_trials_are_told_before_anything_else(tmp_path, text):
+    write_choice(tmp_path, Made(trials=3))
+
+    page = write_report(tmp_path).page.read_text(encoding="utf-8")
+
+    verdict = page.split("<h2>Verdict</h2>")[1].lstrip()
+    assert verdict.startswith('<p class="few">This study explains 3 trials, and fewer than 5 decide nothing')
+    assert 'class="few"' not in text
+
+
+def test_the_thesis_is_named(text):
+    assert text.index("Max Polak, Explainable Neural Networks") < text.index("<h2>Verdict</h2>")
+
+
 def test_one_network_alone_misses_nothing_of_the_other(tmp_path):
     made = Made(inputs=("raw",))
     write_choice(tmp_path, made)

@@ -87,6 +87,15 @@ def test_a_network_that_reads_nothing_is_called_so(workspace, verdict):
     assert "On wet objects that is no better than always answering the mean label." in found.text
 
 
+def test_labels_that_do_not_vary_say_nothing_of_a_network(workspace, verdict):
+    edit(workspace / "test-raw" / "result.json", lambda value: value["conditions"]["wet"].update(r2=None))
+
+    found = verdict()["Accuracy, raw images"]
+
+    assert found.tone == "plain"
+    assert "no better than" not in found.text
+
+
 def test_a_clear_winner_is_named(workspace, verdict):
     found = verdict()["Raw or difference, dry"]
 

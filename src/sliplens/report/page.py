@@ -16,7 +16,8 @@ from sliplens.report.pictures import plate_strip
 from sliplens.report.plates import FOLDER, Plate, write_plates
 from sliplens.report.results import Results, load_results
 from sliplens.report.sections import Section, build_sections
-from sliplens.report.verdict import Statement, count_alarms, judge
+from sliplens.report.thesis import CITATION
+from sliplens.report.verdict import Statement, count_alarms, judge, tell_too_few
 from sliplens.results.study import Study
 
 PAGE = "report.html"
@@ -96,8 +97,10 @@ def _render(
     return pages.get_template("report.html.j2").render(
         name=results.workspace.resolve().name,
         finished=runs[-1].finished[:16].replace("T", " at "),
+        thesis=CITATION,
         waiting_for=waiting_for,
         opening=opening,
+        too_few=tell_too_few(results),
         carrying=[one for one in statements if one.tone != "caution"],
         warning=[one for one in statements if one.tone == "caution"],
         alarms=[*results.notes, *([mixed] if len(versions) > 1 else []), *count_alarms(results)],

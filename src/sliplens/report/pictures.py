@@ -48,7 +48,6 @@ from sliplens.report.plates import (
     told_frame,
 )
 from sliplens.report.results import Results
-from sliplens.report.verdict import rank_methods
 from sliplens.results.explanation import Explained, ExplainedFrame, Strip
 from sliplens.results.faithfulness import DeletionCurve, DeletionScores, is_control
 from sliplens.results.study import StateFrame, States, Truth
@@ -508,7 +507,7 @@ def _bare(ax: Axes) -> None:
 
 
 def plate_truth(results: Results, name: str) -> Plate | None:
-    """Draw frames, effects of each marker on answer and margin, and the best methods' maps; None without the truth."""
+    """Draw frames, effects of each marker on answer and margin, and the maps nearest to these; None without truth."""
     truth, explained = results.study.truth.get(name), explained_of(results, name)
     if truth is None or explained is None:
         return None
@@ -516,7 +515,7 @@ def plate_truth(results: Results, name: str) -> Plate | None:
     chosen = _spread_out([one for one in truth.frame_ids if one in places], explained, places)
     if not chosen:
         return None
-    methods = _best_methods(results, name, explained)
+    methods = _best_methods(truth, explained)
     pictures, called = bright_pictures(explained, [places[one] for one in chosen])
     rows = []
     for frame_id in chosen:
@@ -525,7 +524,7 @@ def plate_truth(results: Results, name: str) -> Plate | None:
         effects = (truth.shapley_maps[row], truth.network_maps[row], truth.margin_maps[row])
         cells = [Cell(picture=picture)]
         cells += [
-            Cell(picture=_painted(picture, one, percentile=100), words=f"up to {100 * np.abs(one).max():.1f} points")
+            Cell(picture=_painted(picture, one, percentile=100.0), words=f"up to {100 * np.abs(one).max():.1f} points")
             for one in effects
         ]
         maps = [explained.relevance[method][index] for method in methods]
@@ -540,8 +539,8 @@ def plate_truth(results: Results, name: str) -> Plate | None:
         f"best reading of the margin, beside the maps of {listed([method_name(one) for one in methods])}",
         caption=f"{input_name(name)}: what each marker does to the network's answer, in whatever company of markers "
         "(Shapley value) and alone, and to the best reading of the margin, in percentage points (value less value with "
-        "that marker put back where it rested), beside the best methods' maps. Orange lowers, blue raises; full colour "
-        f"at the largest effect of each picture, and at a map's {FULL_COLOUR_PERCENTILE:g}th percentile. "
+        "that marker put back where it rested), beside the maps nearest to the first. Orange lowers, blue raises; full "
+        f"colour at the largest effect of each picture, and at a map's {FULL_COLOUR_PERCENTILE:g}th percentile. "
         f"{_tell_match(truth, methods)}",
         numbers={name: getattr(truth.effects, own) for name, own in _EFFECT_COLUMNS.items()},
         pixels=True,
@@ -563,11 +562,11 @@ def _spread_out(ids: list[str], explained: Explained, places: dict[str, int]) ->
     return [ranked[place] for place in np.linspace(0, len(ranked) - 1, _TRUTH_FRAMES).round().astype(int)]
 
 
-def _best_methods(results: Results, name: str, explained: Explained) -> list[str]:
-    faithful = results.study.faithfulness.get(name)
-    ranked = [] if faithful is None else [one.method for one in rank_methods(faithful)]
-    known = methods_in_order(name for name in explained.saliency if not is_control(name))
-    return [*(one for one in ranked if one in known), *(one for one in known if one not in ranked)][:_TRUTH_METHODS]
+def _best_methods(truth: Truth, explained: Explained) -> list[str]:
+    """Methods whose maps correlate best with the Shapley values, as the verdict has it."""
+    known = {name: found.shapley for name in explained.relevance if (found := truth.methods.get(name)) is not None}
+    likeness = {name: gap.estimate for name, gap in known.items() if gap is not None and not is_control(name)}
+    return sorted(methods_in_order(likeness), key=lambda name: -likeness[name])[:_TRUTH_METHODS]
 
 
 def _tell_match(truth: Truth, methods: list[str]) -> str:

@@ -8,6 +8,10 @@ the third digit of the recorded scores, the seconds on an RTX 3060 Ti and withou
 
 from collections.abc import Collection
 
+CITATION = (
+    "Max Polak, Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning, Master's thesis, "
+    "Delft University of Technology"
+)
 MARK = "thesis (real touch, other data)"
 NETWORK_PIXELS = 224
 

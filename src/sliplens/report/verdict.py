@@ -97,6 +97,17 @@ def judge(results: Results, *, claims: Sequence[Claim] = (), rng: np.random.Gene
     return tuple(sorted(statements, key=lambda one: one.tone == "caution"))
 
 
+def tell_too_few(results: Results) -> str:
+    """Say of how few trials a study is where they decide nothing; empty where they may."""
+    trials = FEWEST_UNITS if results.study.choice is None else len(results.study.choice.trials)
+    if trials >= FEWEST_UNITS:
+        return ""
+    return (
+        f"This study explains {trials} {'trial' if trials == 1 else 'trials'}, and fewer than {FEWEST_UNITS} decide "
+        "nothing: below is how explanations are judged, not yet which one to believe."
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class Recommended:
     """Method whose map ranks the markers most like their Shapley values, and whether it may be recommended."""
@@ -178,7 +189,8 @@ def _tell_recommended(topic: str, best: Recommended, truth: Truth, faithful: Rem
     text += _tell_limits(
         best.correlation, f"a study of other trials, or of a second seed of the network, in which {other}"
     )
-    return Statement(topic=topic, text=text, tone="good" if best.shown else "caution")
+    tone: Tone = "good" if best.shown else "plain" if best.lead.shows_something else "caution"
+    return Statement(topic=topic, text=text, tone=tone)
 
 
 def _tell_limits(gap: Difference, overturned_by: str) -> str:
@@ -199,14 +211,16 @@ def _tell_claims(claims: Sequence[Claim], results: Results) -> list[Statement]:
         return []
     outcomes = {claim.title: {answer.outcome for answer in claim.answers} for claim in claims}
     kinds = {
-        "hold": [title for title, own in outcomes.items() if own == {"holds"}],
-        "do not hold": [title for title, own in outcomes.items() if own == {"does not hold"}],
-        "are undecided": [title for title, own in outcomes.items() if own == {"undecided"}],
-        "differ between the networks": [title for title, own in outcomes.items() if len(own) > 1],
+        ("holds", "hold"): [f"“{title}”" for title, own in outcomes.items() if own == {"holds"}],
+        ("does not hold", "do not hold"): [f"“{title}”" for title, own in outcomes.items() if own == {"does not hold"}],
+        ("is undecided", "are undecided"): [f"“{title}”" for title, own in outcomes.items() if own == {"undecided"}],
+        ("differs between the networks", "differ between the networks"): [
+            f"“{title}”" for title, own in outcomes.items() if len(own) > 1
+        ],
     }
-    counts = [f"{len(titles)} {'hold' if kind == 'hold' else kind}" for kind, titles in kinds.items() if titles]
-    text = f"Of the thesis's {len(claims)} claims {listed(counts)}."
-    text += "".join(f" These {kind}: {'; '.join(titles)}." for kind, titles in kinds.items() if titles)
+    told = {f"{len(titles)} {words[len(titles) > 1]}": listed(titles) for words, titles in kinds.items() if titles}
+    text = f"Of the thesis's {len(claims)} claims {listed([*told])}."
+    text += "".join(f" {count}: {titles}." for count, titles in told.items())
     for name in inputs_in_order(results.study.truth)[::-1]:
         best = recommend(results.study.truth[name])
         gap = None if best is None else best.found.lead_over_methods.get(POLY_CAM)
@@ -239,7 +253,8 @@ def _accuracy(results: Results) -> list[Statement]:
             f"{listed(mae)} percentage points. That is of one network, over {trials} trials of "
             f"{'one day' if days == 1 else f'{days} days'}."
         )
-        poor = [condition for condition in conditions if (scores[condition].r2 or 0.0) <= 0]
+        # of labels that do not vary there is no R²
+        poor = [condition for condition in conditions if (value := scores[condition].r2) is not None and value <= 0]
         if poor:
             text += f" On {listed(poor)} objects that is no better than always answering the mean label."
         tone: Tone = "caution" if poor else "plain"
@@ -312,23 +327,20 @@ def _faithfulness(scored: DeletionScores, *, rng: np.random.Generator) -> Statem
 def _what_deletion_measures(results: Results) -> Statement:
     last = []
     for (name, source), scored in sorted(results.scores.items(), key=lambda item: (item[0][1] == "real", item[0])):
-        values = [one.last_step_mean for one in scored.methods.values() if one.last_step_mean is not None]
-        if values:
-            told = f"{input_name(name).lower()}, {source_name(source)}, {scored.fill}"
-            last.append(f"{decimals(float(np.mean(values)), 2)} ({told})")
+        mean = float(np.mean([one.last_step_mean for one in scored.methods.values()]))
+        last.append(f"{decimals(mean, 2)} ({input_name(name).lower()}, {source_name(source)}, {scored.fill})")
     text = (
         "The deletion score depends on what a removed pixel becomes. It says how far the answer moves, not that the "
-        "map shows what slip is, and its sign is lost."
+        "map shows what slip is, and its sign is lost. With every pixel filled, where no map has a part, D is "
+        f"{listed(last)}: a score near that tells of the fill."
     )
-    if last:
-        text += f" With every pixel filled, where no map has a part, D is {listed(last)}"
-        text += ": a score near that tells of the fill."
     return Statement(topic="How far to trust D", text=text, tone="caution")
 
 
 def _real_touch(explained: Explained) -> Statement:
     topic = f"Real touch, {input_name(explained.input).lower()}"
     labelled = [(one.safety_margin, one.prediction) for one in explained.frames if one.safety_margin is not None]
+    trials = len({one.trial for one in explained.frames if one.safety_margin is not None})
     if not labelled:
         text = f"The {len(explained.frames)} real frames have no label, so nothing can be said of the answers on them."
         return Statement(topic=topic, text=text, tone="caution")
@@ -338,8 +350,9 @@ def _real_touch(explained: Explained) -> Statement:
     constant = np.abs(labels - np.median(labels)).mean()
     useful = error < constant
     text = (
-        f"On {len(labels)} frames of real touch the network is off by {100 * error:.0f} percentage points "
-        f"on average; the best constant answer would be off by {100 * constant:.0f}."
+        f"On {len(labels)} frames of {'one trial' if trials == 1 else f'{trials} trials'} of real touch the network is "
+        f"off by {100 * error:.0f} percentage points on average; the best constant answer would be off by "
+        f"{100 * constant:.0f}."
     )
     # frames with equal labels have no order
     pairs = [(first, second) for first, second in combinations(labelled, 2) if first[0] != second[0]]
@@ -356,14 +369,14 @@ def _tell_scale(results: Results) -> list[Statement]:
     """State how little or much the networks were trained on."""
     if not results.trainings:
         return []
-    one = results.trainings[inputs_in_order(results.trainings)[-1]]
-    text = "Each network was trained"
-    if one.train_frames:
-        text += f" on {one.train_frames} frames"
-    if one.minutes is not None:
-        text += f" for {decimals(one.minutes, 1)} minutes"
-    text += f", on images of {one.image_size} px"
-    if one.frame_size and max(one.frame_size) > one.image_size:
+    trainings = [results.trainings[name] for name in inputs_in_order(results.trainings)]
+    told = [
+        f"{one.train_frames} frames for {decimals(one.minutes, 1)} minutes ({input_name(one.input).lower()})"
+        for one in trainings
+    ]
+    one = trainings[-1]
+    text = f"Trained on {listed(told)}, on images of {one.image_size} px"
+    if max(one.frame_size) > one.image_size:
         text += f", shrunk from the camera's {' x '.join(map(str, one.frame_size))}"
     if one.image_size != NETWORK_PIXELS:
         text += f" (the thesis: {NETWORK_PIXELS} px)"
