@@ -13,9 +13,10 @@ from torch import Tensor, nn
 import sliplens as sl
 from sliplens.errors import InputError
 from sliplens.files import output_folder
+from sliplens.intervals import Difference
 from sliplens.models import Manifest, Run
 from sliplens.recordings import Dataset, load_dataset
-from sliplens.results.diagnosis import ErrorTable, FrictionTable
+from sliplens.results.diagnosis import ErrorSlice, ErrorTable, FrictionTable
 from sliplens.simulation import SimulationRecipe, simulate_dataset
 from sliplens.study import diagnose as diagnosing
 from sliplens.study.diagnose import (
@@ -223,8 +224,14 @@ def test_simulated_frames_are_explained_and_filmed_anew(simulated, tmp_path, mon
     rows, columns = np.nonzero(recording.truth.contact_map[found.errors.frame[0]])
     assert found.errors.contact_x[0] == pytest.approx((columns.mean() + 0.5) / 224)
     assert found.errors.contact_y[0] == pytest.approx((rows.mean() + 0.5) / 224)
-    labels = sl.plot(found).axes[0].get_yticklabels()
-    assert [label.get_text().replace("\n", " ") for label in labels] == [one.name for one in found.slices]
+    # one trial has no half to test a slice on
+    with pytest.raises(InputError, match="tested no slice of the trials"):
+        sl.plot(found)
+    excess = Difference(estimate=0.1, low=0.05, high=0.15, units=6)
+    slippery = ErrorSlice(name="wet objects", frames=12, trials=6, error=0.2, bias=0.1, excess=excess)
+    (ax,) = sl.plot(replace(found, slices=(slippery,))).axes
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["wet objects"]
+    assert ax.lines[0].get_xdata() == pytest.approx([5, 15])  # percentage points
     # kept: the same call reads it
     monkeypatch.setattr(diagnosing, "find_contributions", None)
     assert sl.diagnose(network, data, tmp_path, trials=1).sentences == found.sentences

@@ -150,14 +150,19 @@ _KIN = ("shapley-marker", "shapley", "integrated-gradients", "integrated-gradien
 
 
 def _tell_recommended(topic: str, best: Recommended, truth: Truth, faithful: RemovalScores | None) -> Statement:
-    name, over, control = method_name(best.method), best.found.lead_over_methods, method_name(best.lead.control)
+    name, over = method_name(best.method), best.found.lead_over_methods
+    control = method_name(best.lead.control).removesuffix(" (control)")
     if best.correlation.units < FEWEST_UNITS:
         few = f"{best.correlation.units} trials are too few to tell a method from chance; {FEWEST_UNITS} or more are"
         return Statement(topic=topic, text=f"Not known: {few} needed.", tone="caution")
     evidence = (
-        f"its signed rank correlation with the markers' Shapley values is {tell_interval(best.correlation, digits=2)}"
+        "its map ranks the markers by what each adds to the answer (its Shapley value, found by drawing the scene anew "
+        f"without its motion) with a signed correlation of {tell_interval(best.correlation, digits=2)}, 1 being perfect"
     )
-    ahead = f"its lead over the strongest control, {control}, is {tell_interval(best.lead.gap, digits=2)}"
+    ahead = (
+        f"its lead over the strongest map that knows nothing of what the network learned ({control}) is "
+        f"{tell_interval(best.lead.gap, digits=2)}"
+    )
     if best.shown:
         text = f"Believe {name}: of {len(over) + 1} methods its map tells best what each marker adds to this answer. "
         text += _sentence(f"{evidence}, {ahead}")
@@ -166,15 +171,15 @@ def _tell_recommended(topic: str, best: Recommended, truth: Truth, faithful: Rem
             text += f" It leads the next method, {method_name(near)}, by {tell_interval(over[near], digits=2)}."
     elif best.lead.shows_something:
         tied = [f"{method_name(one)} ({tell_interval(over[one], digits=2)})" for one in best.tied]
-        text = f"None is shown to be the best: {name} comes first, and {len(tied)} of {len(over)} others tie with it. "
+        text = f"No method is shown to be best: {name} comes first, and {len(tied)} of {len(over)} others tie with it. "
         text += _sentence(f"{evidence}, {ahead}")
         text += f" Not told apart from it, by the lead over each: {listed(tied)}."
     else:
         text = f"None: no map is shown to tell what this network uses; the first, {name}, does not beat every control. "
-        text += _sentence(f"{evidence}, but {ahead}, not off zero: a map that knows nothing of it may do as well")
+        text += _sentence(f"{evidence}, but {ahead}, not off zero")
     if truth.reliability is not None:
         most = decimals(max(truth.reliability.estimate, 0.0) ** 0.5, 2)
-        text += f" The truth is itself estimated: a perfect map would reach {most}."
+        text += f" These values are themselves estimates: even a perfect map would reach {most}."
     if best.method in _KIN:
         text += " It is kin to that truth by construction: both share the answer out by the rule of Shapley."
     standing = (
@@ -182,8 +187,8 @@ def _tell_recommended(topic: str, best: Recommended, truth: Truth, faithful: Rem
     )
     if standing is not None and standing.tested:
         text += (
-            f" By removal it beats every control under {len(standing.beaten)} of {len(standing.tested)} fills that "
-            "can tell."
+            " When parts of the frame are removed in its order, it also beats every such map under "
+            f"{len(standing.beaten)} of {len(standing.tested)} ways to fill them that can tell."
         )
     other = "its lead is not off zero" if best.shown else "one method leads every other and every control for sure"
     text += _tell_limits(
@@ -226,8 +231,8 @@ def _tell_claims(claims: Sequence[Claim], results: Results) -> list[Statement]:
         gap = None if best is None else best.found.lead_over_methods.get(POLY_CAM)
         if best is not None and gap is not None and _gains(gap):
             text += (
-                f" Its recommendation, Poly-CAM, is not borne out on {input_name(name).lower()}: "
-                f"{method_name(best.method)} leads it, as the thesis ran it, by {tell_interval(gap, digits=2)}."
+                f" Its recommendation, Poly-CAM as it ran it, is not borne out on {input_name(name).lower()}: "
+                f"{method_name(best.method)} leads that map by {tell_interval(gap, digits=2)}, ranking the markers."
             )
     text += (
         " Tested with its methods as published, on networks and data of our own: its network and most of its data are "

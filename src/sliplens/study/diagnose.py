@@ -421,7 +421,8 @@ def _gap(gap: Difference, *, points: bool = False) -> str:
 
 
 def _frames(table: ErrorTable) -> str:
-    return f"{len(table):,} frames of {len(np.unique(table.trial))} trials"
+    trials = len(np.unique(table.trial))
+    return f"{len(table):,} frames of {'one trial' if trials == 1 else f'{trials} trials'}"
 
 
 def _off(table: ErrorTable) -> str:
