@@ -9,6 +9,7 @@ from sliplens.errors import InputError
 from sliplens.explainers import EXPLAINERS
 from sliplens.extras import Table
 from sliplens.faithfulness import FILLS
+from sliplens.live.sinks import SINKS
 from sliplens.live.sources import SOURCES
 from sliplens.markers import KINDS
 from sliplens.markers.estimators import ESTIMATORS
@@ -27,6 +28,7 @@ TABLES = {
     "sliplens.explainers": EXPLAINERS,
     "sliplens.fills": FILLS,
     "sliplens.formats": FORMATS,
+    "sliplens.sinks": SINKS,
     "sliplens.sources": SOURCES,
     "sliplens.augmentations": AUGMENTATIONS,
     "sliplens.recipes": RECIPES,

@@ -17,6 +17,10 @@ class RecordingError(InputError):
     """A recording or data set that breaks a law: empty, times not rising, a label outside [0, 1]."""
 
 
+class SourceError(InputError):
+    """A running source that is lost, taken, or gives what is no frame; it may come back."""
+
+
 class CheckpointError(InputError):
     """A checkpoint that is incomplete, damaged, or does not fit the data it is asked about."""
 
@@ -35,5 +39,5 @@ class SaliencyError(SliplensError):
 
 __all__ = [
     "CheckpointError", "ContactError", "ImageError", "InputError", "ModelError", "RecordingError", "SaliencyError",
-    "SliplensError",
+    "SliplensError", "SourceError",
 ]  # fmt: skip

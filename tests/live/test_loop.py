@@ -11,9 +11,9 @@ import pytest
 
 import sliplens as sl
 from sliplens.errors import ImageError, InputError
+from sliplens.live.contract import LiveSource
 from sliplens.live.loop import LowPass
 from sliplens.live.reading import Check, LiveFrame, Reading, SlipState
-from sliplens.live.sources import LiveSource
 from sliplens.models import Run
 from sliplens.recordings import Dataset, Recording
 

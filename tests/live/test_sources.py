@@ -117,12 +117,20 @@ def test_a_film_under_another_load_is_one_that_was_prepared_for_it(rng: np.rando
             SourceOptions(),
             "no simulated sensor named 'thumb'; choose one of chromatouch, flat-gel",
         ),
-        ("simulated", SourceOptions(rate_hz=-3.0), "--rate must be positive, got -3"),
+        ("7", SourceOptions(speed=2.0), "the camera /dev/video7 takes no --speed; leave it out"),
+        ("rtsp://10.0.0.1/", SourceOptions(trial="a"), "takes no --trial; leave it out"),
     ],
 )
 def test_what_cannot_be_opened_is_told(source: str, options: SourceOptions, words: str):
     with pytest.raises(InputError, match=words):
         open_live(source, options=options)
+
+
+def test_wishes_that_cannot_be_are_told():
+    with pytest.raises(InputError, match="--rate must be positive, got -3"):
+        SourceOptions(rate_hz=-3.0)
+    with pytest.raises(InputError, match="--size must be positive, got 0"):
+        SourceOptions(size=(0, 640))
 
 
 def test_a_path_is_replayed_by_its_text_too(small_dataset: Dataset):

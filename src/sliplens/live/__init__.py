@@ -1,18 +1,13 @@
 """The margin of a running sensor: sources, the loop that reads them, and what it says of its own health."""
 
+from sliplens.live.camera import Camera, CameraMode, CameraSource, list_cameras
+from sliplens.live.contract import LiveSource, SourceKind, SourceOptions
 from sliplens.live.loop import LiveReader, read_live
 from sliplens.live.reading import Check, Latency, LiveFrame, Reading, SlipState
-from sliplens.live.sources import (
-    SOURCES,
-    LiveSource,
-    ReplaySource,
-    SimulatedSource,
-    SourceKind,
-    SourceOptions,
-    open_live,
-)
+from sliplens.live.sources import SOURCES, FolderSource, ReplaySource, SimulatedSource, StreamSource, open_live
 
 __all__ = [
-    "SOURCES", "Check", "Latency", "LiveFrame", "LiveReader", "LiveSource", "Reading", "ReplaySource",
-    "SimulatedSource", "SlipState", "SourceKind", "SourceOptions", "open_live", "read_live",
+    "SOURCES", "Camera", "CameraMode", "CameraSource", "Check", "FolderSource", "Latency", "LiveFrame", "LiveReader",
+    "LiveSource", "Reading", "ReplaySource", "SimulatedSource", "SlipState", "SourceKind", "SourceOptions",
+    "StreamSource", "list_cameras", "open_live", "read_live",
 ]  # fmt: skip

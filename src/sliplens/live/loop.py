@@ -6,15 +6,16 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Condition, Event, Thread
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
-from sliplens.errors import InputError
+from sliplens.errors import InputError, SourceError
 from sliplens.images import read_image
+from sliplens.live.contract import LiveSource, SourceOptions
 from sliplens.live.reading import Check, Latency, LiveFrame, Reading, SlipState
-from sliplens.live.sources import Images, LiveSource, SourceOptions, open_live
+from sliplens.live.sources import Images, open_live
 from sliplens.markers import Tracker
 from sliplens.models.checkpoint import Run, load
 from sliplens.models.engines import Engine, make_engine
@@ -28,6 +29,7 @@ Subscriber = Callable[[Reading, LiveFrame | None], None]
 """Called with each reading and its frame, in the thread that reads; None where there is no frame to it."""
 
 
+@runtime_checkable
 class HealthWatch(Protocol):
     """Judges frames against the reference that it was made for."""
 
@@ -36,6 +38,7 @@ class HealthWatch(Protocol):
         ...
 
 
+@runtime_checkable
 class SlipWatch(Protocol):
     """Tells slip from the motion of the markers, frame after frame."""
 
@@ -73,6 +76,9 @@ class _Newest(Generic[Item]):
 
 
 _MOST_FRAMES = 10**6
+_RETRY_S = 1.0  # between two tries to open a source that was lost
+_JUMP_S = 1.0
+_PATIENCE_S = 3.0
 _STILL_S = 0.3
 _STILL_FRAMES = 5
 _STILL_GREY = 0.75
@@ -193,8 +199,11 @@ class LiveReader:
             raise InputError(f"--smoothing must be 0 or more seconds, got {smoothing_s:g}")
         if seconds is not None and not seconds > 0:
             raise InputError(f"--seconds must be positive, got {seconds:g}")
-        self.source = open_live(source, options=options)
         self.network = load(network, device=device) if isinstance(network, Path | str) else network
+        options = options or SourceOptions()
+        if self.network is not None:
+            options = replace(options, fit_size=self.network.manifest.frame_size)
+        self.source = open_live(source, options=options)
         self.reference: Frame | None = None
         """The sensor untouched, as the next frame is compared with it."""
         self.engine: Engine | None = None
@@ -213,6 +222,7 @@ class LiveReader:
         self._taker: _ReferenceTaker | None = None
         self._asked, self._stopped, self._over = Event(), Event(), Event()
         self._error: BaseException | None = None
+        self._trouble: str | None = None
         self._last: LiveFrame | None = None
         self._dropped = 0
         self._threads: list[Thread] = []
@@ -244,7 +254,7 @@ class LiveReader:
         self.source.close()
         self._frames.close()
         for thread in self._threads:
-            thread.join()
+            thread.join(_PATIENCE_S)  # a driver that hangs is left to itself
         self._stack.close()
 
     def readings(self) -> Iterator[Reading]:
@@ -305,24 +315,49 @@ class LiveReader:
             self._frames.close()
 
     def _capture(self) -> None:
-        ends_s = None if self._seconds is None else time.monotonic() + self._seconds
-        for frame in self.source.frames():
-            if self._stopped.is_set() or (ends_s is not None and time.monotonic() >= ends_s):
-                break
-            self._frames.put(frame)
-        self._frames.close()
+        """Capture until the source ends; one that is lost is opened again until it is back."""
+        try:
+            while not self._stopped.is_set():
+                try:
+                    for frame in self.source.frames():
+                        if self._stopped.is_set():
+                            return
+                        self._trouble = None
+                        self._frames.put(frame)
+                except SourceError as error:
+                    if not self.source.reconnects:
+                        raise
+                    self._trouble = str(error)
+                    self._reconnect()
+                else:
+                    return
+        finally:
+            self._frames.close()
+
+    def _reconnect(self) -> None:
+        while not self._stopped.wait(_RETRY_S):
+            self.source.__exit__(None, None, None)
+            try:
+                self.source.__enter__()
+            except SourceError as error:
+                self._trouble = str(error)
+            else:
+                return
 
     def _infer(self) -> None:
+        ends_s = np.inf if self._seconds is None else time.monotonic() + self._seconds
         try:
-            while True:
-                frame = self._frames.take(self._stall_s)
+            while (left_s := ends_s - time.monotonic()) > 0:
+                frame = self._frames.take(min(self._stall_s, left_s))
                 if frame is not None:
                     self._tell(self._read(frame), frame)
                 elif self._frames.closed:
                     break
-                else:
+                elif time.monotonic() < ends_s:
                     self._tell(self._missing(), None)
         finally:
+            self._stopped.set()
+            self.source.close()
             self._over.set()
             for place in tuple(self._listening):
                 place.close()
@@ -336,21 +371,19 @@ class LiveReader:
 
     def _missing(self) -> Reading:
         """Reading where no frame came."""
-        last = self._last
+        last, source = self._last, self.source
         return Reading(
             number=-1 if last is None else last.number,
             time_s=np.nan if last is None else last.time_s,
             captured_s=np.nan if last is None else last.captured_s,
-            withheld=f"{self.source.name} has given no frame for {self._stall_s:g} s; check its cable or connection",
+            withheld=self._trouble or f"{source.name} has given no frame for {self._stall_s:g} s; {source.cure}",
             dropped=self._dropped,
         )
 
     def _set_reference(self, image: Frame) -> None:
         self.reference = image
-        self._smooth.forget()
         self._health = None if self._make_health is None else self._make_health(image, self.network)
-        if self._make_slip is not None:
-            self._tracker, self._slip = Tracker(image), self._make_slip(image)
+        self._begin_anew()
 
     def _look_for_reference(self, frame: LiveFrame) -> None:
         if self._asked.is_set():
@@ -363,7 +396,9 @@ class LiveReader:
     def _read(self, frame: LiveFrame) -> Reading:
         last, self._last = self._last, frame
         self._dropped += 0 if last is None else max(0, frame.number - last.number - 1)
-        self._look_for_reference(frame)
+        jump_s = 0.0 if last is None else self._clock_jump(last, frame)
+        if jump_s:
+            self._begin_anew()
         begin = Reading(
             number=frame.number,
             time_s=frame.time_s,
@@ -371,22 +406,48 @@ class LiveReader:
             dropped=self._dropped,
             true_margin=frame.safety_margin,
         )
+        if frame.size != self.source.size or jump_s:
+            return self._withhold(begin, frame, self._sentence(frame, jump_s))
+        self._look_for_reference(frame)
         if self.reference is None:
-            latency = Latency(decode_ms=frame.decode_ms, total_ms=_since_ms(frame.captured_s))
             still = "the picture must be still for a moment: leave the sensor untouched"
-            return replace(begin, withheld=f"there is no reference frame yet; {still}", latency=latency)
+            return self._withhold(begin, frame, f"there is no reference frame yet; {still}")
         slip = None
         if self._tracker is not None and self._slip is not None:
             places = self._tracker.update(frame.image).position_px[: len(self._tracker.rest)]
             slip = self._slip.update(places, frame.time_s)
         health = () if self._health is None else self._health.check(frame)
         withheld = next((check.sentence for check in health if not check.ok), None)
-        reading = replace(begin, slip=slip, health=health, withheld=withheld)
+        reading = replace(begin, slip=slip, health=health)
         if self.network is None or withheld is not None:
-            self._smooth.forget()
-            latency = Latency(decode_ms=frame.decode_ms, total_ms=_since_ms(frame.captured_s))
-            return replace(reading, latency=latency)
+            return self._withhold(reading, frame, withheld)
         return self._estimate(reading, frame)
+
+    def _withhold(self, reading: Reading, frame: LiveFrame, why: str | None) -> Reading:
+        self._smooth.forget()
+        latency = Latency(decode_ms=frame.decode_ms, total_ms=_since_ms(frame.captured_s))
+        return replace(reading, withheld=why, latency=latency)
+
+    def _clock_jump(self, last: LiveFrame, frame: LiveFrame) -> float:
+        """Seconds by which the clock of the source jumped; 0 where it went on."""
+        passed_s = frame.time_s - last.time_s
+        off_s = passed_s - self.source.speed * (frame.captured_s - last.captured_s)
+        return off_s if passed_s <= 0 or abs(off_s) > _JUMP_S else 0.0
+
+    def _sentence(self, frame: LiveFrame, jump_s: float) -> str:
+        if frame.size == self.source.size:
+            return f"the clock of {self.source.name} jumped by {jump_s:+.3g} s; the next frame is read again"
+        (height, width), (before_height, before_width) = frame.size, self.source.size
+        return (
+            f"the frames of {self.source.name} are now {height} x {width} pixels, they were {before_height} x "
+            f"{before_width}; set the camera as it was, or start again"
+        )
+
+    def _begin_anew(self) -> None:
+        """Forget what came before, where frames no longer follow each other."""
+        self._smooth.forget()
+        if self._make_slip is not None and self.reference is not None:
+            self._tracker, self._slip = Tracker(self.reference), self._make_slip(self.reference)
 
     def _estimate(self, reading: Reading, frame: LiveFrame) -> Reading:
         assert self.network is not None

@@ -1,92 +1,34 @@
-"""Sources of running frames: replayed trials, videos and bags, and a simulated fingertip to press and pull."""
+"""Running sources: replays, growing folders, network streams, and a simulated fingertip to press and pull."""
 
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from threading import Event, Lock
 from typing import TypeAlias
 
+import av
 import numpy as np
+from av.error import FFmpegError, InvalidDataError
+from av.video.reformatter import VideoReformatter
 from jaxtyping import UInt8
 
-from sliplens.errors import InputError
+from sliplens.errors import ImageError, InputError, SourceError
 from sliplens.extras import Table
+from sliplens.images import list_images
+from sliplens.live.camera import CameraSource
+from sliplens.live.contract import LiveSource, Pace, SourceKind, SourceOptions
 from sliplens.live.reading import LiveFrame
-from sliplens.recordings.capture import Capture, Forces, Frame
+from sliplens.recordings.capture import Capture, Forces
+from sliplens.recordings.formats import recognise
+from sliplens.recordings.formats.images import frame_size, read_frame
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.source import open_source
 from sliplens.simulation.filming import Film, prepare_film
 from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.nuisances import Day, Grasp, Nuisances, draw_unit
 from sliplens.simulation.sensor import SENSORS
-
-
-@dataclass(frozen=True, kw_only=True)
-class SourceOptions:
-    """Wishes of a user for a source; each takes those that it understands and refuses the others."""
-
-    rate_hz: float | None = None
-    """Frames a second; the source's own if None."""
-    speed: float | None = None
-    """Ratio of the recorded time to that of the replay: 2 is twice as fast; 1 if None."""
-    trial: str | None = None
-    """Trial of a data set or bag; the first if None."""
-
-    def require_only(self, *names: str, what: str) -> None:
-        """Refuse wishes that a source does not understand."""
-        for name, value in vars(self).items():
-            if value is not None and name not in names:
-                raise InputError(f"{what} takes no --{name.removesuffix('_hz')}; leave it out")
-            if isinstance(value, float) and not value > 0:
-                raise InputError(f"--{name.removesuffix('_hz')} must be positive, got {value:g}")
-
-
-class LiveSource(ABC):
-    """Running source of frames; a context manager that holds a device, file or connection while it is open."""
-
-    name: str
-    """What it is, for people."""
-    size: tuple[int, int]
-    """Height and width of its frames, in pixels; known when it is open."""
-    rate_hz: float | None = None
-    """Frames a second that it gives, as far as it knows."""
-    reference: Frame | None = None
-    """The sensor untouched, where the source brings its image."""
-    count: int | None = None
-    """Frames that it will give; None where nobody knows."""
-
-    def __enter__(self) -> "LiveSource":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    @abstractmethod
-    def frames(self) -> Iterator[LiveFrame]:
-        """Frames as they come; it ends when the source does, or soon after `close`."""
-
-    def close(self) -> None:  # noqa: B027 (most have nothing to give back)
-        """Stop giving frames and give back what is held; may be called from another thread, and again."""
-
-
-class _Pace:
-    """Waits until frames are due, and no longer than until the source is closed."""
-
-    def __init__(self, closed: Event) -> None:
-        self._closed, self._start_s = closed, time.monotonic()
-
-    def wait(self, due_s: float) -> bool:
-        """Wait until so many seconds after the start; False if the source was closed.
-
-        What comes late moves the start: a source that is slow falls behind once, and does not hurry afterwards.
-        """
-        left_s = self._start_s + due_s - time.monotonic()
-        if left_s > 0:
-            return not self._closed.wait(left_s)
-        self._start_s -= left_s
-        return not self._closed.is_set()
 
 
 class ReplaySource(LiveSource):
@@ -115,14 +57,14 @@ class ReplaySource(LiveSource):
         step_s = 1 / (rate_hz or capture.frame_rate_hz)
         self._time_s = np.arange(len(capture)) * step_s if known is None else known - known[0]
         self._length_s = float(self._time_s[-1]) + step_s
-        self._speed = speed
+        self.speed = speed
         self.rate_hz = speed / step_s
         read_reference = capture.read_reference
         self.reference = None if read_reference is None else read_reference()
 
     def frames(self) -> Iterator[LiveFrame]:
         """Frames at their times, of the first pass and of those after it."""
-        pace, number, begun_s = _Pace(self._closed), 0, 0.0
+        pace, number, begun_s = Pace(self._closed), 0, 0.0
         capture = self._capture
         first_s = 0.0 if capture.time_s is None else float(capture.time_s[0])
         while True:
@@ -133,7 +75,7 @@ class ReplaySource(LiveSource):
                 image = next(images)
                 decode_ms = 1e3 * (time.perf_counter() - before)
                 time_s = begun_s + offset_s
-                if not pace.wait(time_s / self._speed):
+                if not pace.wait(time_s / self.speed):
                     return
                 margins = capture.safety_margin
                 label = None if margins is None or np.isnan(margins[at]) else float(margins[at])
@@ -165,6 +107,150 @@ class ReplaySource(LiveSource):
     def close(self) -> None:
         """Stop at the next frame."""
         self._closed.set()
+
+
+_POLL_S = 0.02
+_WRITTEN_S = 1.0  # after which a file that cannot be read is damaged, not half written
+
+
+class FolderSource(LiveSource):
+    """Folder into which some other program saves images; the newest is the first frame, then those to come.
+
+    An image's time is that of its file.
+    """
+
+    cure = "nothing new was saved there"
+
+    def __init__(self, folder: Path) -> None:
+        self.name, self._folder, self._closed = f"the folder {folder}", folder, Event()
+        self._seen: set[str] = set()
+
+    def __enter__(self) -> "FolderSource":
+        self._closed.clear()
+        *before, newest = list_images(self._folder)
+        self.size = frame_size(newest)
+        self._seen = {path.name for path in before}
+        return self
+
+    def close(self) -> None:
+        """Stop within some hundredths of a second."""
+        self._closed.set()
+
+    def frames(self) -> Iterator[LiveFrame]:
+        """Images in the natural order of their names; one that stays damaged is missing in the numbers."""
+        looked, number, last_s = -1, 0, -np.inf
+        while not self._closed.is_set():
+            changed = self._folder.stat().st_mtime_ns
+            waiting = False
+            for path in list_images(self._folder) if changed != looked else []:
+                if path.name in self._seen:
+                    continue
+                written_s, before = path.stat().st_mtime, time.monotonic()
+                try:
+                    image = read_frame(path, size=frame_size(path))
+                except ImageError:
+                    if time.time() - written_s < _WRITTEN_S:
+                        waiting = True  # the next ones too, so that they come in order
+                        break
+                    image = None
+                self._seen.add(path.name)
+                number += 1
+                if image is None:
+                    continue
+                last_s = max(written_s, last_s + 1e-6)
+                now_s = time.monotonic()
+                yield LiveFrame(
+                    image=image,
+                    number=number - 1,
+                    time_s=last_s,
+                    captured_s=now_s - max(0.0, time.time() - written_s),
+                    decode_ms=1e3 * (now_s - before),
+                )
+            looked = -1 if waiting else changed
+            self._closed.wait(_POLL_S)
+
+
+_NETWORK = ("rtsp", "rtp", "udp", "tcp", "http", "https", "rtmp", "srt")
+_OPEN_S, _READ_S = 5.0, 2.0
+_QUICK = {
+    # what comes from outside may lead to no file of this machine
+    "protocol_whitelist": ",".join((*_NETWORK, "rtsps", "tls", "crypto", "rtmps")),
+    "rtsp_transport": "tcp",
+    "fflags": "nobuffer",
+    "flags": "low_delay",
+    "analyzeduration": "500000",
+}
+
+
+class StreamSource(LiveSource):
+    """Video that a network camera sends, as far as FFmpeg reads it: RTSP, HTTP, MPEG-TS over UDP or TCP, SRT."""
+
+    reconnects = True
+
+    def __init__(self, address: str, *, size: tuple[int, int] | None = None) -> None:
+        self.name, self._address, self._size, self._closed = f"the stream {address}", address, size, Event()
+        self._held = ExitStack()
+
+    def __enter__(self) -> "StreamSource":
+        self._closed.clear()
+        with ExitStack() as stack:
+            try:
+                opened = av.open(self._address, options=_QUICK, timeout=(_OPEN_S, _READ_S))
+            except (FFmpegError, OSError, ValueError) as error:
+                raise self._told(error) from None
+            self._container = stack.enter_context(opened)
+            if not opened.streams.video:
+                raise SourceError(f"{self.name} shows no pictures; name the address of a camera")
+            self._video = opened.streams.video[0]
+            self._video.thread_type = "SLICE"  # by frame, each thread would keep one back
+            self.size = self._size or (self._video.codec_context.height, self._video.codec_context.width)
+            rate = self._video.average_rate
+            self.rate_hz = float(rate) if rate else None
+            self._held = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+        self._held.close()
+
+    def close(self) -> None:
+        """Stop at the next frame, or when none comes for two seconds."""
+        self._closed.set()
+
+    def frames(self) -> Iterator[LiveFrame]:
+        """Frames as they arrive; those that cannot be decoded are missing in the numbers."""
+        to_rgb, number = VideoReformatter(), 0
+        packets = self._container.demux(self._video)
+        while not self._closed.is_set():
+            try:
+                packet = next(packets)
+                arrived_s = time.monotonic()
+                try:
+                    frames = packet.decode()
+                except InvalidDataError:
+                    number += 1
+                    continue
+            except (FFmpegError, OSError) as error:
+                if self._closed.is_set():
+                    return
+                raise self._told(error) from None
+            except StopIteration:
+                raise SourceError(f"{self.name} has ended; start the camera again") from None
+            for frame in frames:
+                height, width = self._size or (frame.height, frame.width)
+                image = to_rgb.reformat(frame, width=width, height=height, format="rgb24").to_ndarray()
+                yield LiveFrame(
+                    image=image,
+                    number=number,
+                    time_s=arrived_s if frame.time is None else float(frame.time),
+                    captured_s=arrived_s,
+                    decode_ms=1e3 * (time.monotonic() - arrived_s),
+                )
+                number += 1
+
+    def _told(self, error: Exception) -> SourceError:
+        reason = getattr(error, "strerror", None) or str(error)
+        return SourceError(f"{self.name} cannot be read ({reason}); check its address and that the camera runs")
 
 
 _GRIP_S = 10.0
@@ -242,7 +328,7 @@ class SimulatedSource(LiveSource):
 
     def frames(self) -> Iterator[LiveFrame]:
         """Frames of the load that holds when each is due."""
-        pace, number = _Pace(self._closed), 0
+        pace, number = Pace(self._closed), 0
         rate_hz = self.rate_hz or 30.0
         while pace.wait(number / rate_hz):
             captured_s, time_s = time.monotonic(), number / rate_hz
@@ -280,22 +366,33 @@ class SimulatedSource(LiveSource):
         self._closed.set()
 
 
-@dataclass(frozen=True, kw_only=True)
-class SourceKind:
-    """How a running source is recognised and opened."""
-
-    words: str
-    """What it is, for people."""
-    recognises: Callable[[str], bool]
-    """Told by the name that the user gave, without opening anything."""
-    open: Callable[[str, SourceOptions], LiveSource]
-    """Nothing runs before the source is entered."""
-
-
 def _open_simulated(name: str, options: SourceOptions) -> LiveSource:
     options.require_only("rate_hz", what="the simulated fingertip")
     _, _, sensor = name.partition(":")
     return SimulatedSource(sensor or "chromatouch", rate_hz=options.rate_hz or 30.0)
+
+
+def _camera_path(name: str) -> Path | None:
+    """Device file of a number, or of its own path."""
+    if name.isdecimal():
+        return Path(f"/dev/video{int(name)}")
+    return Path(name) if name.startswith("/dev/") else None
+
+
+def _open_camera(name: str, options: SourceOptions) -> LiveSource:
+    path = _camera_path(name)
+    assert path is not None
+    return CameraSource(path, options)
+
+
+def _open_stream(name: str, options: SourceOptions) -> LiveSource:
+    options.require_only("size", what=f"the stream {name}")
+    return StreamSource(name, size=options.size)
+
+
+def _open_folder(name: str, options: SourceOptions) -> LiveSource:
+    options.require_only(what=f"the folder {name}")
+    return FolderSource(Path(name))
 
 
 def _open_replay(name: str, options: SourceOptions) -> LiveSource:
@@ -309,6 +406,21 @@ _ROWS = {
         words="simulated fingertip (simulated, or simulated:flat-gel)",
         recognises=lambda name: name.partition(":")[0] == "simulated",
         open=_open_simulated,
+    ),
+    "camera": SourceKind(
+        words="camera by its number or device file (0, or /dev/video0)",
+        recognises=lambda name: _camera_path(name) is not None,
+        open=_open_camera,
+    ),
+    "stream": SourceKind(
+        words="network stream by its address (rtsp://, http://, udp://)",
+        recognises=lambda name: name.partition("://")[0].lower() in _NETWORK and "://" in name,
+        open=_open_stream,
+    ),
+    "folder": SourceKind(
+        words="folder into which images are saved",
+        recognises=lambda name: Path(name).is_dir() and recognise(Path(name)) in {None, "images"},
+        open=_open_folder,
     ),
     "replay": SourceKind(
         words="video, bag or trial of a data set, replayed",
@@ -330,8 +442,8 @@ def open_live(
     Parameters
     ----------
     source
-        `simulated`, or the path of a video, a bag or a data set; or uint8 RGB frames, what `open_source` gave, or a
-        source.
+        `simulated`; the number of a camera; the address of a stream; the path of a video, a bag, a data set, or a
+        folder that grows; or uint8 RGB frames, what `open_source` gave, or a source.
     options
         Wishes for it.
 
@@ -363,4 +475,4 @@ def open_live(
     raise InputError(f"{name} is no source that is known, nor a path that exists; name a {known}")
 
 
-__all__ = ["SOURCES", "LiveSource", "ReplaySource", "SimulatedSource", "SourceKind", "SourceOptions", "open_live"]
+__all__ = ["SOURCES", "FolderSource", "ReplaySource", "SimulatedSource", "StreamSource", "open_live"]

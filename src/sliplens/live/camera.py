@@ -1,0 +1,310 @@
+"""V4L2 cameras: their modes, and their frames with the stamps and numbers that the kernel gave them."""
+
+import errno
+import select
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from threading import Event
+from typing import TYPE_CHECKING
+
+import av
+import numpy as np
+from av.error import FFmpegError
+from av.video.codeccontext import VideoCodecContext
+from av.video.reformatter import VideoReformatter
+
+from sliplens.errors import SourceError
+from sliplens.extras import require_packages
+from sliplens.live.contract import LiveSource, SourceOptions
+from sliplens.live.reading import LiveFrame
+from sliplens.recordings.capture import Frame
+
+if TYPE_CHECKING:
+    from linuxpy.video.device import Device
+
+# formats of V4L2 by their four letters: the decoder of FFmpeg, its pixel format, and bytes a pixel where rows may be
+# padded
+_DECODERS: dict[str, tuple[str, str | None, int]] = {
+    "MJPG": ("mjpeg", None, 0),
+    "JPEG": ("mjpeg", None, 0),
+    "YUYV": ("rawvideo", "yuyv422", 2),
+    "UYVY": ("rawvideo", "uyvy422", 2),
+    "RGB3": ("rawvideo", "rgb24", 3),
+    "BGR3": ("rawvideo", "bgr24", 3),
+    "GREY": ("rawvideo", "gray", 1),
+}
+_MOST_HALVINGS = 3  # of what a JPEG decoder can leave out of its blocks of 8
+_BUFFERS = 4  # two are not enough where a process is now and then late
+_POLL_S = 0.1
+_STALL_S = 2.0
+_MOST_BAD = 30  # frames in a row that cannot be decoded
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraMode:
+    """One way in which a camera gives frames."""
+
+    pixel_format: str
+    """Four letters, such as MJPG."""
+    size: tuple[int, int]
+    """Height and width, in pixels."""
+    rates_hz: tuple[float, ...]
+    """Frames a second; empty where the camera does not tell."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """A camera of this machine."""
+
+    path: Path
+    """Device file, such as /dev/video0."""
+    name: str
+    """Name that the driver tells."""
+    modes: tuple[CameraMode, ...]
+    """Modes that sliplens can read; empty where the camera is held by another program, or cannot be asked."""
+
+
+class FrameDecoder:
+    """Decodes what a camera sends, scaled down while it is decoded where the format can do that.
+
+    Parameters
+    ----------
+    pixel_format
+        Four letters of V4L2.
+    size, wanted
+        Height and width of what comes and of what is wanted, in pixels.
+    """
+
+    def __init__(self, pixel_format: str, *, size: tuple[int, int], wanted: tuple[int, int] | None = None) -> None:
+        codec, pixels, self._pixel_bytes = _DECODERS[pixel_format]
+        self._size, self._wanted = size, wanted or size
+        context = av.CodecContext.create(codec, "r")
+        assert isinstance(context, VideoCodecContext)
+        self._context = context
+        self._context.thread_count = 1  # frame by frame: more threads would each keep one back
+        if pixels is None:
+            ratio = min(have / want for have, want in zip(size, self._wanted, strict=True))
+            halvings = min(max(int(np.floor(np.log2(ratio))), 0), _MOST_HALVINGS)
+            self._context.options = {"lowres": str(halvings), "err_detect": "explode"}
+        else:
+            self._context.height, self._context.width = size
+            self._context.pix_fmt = pixels
+        self._to_rgb = VideoReformatter()
+
+    def decode(self, data: bytes, *, row_bytes: int = 0) -> Frame | None:
+        """Pixels of one frame as RGB; None where the bytes are no whole frame. `row_bytes`: of a padded row."""
+        height, width = self._size
+        full = width * self._pixel_bytes
+        if row_bytes > full > 0 and len(data) >= height * row_bytes:
+            rows = np.frombuffer(data, dtype=np.uint8, count=height * row_bytes).reshape(height, row_bytes)
+            data = rows[:, :full].tobytes()
+        if len(data) < max(1, height * full):
+            return None
+        try:
+            frames = self._context.decode(av.Packet(data))
+        except FFmpegError:
+            return None
+        if len(frames) != 1 or frames[0].is_corrupt:
+            return None
+        height, width = self._wanted
+        return self._to_rgb.reformat(
+            frames[0], width=width, height=height, format="rgb24", interpolation="AREA"
+        ).to_ndarray()
+
+
+class CameraSource(LiveSource):
+    """V4L2 camera, MJPG where it can; its frames carry the kernel's stamps and numbers.
+
+    Parameters
+    ----------
+    path
+        Device file.
+    options
+        Rate, size and pixel format that are wished for.
+    """
+
+    reconnects = True
+
+    def __init__(self, path: Path, options: SourceOptions) -> None:
+        require_packages("linuxpy", extra="live", purpose="reading a camera")
+        options.require_only("rate_hz", "size", "pixel_format", what=f"the camera {path}")
+        self.name, self._path, self._options = f"the camera {path}", path, options
+        self._closed, self._held = Event(), ExitStack()
+
+    def __enter__(self) -> "CameraSource":
+        from linuxpy.video.device import Device, VideoCapture  # noqa: PLC0415 (an extra)
+
+        self._closed.clear()
+        with ExitStack() as stack:
+            try:
+                self._device = stack.enter_context(Device(self._path))
+                mode = self._choose(read_modes(self._device))
+                self._capture = VideoCapture(self._device, size=_BUFFERS)
+                if mode is not None:
+                    height, width = mode.size
+                    self._capture.set_format(width, height, mode.pixel_format)
+                if self._options.rate_hz is not None:
+                    self._capture.set_fps(self._options.rate_hz)
+                chosen = self._capture.get_format()
+                self._decoder = self._make_decoder(chosen.pixel_format.human_str(), (chosen.height, chosen.width))
+                self._row_bytes = chosen.bytes_per_line
+                rate_hz = float(self._capture.get_fps())
+                stack.enter_context(self._capture)
+            except (OSError, ZeroDivisionError) as error:
+                raise self._told(error) from None
+            self.rate_hz = rate_hz
+            self._held = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+        with suppress(OSError):  # it may be gone already
+            self._held.close()
+
+    def close(self) -> None:
+        """Stop within a tenth of a second; the device is given back on leaving."""
+        self._closed.set()
+
+    def frames(self) -> Iterator[LiveFrame]:
+        """Frames as the kernel hands them out; those that it marks as broken, or that cannot be decoded, are missing
+        in the numbers.
+        """
+        from linuxpy.video.device import BufferFlag  # noqa: PLC0415 (an extra)
+
+        buffers, heard_s, bad = self._capture.buffer, time.monotonic(), 0
+        assert buffers is not None
+        while not self._closed.is_set():
+            try:
+                ready, _, _ = select.select([self._device], [], [], _POLL_S)
+                sent = buffers.raw_read() if ready else None
+            except BlockingIOError:
+                sent = None
+            except (OSError, ValueError) as error:
+                raise self._told(error) from None
+            now_s = time.monotonic()
+            if sent is None:
+                if now_s - heard_s > _STALL_S:
+                    raise SourceError(
+                        f"{self.name} has given no frame for {_STALL_S:g} s; check its cable, "
+                        "or plug it into a port of its own"
+                    )
+                continue
+            heard_s = now_s
+            image = None
+            if BufferFlag.ERROR not in sent.flags:
+                image = self._decoder.decode(bytes(sent.data), row_bytes=self._row_bytes)
+            bad = 0 if image is not None else bad + 1
+            if image is None:
+                if bad >= _MOST_BAD:
+                    raise SourceError(
+                        f"{self.name} sends frames that cannot be decoded; check its cable, choose another "
+                        "--pixel-format, or a smaller --size"
+                    )
+                continue
+            monotonic = (sent.flags & BufferFlag.TIMESTAMP_MASK) == BufferFlag.TIMESTAMP_MONOTONIC
+            yield LiveFrame(
+                image=image,
+                number=int(sent.frame_nb),
+                time_s=float(sent.timestamp),
+                captured_s=float(sent.timestamp) if monotonic else now_s,
+                decode_ms=1e3 * (time.monotonic() - now_s),
+            )
+
+    def _choose(self, modes: Sequence[CameraMode]) -> CameraMode | None:
+        """Mode that suits the wishes; None to leave the camera as it is."""
+        wished, wanted = self._options.pixel_format, self._options.size or self._options.fit_size
+        known = [mode for mode in modes if wished is None or mode.pixel_format == wished]
+        if wished is not None and not known and modes:
+            formats = ", ".join(sorted({mode.pixel_format for mode in modes}))
+            raise SourceError(f"{self.name} has no format {wished}; choose {formats} with --pixel-format")
+        # compressed first: what is not compressed fills the cable, and the rate falls
+        known.sort(key=lambda mode: list(_DECODERS).index(mode.pixel_format))
+        if wanted is None or not known:
+            return None if wished is None or not known else known[0]
+        rate_hz = self._options.rate_hz or 0.0
+        for mode in sorted(known, key=lambda mode: mode.size):
+            larger = all(have >= want for have, want in zip(mode.size, wanted, strict=True))
+            alike = mode.size[0] * wanted[1] == mode.size[1] * wanted[0]
+            fast = not mode.rates_hz or max(mode.rates_hz) >= rate_hz
+            if larger and alike and fast and mode.pixel_format == known[0].pixel_format:
+                return mode
+        if self._options.size is None:
+            return None  # nobody asked for a size: whoever reads the frames says what is wrong with them
+        sizes = ", ".join(dict.fromkeys(f"{mode.size[1]}x{mode.size[0]}" for mode in known))
+        raise SourceError(
+            f"{self.name} has no mode that gives {wanted[1]}x{wanted[0]} at {rate_hz:g} frames a second; "
+            f"choose a --size of the same shape as one of {sizes}, or a lower --rate"
+        )
+
+    def _make_decoder(self, pixel_format: str, size: tuple[int, int]) -> FrameDecoder:
+        if pixel_format not in _DECODERS:
+            raise SourceError(
+                f"{self.name} gives {pixel_format}, which is not read; choose one of {', '.join(_DECODERS)} "
+                "with --pixel-format"
+            )
+        fit = self._options.fit_size
+        alike = fit is not None and size[0] * fit[1] == size[1] * fit[0] and size[0] >= fit[0]
+        self.size = self._options.size or (fit if fit is not None and alike else size)
+        return FrameDecoder(pixel_format, size=size, wanted=self.size)
+
+    def _told(self, error: Exception) -> SourceError:
+        number = getattr(error, "errno", None)
+        cures = {
+            errno.EBUSY: "is taken by another program; close that one",
+            errno.EACCES: "may not be opened; add yourself to the group video and log in again",
+            errno.ENOENT: "is not there; plug it in, and see `sliplens live --list`",
+            errno.ENODEV: "was unplugged; plug it in again",
+            errno.ENXIO: "was unplugged; plug it in again",
+            errno.ENOTTY: "is no camera; see `sliplens live --list`",
+            errno.EINVAL: "does not take these settings; see `sliplens live --list`",
+        }
+        return SourceError(f"{self.name} {cures.get(number or 0, f'cannot be read ({error}); plug it in again')}")
+
+
+def read_modes(device: "Device") -> tuple[CameraMode, ...]:
+    """Modes of an open camera that can be read, the largest rate first in each."""
+    assert device.info is not None
+    found = sorted(
+        (kind.pixel_format.human_str(), (kind.height, kind.width), float(kind.max_fps))
+        for kind in device.info.frame_types
+    )
+    return tuple(
+        CameraMode(
+            pixel_format=pixel_format,
+            size=size,
+            rates_hz=tuple(sorted({rate for *_, rate in same if rate > 0}, reverse=True)),
+        )
+        for (pixel_format, size), same in groupby(found, key=lambda mode: mode[:2])
+        if pixel_format in _DECODERS
+    )
+
+
+def list_cameras(folder: Path = Path("/dev")) -> tuple[Camera, ...]:
+    """Cameras of this machine, with their modes.
+
+    Raises
+    ------
+    InputError
+        If the extra `live` is not installed.
+    """
+    require_packages("linuxpy", extra="live", purpose="listing cameras")
+    from linuxpy.video.device import Capability, Device  # noqa: PLC0415 (an extra)
+
+    cameras = []
+    for path in sorted(folder.glob("video*"), key=lambda path: (len(path.name), path.name)):
+        try:
+            with Device(path) as device:
+                assert device.info is not None
+                if Capability.VIDEO_CAPTURE in device.info.device_capabilities:
+                    cameras.append(Camera(path=path, name=device.info.card, modes=read_modes(device)))
+        except OSError as error:
+            if error.errno not in {errno.ENOTTY, errno.ENODEV}:
+                cameras.append(Camera(path=path, name=f"cannot be opened ({error.strerror})", modes=()))
+    return tuple(cameras)
+
+
+__all__ = ["Camera", "CameraMode", "CameraSource", "FrameDecoder", "list_cameras"]

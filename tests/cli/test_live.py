@@ -1,0 +1,47 @@
+"""`sliplens live`: lines of JSON, lines for people, and what is there."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from sliplens.cli import main
+from sliplens.recordings import Dataset
+
+
+def test_a_line_of_json_a_reading(small_dataset: Dataset, difference_run: Path, capfdbinary: pytest.CaptureFixture):
+    words = ["live", str(small_dataset.folder), "--network", str(difference_run), "--engine", "eager"]
+    assert main([*words, "--speed", "2.0", "--sink", "json"]) == 0
+    lines = [json.loads(line) for line in capfdbinary.readouterr().out.splitlines()]
+    assert lines
+    for line in lines:
+        assert 0 <= line["margin"] <= 1
+        assert set(line["latency"]) == {"decode_ms", "encode_ms", "network_ms", "total_ms"}
+    assert lines[-1]["number"] == 11
+    assert len(lines) + lines[-1]["dropped"] + lines[0]["number"] == 12
+
+
+def test_a_line_for_people(small_dataset: Dataset, capsys: pytest.CaptureFixture[str]):
+    assert main(["live", str(small_dataset.folder), "--speed", "4"]) == 0
+    assert "no network" in capsys.readouterr().out
+
+
+def test_what_can_be_read_is_listed(capsys: pytest.CaptureFixture[str]):
+    pytest.importorskip("linuxpy")
+    assert main(["live", "--list"]) == 0
+    assert "camera by its number or device file" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["99"], "the camera /dev/video99 is not there; plug it in"),
+        (["0", "--size", "640"], "--size is '640'; give width and height as 640x480"),
+        (["simulated", "--sink", "paper"], "there is no sink named 'paper'; choose one of json"),
+        (["simulated", "--speed", "2"], "the simulated fingertip takes no --speed; leave it out"),
+        (["nowhere"], "nowhere is no source that is known"),
+    ],
+)
+def test_mistakes_are_told_in_a_sentence(words: list[str], told: str, capsys: pytest.CaptureFixture[str]):
+    assert main(["live", *words]) == 2
+    assert told in " ".join(capsys.readouterr().err.split())
