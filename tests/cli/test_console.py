@@ -40,6 +40,14 @@ def test_columns_below_have_their_rows_named_again(screen: Console) -> None:
     assert screen.export_text().count("Grad-CAM") == 2
 
 
+def test_numbers_stand_to_the_right_and_words_to_the_left(screen: Console) -> None:
+    print_table("Scores", ["Method", "D", "meaning"], [["a", "0.5", "as it fell"], ["b", "none", "lower"]])
+
+    text = screen.export_text()
+    assert "│  0.5 │ as it fell │" in text
+    assert "│ none │ lower      │" in text
+
+
 def test_brackets_in_a_table_are_text(screen: Console) -> None:
     print_table("Scores", ["Method", "D"], [["[red]", "1"]])
 

@@ -16,8 +16,7 @@ from rich.table import Table
 
 from sliplens.progress import OnProgress
 
-OUT = Console()
-ERR = Console(stderr=True)
+OUT, ERR = Console(), Console(stderr=True)
 
 
 def fail(message: str) -> None:
@@ -115,7 +114,8 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
     for number, shown in enumerate(_fitting(columns, OUT.width)):
         table = Table(title=title if number == 0 else f"{title}, continued", title_justify="left")
         for column in shown:
-            table.add_column(column.head, justify="left" if column is columns[0] else "right")
+            numbers = column is not columns[0] and any(re.match(r"[-+]?\d", cell) for cell in column.cells)
+            table.add_column(column.head, justify="right" if numbers else "left")
         for cells in zip(*(column.cells for column in shown), strict=True):
             table.add_row(*map(escape, cells))
         OUT.print(table)
