@@ -44,7 +44,7 @@ bench: $(INSTALLED) ## run every benchmark
 docs: $(INSTALLED) ## build the documentation: docs/_build/index.html
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build
 
-weights: $(INSTALLED) ## train the networks that come with the package: some four hours on two cores
+weights: $(INSTALLED) ## train the networks that come with the package: some five hours on two cores
 	$(BIN)/sliplens simulate runs/weights/varied --preset varied
 	@set -e; for input in difference raw; do \
 		$(BIN)/sliplens train runs/weights/varied -o runs/weights/small-$$input --input $$input \
@@ -56,10 +56,16 @@ weights: $(INSTALLED) ## train the networks that come with the package: some fou
 	$(BIN)/sliplens simulate runs/weights/more --preset varied --dry-trials 3060 --days 1020 --seed 1
 	$(BIN)/sliplens train runs/weights/more -o runs/weights/more-difference --input difference \
 		--start-from runs/weights/large-difference --epochs 5 --learning-rate 1e-3
-	@set -e; for kept in more-difference large-raw; do \
-		folder=src/sliplens/weights/chromatouch-$${kept#*-}; mkdir -p $$folder; \
+# the networks of the thesis: its days and trials on one sensor, its recipe, as far as two cores reach
+	$(BIN)/sliplens simulate runs/weights/thesis --preset thesis --frames-per-trial 200
+	@set -e; for input in difference raw; do \
+		$(BIN)/sliplens train runs/weights/thesis -o runs/weights/thesis-$$input --input $$input \
+			--recipe thesis --image-size 112 --epochs 4; \
+	done
+	@set -e; for kept in more-difference:chromatouch large-raw:chromatouch thesis-difference:thesis thesis-raw:thesis; do \
+		run=$${kept%:*}; folder=src/sliplens/weights/$${kept#*:}-$${run##*-}; mkdir -p $$folder; \
 		for file in model.safetensors manifest.json run.json result.json; do \
-			cp runs/weights/$$kept/$$file $$folder; \
+			cp runs/weights/$$run/$$file $$folder; \
 		done; \
 	done
 

@@ -1,15 +1,16 @@
-"""Do maps rank the markers as the simulator knows they count? Signed, against Shapley values and single effects.
+"""Which explanation ranks the markers as they matter, on trials and networks that nothing was chosen by.
 
-Frames of simulated trials whose seed no preset and no study has, but on which methods were tried out: no test of these
-unless `--data` names other trials. Both networks of the package unless `--network` names others. Beside the methods
-stand the controls of a study, which know nothing of what the network learned. `--json` ends with one line of JSON.
+The truth are Shapley values of the markers over scenes drawn anew (docs/study.md). A method is recommended where its
+signed rank correlation with them leads every control and every other method, both intervals off zero. With networks of
+a second seed the whole is done once more on trials of a second seed, of other days, and the two answers are compared.
+Each seed is a study that can be interrupted and goes on where it stopped (`--keep`).
 """
 
 import argparse
 import json
 import os
+import sys
 import tempfile
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,94 +18,117 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # must be set before torch 
 
 import numpy as np
 
+from sliplens.cli.console import Terminal
+from sliplens.errors import SliplensError
 from sliplens.intervals import Difference
-from sliplens.models.checkpoint import load
-from sliplens.recordings import Dataset, load_dataset
-from sliplens.results.study import Truth
+from sliplens.recordings import load_dataset
+from sliplens.report.verdict import recommend
+from sliplens.results import Study
 from sliplens.simulation import simulate
-from sliplens.study.checks import explain_untrained
-from sliplens.study.curves import influences
-from sliplens.study.explaining import explain_frames, frames_at, nearest_frame, network_inputs
-from sliplens.study.material import Material, study_explainers
-from sliplens.study.truth import TRUTH_PAIRS, judge_by_truth
+from sliplens.study import run_study
 
-NETWORKS = ("chromatouch-difference", "chromatouch-raw")
-CHANGES: dict[str, Any] = {"dry_trials": 24, "wet_trials": 8, "days": 8, "test_days": 4, "frames_per_trial": 40}
-METHODS = ("grad-cam", "integrated-gradients", "poly-cam-thesis", "poly-cam", "occlusion")
+INPUTS = ("difference", "raw")
 
 
-def judge(network: str, data: Dataset, args: argparse.Namespace) -> Truth:
-    """Judge the maps of one network on frames of trials that are spread evenly over the test days."""
-    run, infos = load(network), data.select(split="test", condition="dry")
-    infos = infos[:: max(1, len(infos) // args.trials)][: args.trials]
-    rows = [
-        (info.trial, nearest_frame(data.load(info).safety_margin, level)) for info in infos for level in args.levels
-    ]
-    chosen = frames_at(run, data, rows)
-    explainers = study_explainers(METHODS, budget=0.15)
-    explained = explain_frames(run, chosen, methods=METHODS, explainers=explainers)
-    material = Material(
-        trained=run,
-        explained=explained,
-        inputs=network_inputs(run, explained),
-        references=chosen.references.to(run.device),
-        chosen=(),
-        markers={},
-        explainers=explainers,
+def look(networks: dict[str, str], folder: Path, *, seed: int, options: argparse.Namespace) -> Study:
+    """Study the explanations of both networks on test trials of a seed."""
+    terminal = Terminal()
+    data = folder / "data"
+    frames = options.frames_per_trial
+    simulated = (
+        load_dataset(data)
+        if data.exists()
+        else simulate(data, preset="thesis", frames_per_trial=frames, seed=seed, on_progress=terminal)
     )
-    maps = influences(material) | explain_untrained(material).maps
-    return judge_by_truth(run, explained, data, maps=maps, fills=("reference", "blur", "grey"), pairs=args.pairs)
+    return run_study(
+        simulated,
+        difference=networks["difference"],
+        raw=networks["raw"],
+        out=folder / "study",
+        trials=options.trials,
+        tests=("truth",),
+        jobs=options.jobs,
+        seed=seed,
+        on_progress=terminal,
+    )
 
 
-def told(gap: Difference | None) -> str:
-    """Write a mean with its interval."""
-    return "unknown" if gap is None else f"{gap.estimate:+.2f} ({gap.low:+.2f} to {gap.high:+.2f})"
+def interval(gap: Difference | None) -> list[float] | None:
+    """Estimate, lower and upper end."""
+    return None if gap is None else [gap.estimate, gap.low, gap.high]
 
 
-def report(network: str, truth: Truth) -> dict[str, Any]:
-    """Print what was found, and give it as numbers."""
-    print(f"{network}: {truth.summary}\nreliability {told(truth.reliability)}")
-    for name, found in sorted(
-        truth.methods.items(), key=lambda one: -one[1].shapley.estimate if one[1].shapley else 0.0
-    ):
-        print(f"  {name:30} Shapley {told(found.shapley)}, single {told(found.network)}, margin {told(found.margin)}")
-        if found.lead_over_controls is not None:
-            print(f"  {'':30} lead over {found.lead_over_controls.control} {told(found.lead_over_controls.gap)}")
-    for test in truth.meta:
-        for counted, own in (("along", test), ("by size", test.by_size)):
-            gains = f"truth {own.oracle:+.3f}, damaged {own.degraded:+.3f}, |x - b| {own.changed:+.3f}"
-            print(f"  {test.fill:10} {counted:8} {gains}", flush=True)
+def told(study: Study, name: str) -> dict[str, Any]:
+    """What the truth says of one network's explanations."""
+    truth, best = study.truth[name], recommend(study.truth[name])
+    leads = {method: own.lead_over_controls for method, own in truth.methods.items()}
     effects = truth.effects
     sums = {frame: own.shapley.sum() for (frame,), own in effects.groups("frame_id").items()}
     towards = np.sign([sums[frame] for frame in effects.frame_id])
     return {
-        "spearman": {name: found.shapley and asdict(found.shapley) for name, found in truth.methods.items()},
-        "lead_over_controls": {
-            name: asdict(lead.gap) for name, found in truth.methods.items() if (lead := found.lead_over_controls)
-        },
-        "spearman_single": {name: found.network and asdict(found.network) for name, found in truth.methods.items()},
-        "reliability": truth.reliability and asdict(truth.reliability),
+        "spearman": {method: interval(own.shapley) for method, own in truth.methods.items()},
+        "lead_over_controls": {method: interval(lead.gap) for method, lead in leads.items() if lead is not None},
+        "best": best and best.method,
+        "tied": best and best.tied,
+        "recommended": best.method if best is not None and best.shown else None,
+        "spearman_single": {method: interval(own.network) for method, own in truth.methods.items()},
+        "reliability": interval(truth.reliability),
         "sums": truth.sums,
-        "opposing": {name: float((towards * getattr(effects, name) < 0).mean()) for name in ("network", "shapley")},
+        "opposing": {kind: float((towards * getattr(effects, kind) < 0).mean()) for kind in ("network", "shapley")},
+        "frames": truth.frames,
+        "qualifying_trials": study.choice and study.choice.qualified_alone[name],
+        "mean_error": study.choice and study.choice.mean_error[name],
     }
 
 
+def show(name: str, found: dict[str, Any]) -> None:
+    """Print one network's answers, the best method first."""
+    print(f"{name}: recommended {found['recommended'] or 'none'}; {found['qualifying_trials']} trials qualify")
+    known = {method: own for method, own in found["spearman"].items() if own}
+    for method in sorted(known, key=lambda method: -known[method][0]):
+        lead = found["lead_over_controls"].get(method)
+        words = "" if lead is None else ", lead over controls {:+.2f} ({:+.2f} to {:+.2f})".format(*lead)
+        print("  {:32} {:+.2f} ({:+.2f} to {:+.2f})".format(method, *known[method]) + words)
+
+
 def main() -> None:
-    """Judge each network, on the data set that is named or on one that is simulated."""
+    """Print correlations, leads and verdicts by input, as text or as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, help="data set; simulated if not given")
-    parser.add_argument("--network", nargs="+", default=list(NETWORKS))
-    parser.add_argument("--trials", type=int, default=6)
-    parser.add_argument("--levels", type=float, nargs="+", default=[0.3], help="safety margins to look at")
-    parser.add_argument("--pairs", type=int, default=TRUTH_PAIRS)
+    for name in INPUTS:
+        parser.add_argument(f"--{name}", default=f"thesis-{name}", help="network: folder or name")
+        parser.add_argument(f"--second-{name}", help="network of another seed")
+    parser.add_argument("--seeds", type=int, nargs=2, default=(0, 1), help="of the trials, and of the second ones")
+    parser.add_argument("--trials", type=int, default=14)
+    parser.add_argument("--frames-per-trial", type=int, default=80)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--keep", type=Path, help="folder to keep data and studies in, and to go on from")
     parser.add_argument("--json", action="store_true")
-    args = parser.parse_args()
+    options = parser.parse_args()
+    second = {name: getattr(options, f"second_{name}") for name in INPUTS}
+    if len({network is None for network in second.values()}) > 1:
+        parser.error("a second look needs both networks: give --second-difference and --second-raw")
+    first = {name: getattr(options, name) for name in INPUTS}
     with tempfile.TemporaryDirectory() as scratch:
-        simulated = None if args.data else simulate(Path(scratch) / "data", preset="thesis", seed=11, **CHANGES)
-        data = simulated or load_dataset(args.data)
-        found = {network: report(network, judge(network, data, args)) for network in args.network}
-    if args.json:
-        print(json.dumps(found))
+        work = options.keep or Path(scratch)
+        try:
+            studies = [
+                look(networks, work / str(number), seed=seed, options=options)
+                for number, (networks, seed) in enumerate(zip((first, second), options.seeds, strict=True), start=1)
+                if networks["raw"] is not None
+            ]
+        except SliplensError as error:
+            sys.exit(f"{Path(__file__).name}: {error}")
+        looks = [{name: told(study, name) for name in INPUTS} for study in studies]
+    result = {name: dict(looks[0][name]) for name in INPUTS}
+    for name, own in result.items():
+        show(name, own)
+        again = looks[1][name] if len(looks) > 1 else None
+        own["second_seed"] = again
+        own["same_verdict_second_seed"] = again and again["recommended"] == own["recommended"]
+        if again is not None:
+            show(f"{name}, second seed", again)
+    if options.json:
+        print(json.dumps(result))
 
 
 if __name__ == "__main__":

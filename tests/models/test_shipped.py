@@ -14,8 +14,8 @@ from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 from sliplens.study import frames_from_folder
 
 
-def test_both_networks_come_with_the_package():
-    assert shipped_names() == ["chromatouch-difference", "chromatouch-raw"]
+def test_the_networks_that_come_with_the_package():
+    assert shipped_names() == ["chromatouch-difference", "chromatouch-raw", "thesis-difference", "thesis-raw"]
 
 
 @pytest.mark.parametrize("name", shipped_names())

@@ -30,18 +30,19 @@ class Study(Command):
     """Data set with labels; leave out with --preset."""
     output: Output
     """Folder to make, one subfolder a stage; the page is report.html in it."""
-    difference: str = "chromatouch-difference"
-    """Network on difference images: a folder, or a name of one that comes with sliplens; none to leave it out."""
-    raw: str = "chromatouch-raw"
-    """Network on raw images: a folder, or a name of one that comes with sliplens; none to leave it out."""
+    difference: str | None = None
+    """Network on difference images: a folder, or a name of one that comes with sliplens; none to leave it out. If not
+    given, chromatouch-difference, or with --preset thesis-difference."""
+    raw: str | None = None
+    """Network on raw images, named and chosen alike."""
     preset: Literal["thesis"] | None = None
-    """Simulate the data set first: the days and trials of the thesis, 80 frames each, some 1.5 GB. The networks of the
-    package never saw its trials, so the training trials are chosen from, as in the thesis."""
+    """Simulate the data set first: the days and trials of the thesis, 80 frames each, some 1.5 GB; and explain networks
+    that were trained on its training trials with the recipe of the thesis."""
     method: tuple[str, ...] | None = None
     """Explainers to compare; those that end in -thesis are as the thesis ran them. If not given, these three, the same
     against the untouched sensor, occlusion, and Shapley values of markers."""
-    split: str | None = None
-    """Trials to choose from; test if not given, train with --preset."""
+    split: str = "test"
+    """Trials to choose from."""
     condition: str = "dry"
     """Condition of those trials."""
     trials: int = 14
@@ -67,7 +68,9 @@ class Study(Command):
         if (self.data is None) == (self.preset is None):
             raise InputError("name a data set, or --preset thesis to simulate one")
         require_device(self.device)
-        given = {name: run for name, run in (("difference", self.difference), ("raw", self.raw)) if run != _NONE}
+        kind = self.preset or "chromatouch"
+        asked = {"difference": self.difference, "raw": self.raw}
+        given = {name: run or f"{kind}-{name}" for name, run in asked.items() if run != _NONE}
         # a mistake is told before a data set is simulated
         networks = {name: load_network(run, name, device=self.device) for name, run in given.items()}
         study_explainers(methods := self.method or STUDY_METHODS, budget=self.budget)
@@ -79,7 +82,6 @@ class Study(Command):
             raw=networks.get("raw"),
             out=self.output,
             methods=methods,
-            split=self.split or ("train" if self.preset else "test"),
             jobs=self.jobs if self.jobs is not None else 1 if self.device != "cpu" else 2,
         )
         Report(workspace=self.output).run()
