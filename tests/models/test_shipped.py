@@ -32,8 +32,12 @@ def test_every_network_of_the_package_loads_and_says_what_it_learned_from(name: 
 @pytest.mark.parametrize("name", shipped_names())
 def test_it_reads_a_simulated_grip_in_the_right_order(name: str):
     trained = sliplens.load(name)
-    # another series and seed than its training's: a day and a sensor it never saw
-    trial = simulate_trial(plan_trials(replace(PRESETS["small"], seed=77, frames_per_trial=30))[0])
+    if name.startswith("thesis"):  # of the one sensor that it knows, on the day that was held out
+        planned = plan_trials(replace(PRESETS["thesis"], frames_per_trial=30))
+        planned = [plan for plan in planned if plan.split == "test"]
+    else:  # another series and seed than its training's: a day and a sensor it never saw
+        planned = plan_trials(replace(PRESETS["small"], seed=77, frames_per_trial=30))
+    trial = simulate_trial(planned[0])
     inputs = trained.encode(trial.frames[trial.labelled], trial.reference)
     labels = trial.safety_margin[trial.labelled]
 
