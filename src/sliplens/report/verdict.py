@@ -187,7 +187,7 @@ def _tell_recommended(topic: str, best: Recommended, truth: Truth, faithful: Rem
     )
     if standing is not None and standing.tested:
         text += (
-            " When parts of the frame are removed in its order, it also beats every such map under "
+            " When parts of the frame are removed in its order, it beats every such map under "
             f"{len(standing.beaten)} of {len(standing.tested)} ways to fill them that can tell."
         )
     other = "its lead is not off zero" if best.shown else "one method leads every other and every control for sure"
@@ -518,6 +518,7 @@ _KINDS = {
     r"masked passes chose nothing": "Layers in which the passes of Poly-CAM chose nothing: activity only",
     r"so the map is zero": "Maps in which nothing speaks for the answer",
     r"expected to correlate": "Maps from some of the channels that may differ from the exact ones",
+    r"so small that rounding": "Maps so faint that another engine or machine may give another",
 }
 
 
