@@ -40,6 +40,23 @@ def test_few_players_are_told_exactly(players: int) -> None:
     assert not found.standard_errors.any()
 
 
+@pytest.mark.parametrize("players", [9, 12])
+def test_all_coalitions_of_a_dozen_players_tell_as_their_definition_does(players: int) -> None:
+    """What a player adds to each coalition without him, by how often that one has come before him."""
+    game = random_game(players, seed=players)
+    every = (np.arange(2**players)[:, None] >> np.arange(players) & 1).astype(bool)
+    worth, before = game(every), every.sum(axis=1)
+    orders = np.array([1 / (players * comb(players - 1, size)) for size in range(players)])
+    expected = []
+    for player in range(players):
+        without = np.flatnonzero(~every[:, player])
+        expected.append((orders[before[without]] * (worth[without | 1 << player] - worth[without])).sum())
+
+    found = shapley_values(game, players, pairs=2 ** (players - 1), rng=np.random.default_rng(0))
+
+    np.testing.assert_allclose(found.values, expected, atol=1e-12)
+
+
 def test_one_player_is_worth_the_whole() -> None:
     found = shapley_values(lambda members: 3.0 * members[:, 0] - 1, 1, pairs=1, rng=np.random.default_rng(0))
 
@@ -95,6 +112,23 @@ def test_sampled_values_come_near_and_tell_by_how_much() -> None:
 
     assert np.std(scaled) == pytest.approx(1, abs=0.3)
     assert np.abs(np.mean(errors, axis=0)).max() < 5 * np.std(errors) / np.sqrt(40)
+
+
+@pytest.mark.parametrize("kind", ["good", "fair", "poor"])
+def test_errors_of_values_drawn_towards_a_guess_are_as_large_as_they_say(kind: str) -> None:
+    """As many coalitions as a map asks for; where the guess is the truth but for its size, that is estimated still.
+
+    Errors hang together within a draw, so that the ratio's own spread is some 10 %.
+    """
+    truth, scaled = glove_values(), []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        noise = rng.normal(size=30) * np.std(truth)
+        guess = {"good": 3 * truth + 1e-3 * noise, "fair": truth + 0.3 * noise, "poor": noise}[kind]
+        found = shapley_values(glove, 30, pairs=200, rng=rng, guess=guess)
+        scaled.append((found.values - truth) / found.standard_errors)
+
+    assert np.sqrt(np.mean(np.square(scaled))) == pytest.approx(1, abs=0.3)
 
 
 def test_players_without_part_get_nothing_and_twins_the_same() -> None:

@@ -19,6 +19,8 @@ from sliplens.progress import OnProgress
 
 _FEW = 20
 """Players of which all coalitions can be counted."""
+_RANK = 1e-9
+"""Singular value over the largest below which it is rounding: players that all count for more count for nothing."""
 Value = Callable[[Bool[np.ndarray, "coalitions players"]], Float64[np.ndarray, " coalitions"]]
 """What each coalition is worth; True for players that take part."""
 
@@ -48,7 +50,7 @@ def shapley_values(
 
     With a first guess the values are drawn towards a multiple of it, and no farther than the noise of the coalitions
     asks for (empirical Bayes): a good guess saves most of the pairs, a poor one costs little, and both fade as pairs
-    are added.
+    are added. Errors are then those of the best linear prediction, that of the multiple included.
 
     `pairs` are asked, or all, exactly, where the players have no more; at least twice as many as the players.
 
@@ -57,7 +59,8 @@ def shapley_values(
     Lundberg and Lee, *A Unified Approach to Interpreting Model Predictions* (2017), Theorem 2; Covert and Lee,
     *Improving KernelSHAP: Practical Shapley Value Estimation via Linear Regression* (2021), section 4.2, pairs.
     Patterson and Thompson, *Recovery of inter-block information when block sizes are unequal* (1971), for how far to
-    draw: restricted maximum likelihood.
+    draw: restricted maximum likelihood. Henderson, *Best linear unbiased estimation and prediction under a selection
+    model* (1975), for the errors.
     """
     whole, empty = value(np.array([[True] * players, [False] * players])).tolist()
     if players == 1:
@@ -80,7 +83,7 @@ def shapley_values(
         differing, errors = _shrink(root[:, None] * centred, fixed, root * left, guess)
     else:
         columns = np.column_stack([centred, number])
-        solve = np.linalg.pinv(root[:, None] * columns) * root
+        solve = np.linalg.pinv(root[:, None] * columns, rcond=_RANK) * root
         differing = solve @ left
         spread = (solve * (left - columns @ differing)) ** 2 * len(odd) / max(len(odd) - players, 1)
         errors = np.zeros(players + 1) if exact else np.sqrt(spread.sum(axis=1))
@@ -96,7 +99,7 @@ def _shrink(
     """Coefficients, a multiple of the guess plus a ridge as wide as restricted likelihood says, and their errors."""
     known = np.linalg.qr(fixed)[0]
     rest, inside = (values - known @ (known.T @ values) for values in (left, columns))
-    along, sizes, axes = np.linalg.svd(inside, full_matrices=False)
+    along, sizes, _ = np.linalg.svd(inside, full_matrices=False)
     seen = along.T @ rest
     freedom = len(left) - fixed.shape[1]
     unexplained = max(float(rest @ rest - seen @ seen), 0.0)
@@ -109,10 +112,17 @@ def _shrink(
         return freedom * np.log(variance(ridge) + 1e-300) + np.log1p(sizes**2 / ridge).sum()
 
     ridge = float(np.exp(fminbound(doubt, -12, 12)))
-    off = axes.T @ (sizes / (sizes**2 + ridge) * seen)
-    multiple = np.linalg.lstsq(fixed, left - columns @ off, rcond=None)[0][0]
-    errors = np.sqrt(variance(ridge) * (axes**2 / (sizes**2 + ridge)[:, None]).sum(axis=0))
-    return multiple * (guess - guess.mean()) + off - off.mean(), errors
+    # the multiple and the cubic are free, what players differ by from the multiple is drawn (Henderson's equations)
+    design, players = np.column_stack([fixed, columns]), columns.shape[1]
+    gram = design.T @ design + np.diag(np.r_[np.zeros(fixed.shape[1]), np.full(players, ridge)])
+    fit = np.linalg.solve(gram, design.T)
+    of_players = np.column_stack([guess, np.zeros(players), np.eye(players)])
+    of_players -= of_players.mean(axis=0)
+    solve = of_players @ fit
+    # noise, and what the drawing leaves of each player's own part
+    noise = (solve * (left - design @ (fit @ left))) ** 2 * len(left) / (len(left) - np.trace(design @ fit))
+    drawn = variance(ridge) / ridge * (solve @ columns - of_players[:, fixed.shape[1] :]) ** 2
+    return solve @ left, np.sqrt(noise.sum(axis=1) + drawn.sum(axis=1))
 
 
 def _all_pairs(players: int) -> tuple[Bool[np.ndarray, "pairs players"], Float64[np.ndarray, " pairs"]]:
