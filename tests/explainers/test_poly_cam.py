@@ -11,7 +11,7 @@ from torch import nn
 
 from sliplens.errors import InputError
 from sliplens.explainers import PolyCam, capture, find_layers
-from sliplens.explainers.explanation import EXACT, effect_rounding
+from sliplens.explainers.explanation import EXACT, check_rounding, effect_rounding
 
 
 @lru_cache
@@ -290,6 +290,8 @@ def test_the_error_of_small_effects_stays_within_what_is_said_of_it(network, ima
         seen.append((max(errors), told))
     # it is the smallness of the change that makes both the error and what is said of it
     assert seen[0][1] < EXACT < seen[2][0]
+    with pytest.raises(ValueError, match="argument"):  # no image is passed over in silence
+        list(check_rounding([], predictions=[(0.5, 0.4)]))
 
 
 @pytest.mark.parametrize(

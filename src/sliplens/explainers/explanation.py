@@ -164,7 +164,7 @@ def check_rounding(
     weights: Sequence[Sequence[Float[Tensor, " _channels"]]], *, predictions: Iterable[tuple[float, float]]
 ) -> Iterator[str]:
     """Where so little changes that a map depends on the order of sums; predictions are f(x) and f(b) of each image."""
-    for index, (shares, (high, low)) in enumerate(zip(weights, predictions, strict=False)):
+    for index, (shares, (high, low)) in enumerate(zip(weights, predictions, strict=True)):
         if (share := effect_rounding(shares, prediction=high, reference_prediction=low)) > EXACT:
             yield (
                 f"image {index}: the effects are so small that rounding makes up to {share:.1g} of the strongest, so "

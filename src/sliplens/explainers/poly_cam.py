@@ -225,9 +225,9 @@ class PolyCam(Method):
             )
             for depth, layer in enumerate(layers if self.levels else ())
         )
-        # weights as published are no effects
-        effects = [] if SCORES[self.score].as_published else weights
         predictions = zip(comparison.prediction.tolist(), comparison.reference_prediction.tolist(), strict=True)
+        # weights as published are no effects
+        rounding = () if SCORES[self.score].as_published else check_rounding(weights, predictions=predictions)
         return comparison.explanation(
             scale_to(torch.stack(shown), total=comparison.change),
             method="poly-cam",
@@ -235,7 +235,7 @@ class PolyCam(Method):
             warnings=(
                 *check_weights(names, weights, change=change),
                 *check_approximations(approximations),
-                *check_rounding(effects, predictions=predictions),
+                *rounding,
             ),
             levels=levels,
             approximations=tuple(approximations),

@@ -1,12 +1,14 @@
 """Map quality: what the eye judges of a map, as numbers, and whether it lies where the truth lies."""
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
 from sliplens.arrays import require_saliency
 from sliplens.errors import InputError
+from sliplens.explainers.maps import pearson_r
 
 _SAMPLES = 33
 
@@ -60,11 +62,8 @@ def stability(
     maps: Float[np.ndarray, "images height width"], others: Float[np.ndarray, "images height width"]
 ) -> Float[np.ndarray, " images"]:
     """Pearson's correlation of each map with its like, such as the next frame's; NaN where a map is constant."""
-    first, second = (values.reshape(len(values), -1) for values in (maps, others))
-    first, second = (values - values.mean(axis=1, keepdims=True) for values in (first, second))
-    size = np.sqrt((first**2).sum(axis=1) * (second**2).sum(axis=1))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return (first * second).sum(axis=1) / size
+    pairs = zip(torch.tensor(maps), torch.tensor(others), strict=True)
+    return np.array([pearson_r(map_, other) for map_, other in pairs])
 
 
 def relevance_mass(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "height width"]) -> float:
