@@ -51,6 +51,20 @@ def test_the_same_seed_draws_the_same_weights_however_many_stages(model: nn.Modu
     assert not torch.equal(other.state_dict()["0.weight"], first.state_dict()["0.weight"])
 
 
+def test_networks_of_neighbouring_seeds_share_no_weights():
+    equal = nn.Sequential(*(nn.Linear(4, 4) for _ in range(3)), nn.Flatten(), nn.Linear(48, 1))
+    images = torch.rand(2, 3, 4, 4)
+    drawn = [
+        value
+        for seed in range(3)
+        for _, network in cascade(equal, seed=seed, stages=1, images=images)
+        for name, value in network.state_dict().items()
+        if name in {"0.weight", "1.weight", "2.weight"}
+    ]
+    assert len(drawn) == 9
+    assert len({tuple(value.flatten().tolist()) for value in drawn}) == 9
+
+
 def test_new_normalisation_has_the_statistics_of_the_images_and_the_network_still_tells_them_apart():
     torch.manual_seed(0)
     blocks = [layer for _ in range(12) for layer in (nn.Conv2d(8, 8, 3, padding=1), nn.BatchNorm2d(8), nn.ReLU())]

@@ -23,6 +23,8 @@ ControlMaps = Float[Tensor, "images height width"]
 Maps = Float[np.ndarray, "images height width"]
 _QUARTER_GREY_LEVEL = 0.001
 """Added to what is divided by: where nothing changed there is nothing to compare."""
+_SEEDS_APART = 1000
+"""Seeds that each network has for its layers, of which none has so many: those of no other network."""
 _BATCH_NORMS = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm)
 
 
@@ -115,7 +117,8 @@ def lead_over_controls(
     others = {**controls, CHANCE: np.zeros(len(own))}
     gaps = {name: paired_difference(own, other, clusters=clusters, rng=rng) for name, other in others.items()}
     control = min(gaps, key=lambda name: gaps[name].estimate)
-    low, high = (min(getattr(gap, end) for gap in gaps.values()) for end in ("low", "high"))
+    ends = ([getattr(gap, end) for gap in gaps.values()] for end in ("low", "high"))
+    low, high = (None if None in over_all else min(over_all) for over_all in ends)
     return Lead(control=control, gap=replace(gaps[control], low=low, high=high))
 
 
@@ -140,7 +143,7 @@ def cascade(model: nn.Module, *, seed: int, stages: int, images: Images) -> Iter
     for count, module in enumerate(weighted, start=1):
         with torch.random.fork_rng(devices=[]):
             # by its place, so that a layer gets the same weights whatever came before it
-            torch.manual_seed(seed + count - 1)
+            torch.manual_seed(_SEEDS_APART * seed + count - 1)
             module.reset_parameters()  # pyright: ignore[reportCallIssue]
         if count in shown:
             _settle(changed, weighted[:count], images)

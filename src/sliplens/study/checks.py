@@ -255,8 +255,8 @@ def _smooth_rise(
         return mean_of_known((after - before) / before)
 
 
-_SEEDS_APART = 1000
-"""`cascade` counts its layers on from the seed: no network has so many."""
+_TRIALS = 1000
+"""Seeds of networks that each study has, one a trial, of which none has so many: those of no other study."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,7 +277,7 @@ def explain_untrained(
     controls = {name: _shortened(explainer, passes_matter=True) for name, explainer in material.explainers.items()}
 
     def explain(number: int, frames: list[int], on_frame: OnProgress | None) -> _TrialMaps:
-        model = _untrained(material.trained.model, inputs, seed=seed + _SEEDS_APART * number)
+        model = _untrained(material.trained.model, inputs, seed=_TRIALS * seed + number)
         maps: dict[str, list[np.ndarray]] = {}
         with suppress(ModelError):  # without layers that have a map
             maps["weights-1"] = list(even_channels(model, inputs[frames], references[frames]).cpu().numpy())
