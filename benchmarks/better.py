@@ -3,7 +3,7 @@
 Maps of `PolyCam(score="regression")`, with a budget (an engine, and an approximation of a likeness that is asked for),
 against `PolyCam(score="thesis")`: its finest map, which the thesis displayed, and its sixth, which it scored. Controls
 know nothing of answers: the same layers with all weights 1, and |x - reference|. Random orders are shared by the maps
-of a frame. Differences are paired, and intervals resample whole trials. `--json` ends with one line of JSON.
+of a frame. Differences are paired, and intervals are those over days and trials. `--json` ends with one line of JSON.
 """
 
 import argparse
@@ -35,6 +35,7 @@ from sliplens.intervals import paired_difference
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
 from sliplens.models.engines import prepare
+from sliplens.plots.style import tell_ends
 from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.recordings.trial import SLIPS
 from sliplens.simulation import SimulationRecipe, simulate_dataset
@@ -53,6 +54,7 @@ class Case:
     """One frame as a network sees it, with the simulator's truth."""
 
     trial: str
+    day: int
     margin: float
     image: Tensor
     reference: Tensor
@@ -72,6 +74,7 @@ def find_cases(trained: Run, data: Dataset, *, options: argparse.Namespace) -> I
             row = int(np.nanargmin(np.abs(margin - level)))
             yield Case(
                 trial=info.trial,
+                day=info.day,
                 margin=float(margin[row]),
                 image=trained.encode(recording.frames[[row]], recording.reference)[0],
                 reference=trained.encoding.empty(recording.reference, image_size=trained.manifest.image_size),
@@ -168,13 +171,13 @@ def summarise(cases: Sequence[tuple[Case, dict[str, dict[str, float]]]], *, seed
         ]
         if not known:
             continue
-        trials = np.array([case.trial for case, _ in known])
+        clusters = [np.array([case.day for case, _ in known]), np.array([case.trial for case, _ in known])]
         values = {name: np.array([scores[name][key] for _, scores in known]) for name in names}
         table[key] = {
             "frames": len(known),
             "means": {name: float(one.mean()) for name, one in values.items()},
             "ours_less": {
-                name: asdict(paired_difference(values[OURS], one, clusters=[trials], rng=np.random.default_rng(seed)))
+                name: paired_difference(values[OURS], one, clusters=clusters, rng=np.random.default_rng(seed))
                 for name, one in values.items()
                 if name != OURS
             },
@@ -183,15 +186,14 @@ def summarise(cases: Sequence[tuple[Case, dict[str, dict[str, float]]]], *, seed
 
 
 def show(table: dict[str, object]) -> None:
-    """Print means, and differences with their intervals; a star where the interval leaves zero out."""
+    """Print means, and differences with their intervals; a star where that is not chance."""
     for key, row in table.items():
         assert isinstance(row, dict)
         print(f"{key} ({row['frames']} frames): ours {row['means'][OURS]:.3f}")
         for name, gap in row["ours_less"].items():
-            sure = "*" if gap["low"] > 0 or gap["high"] < 0 else " "
             print(
-                f"    {row['means'][name]:7.3f} {name:28} ours less it {gap['estimate']:+.3f} "
-                f"({gap['low']:+.3f} to {gap['high']:+.3f}){sure}"
+                f"    {row['means'][name]:7.3f} {name:28} ours less it {gap.estimate:+.3f} "
+                f"({tell_ends(gap, '{:+.3f}'.format)}){'*' if gap.sure else ' '}"
             )
 
 
@@ -232,7 +234,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.exit(f"{Path(__file__).name}: {error}")
     if options.json:
         asked = {key: str(value) for key, value in vars(options).items()}
-        print(json.dumps({"networks": found, "asked": asked, "machine": vars(machine()), "versions": versions()}))
+        told = {"networks": found, "asked": asked, "machine": vars(machine()), "versions": versions()}
+        print(json.dumps(told, default=asdict))
 
 
 if __name__ == "__main__":
