@@ -2,9 +2,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from known_ends import ends_of, width_of
 from scipy.special import stdtrit
 
-from sliplens.intervals import FEWEST_UNITS, Difference, paired_difference
+from sliplens.intervals import FEWEST_UNITS, Difference, mean_interval, paired_difference
 
 DRAWS = 300
 # 95 % less and plus 2.8 standard errors of a share of 300: one test in 200 fails by chance, and the seed is fixed
@@ -47,7 +48,8 @@ def test_intervals_hold_as_often_as_they_say_and_those_of_the_plain_bootstrap_do
     for _ in range(DRAWS):
         values, clusters = scene(draw, rng)
         gap = paired_difference(values, np.zeros(len(values)), clusters=clusters, rng=rng)
-        held += gap.low <= 0 <= gap.high
+        low, high = ends_of(gap)
+        held += low <= 0 <= high
         low, high = percentile(values, clusters[-1], rng)
         plain += low <= 0 <= high
     assert LEAST <= held / DRAWS <= MOST
@@ -86,7 +88,7 @@ def test_frames_of_one_trial_are_not_evidence_of_their_own(rng: np.random.Genera
     assert together.units == 20
     assert together.estimate == pytest.approx(alone.estimate)
     # 50 copies of each: sqrt(50) = 7 times as wide
-    assert together.high - together.low > 5 * (alone.high - alone.low)
+    assert width_of(together) > 5 * width_of(alone)
 
 
 def test_networks_that_differ_widen_the_interval(rng: np.random.Generator):
@@ -96,10 +98,10 @@ def test_networks_that_differ_widen_the_interval(rng: np.random.Generator):
     alike = paired_difference(of_trial, np.zeros(42), clusters=[networks, 0 * trials, trials], rng=rng)
     differing = paired_difference(apart, np.zeros(42), clusters=[networks, 0 * trials, trials], rng=rng)
     unknown = paired_difference(apart, np.zeros(42), clusters=[trials], rng=rng)
-    assert differing.high - differing.low > 2 * (alike.high - alike.low)
+    assert width_of(differing) > 2 * width_of(alike)
     # the same trials seen thrice are no more trials
     assert (alike.networks, alike.days, alike.units) == (3, 1, 14)
-    assert unknown.high - unknown.low < (differing.high - differing.low) / 2
+    assert width_of(unknown) < width_of(differing) / 2
 
 
 def test_an_interval_tells_what_it_was_taken_over():
@@ -113,7 +115,30 @@ def test_the_order_of_the_two_turns_the_interval_round(rng: np.random.Generator)
         paired_difference(*pair, clusters=(), rng=np.random.default_rng(0))
         for pair in ((first, second), (second, first))
     )
-    assert (one.estimate, one.low, one.high) == pytest.approx((-other.estimate, -other.high, -other.low))
+    assert one.estimate == pytest.approx(-other.estimate)
+    assert ends_of(one) == pytest.approx([-end for end in ends_of(other)[::-1]])
+
+
+def test_a_single_trial_has_no_interval(rng: np.random.Generator):
+    alone = paired_difference(rng.random(6) + 1, np.zeros(6), clusters=[np.ones(6), np.zeros(6)], rng=rng)
+    assert (alone.low, alone.high) == (None, None)
+    assert alone.over == "one trial, one day, one network"
+    assert not alone.sure
+    # of several trials that are all alike the spread is known, and nothing
+    same = paired_difference(np.ones(6), np.zeros(6), clusters=[np.arange(6) // 2], rng=rng)
+    assert (same.low, same.estimate, same.high) == (1, 1, 1)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_interval_of_a_correlation_ends_where_correlations_do(sign, rng: np.random.Generator):
+    values, trials = sign * np.array([0.95, 0.99, 0.6, 0.97, 0.98, 0.2]), [np.arange(6)]
+    free = mean_interval(values, clusters=trials, rng=rng)
+    found = mean_interval(values, clusters=trials, rng=rng, limits=(-1.0, 1.0))
+    # the mean may be anywhere within: what is cut off held it in no case
+    low, high = ends_of(free)
+    assert max(-low, high) > 1
+    assert ends_of(found) == ((low, 1) if sign > 0 else (-1, high))
+    assert found.estimate == free.estimate
 
 
 def test_few_units_are_never_sure(rng: np.random.Generator):

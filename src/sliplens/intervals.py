@@ -1,13 +1,13 @@
 """Paired differences with their uncertainty over networks, days and trials."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 from scipy.special import stdtrit
 
-__all__ = ["FEWEST_UNITS", "Difference", "paired_difference"]
+__all__ = ["FEWEST_UNITS", "Difference", "mean_interval", "paired_difference"]
 
 FEWEST_UNITS = 5
 """Fewer trials say little."""
@@ -22,8 +22,9 @@ class Difference:
     """Mean of the first minus mean of the second, with a 95 % interval, and over what it was taken."""
 
     estimate: float
-    low: float
-    high: float
+    low: float | None
+    high: float | None
+    """Ends of the interval; None of a single trial, of which nothing but the estimate is known."""
     units: int
     """Trials."""
     days: int = 1
@@ -31,9 +32,19 @@ class Difference:
     """Of a single day or network the interval holds for that one alone: how far others differ is not in it."""
 
     @property
+    def above_zero(self) -> bool:
+        """Whether the whole interval lies above zero, and rests on enough trials."""
+        return self.units >= FEWEST_UNITS and self.low is not None and self.low > 0
+
+    @property
+    def below_zero(self) -> bool:
+        """Whether the whole interval lies below zero, and rests on enough trials."""
+        return self.units >= FEWEST_UNITS and self.high is not None and self.high < 0
+
+    @property
     def sure(self) -> bool:
         """Whether the interval leaves zero out, and rests on enough trials."""
-        return self.units >= FEWEST_UNITS and (self.low > 0 or self.high < 0)
+        return self.above_zero or self.below_zero
 
     @property
     def over(self) -> str:
@@ -54,7 +65,8 @@ def paired_difference(
     Frames of one trial resemble one another, and so do trials of one day and answers of one network. The interval is
     that of a mean over the outermost clusters of which there are several: the trials of a single day; else the days,
     whose spread has that of their trials in it. The ends come from the distribution of t among resampled clusters, or
-    from Student's where clusters are fewer than eight. Of a single trial nothing is known but the estimate.
+    from Student's where clusters are fewer than eight. Of a single trial nothing is known but the estimate:
+    there is no interval.
 
     `clusters` are labels of each image, outermost first: `[networks, days, trials]`, the last of them, or none where
     images are trials of their own. Equal labels are the same cluster: days that several networks saw count beside them.
@@ -86,8 +98,37 @@ def paired_difference(
     over = dict(zip(("units", "days", "networks"), counts[::-1], strict=False))
     estimate = float(gap.mean())
     ends = _drawn_ends(gap, free[0], rng) if len(free) == 1 else _student_ends(gap, free)
-    low, high = (estimate + ends).tolist()
+    low, high = (None, None) if ends is None else (estimate + ends).tolist()
     return Difference(estimate=estimate, low=low, high=high, **over)
+
+
+def mean_interval(
+    values: Float[np.ndarray, " images"],
+    *,
+    clusters: Iterable[Shaped[np.ndarray, " images"]],
+    rng: np.random.Generator,
+    limits: tuple[float, float] = (-np.inf, np.inf),
+) -> Difference:
+    """Mean of a score of images, such as a correlation, with the interval of `paired_difference`.
+
+    `limits` are the least and the most that the score can be, -1 and 1 of a correlation. What lies beyond is cut off:
+    the mean is never there, so that the interval holds it exactly as often as before.
+
+    Examples
+    --------
+    Correlations of frames of two trials, which tell little:
+
+    >>> import numpy as np
+    >>> from sliplens.intervals import mean_interval
+    >>> alike, trials = np.array([0.9, 0.9, 0.5, 0.5]), np.array([0, 0, 1, 1])
+    >>> found = mean_interval(alike, clusters=[trials], rng=np.random.default_rng(0), limits=(-1.0, 1.0))
+    >>> round(found.estimate, 2), found.low, found.high
+    (0.7, -1.0, 1.0)
+    """
+    found = paired_difference(values, np.zeros(len(values)), clusters=clusters, rng=rng)
+    if found.low is None or found.high is None:
+        return found
+    return replace(found, low=float(max(found.low, limits[0])), high=float(min(found.high, limits[1])))
 
 
 def _within(inner: Int[np.ndarray, " images"], outer: Int[np.ndarray, " images"]) -> bool:
@@ -97,7 +138,7 @@ def _within(inner: Int[np.ndarray, " images"], outer: Int[np.ndarray, " images"]
 
 def _drawn_ends(
     gap: Float[np.ndarray, " images"], level: Int[np.ndarray, " images"], rng: np.random.Generator
-) -> Float[np.ndarray, " 2"]:
+) -> Float[np.ndarray, " 2"] | None:
     """Ends of the interval less the estimate; clusters are drawn again where there are enough."""
     sums, counts = np.bincount(level, weights=gap), np.bincount(level)
     if len(sums) < _FEWEST_DRAWN:
@@ -116,10 +157,10 @@ def _drawn_ends(
 
 def _student_ends(
     gap: Float[np.ndarray, " images"], levels: Sequence[Int[np.ndarray, " images"]]
-) -> Float[np.ndarray, " 2"]:
+) -> Float[np.ndarray, " 2"] | None:
     """Ends of the interval less the estimate, by Student's t; clusters of several levels cross one another."""
-    if not levels:
-        return np.zeros(2)
+    if not levels:  # a single trial
+        return None
     rest = gap - gap.mean()
     parts, freedom, cells = [], [], np.zeros(len(gap), dtype=np.int64)
     alone = rest.copy()

@@ -9,7 +9,7 @@ import pytest
 from sliplens.intervals import Difference
 from sliplens.report import load_results
 from sliplens.report.claims import all_of, judge_claims, judge_gap, most_of
-from sliplens.report.comparisons import compare_gain, share_of_strongest
+from sliplens.report.comparisons import compare_gain, gap_from, share_of_strongest, tell_interval
 from sliplens.report.results import Results
 from sliplens.report.sections import build_sections
 from sliplens.report.tables import Table
@@ -185,7 +185,7 @@ def test_the_score_of_the_thesis_is_told_but_does_not_decide(tmp_path, rng):
     told = [finding for finding in answer.findings if finding.where == "score of the thesis"]
     assert answer.outcome == "holds"
     assert len(told) == 2
-    assert all(finding.outcome is None and finding.gap is not None and finding.gap.low > 0 for finding in told)
+    assert all(finding.outcome is None and finding.gap is not None and finding.gap.above_zero for finding in told)
 
 
 def test_estimates_are_the_gaps_that_were_put_in(judged, tmp_path, rng):
@@ -239,6 +239,23 @@ def test_a_gap_over_too_few_trials_decides_nothing():
     gap = Difference(estimate=1.0, low=0.9, high=1.1, units=3)
 
     assert judge_gap(gap) == "undecided"
+
+
+def test_a_single_trial_decides_nothing_and_is_told_without_an_interval():
+    gap = Difference(estimate=1.0, low=None, high=None, units=1)
+
+    assert judge_gap(gap) == "undecided"
+    assert tell_interval(gap) == "+1.000 (no interval of one trial)"
+
+
+def test_a_study_of_one_trial_is_judged_and_shown_without_intervals(judged, tmp_path, rng):
+    answers = judged(thesis(trials=1))
+
+    assert {answer.outcome for answer in answers.values()} == {"undecided"}
+    assert "no interval of one trial" in answers["two-markers", "Raw images"].text
+    results = load_results(tmp_path)
+    assert judge(results, rng=rng)[0].text.startswith("Not known: one trial is too few")
+    assert build_sections(results, rng=rng)
 
 
 def removal_alone(folder: Path) -> Results:
@@ -326,7 +343,7 @@ def test_where_the_next_method_gains_more_it_is_told_with_both_means(judged, tmp
     faithful = load_results(tmp_path).study.faithfulness["difference"]
     ranked = rank_methods(faithful)
     turned = tuple(
-        replace(one, gap=replace(one.gap, estimate=-one.gap.estimate, low=-one.gap.high, high=-one.gap.low))
+        replace(one, gap=gap_from(one, one.second))
         if one.fill == "blur"
         and "integrated-gradients" in {one.first, one.second}
         and "poly-cam" in {one.first, one.second}
@@ -363,6 +380,22 @@ def test_a_fill_that_cannot_tell_the_truth_has_no_vote(judged, tmp_path, rng):
     best = rank_methods(study.faithfulness["difference"], truth)[0]
 
     assert best.tested == (("reference", "pixel"), ("blur", "pixel"), ("true", "marker"))
+
+
+def test_where_no_fill_can_judge_nothing_is_believed_and_it_says_why(judged, tmp_path, rng):
+    judged(Made())
+    results = load_results(tmp_path)
+    unknown = [
+        replace(one, gap=None, fill=fill)
+        for one in results.study.truth["raw"].meta
+        for fill in ("reference", "grey", "blur", "true")
+    ]
+    truth = {name: replace(own, methods={}, meta=tuple(unknown)) for name, own in results.study.truth.items()}
+
+    found = judge(replace(results, study=replace(results.study, truth=truth)), rng=rng)[0]
+
+    assert found.text.startswith("Not known: no method was compared with a control under a fill that can judge it.")
+    assert "Left out: " in found.text
 
 
 def test_too_few_trials_believe_nothing(judged, tmp_path, rng):
@@ -411,7 +444,7 @@ def test_a_claim_counts_a_fill_once_too(judged, tmp_path, rng):
     assert answer.outcome == "holds"
     opposite = [one for one in answer.findings if one.where == "untouched frame (markers)"]
     assert opposite
-    assert all(one.outcome is None and one.gap is not None and one.gap.high < 0 for one in opposite)
+    assert all(one.outcome is None and one.gap is not None and one.gap.below_zero for one in opposite)
 
 
 def test_without_scores_nothing_is_believed(tmp_path, rng):

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from known_ends import ends_of
 from torch import Tensor, nn
 
 from sliplens.explainers import Explanation, IntegratedGradients
@@ -91,8 +92,8 @@ def test_each_trial_has_a_network_of_its_own(material: Material):
     found = explain_untrained(small, seed=7).maps["grad-cam-new-weights"]
     trials = material.clusters[1].tolist()
     for number, trial in enumerate(dict.fromkeys(trials)):
-        seed = 7 + 1000 * number  # no two layers of two networks have the same seed
-        ((_, network),) = cascade(material.trained.model, seed=seed, stages=1, images=material.inputs)
+        # no two trials of this study or the next have the same
+        ((_, network),) = cascade(material.trained.model, seed=7000 + number, stages=1, images=material.inputs)
         for frame in [place for place, own in enumerate(trials) if own == trial]:
             image, empty = material.inputs[frame, None], material.references[frame, None]
             explanation = material.explainers["grad-cam"](network, image, reference=empty)
@@ -107,7 +108,7 @@ def test_a_method_that_ignores_the_weights_shows_nothing_about_the_network(mater
     scored = score_removal(small, maps=maps, settings=(Setting(fill="grey", unit="pixel"),), random_orders=1)
     (lead,) = [score.lead_over_controls for score in scored.scores if score.method == "image"]
     assert lead is not None
-    assert lead.gap.high <= 0
+    assert ends_of(lead.gap)[1] <= 0
     assert not lead.shows_something
 
 

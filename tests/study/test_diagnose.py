@@ -144,6 +144,8 @@ def test_contributions_are_held_against_those_of_the_best_reading():
     assert same.network_slipping == same.reading_slipping == pytest.approx(0.4 / 0.8)
     # signed: what works the other way round disagrees
     assert hold_against(-values, values, state).agreement == pytest.approx(-1)
+    # an answer that no marker moves ranks none
+    assert np.isnan(hold_against(0 * values, values, state).agreement)
 
 
 def frictions(slope: float, best: float, *, trials: int = 12) -> FrictionTable:

@@ -15,7 +15,7 @@ from sliplens.arrays import require_saliency
 from sliplens.errors import InputError
 from sliplens.explainers.occlusion import marker_regions, tile_regions
 from sliplens.faithfulness.fills import Fill, Painter
-from sliplens.intervals import Difference, paired_difference
+from sliplens.intervals import Difference, mean_interval
 from sliplens.models.engines import Engine
 from sliplens.progress import OnProgress, counted
 
@@ -179,8 +179,7 @@ class Faithfulness:
 
         `clusters` are labels of the images, such as `[days, trials]`: frames of one trial resemble one another.
         """
-        nothing = np.zeros_like(self.symmetric_gain)
-        return paired_difference(self.symmetric_gain, nothing, clusters=clusters, rng=np.random.default_rng(seed))
+        return mean_interval(self.symmetric_gain, clusters=clusters, rng=np.random.default_rng(seed))
 
     def frame(self) -> pa.Table:
         """Arrow table of the curves, a row for each image and share of it removed, in margin units."""

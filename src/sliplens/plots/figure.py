@@ -147,8 +147,9 @@ def _diagnosis(diagnosis: Diagnosis, ax: Axes, _: int) -> None:
         raise InputError("this diagnosis tested no slice of the trials; diagnose a network on more trials")
     rows = []
     for one in diagnosis.slices:
-        ends = {name: 100 * getattr(one.excess, name) for name in ("estimate", "low", "high")}
-        rows.append((wrap(one.name, 32), replace(one.excess, **ends), BLUE if one.holds else GREY))
+        ends = {name: getattr(one.excess, name) for name in ("estimate", "low", "high")}
+        points = {name: None if end is None else 100 * end for name, end in ends.items()}
+        rows.append((wrap(one.name, 32), replace(one.excess, **points), BLUE if one.holds else GREY))
     _plot_gaps(rows, ax)
     ax.set(xlabel="Mean |error| less elsewhere (points of Γ, 95 % interval)")
     ax.set_title(f"{input_name(diagnosis.input)}: where the error is")
@@ -157,7 +158,8 @@ def _diagnosis(diagnosis: Diagnosis, ax: Axes, _: int) -> None:
 def _plot_gaps(rows: Sequence[tuple[str, Difference, str]], ax: Axes) -> None:
     """Draw estimates with their intervals, each with its name and colour, the first on top."""
     for place, (_, gap, colour) in enumerate(rows):
-        ax.plot([gap.low, gap.high], [place, place], color=colour)
+        if gap.low is not None and gap.high is not None:
+            ax.plot([gap.low, gap.high], [place, place], color=colour)
         ax.plot([gap.estimate], [place], color=colour, marker="o")
     ax.axvline(0, color=BLACK, linewidth=0.8, linestyle=":")
     ax.set_yticks(range(len(rows)), [name for name, _, _ in rows])

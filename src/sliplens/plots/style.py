@@ -1,13 +1,14 @@
 """Names, colours and drawing style that all figures and tables share."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
 import matplotlib as mpl
 from cycler import cycler
 
+from sliplens.intervals import Difference
 from sliplens.results.faithfulness import CHANCE, CONTROLS, NEW_WEIGHTS, is_control
 
 # Okabe and Ito's palette, told apart under every common colour blindness
@@ -185,6 +186,13 @@ def listed(texts: Sequence[str]) -> str:
 def conditions_in_order(names: Iterable[str]) -> list[str]:
     """Dry before wet before any other."""
     return in_order(set(names), ("dry", "wet"))
+
+
+def tell_ends(gap: Difference, write: Callable[[float], str], *, title: str = "") -> str:
+    """Write the ends of a 95 % interval, or that there is none."""
+    if gap.low is None or gap.high is None:
+        return "no interval of one trial"
+    return f"{title}{write(gap.low)} to {write(gap.high)}"
 
 
 def percent(value: float | None, *, digits: int = 0) -> str:

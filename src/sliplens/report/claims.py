@@ -11,8 +11,17 @@ from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 
-from sliplens.intervals import FEWEST_UNITS, Difference, paired_difference
-from sliplens.plots.style import decimals, fill_name, input_name, inputs_in_order, listed, method_name, percent
+from sliplens.intervals import FEWEST_UNITS, Difference, mean_interval
+from sliplens.plots.style import (
+    decimals,
+    fill_name,
+    input_name,
+    inputs_in_order,
+    listed,
+    method_name,
+    percent,
+    tell_ends,
+)
 from sliplens.report.comparisons import (
     compare_deletion,
     compare_gain,
@@ -260,7 +269,7 @@ def _no_better(faithful: RemovalScores, *, rng: np.random.Generator) -> Answer:
         own = curves.get(GRAD_CAM)
         if own is None:
             continue
-        nothing = paired_difference(own.srg, np.zeros(len(own.srg)), clusters=own.clusters, rng=rng)
+        nothing = mean_interval(own.srg, clusters=own.clusters, rng=rng)
         gaps: dict[str, Difference] = {"chance": nothing}
         if (lead := leads.get(where)) is not None:
             gaps[method_name(lead.control)] = lead.gap
@@ -314,9 +323,10 @@ def _looks_at_two(truth: Truth, *, rng: np.random.Generator) -> Answer:
     share = share_of_strongest(truth.effects, count=2, rng=rng)
     two, told = judge_gap(None), "no marker changes the answer"
     if share is not None:
-        two = judge_gap(replace(share, estimate=share.estimate - 0.5, low=share.low - 0.5, high=share.high - 0.5))
-        bounds = f"{percent(share.low)} to {percent(share.high)}"
-        told = f"{percent(share.estimate)} of the change of the answer ({bounds})"
+        # of a single trial there are no ends
+        known = {name: end for name in ("estimate", "low", "high") if (end := getattr(share, name)) is not None}
+        two = judge_gap(replace(share, **{name: end - 0.5 for name, end in known.items()}))
+        told = f"{percent(share.estimate)} of the change of the answer ({tell_ends(share, percent)})"
     found, area = truth.methods.get(POLY_CAM), truth.areas["edges"]
     mass, gap = (None, None) if found is None else (found.mass["edges"], found.edges)
     on_edges, on_edges_told = judge_gap(gap), "No map of the thesis's Poly-CAM was held against the truth."

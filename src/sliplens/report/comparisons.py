@@ -2,11 +2,12 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float64
 
-from sliplens.intervals import Difference, paired_difference
+from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.plots import style
 from sliplens.results.evaluation import Predictions
 from sliplens.results.faithfulness import Comparison, DeletionCurve, DeletionScores, RemovalCurve, RemovalScores
@@ -59,7 +60,10 @@ def compare_gain(*pairs: tuple[RemovalCurve, RemovalCurve], rng: np.random.Gener
 def gap_from(compared: Comparison | Roughness, method: str) -> Difference:
     """Difference of a method, one of the two that were compared, less the other."""
     gap = compared.gap
-    return gap if compared.first == method else replace(gap, estimate=-gap.estimate, low=-gap.high, high=-gap.low)
+    if compared.first == method:
+        return gap
+    low, high = (None if end is None else -end for end in (gap.high, gap.low))
+    return replace(gap, estimate=-gap.estimate, low=low, high=high)
 
 
 def share_of_strongest(effects: MarkerEffects, *, count: int, rng: np.random.Generator) -> Difference | None:
@@ -75,7 +79,7 @@ def share_of_strongest(effects: MarkerEffects, *, count: int, rng: np.random.Gen
             clusters.append((str(frame.day[0]), frame.trial[0]))
     if not shares:
         return None
-    return paired_difference(np.array(shares), np.zeros(len(shares)), clusters=np.array(clusters).T, rng=rng)
+    return mean_interval(np.array(shares), clusters=np.array(clusters).T, rng=rng, limits=(0.0, 1.0))
 
 
 def settings(faithful: RemovalScores) -> list[tuple[str, str]]:
@@ -134,5 +138,5 @@ def tell_interval(gap: Difference, *, digits: int = 3) -> str:
 
 
 def tell_bounds(gap: Difference, *, digits: int = 3) -> str:
-    """Write the ends of a 95 % interval."""
-    return f"{style.signed(gap.low, digits)} to {style.signed(gap.high, digits)}"
+    """Write the ends of a 95 % interval, or that there is none."""
+    return style.tell_ends(gap, partial(style.signed, digits=digits))

@@ -17,6 +17,7 @@ from sliplens.plots.style import (
     input_name,
     percent,
     signed,
+    tell_ends,
 )
 from sliplens.report.charts import make_charts
 from sliplens.report.plates import Cell, Plate, draw_grid, named_columns, picture_brightness, rows_of
@@ -41,15 +42,16 @@ def table_slices(diagnosis: Diagnosis) -> Table:
         ("Slice", "Frames", "Trials", "Mean |error|", "Mean error", "Less elsewhere (95 %)"),
         [
             (
-                one.name, f"{one.frames:,}", str(one.trials), f"{100 * one.error:.1f}", signed(100 * one.bias, 1),
-                "{} ({} to {}){}".format(
-                    *(signed(100 * end, 1) for end in (one.excess.estimate, one.excess.low, one.excess.high)),
-                    ", larger" if one.holds else "",
-                ),
+                one.name, f"{one.frames:,}", str(one.trials), f"{100 * one.error:.1f}", _points(one.bias),
+                f"{_points(one.excess.estimate)} ({tell_ends(one.excess, _points)}){', larger' if one.holds else ''}",
             )
             for one in diagnosis.slices
         ],
     )  # fmt: skip
+
+
+def _points(margin: float) -> str:
+    return signed(100 * margin, 1)
 
 
 def plate_frictions(diagnosis: Diagnosis) -> Plate:

@@ -142,7 +142,9 @@ def recommend(truth: Truth) -> Recommended | None:
         found=truth.methods[best],
         correlation=known[best][1],
         lead=known[best][2],
-        tied=tuple(sorted((one for one, gap in over.items() if not _gains(gap)), key=lambda one: over[one].estimate)),
+        tied=tuple(
+            sorted((one for one, gap in over.items() if not gap.above_zero), key=lambda one: over[one].estimate)
+        ),
     )
 
 
@@ -153,8 +155,7 @@ def _tell_recommended(topic: str, best: Recommended, truth: Truth, faithful: Rem
     name, over = method_name(best.method), best.found.lead_over_methods
     control = method_name(best.lead.control).removesuffix(" (control)")
     if best.correlation.units < FEWEST_UNITS:
-        few = f"{best.correlation.units} trials are too few to tell a method from chance; {FEWEST_UNITS} or more are"
-        return Statement(topic=topic, text=f"Not known: {few} needed.", tone="caution")
+        return _too_few(topic, best.correlation.units)
     evidence = (
         "its map ranks the markers by what each adds to the answer (its Shapley value, found by drawing the scene anew "
         f"without its motion) with a signed correlation of {tell_interval(best.correlation, digits=2)}, 1 being perfect"
@@ -198,6 +199,12 @@ def _tell_recommended(topic: str, best: Recommended, truth: Truth, faithful: Rem
     return Statement(topic=topic, text=text, tone=tone)
 
 
+def _too_few(topic: str, trials: int) -> Statement:
+    few = "one trial is" if trials == 1 else f"{trials} trials are"
+    text = f"Not known: {few} too few to tell a method from chance; {FEWEST_UNITS} or more are needed."
+    return Statement(topic=topic, text=text, tone="caution")
+
+
 def _tell_limits(gap: Difference, overturned_by: str) -> str:
     """Say over what it was found, and what it would take to change it."""
     single = [what for what, count in (("network", gap.networks), ("day", gap.days)) if count == 1]
@@ -229,7 +236,7 @@ def _tell_claims(claims: Sequence[Claim], results: Results) -> list[Statement]:
     for name in inputs_in_order(results.study.truth)[::-1]:
         best = recommend(results.study.truth[name])
         gap = None if best is None else best.found.lead_over_methods.get(POLY_CAM)
-        if best is not None and gap is not None and _gains(gap):
+        if best is not None and gap is not None and gap.above_zero:
             text += (
                 f" Its recommendation, Poly-CAM as it ran it, is not borne out on {input_name(name).lower()}: "
                 f"{method_name(best.method)} leads that map by {tell_interval(gap, digits=2)}, ranking the markers."
@@ -315,7 +322,7 @@ def _faithfulness(scored: DeletionScores, *, rng: np.random.Generator) -> Statem
         return Statement(topic=topic, text=text, tone="caution")
     text += f"; removing pixels in random order gives {control.mean:.3f} ± {control.sd:.3f}."
     gaps = {name: against_control(scored, name, rng=rng) for name in methods}
-    beating = [name for name, gap in gaps.items() if gap is not None and gap.sure and gap.estimate < 0]
+    beating = [name for name, gap in gaps.items() if gap is not None and gap.below_zero]
     failing = [method_name(name) for name in methods if name not in beating]
     if best not in beating:
         if methods[best].mean < control.mean:
@@ -431,14 +438,14 @@ def _believe(faithful: RemovalScores, results: Results) -> Statement:
     topic = f"Which to believe, {input_name(faithful.input).lower()}"
     truth = results.study.truth.get(faithful.input)
     ranked = rank_methods(faithful, truth)
-    if not any(one.tested for one in ranked):
-        return Statement(topic=topic, text="Not known: no method was compared with a control.", tone="caution")
-    best = ranked[0]
+    if faithful.trials < FEWEST_UNITS:
+        return _too_few(topic, faithful.trials)
     fills = [FILL_NAMES.get(fill, fill) for fill in _unfit_fills(truth)]
     unfit = f" Left out: {listed(fills)}, where even a map made from the truth does not win for sure." if fills else ""
-    if faithful.trials < FEWEST_UNITS:
-        trials = f"{faithful.trials} trials are too few to tell a method from chance; {FEWEST_UNITS} or more are needed"
-        return Statement(topic=topic, text=f"Not known: {trials}.", tone="caution")
+    if not any(one.tested for one in ranked):
+        why = "no method was compared with a control under a fill that can judge it"
+        return Statement(topic=topic, text=f"Not known: {why}.{unfit}", tone="caution")
+    best = ranked[0]
     if not best.qualifies:
         nearest = max(ranked, key=lambda one: (len(one.beaten), one.mean_gain))
         text = (
@@ -482,8 +489,8 @@ def _tell_lead(faithful: RemovalScores, best: Standing, others: list[Standing]) 
         if {one.first, one.second} == pair
     }
     ahead, behind = (
-        [fill_name(*one) for one, gap in gaps.items() if one in best.tested and told(gap)]
-        for told in (_gains, lambda gap: gap.high < 0)
+        [fill_name(*one) for one, gap in gaps.items() if one in best.tested and getattr(gap, side)]
+        for side in ("above_zero", "below_zero")
     )
     name = method_name(rival.method)
     means = f"their mean gains are {signed(best.mean_gain, 3)} and {signed(rival.mean_gain, 3)}"
@@ -497,10 +504,6 @@ def _tell_lead(faithful: RemovalScores, best: Standing, others: list[Standing]) 
 
 def _unfit_fills(truth: Truth | None) -> list[str]:
     return [] if truth is None else [one.fill for one in truth.meta if not one.holds]
-
-
-def _gains(gap: Difference) -> bool:
-    return gap.sure and gap.estimate > 0
 
 
 _KINDS = {

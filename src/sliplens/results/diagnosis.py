@@ -47,7 +47,7 @@ class ErrorSlice:
     @property
     def holds(self) -> bool:
         """Whether the error is larger there beyond the interval, on enough held-out trials."""
-        return self.trials >= FEWEST_UNITS and self.excess.sure and self.excess.low > 0
+        return self.trials >= FEWEST_UNITS and self.excess.above_zero
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,7 +36,7 @@ class Lead:
     @property
     def shows_something(self) -> bool:
         """Whether the method beats every control for sure; otherwise it has shown nothing about this network."""
-        return self.gap.sure and self.gap.low > 0
+        return self.gap.above_zero
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -293,8 +293,8 @@ class OracleTest:
 
     @property
     def holds(self) -> bool:
-        """Whether the interval of `gap` lies above zero; a gain for which it does not cannot judge maps."""
-        return self.gap is not None and self.gap.low > 0
+        """Whether `gap` is above zero for sure, as no few trials can show; else the gain cannot judge maps."""
+        return self.gap is not None and self.gap.above_zero
 
 
 @dataclass(frozen=True, kw_only=True)

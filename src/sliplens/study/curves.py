@@ -19,7 +19,7 @@ from sliplens.faithfulness.alarms import controls_win, fill_decides, flat_maps, 
 from sliplens.faithfulness.controls import control_maps, lead_over_controls
 from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness, Predict, answer_whole, score_maps
 from sliplens.faithfulness.scoring import prepare_passes
-from sliplens.intervals import paired_difference
+from sliplens.intervals import mean_interval, paired_difference
 from sliplens.progress import OnProgress, continued
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import Agreement, Comparison, RemovalScore, RemovalScores, RemovalTable, is_control
@@ -169,7 +169,7 @@ def judge_curves(
         gains = {name: curve.symmetric_gain for name, curve in own.items()}
         controls = {name: gain for name, gain in gains.items() if is_control(name)}
         for name, curve in own.items():
-            zero = partial(paired_difference, second=np.zeros_like(gains[name]), clusters=clusters, rng=rng)
+            mean = partial(mean_interval, clusters=clusters, rng=rng)
             lead = partial(lead_over_controls, gains[name], controls, clusters=clusters, rng=rng)
             orders: dict[str, Any] = {
                 order: float(getattr(curve, order).mean()) for order in ("most_first", "least_first", "random")
@@ -178,8 +178,8 @@ def judge_curves(
                 **vars(setting),
                 method=name,
                 control=is_control(name),
-                srg=zero(gains[name]),
-                gain_over_random=zero(curve.gain_over_random),
+                srg=mean(gains[name]),
+                gain_over_random=mean(curve.gain_over_random),
                 lead_over_controls=None if is_control(name) else lead(),
                 **orders,
                 at={area: float(curve.at(area)[0].mean()) for area in EQUAL_AREAS if area in curve.areas},

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int64, UInt8
-from scipy.stats import spearmanr
 from torch.nn.functional import adaptive_avg_pool2d
 
 from sliplens.codec import keep_part, load_result, save_result
@@ -20,10 +19,10 @@ from sliplens.extras import require_packages
 from sliplens.faithfulness.removal import answer_whole
 from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.files import output_folder
-from sliplens.intervals import FEWEST_UNITS, Difference, paired_difference
+from sliplens.intervals import FEWEST_UNITS, Difference, mean_interval
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
-from sliplens.plots.style import decimals, signed
+from sliplens.plots.style import decimals, signed, tell_ends
 from sliplens.progress import OnProgress, counted, note, stage, wrote
 from sliplens.recordings import Dataset
 from sliplens.recordings.dataset import load_dataset
@@ -32,7 +31,7 @@ from sliplens.results.evaluation import Predictions
 from sliplens.results.explanation import Explained
 from sliplens.simulation.intervention import film_with_friction, marker_readings, reading_slope
 from sliplens.study.explaining import explain_frames, frames_at, network_inputs
-from sliplens.study.truth import StagedFrame, find_places, redrawing, stage_frames
+from sliplens.study.truth import StagedFrame, find_places, rank_correlation, redrawing, stage_frames
 from sliplens.training import evaluate
 
 Markers = Float64[np.ndarray, " markers"]
@@ -256,11 +255,13 @@ def find_slices(errors: ErrorTable, *, seed: int) -> tuple[tuple[ErrorSlice, ...
 
 
 def _mean(
-    values: Float[np.ndarray, " rows"], table: ErrorTable | FrictionTable, rng: np.random.Generator
+    values: Float[np.ndarray, " rows"],
+    table: ErrorTable | FrictionTable,
+    rng: np.random.Generator,
+    limits: tuple[float, float] = (-np.inf, np.inf),
 ) -> Difference:
     """Mean over rows of a table with a 95 % interval over days and trials."""
-    clusters = [table.day.astype(str), table.trial]
-    return paired_difference(values, np.zeros(len(values)), clusters=clusters, rng=rng)
+    return mean_interval(values, clusters=[table.day.astype(str), table.trial], rng=rng, limits=limits)
 
 
 def compare_errors(table: ErrorTable, inside: Bool[np.ndarray, " frames"], rng: np.random.Generator) -> Difference:
@@ -302,7 +303,7 @@ def hold_against(values: Markers, reading: Markers, state: Int64[np.ndarray, " m
     """Hold contributions of markers that slip (1), stick (2) or touch nothing (0) against those to the best reading."""
     sizes, least = (np.abs(values), np.abs(reading)), np.finfo(float).tiny
     network, best = (float(size[state == 1].sum() / max(size[state > 0].sum(), least)) for size in sizes)
-    agreement = float(np.asarray(spearmanr(values, reading))[0])
+    agreement = rank_correlation(values, reading)
     return MarkerContributions(values=values, agreement=agreement, network_slipping=network, reading_slipping=best)
 
 
@@ -416,8 +417,8 @@ def cluster_explanations(
 
 def _gap(gap: Difference, *, points: bool = False) -> str:
     scale, digits = (100, 1) if points else (1, 2)
-    ends = " to ".join(decimals(scale * end, digits) for end in (gap.low, gap.high))
-    return f"{signed(scale * gap.estimate, digits)} (95 % interval {ends}; {gap.over})"
+    ends = tell_ends(gap, lambda end: decimals(scale * end, digits), title="95 % interval ")
+    return f"{signed(scale * gap.estimate, digits)} ({ends}; {gap.over})"
 
 
 def _frames(table: ErrorTable) -> str:
@@ -463,7 +464,7 @@ def say_looked(table: ExplainedErrors, slices: Sequence[ErrorSlice], rng: np.ran
     known = {name: table.where(rows & np.isfinite(table.agreement)) for name, rows in groups.items()}
     return [
         f"In {_frames(own)} {name} the markers' parts in the answer rank as in the best reading, to a signed rank "
-        f"correlation (Spearman's) of {_gap(_mean(own.agreement, own, rng))}; of the parts in contact, "
+        f"correlation (Spearman's) of {_gap(_mean(own.agreement, own, rng, (-1.0, 1.0)))}; of the parts in contact, "
         f"{100 * own.network_slipping.mean():.0f} % of the answer's and {100 * own.reading_slipping.mean():.0f} % of "
         "the best reading's are of slipping markers."
         for name, own in known.items()
@@ -473,7 +474,7 @@ def say_looked(table: ExplainedErrors, slices: Sequence[ErrorSlice], rng: np.ran
 
 def say_slope(slope: FrictionSlope) -> str:
     """Say whether the answer follows the margin where friction alone changes, and whether the markers let it."""
-    verdict = "not told from" if not slope.gap.sure else "more than" if slope.gap.estimate > 0 else "less than"
+    verdict = "more than" if slope.gap.above_zero else "less than" if slope.gap.below_zero else "not told from"
     return (
         f"With the forces kept and friction alone changed, the answer on {slope.condition} objects follows the margin "
         f"with a slope of {_gap(slope.network)}, {verdict} that of the best reading of the markers, "

@@ -7,9 +7,10 @@ import numpy as np
 
 from sliplens.errors import InputError
 from sliplens.faithfulness.controls import lead_over_controls
+from sliplens.intervals import mean_interval
 from sliplens.results.faithfulness import is_control
 from sliplens.results.study import PooledScore, PooledScores, Study
-from sliplens.study.truth import mean_interval, rank_correlation
+from sliplens.study.truth import mean_of_defined, rank_correlation
 
 _Measured: TypeAlias = tuple[np.ndarray, np.ndarray]
 """A score of each frame, and the networks, days and trials of the frames, a row a level."""
@@ -51,10 +52,10 @@ def _pool(name: str, studies: Sequence[Study], *, seed: int) -> list[PooledScore
         found = {method: _join(_gains(study, name, (fill, unit, method)) for study in studies) for method in methods}
         controls = {method: gains for method, (gains, _) in found.items() if is_control(method)}
         for method, (gains, clusters) in found.items():
-            gain, rng = mean_interval(gains, clusters, seed=seed), np.random.default_rng(seed)
-            assert gain is not None  # gains are always known
+            gain = mean_interval(gains, clusters=clusters, rng=np.random.default_rng(seed))
+            rng = np.random.default_rng(seed)
             lead = None if method in controls else lead_over_controls(gains, controls, clusters=clusters, rng=rng)
-            held = mean_interval(*truth[method], seed=seed) if method in truth else None
+            held = mean_of_defined(*truth[method], seed=seed, limits=(-1.0, 1.0)) if method in truth else None
             pooled.append(
                 PooledScore(input=name, fill=fill, unit=unit, method=method, gain=gain, lead=lead, truth=held)
             )

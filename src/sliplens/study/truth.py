@@ -33,8 +33,9 @@ from sliplens.faithfulness.removal import (
     unit_order,
 )
 from sliplens.faithfulness.scoring import prepare_passes
-from sliplens.intervals import Difference, paired_difference
+from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.models import Run
+from sliplens.plots.style import tell_ends
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
 from sliplens.recordings.trial import SLIPS
@@ -249,16 +250,20 @@ def rank_correlation(first: Float[np.ndarray, " markers"], second: Float[np.ndar
     return float(np.asarray(spearmanr(first, second))[0])
 
 
-def mean_interval(
-    measured: Iterable[float], clusters: Shaped[np.ndarray, "levels frames"], *, seed: int
+def mean_of_defined(
+    measured: Iterable[float],
+    clusters: Shaped[np.ndarray, "levels frames"],
+    *,
+    seed: int,
+    limits: tuple[float, float] = (-np.inf, np.inf),
 ) -> Difference | None:
-    """Mean over the frames in which it is defined, with a 95 % interval over its clusters; None if in none."""
+    """Mean over the frames in which a score is defined, with its interval (`mean_interval`); None if in none."""
     values = np.array(list(measured))
     known = np.isfinite(values)
     if not known.any():
         return None
-    values = values[known]
-    return paired_difference(values, 0 * values, clusters=clusters[:, known], rng=np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    return mean_interval(values[known], clusters=clusters[:, known], rng=rng, limits=limits)
 
 
 _Interval = Callable[[Iterable[float]], Difference | None]
@@ -317,7 +322,7 @@ def _summarise(truth: Truth) -> str:
     if agreement is not None:
         summary += (
             f" Marker by marker the Shapley values of the answer agree with those of the best reading of the margin by "
-            f"{agreement.estimate:.2f} (Spearman, 95 % interval {agreement.low:.2f} to {agreement.high:.2f})."
+            f"{agreement.estimate:.2f} (Spearman, {tell_ends(agreement, '{:.2f}'.format, title='95 % interval ')})."
         )
     return summary
 
@@ -367,7 +372,8 @@ def judge_by_truth(
     }
     change = np.array([frame.prediction - frame.reference_prediction for frame in explained.frames])
     painted = {name: _paint(places, [getattr(one, name) for one in effects]) for name in _EFFECTS}
-    interval = partial(mean_interval, clusters=explained.clusters, seed=seed)
+    interval = partial(mean_of_defined, clusters=explained.clusters, seed=seed)
+    alike = partial(interval, limits=(-1.0, 1.0))
     truth = Truth(
         input=explained.input,
         source=explained.source,
@@ -376,10 +382,10 @@ def judge_by_truth(
         areas=_by_region(places, lambda _, region: float(region.mean())),
         methods=_judge(judged, places, along, explained.clusters, seed=seed),
         pairs=pairs,
-        reliability=interval(_reliability(one) for one in effects),
+        reliability=interval((_reliability(one) for one in effects), limits=(0.0, 1.0)),
         sums={name: _sum_over_change(effects, change, name) for name in ("shapley", "network")},
-        shapley_against_margin=interval(rank_correlation(one.shapley, one.margin) for one in effects),
-        network_against_margin=interval(rank_correlation(one.network, one.margin) for one in effects),
+        shapley_against_margin=alike(rank_correlation(one.shapley, one.margin) for one in effects),
+        network_against_margin=alike(rank_correlation(one.network, one.margin) for one in effects),
         meta=meta_test(effects, interval),
         summary="",
         effects=_table(frames, places, effects),
@@ -407,7 +413,8 @@ def _judge(
     # a map that tells no marker from another ranks them as chance does
     ranks = {name: np.nan_to_num(own["shapley"]) for name, own in alike.items()}
     controls = {name: own for name, own in ranks.items() if is_control(name) and name != RANDOM}
-    rng, interval, found = np.random.default_rng(seed), partial(mean_interval, clusters=clusters, seed=seed), {}
+    rng, found = np.random.default_rng(seed), {}
+    interval = partial(mean_of_defined, clusters=clusters, seed=seed, limits=(-1.0, 1.0))
     methods = [name for name in maps if not is_control(name) and name not in (ORACLE, DEGRADED)]
     for name, values in maps.items():
         others = [one for one in methods if one != name] if name in methods else []
