@@ -87,8 +87,8 @@ def figure_picture(figure: Figure, *, alt: str, pixels: bool = False) -> Picture
         if pixels:
             # as bare pixels: a PNG made only to be read again takes as long as the drawing
             figure.savefig(buffer, format="rgba", dpi=_DOTS_PER_INCH)
-            size = tuple(int(side * _DOTS_PER_INCH) for side in figure.get_size_inches())
-            buffer = _fewer_colours(Image.frombytes("RGBA", size, buffer.getvalue()))
+            width, height = (int(side * _DOTS_PER_INCH) for side in figure.get_size_inches())
+            buffer = _fewer_colours(Image.frombytes("RGBA", (width, height), buffer.getvalue()))
         else:
             # no date: the same results make the same page
             figure.savefig(buffer, format="svg", dpi=200, metadata={"Date": None, "Creator": None})
