@@ -17,6 +17,7 @@ HEAD = ["Method", "Score D (lower is better)", "Standard deviation", "SRG, grey 
 def screen(monkeypatch: pytest.MonkeyPatch) -> Console:
     narrow = Console(width=80, record=True)
     monkeypatch.setattr(console, "OUT", narrow)
+    monkeypatch.setattr(console, "ERR", narrow)
     return narrow
 
 

@@ -47,7 +47,7 @@ def test_maps_overlays_and_a_panel(difference_run: Path, small_dataset: Dataset,
     # a row for the input and for each method, a column for each frame
     with Image.open(output / "panel.png") as panel:
         assert panel.height > panel.width
-    told = capsys.readouterr().out
+    told = capsys.readouterr().err
     notes = {note for one in read_json(output / "result.json")["methods"].values() for note in one["warnings"]}
     assert told.count("note: ") == len(notes)  # what several methods warn of is told once
     run(difference_run, small_dataset.folder, "-o", output, *QUICK, "--levels", 1, 0)
@@ -85,9 +85,9 @@ def test_expected_gradients_take_the_frames_without_slip(
 ):
     common = ("--method", "expected-gradients", "--levels")
     run(difference_run, small_dataset.folder, "-o", tmp_path / "with", *common, 1, 0)
-    assert "no background" not in capsys.readouterr().out
+    assert "no background" not in capsys.readouterr().err
     run(difference_run, small_dataset.folder, "-o", tmp_path / "without", *common, 0)
-    assert "no background was given" in capsys.readouterr().out.replace("\n", " ")
+    assert "no background was given" in capsys.readouterr().err.replace("\n", " ")
 
 
 MARKERS = torch.tensor([[8.0, 8.0], [24.0, 9.0], [15.0, 22.0]])

@@ -70,6 +70,42 @@ def test_labels_of_an_imported_video_are_those_of_the_simulator(
     assert "kept" in capsys.readouterr().out
 
 
+def test_bad_samples_of_the_force_sensor_cost_their_frames_and_are_told(
+    tmp_path: Path, trial: Recording, table: Path, video: Path, capsys: pytest.CaptureFixture[str]
+):
+    head, *rows = [line.split(",") for line in table.read_text().splitlines()]
+    times = np.array([float(row[0]) for row in rows])
+    # an instrument that loses samples, and then shoots up
+    for row in rows[int(np.searchsorted(times, 2.5)) : int(np.searchsorted(times, 2.7))]:
+        row[1:] = "", "nan", ""
+    rows[int(np.searchsorted(times, 4.0))][3] = "70"
+    spoilt = tmp_path / "spoilt.csv"
+    spoilt.write_text("\n".join(",".join(row) for row in (head, *rows)) + "\n")
+    command = ("import", video, "-o", tmp_path / "data", "--sensor", "mine", "--forces", spoilt)
+    assert run(*command) == 0
+    flags = (
+        "cup: drop-out of the force at 2.50 s, 0.20 s in all",
+        "cup: spike of the force at 4.00 s, 0.00 s in all, up to 70 N",
+    )
+    told = capsys.readouterr().err
+    assert all(told.count(flag) == 1 for flag in flags)
+    assert (tmp_path / "data" / "audit" / "cup.png").is_file()
+    assert run("check", tmp_path / "data") == 0
+    repeated = capsys.readouterr()
+    assert all(repeated.err.count(flag) == 1 for flag in flags)
+    assert "is sound" in repeated.out
+    data = load_dataset(tmp_path / "data")
+    labels = data.read_labels(data.trials[0])
+    assert labels.valid is not None
+    assert labels.reason is not None
+    reasons = dict(zip(np.round(trial.time_s, 3).tolist(), labels.reason, strict=True))
+    assert {reason for time, reason in reasons.items() if 2.5 <= time <= 2.7} == {"drop-out of the force"}
+    assert "spike of the force" in {reason for time, reason in reasons.items() if 3.95 <= time <= 4.05}
+    error = (labels.safety_margin - trial.safety_margin)[labels.valid]
+    assert len(error) > 170
+    assert np.sqrt(np.mean(error**2)) < 0.03
+
+
 def test_a_folder_of_images_gives_the_labels_of_the_video(tmp_path: Path, trial: Recording, table: Path, video: Path):
     folder = tmp_path / "cup"
     folder.mkdir()

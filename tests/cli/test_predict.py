@@ -46,7 +46,7 @@ def test_engines_agree_on_a_folder_of_images(difference_run: Path, difference_fo
     for engine in ("eager", "folded"):
         run(difference_run, difference_folder, "-o", tmp_path / f"{engine}.parquet", "--engine", engine)
         answers[engine] = pq.read_table(tmp_path / f"{engine}.parquet").to_pydict()
-    assert "taken for difference images" in capsys.readouterr().out.replace("\n", " ")
+    assert "taken for difference images" in capsys.readouterr().err.replace("\n", " ")
     # float32 sums in another order, through some 60 layers
     assert answers["eager"]["prediction"] == pytest.approx(answers["folded"]["prediction"], abs=1e-4)
     assert [name.split("_")[0] for name in answers["eager"]["file"]] == ["frame1", "frame6", "frame11"]

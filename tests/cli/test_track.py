@@ -50,7 +50,7 @@ def test_without_a_reference_the_first_frame_stands_for_it_and_says_so(folder, t
     table = pq.read_table(output)
     first = np.array(table["frame"]) == 0
     np.testing.assert_allclose(np.array(table["dx_px"])[first], 0.0, atol=1e-5)
-    assert "displacements count from the first frame" in capsys.readouterr().out
+    assert "displacements count from the first frame" in capsys.readouterr().err
 
 
 def test_a_data_set_gives_what_the_tracker_gives(trials, tmp_path):

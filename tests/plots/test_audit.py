@@ -21,11 +21,13 @@ from sliplens.plots.layout import save_page
 from sliplens.recordings import ContactState, Recording
 from sliplens.recordings.labelling import (
     ForceAxes,
+    ForceFault,
     Found,
     FrictionEstimate,
     LabelBasis,
     Labelling,
     Lag,
+    Reason,
     ReferenceChoice,
 )
 
@@ -119,6 +121,19 @@ def bands(ax: Axes) -> list[PolyCollection]:
 
 def onsets(ax: Axes) -> list[float]:
     return [float(np.asarray(line.get_xdata())[0]) for line in ax.lines if str(line.get_label()).startswith("slip at")]
+
+
+def test_what_puts_labels_in_doubt_stands_first_among_what_is_told():
+    faults = (
+        ForceFault(kind=Reason.SPIKE, start_s=1.0, end_s=1.0, largest_n=70.0),
+        ForceFault(kind=Reason.SPIKE, start_s=1.4, end_s=1.41, largest_n=9.0),
+    )
+    words = told(draw_audit(make_trial(), make_labelling(faults=faults, doubts=("a friction of 9 was given",))))
+    assert "▲ Flags" in words
+    assert "spike of the force in 2 places from 1.00 s on, 0.01 s in all, up to 70 N: frames there are" in words
+    assert "a friction of 9 was given" in words
+    assert words.index("▲ Flags") < words.index("Axes")
+    assert "Flags" not in told(draw_audit(make_trial(), make_labelling()))
 
 
 def test_words_hold_what_the_labels_rest_on():

@@ -264,7 +264,8 @@ def test_what_is_missing_or_impossible_is_refused(difference_run, fine_dataset, 
 
 def test_the_command_says_what_was_found_and_draws_the_page(difference_run, fine_dataset, tmp_path, capsys):
     assert run("diagnose", difference_run, fine_dataset.folder, "-o", tmp_path / "runs", "--trials", 1) == 0
-    said = " ".join(capsys.readouterr().out.split())
+    captured = capsys.readouterr()
+    said = " ".join((captured.out + captured.err).split())
     assert "the answer is off by" in said
     assert "is left out" in said
     assert (tmp_path / "runs" / "report.html").is_file()

@@ -91,7 +91,7 @@ class Terminal:
 
     def _tell_notes(self) -> None:
         for message in fold_equal(self._notes.elements()):
-            say(f"  note: {message}")
+            ERR.print(f"  note: {escape(message)}", soft_wrap=True, highlight=False)
         self._notes.clear()
 
 

@@ -79,7 +79,7 @@ def show_labelling(title: str, data: "Dataset") -> None:
         kept = labels.labelling
         rows.append((info.trial, f"{counts.get('valid', 0)} of {info.frames}", *_basis(kept, counts)))
         if kept is not None:
-            notes += [*kept.notes, *(kept.basis.axes.notes if kept.basis else ())]
+            notes += kept.notes
         why = ", ".join(f"{count} {reason}" for reason, count in counts.items() if reason != "valid")
         lost.append(f"  {info.trial}: frames without a valid label: {why or 'none'}")
     print_table(title, ("trial", "valid", "mu", "lag, ms", "reference"), rows)

@@ -53,7 +53,7 @@ def audit_facts(recording: Recording, labelling: Labelling) -> list[Fact]:
     basis, reference = labelling.basis, labelling.reference
     if basis is None:
         return _tell_given(recording, labelling)
-    axes, limit, notes = basis.axes, basis.force_range_n, [*basis.axes.notes, *labelling.notes]
+    axes, limit, notes = basis.axes, basis.force_range_n, labelling.notes
     pressing = f"normal force is {'+' if axes.sign > 0 else _MINUS}{axes.normal}"
     told = f"{pressing} (axis {_found(axes.normal_found)}, sign {_found(axes.sign_found)})"
     still = f"untouched until {decimals(axes.still_until_s, 2)} s"
@@ -66,6 +66,7 @@ def audit_facts(recording: Recording, labelling: Labelling) -> list[Fact]:
     chosen = [reference.method] if reference.index is None else chosen
     return [
         _tell_frames(recording),
+        *([Fact("Flags", [f"• {flag}" for flag in basis.flags], doubtful=True, indent="   ")] if basis.flags else []),
         Fact("Axes", [told], any("axis" in note for note in axes.notes)),
         Fact(f"Tare {_found(axes.tare_found)}", tare, axes.tare_found == Found.ASSUMED),
         _tell_friction(basis.friction, basis.slip_s),
@@ -110,13 +111,15 @@ def _tell_frames(recording: Recording) -> Fact:
     }
     kinds = np.select([recording.labelled, *lacking.values()], range(5), default=5)
     counts = dict(zip(("valid", *lacking, "not valid"), np.bincount(kinds, minlength=6).tolist(), strict=True))
+    if recording.reason is not None:
+        counts = {"valid": 0, **recording.count()}
     words = [", ".join(f"{count} {name}" for name, count in counts.items() if count and name != "valid")]
     middle = most = 0.0
     if sigma is not None and np.isfinite(sigma).any():
         middle, most = 100 * float(np.nanmedian(sigma)), 100 * float(np.nanmax(sigma))
         words.append(f"Γ known to ± {middle:.1f} % (median), {most:.1f} % at worst")
-    lost = counts["missing samples"] + counts["outside the sensor's range"]
-    return Fact(f"Frames: {counts['valid']} of {len(states)} valid", words, lost > 0 or middle > _LOOSE)
+    usual = sum(counts.get(name, 0) for name in ("valid", "no contact", "after gross slip"))
+    return Fact(f"Frames: {counts['valid']} of {len(states)} valid", words, usual < len(states) or middle > _LOOSE)
 
 
 def _tell_friction(friction: FrictionEstimate, slip_s: float | None) -> Fact:

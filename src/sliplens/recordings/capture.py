@@ -22,7 +22,7 @@ class Forces:
 
     time_s: Float[np.ndarray, " _"]
     force_n: Float[np.ndarray, "_ 3"]
-    """x, y, z of the sensor, sign and tare as recorded."""
+    """x, y, z of the sensor, sign and tare as recorded; no number where a sample dropped out."""
     source: str
     """Topic, file or column names, for people."""
 
@@ -34,9 +34,8 @@ class Forces:
                 f"{self.source} has {len(self.time_s)} times but {len(self.force_n)} forces; give one force a time"
             )
         _require_rising(self.time_s, what=self.source)
-        bad = ~np.isfinite(self.force_n).all(axis=1)
-        if bad.any():
-            raise RecordingError(f"{self.source}: sample {int(np.argmax(bad))} is not a number; mend or drop it")
+        if not np.isfinite(self.force_n).all(axis=1).any():
+            raise RecordingError(f"{self.source} has no sample that is a number; record the force sensor too")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ import numpy as np
 from sliplens.errors import SliplensError
 from sliplens.files import hash_file
 from sliplens.progress import OnProgress, counted
-from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_path
+from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, tell_flags, trial_path
 from sliplens.recordings.store import forces_path, load_recording, read_header
 from sliplens.recordings.trial import SIGNALS, ContactState, Recording
 
@@ -31,10 +31,11 @@ class Finding:
 def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None = None) -> tuple[Finding, ...]:
     """Read every trial of a data set and list what is wrong with it.
 
-    Checked are, for each trial: that its file is there, has the hash of the table and is what the table says; that
-    every image can be read; that times rise, forces are finite, labels lie in [0, 1] and are missing only without
-    contact, margin and forces agree, and contact states follow the margin. For the set: that no trial is listed twice,
-    which would put its frames into two splits, and that no file is left over.
+    What puts labels in doubt, such as faults of the force sensor, is told by `on_progress` if it shows notes, and is no
+    finding: frames at a fault are not valid. Checked are, for each trial: that its file is there, has the hash of the
+    table and is what the table says; that every image can be read; that times rise, forces are finite, labels lie in
+    [0, 1] and are missing only without contact, margin and forces agree, and contact states follow the margin. For the
+    set: that no trial is listed twice, which would put its frames into two splits, and that no file is left over.
 
     Raises
     ------
@@ -55,11 +56,11 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
         if path not in listed
     ]
     for info in counted(data.trials, on_progress):
-        findings += [Finding(where=info.trial, what=what) for what in _check_trial(folder, info)]
+        findings += [Finding(where=info.trial, what=what) for what in _check_trial(folder, info, on_progress)]
     return tuple(findings)
 
 
-def _check_trial(folder: Path, info: TrialInfo) -> Iterator[str]:
+def _check_trial(folder: Path, info: TrialInfo, on_progress: OnProgress | None) -> Iterator[str]:
     path = trial_path(folder, info.trial)
     if not path.is_file():
         yield "has no file"
@@ -77,6 +78,7 @@ def _check_trial(folder: Path, info: TrialInfo) -> Iterator[str]:
     for name, value in vars(info).items():
         if hasattr(header, name) and value != getattr(header, name):
             yield f"has {name} {getattr(header, name)}, the table says {value}"
+    tell_flags(info.trial, header.labelling, on_progress)
     yield from _check_laws(recording)
 
 

@@ -7,6 +7,8 @@ from pathlib import Path
 from sliplens.codec import from_builtins, save_record
 from sliplens.errors import RecordingError
 from sliplens.files import hash_file, hash_json, read_json, require_folder
+from sliplens.progress import OnProgress, note
+from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.store import SCHEMA_VERSION, forces_path, load_recording, read_header
 from sliplens.recordings.trial import Labels, Recording, TrialFacts
 
@@ -118,6 +120,13 @@ def load_dataset(folder: Path | str) -> Dataset:
     if not table.trials:
         raise RecordingError(f"{folder} lists no trials; make or import a data set first")
     return Dataset(folder=folder, trials=table.trials, simulated=table.simulated)
+
+
+def tell_flags(trial: str, labelling: Labelling | None, on_progress: OnProgress | None) -> None:
+    """Note all that puts the labels of a trial in doubt."""
+    basis = None if labelling is None else labelling.basis
+    for flag in () if basis is None else basis.flags:
+        note(on_progress, f"{trial}: {flag}")
 
 
 def trial_path(folder: Path, trial: str) -> Path:

@@ -13,14 +13,14 @@ from sliplens.errors import InputError, RecordingError
 from sliplens.files import output_folder
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings.capture import Capture, Frame
-from sliplens.recordings.dataset import Dataset, load_dataset, trial_info, trial_path, write_dataset_table
+from sliplens.recordings.dataset import Dataset, load_dataset, tell_flags, trial_info, trial_path, write_dataset_table
 from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.labelling import Labelling, ReferenceChoice
 from sliplens.recordings.labels import Reason, choose_reference, label_trial, measure_motion
 from sliplens.recordings.options import LabelSettings, ReadOptions
 from sliplens.recordings.source import open_source
 from sliplens.recordings.splits import SPLITS_FILE, SplitPlan, assign_splits, read_splits, write_split_record
-from sliplens.recordings.store import encode_frames, forces_path, save_forces, write_trial
+from sliplens.recordings.store import encode_frames, forces_path, read_header, save_forces, write_trial
 from sliplens.recordings.trial import Labels
 
 
@@ -168,6 +168,8 @@ def label_dataset(
 
 
 def _tell(data: Dataset, on_progress: OnProgress | None, *, kept: bool) -> Dataset:
+    for info in data.trials:
+        tell_flags(info.trial, read_header(trial_path(data.folder, info.trial)).labelling, on_progress)
     wrote(on_progress, data.folder, f"{len(data.trials)} trials, {data.frames:,} frames", kept=kept)
     return data
 

@@ -1,5 +1,6 @@
 """How the labels of a trial were made: kept with it, shown by the audit and the viewer."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TypeAlias
@@ -41,6 +42,8 @@ class ForceAxes:
     normal_found: Found
     sign_found: Found
     tare_found: Found
+    drift_n_s: Vector = (0.0, 0.0, 0.0)
+    """Rate at which the reading of the untouched sensor drifts; 0 where it cannot be told from none."""
     notes: tuple[str, ...] = ()
     """Doubts, a sentence each."""
 
@@ -147,11 +150,28 @@ class Reason(StrEnum):
     """Why a frame has no valid label; empty where it has one."""
 
     NONE = ""
+    DROP_OUT = "drop-out of the force"
+    STUCK = "stuck force"
+    CLIPPED = "clipped force"
+    SPIKE = "spike of the force"
+    STEP = "step of the force"
     MISSING_SAMPLES = "missing samples"
     OUT_OF_RANGE = "outside the force sensor's range"
     NO_CONTACT = "no contact"
     AFTER_GROSS_SLIP = "after gross slip"
     TOO_UNCERTAIN = "too uncertain"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForceFault:
+    """A stretch of samples that the force sensor got wrong."""
+
+    kind: Reason
+    start_s: float
+    """On the force sensor's clock."""
+    end_s: float
+    largest_n: float | None = None
+    """Largest number that any axis reads in it, as recorded; None of missing samples."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,6 +194,32 @@ class LabelBasis:
     """Time beyond which samples count as missing between two others."""
     force_range_n: float | None
     """Largest force that each axis can measure; None where it is not known."""
+    faults: tuple[ForceFault, ...] = ()
+    """Samples that were left out, in the order of time."""
+    doubts: tuple[str, ...] = ()
+    """What else is not plausible, a sentence each."""
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """All that puts labels in doubt, a sentence each."""
+        return (*tell_faults(self.faults), *self.axes.notes, *self.doubts)
+
+
+def tell_faults(faults: Sequence[ForceFault]) -> tuple[str, ...]:
+    """Tell of the faults of each kind in a sentence."""
+    told = []
+    for kind in dict.fromkeys(fault.kind for fault in faults):
+        some = [fault for fault in faults if fault.kind == kind]
+        where = (
+            f"at {some[0].start_s:.2f} s"
+            if len(some) == 1
+            else f"in {len(some)} places from {some[0].start_s:.2f} s on"
+        )
+        size = max((one.largest_n for one in some if one.largest_n), default=None)
+        up_to = "" if size is None else f", up to {size:.3g} N"
+        length = sum(one.end_s - one.start_s for one in some)
+        told.append(f"{kind} {where}, {length:.2f} s in all{up_to}: frames there are not valid")
+    return tuple(told)
 
 
 @dataclass(frozen=True, kw_only=True)

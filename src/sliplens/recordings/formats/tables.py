@@ -4,9 +4,9 @@ import codecs
 import csv
 import re
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
-from math import isfinite
+from math import isfinite, nan
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from sliplens.recordings.labels.axes import typical_step
 from sliplens.recordings.options import ReadOptions
 
 _SEPARATORS = ("\t", ";", ",")  # a comma may be a decimal one where another separator is there
+_LACKING = ("", "nan", "na", "n/a", "null")  # fields of a sample that dropped out
 _COMMENTS = ("#", "%")
 _PROBED_BYTES = 65536
 _OLD = "cp1252"
@@ -93,8 +94,13 @@ def open_table(path: Path) -> TextTable:
     raise RecordingError(f"{path} is empty; name a table with a header and a row a sample")
 
 
-def read_numbers(table: TextTable, names: Sequence[str]) -> tuple[Float[np.ndarray, "rows columns"], array, bool]:
-    """Read columns as finite numbers, with the line of each row, and whether decimals have commas."""
+def read_numbers(
+    table: TextTable, names: Sequence[str], *, may_lack: Collection[str] = ()
+) -> tuple[Float[np.ndarray, "rows columns"], array, bool]:
+    """Read columns as finite numbers, with the line of each row, and whether decimals have commas.
+
+    Columns that may lack numbers have NaN where a field is empty or says so.
+    """
     places = [table.header.index(name) for name in names]
     values, lines = array("d"), array("q")
     commas = points = False
@@ -103,6 +109,9 @@ def read_numbers(table: TextTable, names: Sequence[str]) -> tuple[Float[np.ndarr
         for place in places:
             points |= "." in fields[place]
             commas |= "," in fields[place]
+            if table.header[place] in may_lack and fields[place].lower() in _LACKING:
+                values.append(nan)
+                continue
             values.append(to_number(fields[place], where=f"{table.path}, line {line}, {table.header[place]!r}"))
     if not lines:
         raise RecordingError(f"{table.path} has a header but no row; record the force sensor too")
@@ -362,17 +371,17 @@ def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[st
     table, time_column, force_columns = open_table(path), options.time_column, options.force_columns
     time_name = guess_time_column(table) if time_column is None else table.require(time_column, option="--time-column")
     names = _force_names(table, force_columns)
-    values, lines, decimal_comma = read_numbers(table, [time_name, *names])
+    values, lines, decimal_comma = read_numbers(table, [time_name, *names], may_lack=names)
     time = values[:, 0]
     require_rising(time, lines, path=path, column=time_name)
     unit, how = _time_unit(table, time_name, options.time_unit, time)
     scales, units = _force_scales(table, names, options.force_unit)
     forces = values[:, 1:] * scales
-    large = np.abs(forces).max(axis=1) > _MOST_FORCE_N
+    large = np.any(np.abs(forces) > _MOST_FORCE_N, axis=1)
     if large.any():
         at = int(np.argmax(large))
         raise RecordingError(
-            f"{path}, line {lines[at]}: {np.abs(forces[at]).max():.4g} N is no force of a fingertip; "
+            f"{path}, line {lines[at]}: {np.nanmax(np.abs(forces[at])):.4g} N is no force of a fingertip; "
             "declare the right one with --force-unit"
         )
     found = "declared" if time_column is not None else "by its name"

@@ -22,6 +22,11 @@ _MOST = 0.9  # share of the still samples that cannot all be spikes
 _FEW_STILL = 10  # fewer still samples tell no tare
 _STRETCHES = 10  # parts of the still samples whose means are compared
 _DOUBTFUL = 0.6  # a second axis that departs by this share of the first makes the normal axis doubtful
+# of a drift, of the untouched reading at the end or of its slope before the touch: a false one costs good labels
+_DRIFT_SIGMAS = 4.0
+_DRIFT_SHARE = 0.01  # of the load: less is no matter
+_CALM_NOISES = 1.5
+_RELEASED_SHARE = 0.3  # of the load: what reads less at the end may be an untouched sensor that drifted
 _MAD_TO_SIGMA = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 
 
@@ -124,6 +129,14 @@ def infer_axes(
         )
     # an axis that is none is ForceAxes' to refuse
     inferred_sign = 1 if axis not in AXES or press[AXES.index(axis)] >= 0 else -1
+    drift = np.zeros(3)
+    if tare_found is not Found.ASSUMED and np.isfinite(touch):
+        drift = _find_drift(forces, tare, tare_sigma, noise=noise, until_s=until)
+    if drift.any():
+        notes.append(
+            f"the zero of the force sensor drifts by {_written(drift * np.ptp(forces.time_s))} N (x, y, z) over the "
+            "trial, which counts as an error of its size; let it warm up"
+        )
     return ForceAxes(
         normal=axis,
         sign=inferred_sign if sign is None else sign,
@@ -134,8 +147,37 @@ def infer_axes(
         normal_found=Found.INFERRED if normal is None else Found.DECLARED,
         sign_found=Found.INFERRED if sign is None else Found.DECLARED,
         tare_found=tare_found,
+        drift_n_s=_vector(drift),
         notes=tuple(notes),
     )
+
+
+def _find_drift(forces: Forces, tare_n: Axes, tare_sigma_n: Axes, *, noise: Axes, until_s: float) -> Axes:
+    """Rate at which the zero drifts: to what is read at the end, if nothing touches there, else as before the touch."""
+    time, force = forces.time_s, forces.force_n
+    still, ends = time < until_s, time > time[-1] - _FIRST_S
+    away = np.linalg.norm(force - tare_n, axis=1)
+    offset = np.mean(force[ends], axis=0) - tare_n
+    unsure = np.hypot(noise / np.sqrt(ends.sum()), tare_sigma_n)
+    # what wanders by more than its noise at the end is touched, or swings
+    calm = np.all(np.std(force[ends], axis=0) < _CALM_NOISES * noise + 1e-9)
+    if calm and np.linalg.norm(offset) < _RELEASED_SHARE * np.quantile(away, 0.9):
+        real = np.abs(offset) > np.maximum(_DRIFT_SIGMAS * unsure, _DRIFT_SHARE * np.quantile(away, 0.9))
+        return np.where(real, offset / (time[-1] - time[still].mean() if still.any() else np.inf), 0.0)
+    if still.sum() < _FEW_STILL:
+        return np.zeros(3)
+    parts = np.array_split(np.flatnonzero(still), _STRETCHES)
+    middles = np.array([time[part].mean() for part in parts])
+    line, covariance = np.polyfit(
+        middles - middles.mean(), np.array([np.median(force[part], axis=0) for part in parts]), 1, cov=True
+    )
+    white = noise / np.sqrt(still.sum()) / np.std(time[still])
+    unsure = np.maximum(np.sqrt(covariance[0, 0]), white)
+    return np.where(np.abs(line[0]) > _DRIFT_SIGMAS * unsure + 1e-9, line[0], 0.0)
+
+
+def _written(values: Axes) -> str:
+    return ", ".join(f"{value:+.2g}" for value in values)
 
 
 def _read_tare(still: Float[np.ndarray, "samples 3"], *, noise: Axes) -> tuple[Axes, Axes]:
@@ -209,10 +251,18 @@ class ContactForces:
         """Standard deviation of a sample's noise."""
         return self._split(self.axes.noise_n)
 
-    @property
-    def tare_sigma_n(self) -> NormalTangential:
-        """Standard uncertainty of the tare."""
-        return self._split(self.axes.tare_sigma_n)
+    def tare_sigma_n(self, time_s: Times) -> tuple[Times, Times]:
+        """Standard uncertainty of the tare at given times, of the normal force and of a tangential component.
+
+        A drift counts as an error of its size, from the middle of the untouched samples on.
+        """
+        still, drift = self._split(self.axes.tare_sigma_n), self._split(self.axes.drift_n_s)
+        begin = float(self.time_s[0])
+        until = begin if self.axes.still_until_s is None else self.axes.still_until_s
+        since = np.maximum(time_s - (begin + until) / 2, 0)
+        # of a drift the length counts, for it is the same in all samples
+        tangential = np.hypot(still.tangential, np.sqrt(2) * drift.tangential * since)
+        return np.hypot(still.normal, drift.normal * since), tangential
 
     def noise_of_means_n(self, window_s: float) -> NormalTangential:
         """Standard deviation of the noise of means over a window; white or not, it is taken from means."""
@@ -225,7 +275,7 @@ class ContactForces:
     def _split(self, of_axes: Vector | Axes) -> NormalTangential:
         index = self.axes.normal_index
         return NormalTangential(
-            normal=float(of_axes[index]), tangential=float(np.sqrt(np.mean(np.delete(of_axes, index) ** 2)))
+            normal=float(abs(of_axes[index])), tangential=float(np.sqrt(np.mean(np.delete(of_axes, index) ** 2)))
         )
 
 

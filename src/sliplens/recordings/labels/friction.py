@@ -176,7 +176,8 @@ def estimate_friction(
     ratio = forces.tangential_n[near] @ (pull / np.linalg.norm(pull)) / forces.normal_n[near]
     fit = fit_break(forces.time_s[near], ratio, about_s=rough, rng=rng, draws=draws)
     # no resampling of the slip can show the uncertainty of the tare
-    tare = np.hypot(forces.tare_sigma_n.tangential, fit.level * forces.tare_sigma_n.normal)
+    (normal,), (tangential,) = forces.tare_sigma_n(np.array([fit.time_s]))
+    tare = np.hypot(tangential, fit.level * normal)
     low, high = np.quantile(fit.levels + rng.normal(0, float(tare / forces.normal_n[near].mean()), draws), _BAND)
     early, late = np.quantile(fit.times_s, _BAND)
     return FrictionEstimate(

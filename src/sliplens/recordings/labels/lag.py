@@ -79,7 +79,7 @@ def estimate_lag(
     step = typical_step(frame_time_s) / _STEPS_A_FRAME
     reach = int(np.ceil(longest_s / step))
     lags = np.arange(-reach, reach + 1) * step
-    changes = np.stack([_force_changes(frame_time_s - lag, forces) for lag in lags])
+    changes = np.stack([force_changes(frame_time_s - lag, forces) for lag in lags])
     covered = ~np.isnan(changes)
     usable = covered.mean(axis=1) >= _OVERLAP
     if not usable.any():
@@ -127,7 +127,7 @@ def _find_release(forces: Forces, *, sudden_s: float) -> tuple[float, float] | N
     return float(heavy[0]), float(heavy[-1]) - fall_s
 
 
-def _force_changes(time_s: Float[np.ndarray, " frames"], forces: Forces) -> Float[np.ndarray, " intervals"]:
+def force_changes(time_s: Float[np.ndarray, " frames"], forces: Forces) -> Float[np.ndarray, " intervals"]:
     """Length of the change of the force from frame to frame; NaN beyond the ends of the samples."""
     # over a frame's time: as the images do, the change then tells of all that happened since the last frame
     force = mean_force(forces.time_s, forces.force_n, time_s, window_s=typical_step(time_s))

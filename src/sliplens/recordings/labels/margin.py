@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from sliplens.errors import RecordingError
 from sliplens.mechanics import safety_margin, stick_ratio
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labelling import FrictionEstimate, LabelBasis, Lag, Reason
+from sliplens.recordings.labelling import Found, FrictionEstimate, LabelBasis, Lag, Reason, tell_faults
 from sliplens.recordings.labels.axes import (
     ContactForces,
     apply_axes,
@@ -21,8 +21,8 @@ from sliplens.recordings.labels.axes import (
     mean_force,
     typical_step,
 )
+from sliplens.recordings.labels.faults import FAULTS, GAP_STEPS, Screened, faults_at, screen_trial
 from sliplens.recordings.labels.friction import ImageMotion, estimate_friction
-from sliplens.recordings.labels.lag import estimate_lag
 from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.trial import ContactState, Labels
 
@@ -61,7 +61,7 @@ def interpolate_forces(
     more = np.sqrt(window_s / np.maximum(length, 1e-9))
     normal_noise = np.minimum(noise.normal * more, max(one.normal, noise.normal))
     tangential_noise = np.minimum(noise.tangential * more, max(one.tangential, noise.tangential))
-    tare = forces.tare_sigma_n
+    normal_tare, tangential_tare = forces.tare_sigma_n(time_s)
     # the neighbours of a time on a sample are both that sample
     before = samples[np.maximum(np.searchsorted(samples, time_s, side="right") - 1, 0)]
     after = samples[np.minimum(np.searchsorted(samples, time_s), len(samples) - 1)]
@@ -71,8 +71,8 @@ def interpolate_forces(
     return FrameForces(
         normal_n=normal,
         tangential_n=magnitude(tangential, sigma_n=tangential_noise),
-        normal_sigma_n=np.hypot(normal_noise, tare.normal),
-        tangential_sigma_n=np.hypot(tangential_noise, tare.tangential),
+        normal_sigma_n=np.hypot(normal_noise, normal_tare),
+        tangential_sigma_n=np.hypot(tangential_noise, tangential_tare),
         missing=(time_s < samples[0]) | (time_s > samples[-1]) | (after - before > gap_s),
         out_of_range=mean_force(samples, full, time_s, window_s=window_s)[:, 0] > _NO_FLAG,
     )
@@ -80,7 +80,6 @@ def interpolate_forces(
 
 _CONTACT_SIGMAS = 8.0  # least normal force of a contact, in standard deviations of its noise
 _CONTACT_SHARE = 0.05  # and as a share of the trial's largest: of a lighter touch the margin would be all noise
-_GAP_STEPS = 4.0  # samples further apart than so many typical steps miss others between them
 LARGEST_SIGMA = 0.2
 """Largest standard uncertainty of a margin that is valid: beyond, it tells full stick hardly from slip."""
 _STUCK_SIGMAS = 2.0  # a margin nearer to 1 than so many standard deviations cannot be told from full stick
@@ -118,6 +117,8 @@ def label_frames(
     friction: FrictionEstimate,
     lag: Lag | None = None,
     settings: LabelSettings = LabelSettings(),  # noqa: B008 (frozen)
+    screened: Screened | None = None,
+    doubts: tuple[str, ...] = (),
 ) -> FoundLabels:
     """Label frames, each at its own time.
 
@@ -131,7 +132,7 @@ def label_frames(
     if apply_lag and (lag is None or lag.doubt):
         cause = "it is not estimated" if lag is None else lag.doubt
         raise RecordingError(f"the lag cannot be applied: {cause}; give the lag by hand or leave it out")
-    window, gap = typical_step(frame_time_s), _GAP_STEPS * typical_step(forces.time_s)
+    window, gap = typical_step(frame_time_s), GAP_STEPS * typical_step(forces.time_s)
     threshold = settings.contact_threshold
     if threshold is None:
         threshold = contact_threshold(forces, window_s=window)
@@ -154,13 +155,14 @@ def label_frames(
     drift = settings.friction_change * _remaining(time, contact, until_s=onset)
     sigma = np.sqrt(_variance(at, friction, threshold) + swing**2 + (used * drift) ** 2)
 
-    reliable = contact & ~at.missing & ~at.out_of_range
+    fault = np.zeros(len(time), dtype=np.int64) if screened is None else faults_at(screened, time, window_s=window)
+    reliable = contact & ~at.missing & ~at.out_of_range & (fault == 0)
     slip_s = friction.onset_s
     if slip_s is None and np.any(outside := reliable & (used > 1 + sigma)):
         slip_s = float(time[np.argmax(outside)])
     slipped = time >= (np.inf if slip_s is None else slip_s)
     margin = safety_margin(np.where(contact, at.normal_n, 0.0), at.tangential_n, friction.mu)
-    margin = np.where(at.missing | at.out_of_range, np.nan, np.where(slipped & contact, 0.0, margin))
+    margin = np.where(at.missing | at.out_of_range | (fault > 0), np.nan, np.where(slipped & contact, 0.0, margin))
     valid = reliable & ~slipped & (sigma <= LARGEST_SIGMA)
     holds = np.where(slipped & contact & (at.tangential_n > 0), used * friction.mu, friction.mu)
     return FoundLabels(
@@ -173,8 +175,16 @@ def label_frames(
         stick_ratio=stick_ratio(margin),
         contact_state=_first_of(_STATES, ~contact, slipped, used <= _STUCK_SIGMAS * sigma),
         valid=valid,
-        # a frame without samples cannot be known to touch
-        reason=_first_of(_REASONS, at.missing, at.out_of_range, ~contact, slipped, ~valid),
+        # a frame without samples, or with wrong ones, cannot be known to touch
+        reason=_first_of(
+            _REASONS,
+            *(fault == kind for kind in range(1, len(FAULTS))),
+            at.missing,
+            at.out_of_range,
+            ~contact,
+            slipped,
+            ~valid,
+        ),
         basis=LabelBasis(
             axes=forces.axes,
             friction=friction,
@@ -186,6 +196,8 @@ def label_frames(
             window_s=window,
             gap_s=gap,
             force_range_n=settings.force_range,
+            faults=() if screened is None else screened.faults,
+            doubts=doubts,
         ),
     )
 
@@ -215,6 +227,7 @@ def _remaining(time_s: Frames, contact: Bool[np.ndarray, " frames"], *, until_s:
 
 _STATES = (ContactState.NO_CONTACT, ContactState.FULL_SLIP, ContactState.CONTACT, ContactState.INCIPIENT_SLIP)
 _REASONS = (
+    *FAULTS[1:],
     Reason.MISSING_SAMPLES, Reason.OUT_OF_RANGE, Reason.NO_CONTACT, Reason.AFTER_GROSS_SLIP, Reason.TOO_UNCERTAIN,
     Reason.NONE,
 )  # fmt: skip
@@ -246,6 +259,27 @@ def label_trial(
         If nothing touches, no tangential force was recorded, the trial never slips and no friction is given, or a
         doubtful lag is to be applied.
     """
+    if lag is None and settings.lag_ms is not None:
+        lag = Lag(lag_s=settings.lag_ms / 1e3, sigma_s=0.0)
+    screened, lag = screen_trial(frame_time_s, image_motion, forces, lag=lag, rng=rng)
+    try:
+        return _label_screened(frame_time_s, image_motion, screened, lag=lag, settings=settings, rng=rng)
+    except RecordingError as error:
+        if not screened.faults:
+            raise
+        raise RecordingError(f"{error} (left out were: {'; '.join(tell_faults(screened.faults))})") from None
+
+
+def _label_screened(
+    frame_time_s: Frames,
+    image_motion: Frames,
+    screened: Screened,
+    *,
+    lag: Lag,
+    settings: LabelSettings,
+    rng: np.random.Generator,
+) -> FoundLabels:
+    forces = screened.forces
     axes = infer_axes(forces, normal=settings.normal_axis, sign=settings.normal_sign, tare_n=settings.tare)
     contact = apply_axes(forces, axes)
     if not np.ptp(contact.tangential_n, axis=0).any():
@@ -255,10 +289,6 @@ def label_trial(
             "needs it; name the columns of all axes with --force-columns, or go without margins: sliplens track "
             "follows the markers"
         )
-    if lag is None and settings.lag_ms is not None:
-        lag = Lag(lag_s=settings.lag_ms / 1e3, sigma_s=0.0)
-    elif lag is None:
-        lag = estimate_lag(frame_time_s, image_motion, forces, rng=rng)
     threshold = settings.contact_threshold
     if threshold is None:
         threshold = contact_threshold(contact, window_s=typical_step(frame_time_s))
@@ -267,4 +297,48 @@ def label_trial(
     else:
         image = ImageMotion(time_s=frame_time_s - (0.0 if lag.doubt else lag.lag_s), motion=image_motion)
         friction = estimate_friction(contact, contact_threshold_n=threshold, rng=rng, image=image)
-    return label_frames(frame_time_s, contact, friction=friction, lag=lag, settings=settings)
+    if friction.onset_s is not None:
+        begin = forces.time_s[0] if axes.still_until_s is None else axes.still_until_s
+        pull = (screened.recorded.time_s > begin) & (screened.recorded.time_s < friction.onset_s)
+        lost = np.isin(screened.recorded.time_s[pull], forces.time_s, invert=True)
+        if lost.sum() > _MOST_LOST * len(lost):
+            raise RecordingError(
+                "most samples between touch and slip are faulty, so the contact may have slipped before; give "
+                "the coefficient of friction by hand, or record the trial again"
+            )
+    return label_frames(
+        frame_time_s,
+        contact,
+        friction=friction,
+        lag=lag,
+        settings=settings,
+        screened=screened,
+        doubts=_find_doubts(contact, friction, threshold),
+    )
+
+
+_MOST_LOST = 0.5  # share of the samples between touch and slip that may be faulty
+_PLAUSIBLE_FRICTION = (0.05, 4.0)  # of soft skins on anything dry, wet or greased
+
+
+def _find_doubts(forces: ContactForces, friction: FrictionEstimate, threshold_n: float) -> tuple[str, ...]:
+    """Tell what a fingertip cannot do: a friction that no skin has, a contact that pulls more than it presses."""
+    doubts = []
+    low, high = _PLAUSIBLE_FRICTION
+    if not low <= friction.mu <= high:
+        if friction.found is Found.INFERRED:
+            raise RecordingError(
+                f"the friction comes out as {friction.mu:.3g}, and that of a fingertip lies between {low:g} and "
+                f"{high:g}: the forces are wrong, or their axes; name the axis that presses with --normal-axis and its "
+                "sign with --normal-sign, or give the friction with --mu"
+            )
+        doubts.append(
+            f"a friction of {friction.mu:.3g} was given, and that of a fingertip lies between {low:g} and {high:g}"
+        )
+    pulls, presses = (np.mean(side > threshold_n) for side in (-forces.normal_n, forces.normal_n))
+    if pulls > presses:
+        doubts.append(
+            f"the normal force is negative in {100 * pulls:.0f} % of the samples, positive in {100 * presses:.0f} %; "
+            "give its sign with --normal-sign"
+        )
+    return tuple(doubts)

@@ -1,0 +1,345 @@
+"""How labels stand up to faults of the force sensor: 14 kinds at three strengths, in simulated trials that are known.
+
+Each trial is filmed once, seen through noise, offset, lag, turned axes and a wrong sign as in `labels.py`, and labelled
+without a fault and with each. Of the valid labels is told how many are off by more than 3 sigma, or have no truth; of
+the frames that are valid without a fault, and that no faulty sample comes near, how many still are. Trials alternate
+between forces of 500 and of 100 samples a second, and between held to the end and let go. Shares have standard errors
+over trials.
+"""
+
+import argparse
+import json
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from labels import FORCE_HZ, LONGEST_LAG_S, Seen, film_trial, spoil
+from sliplens.errors import RecordingError
+from sliplens.recordings.capture import Forces
+from sliplens.recordings.labels import LARGEST_SIGMA, FoundLabels, LabelSettings, label_trial
+from sliplens.simulation import SimulationRecipe, plan_trials
+from sliplens.simulation.loading import TRIAL_S
+
+SELECTION_SEED = 100
+"""Seed on which thresholds were chosen; the benchmark's own begin at 0."""
+_SLOWER = 5  # a second rate of samples, as a part of the first
+_SIGMAS = 3.0
+_NEAR_S = 0.06  # frames as near to a faulty sample may lose their label: a frame's time and some samples
+
+Samples = Float[np.ndarray, "samples 3"]
+Fault = Callable[[Samples, np.ndarray, int, np.random.Generator], Bool[np.ndarray, " samples"]]
+"""Spoils forces in place between two samples, at one of three strengths, and tells which samples it changed."""
+
+_PEAK_N = (0.5, 5.0, 70.0)
+_LENGTH_S = (0.1, 0.4, 1.2)
+
+
+def _span(time_s: np.ndarray, begin_s: float, length_s: float) -> Bool[np.ndarray, " samples"]:
+    return (time_s >= begin_s) & (time_s < begin_s + length_s)
+
+
+def _anywhere(time_s: np.ndarray, rng: np.random.Generator, *, length_s: float = 0.0) -> float:
+    """A moment between the touch and the slip of most trials."""
+    return float(rng.uniform(0.07, 0.88 - length_s / TRIAL_S) * TRIAL_S + time_s[0])
+
+
+def _add(force: Samples, where: np.ndarray, size_n: float, rng: np.random.Generator) -> np.ndarray:
+    force[where, int(rng.integers(3))] += size_n * rng.choice((-1, 1))
+    return where
+
+
+def spike(force: Samples, time_s: np.ndarray, strength: int, rng: np.random.Generator) -> np.ndarray:
+    """One sample of one axis."""
+    where = np.arange(len(time_s)) == np.searchsorted(time_s, _anywhere(time_s, rng))
+    return _add(force, where, _PEAK_N[strength], rng)
+
+
+def spikes(force: Samples, time_s: np.ndarray, strength: int, rng: np.random.Generator) -> np.ndarray:
+    """Several samples, anywhere in the trial."""
+    where = np.zeros(len(time_s), dtype=bool)
+    for at in rng.choice(len(time_s), (3, 10, 30)[strength], replace=False).tolist():
+        where |= _add(force, np.arange(len(time_s)) == at, float(rng.choice(_PEAK_N)), rng)
+    return where
+
+
+def pull(force: Samples, time_s: np.ndarray, strength: int, rng: np.random.Generator) -> np.ndarray:
+    """A tenth of a second of another force."""
+    return _add(force, _span(time_s, _anywhere(time_s, rng), 0.1), _PEAK_N[strength], rng)
+
+
+def step(force: Samples, time_s: np.ndarray, strength: int, rng: np.random.Generator) -> np.ndarray:
+    """An offset from a moment on."""
+    return _add(force, time_s >= _anywhere(time_s, rng), _PEAK_N[strength], rng)
+
+
+def drift(force: Samples, time_s: np.ndarray, strength: int, rng: np.random.Generator) -> np.ndarray:
+    """An offset that grows evenly from the first sample to the last."""
+    size_n = (0.3, 1.0, 3.0)[strength] * rng.choice((-1, 1))
+    force[:, int(rng.integers(3))] += size_n * (time_s - time_s[0]) / np.ptp(time_s)
+    return np.zeros(len(time_s), dtype=bool)
+
+
+def clipping(force: Samples, time_s: np.ndarray, strength: int, rng: np.random.Generator) -> np.ndarray:
+    """The axis that moves most, cut off below its largest departure."""
+    del rng  # where it clips is told by the trial
+    rest = np.median(force[time_s < time_s[0] + 0.1], axis=0)
+    axis = int(np.argmax(np.quantile(np.abs(force - rest), 0.9, axis=0)))
+    away = force[:, axis] - rest[axis]
+    most = (0.9, 0.7, 0.5)[strength] * np.quantile(np.abs(away), 0.98)
+    where = np.abs(away) > most
+    force[where, axis] = rest[axis] + np.sign(away[where]) * most
+    return where
+
+
+def _dropped(value: float) -> Fault:
+    def drop(force: Samples, time_s: np.ndarray, strength: int, rng: np.random.Generator) -> np.ndarray:
+        length_s = _LENGTH_S[strength]
+        where = _span(time_s, _anywhere(time_s, rng, length_s=length_s), length_s)
+        force[where] = value
+        return where
+
+    return drop
+
+
+def stuck_sample(force: Samples, time_s: np.ndarray, strength: int, rng: np.random.Generator) -> np.ndarray:
+    """A sample that is repeated for some 10, 20 or 50 ms, at ten moments."""
+    count = np.searchsorted(time_s - time_s[0], (0.01, 0.02, 0.05)[strength])
+    where = np.zeros(len(time_s), dtype=bool)
+    for _ in range(10):
+        at = int(np.searchsorted(time_s, _anywhere(time_s, rng)))
+        force[at : at + count] = force[at]
+        where[at : at + count] = True
+    return where
+
+
+def stuck(force: Samples, time_s: np.ndarray, strength: int, rng: np.random.Generator) -> np.ndarray:
+    """A sample that is repeated for long."""
+    where = _span(time_s, _anywhere(time_s, rng, length_s=_LENGTH_S[strength]), _LENGTH_S[strength])
+    force[where] = force[int(np.argmax(where))]
+    return where
+
+
+def _changed(change: Callable[[Samples], Samples]) -> Fault:
+    def fault(force: Samples, time_s: np.ndarray, strength: int, rng: np.random.Generator) -> np.ndarray:
+        length_s = _LENGTH_S[strength]
+        where = _span(time_s, _anywhere(time_s, rng, length_s=length_s), length_s)
+        force[where] = change(force[where])
+        return where
+
+    return fault
+
+
+FAULTS: dict[str, Fault] = {
+    "spike": spike,
+    "several spikes": spikes,
+    "pull of 100 ms": pull,
+    "step": step,
+    "drift": drift,
+    "clipping": clipping,
+    "drop-out, no number": _dropped(float("nan")),
+    "drop-out, zero": _dropped(0.0),
+    "stuck sample": stuck_sample,
+    "stuck span": stuck,
+    "sign flip": _changed(lambda force: -force),
+    "swapped axes": _changed(lambda force: force[:, [1, 0, 2]]),
+    "scaled": _changed(lambda force: 2 * force),
+    "time gap": _dropped(float("inf")),
+}
+"""A time gap is cut out where the samples are infinite."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """Labels of one trial with one fault."""
+
+    trial: str
+    fault: str
+    strength: int
+    valid: int
+    off: int
+    """Of the valid, more than 3 sigma from the truth, or without one."""
+    loose: int
+    """Of the valid, those whose sigma is above the bound."""
+    clean: int
+    """Frames that are valid without the fault and that no faulty sample comes near."""
+    kept: int
+    flagged: bool
+    refusal: str = ""
+
+
+def measure_trial(seen: Seen, *, rate: int, rng: np.random.Generator, noise_n: float) -> list[Outcome]:
+    """Label a trial without a fault and with each, the same but for it."""
+    forces, _, _ = spoil(seen, noise_n=noise_n, rng=rng)
+    forces = replace(forces, time_s=forces.time_s[::rate], force_n=forces.force_n[::rate])
+    time_s = seen.loading.time_s[seen.frames] + rng.uniform(-LONGEST_LAG_S, LONGEST_LAG_S)
+    truth, seed = seen.loading.safety_margin[seen.frames], int(rng.integers(2**32))
+    name = f"seed{seen.plan.recipe.seed}-{seen.plan.trial}"
+
+    def label(one: Forces) -> FoundLabels:
+        settings = LabelSettings(friction_change=0.0 if seen.plan.condition == "dry" else 0.1)
+        return label_trial(time_s, seen.motion, one, settings=settings, rng=np.random.default_rng(seed))
+
+    try:
+        fine = label(forces)
+    except RecordingError as refusal:
+        print(f"{name} without a fault: {refusal}")
+        return []
+    outcomes = [_compare(fine, fine, truth, np.zeros(len(truth), dtype=bool), trial=name, fault="none", strength=0)]
+    for fault, spoiled in FAULTS.items():
+        for strength in range(3):
+            force = forces.force_n.copy()
+            wrong = spoiled(force, forces.time_s, strength, rng)
+            there = ~np.isinf(force).any(axis=1)
+            gaps = np.flatnonzero(wrong)
+            times = forces.time_s[gaps]
+            near = np.zeros(len(truth), dtype=bool)
+            if len(times):
+                after = np.minimum(np.searchsorted(times, time_s), len(times) - 1)
+                apart = np.minimum(np.abs(times[after] - time_s), np.abs(times[np.maximum(after - 1, 0)] - time_s))
+                near = apart <= _NEAR_S + LONGEST_LAG_S
+            facts = {"trial": name, "fault": fault, "strength": strength}
+            try:
+                found = label(replace(forces, time_s=forces.time_s[there], force_n=force[there]))
+            except RecordingError as refusal:
+                clean = int(np.sum(fine.valid & ~near))
+                nothing = {"valid": 0, "off": 0, "loose": 0, "kept": 0, "flagged": True}
+                outcomes.append(Outcome(**facts, **nothing, clean=clean, refusal=str(refusal)))
+                continue
+            outcomes.append(_compare(found, fine, truth, near, **facts))
+    return outcomes
+
+
+def _compare(
+    found: FoundLabels,
+    fine: FoundLabels,
+    truth: Float[np.ndarray, " frames"],
+    near: Bool[np.ndarray, " frames"],
+    *,
+    trial: str,
+    fault: str,
+    strength: int,
+) -> Outcome:
+    valid, sigma = found.valid, found.safety_margin_sigma
+    wrong = ~(np.abs(found.safety_margin - truth) <= _SIGMAS * sigma)
+    clean = fine.valid & ~near
+    return Outcome(
+        trial=trial,
+        fault=fault,
+        strength=strength,
+        valid=int(valid.sum()),
+        off=int(np.sum(valid & wrong)),
+        loose=int(np.sum(valid & (sigma > LARGEST_SIGMA))),
+        clean=int(clean.sum()),
+        kept=int(np.sum(clean & valid)),
+        flagged=bool(found.basis.flags),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FaultShares:
+    """What comes of one kind of fault."""
+
+    false_valid_share: float
+    valid_kept_share: float
+    refused_share: float
+    flagged_share: float
+    false_valid_by_strength: tuple[float, ...]
+
+
+def summarise(outcomes: list[Outcome]) -> dict[str, float]:
+    """Shares over all faults."""
+    faulty = [one for one in outcomes if one.fault != "none"]
+    false, kept = (_share(faulty, *pair) for pair in (("off", "valid"), ("kept", "clean")))
+    return {
+        "trials": len({one.trial for one in outcomes}),
+        "false_valid_share": false[0],
+        "false_valid_share_error": false[1],
+        "valid_kept_share": kept[0],
+        "valid_kept_share_error": kept[1],
+        "valid_above_largest_sigma": sum(one.loose for one in outcomes),
+        "refused_share": float(np.mean([bool(one.refusal) for one in faulty])),
+    }
+
+
+def summarise_faults(outcomes: list[Outcome]) -> dict[str, FaultShares]:
+    """Shares by fault."""
+    shares = {}
+    for fault in ("none", *FAULTS):
+        some = [one for one in outcomes if one.fault == fault]
+        strengths = sorted({one.strength for one in some})
+        by_strength = (_share([one for one in some if one.strength == at], "off", "valid")[0] for at in strengths)
+        shares[fault] = FaultShares(
+            false_valid_share=_share(some, "off", "valid")[0],
+            valid_kept_share=_share(some, "kept", "clean")[0],
+            refused_share=float(np.mean([bool(one.refusal) for one in some])),
+            flagged_share=float(np.mean([one.flagged for one in some])),
+            false_valid_by_strength=tuple(by_strength),
+        )
+    return shares
+
+
+def _share(outcomes: list[Outcome], part: str, whole: str) -> tuple[float, float]:
+    """Share of frames, and its standard error over trials (jackknife)."""
+    parts, wholes = Counter[str](), Counter[str]()
+    for one in outcomes:
+        parts[one.trial] += getattr(one, part)
+        wholes[one.trial] += getattr(one, whole)
+    names, total = list(wholes), max(wholes.total(), 1)
+    without = [(parts.total() - parts[name]) / max(wholes.total() - wholes[name], 1) for name in names]
+    error = np.sqrt((len(names) - 1) * np.var(without)) if len(names) > 1 else float("nan")
+    return parts.total() / total, float(error)
+
+
+def measure_seed(seed: int, *, dry: int, wet: int, noise_n: float) -> list[Outcome]:
+    """Measure the trials of a seed."""
+    rng, outcomes = np.random.default_rng(seed), []
+    for release in (False, True):
+        recipe = SimulationRecipe(
+            dry_trials=dry, wet_trials=wet, frames_per_trial=round(TRIAL_S * FORCE_HZ), release=release, seed=seed
+        )
+        for number, plan in enumerate(plan_trials(recipe)):
+            seen, rate = film_trial(plan), (1, _SLOWER)[number % 2]
+            some = measure_trial(seen, rate=rate, rng=rng, noise_n=noise_n)
+            outcomes += [replace(one, trial=f"{one.trial}-{'released' if release else 'held'}") for one in some]
+    return outcomes
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--dry", type=int, default=4, help="dry trials, over four days, held and let go")
+    parser.add_argument("--wet", type=int, default=1, help="wet trials, held and let go")
+    parser.add_argument("--noise", type=float, default=0.02, help="standard deviation of a force sample, in newtons")
+    parser.add_argument("--seed", type=int, default=0, help="of the trials and of what spoils them")
+    parser.add_argument("--seeds", type=int, default=1, help="pool so many seeds, from --seed on")
+    parser.add_argument("--verbose", action="store_true", help="list the trials whose labels are off or refused")
+    parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
+    arguments = parser.parse_args()
+    outcomes = [
+        outcome
+        for seed in range(arguments.seed, arguments.seed + arguments.seeds)
+        for outcome in measure_seed(seed, dry=arguments.dry, wet=arguments.wet, noise_n=arguments.noise)
+    ]
+    if arguments.verbose:
+        for one in outcomes:
+            if one.off > 0.02 * one.valid or one.refusal or one.kept < 0.9 * one.clean:
+                print(one)
+    numbers, rows = summarise(outcomes), summarise_faults(outcomes)
+    for name, value in numbers.items():
+        print(f"{name:28s} {value:.4g}")
+    print(f"{'':22s} {'false':>7s} {'by strength':>22s} {'kept':>7s} {'refused':>8s} {'flagged':>8s}")
+    for fault, row in rows.items():
+        parts = " ".join(f"{share:6.3f}" for share in row.false_valid_by_strength)
+        print(
+            f"{fault:22s} {row.false_valid_share:7.4f} {parts:>22s} {row.valid_kept_share:7.3f} "
+            f"{row.refused_share:8.2f} {row.flagged_share:8.2f}"
+        )
+    if arguments.json:
+        print(json.dumps({**numbers, "by_fault": {fault: asdict(row) for fault, row in rows.items()}}))
+
+
+if __name__ == "__main__":
+    main()

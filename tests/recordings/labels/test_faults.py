@@ -1,0 +1,215 @@
+"""Faults of the force sensor are marked, what is sound is not, and labels are those of the sound samples."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sliplens.errors import RecordingError
+from sliplens.recordings.capture import Forces
+from sliplens.recordings.labels import FoundLabels, LabelSettings, Reason, label_trial
+from sliplens.recordings.labels.faults import screen_forces
+
+from .conftest import PULL_S, SLIP_S, STATIC, Trial, ratio
+
+TARE = (0.7, -0.4, 0.2)
+NOISE_N = 0.02
+AT_S = 3.0
+Spoil = Callable[[np.ndarray, np.ndarray], None]
+
+
+def spoilt(trial: Trial, spoil: Spoil, *, every: int = 1) -> Forces:
+    """Forces through noise and an offset, changed in place between samples."""
+    forces = trial.forces(noise_n=NOISE_N, rng=np.random.default_rng(5), tare_n=TARE)
+    time, force = forces.time_s[::every], forces.force_n[::every].copy()
+    spoil(time, force)
+    return replace(forces, time_s=time, force_n=force)
+
+
+def label(trial: Trial, forces: Forces) -> FoundLabels:
+    return label_trial(trial.frame_time_s, trial.motion, forces, settings=LabelSettings(), rng=np.random.default_rng(2))
+
+
+def span(time: np.ndarray, length_s: float) -> np.ndarray:
+    return (time >= AT_S - 1e-9) & (time < AT_S + length_s - 1e-9)
+
+
+def add(length_s: float, size_n: float, axis: int) -> Spoil:
+    def spoil(time: np.ndarray, force: np.ndarray) -> None:
+        force[span(time, length_s), axis] += size_n
+
+    return spoil
+
+
+def put(length_s: float, change: Callable[[np.ndarray], object]) -> Spoil:
+    def spoil(time: np.ndarray, force: np.ndarray) -> None:
+        force[span(time, length_s)] = change(force[span(time, length_s)])
+
+    return spoil
+
+
+SPANS = {
+    "a sample of 70 N": (add(0.002, 70, 0), 0.002, Reason.SPIKE),
+    "a small spike": (add(0.004, -0.5, 1), 0.004, Reason.SPIKE),
+    "100 ms of 70 N pull": (add(0.1, -70, 0), 0.1, Reason.STEP),
+    "a soft pull": (add(0.2, 0.4, 2), 0.2, Reason.STEP),
+    "no numbers": (put(0.3, lambda part: np.nan * part), 0.3, Reason.DROP_OUT),
+    "zeros": (put(0.3, lambda part: 0 * part), 0.3, Reason.DROP_OUT),
+    "one value": (put(0.5, lambda part: part[0]), 0.5, Reason.STUCK),
+    "signs": (put(0.3, lambda part: -part), 0.3, Reason.STEP),
+    "scales": (put(0.3, lambda part: 3 * part), 0.3, Reason.STEP),
+    "axes": (put(0.3, lambda part: part[:, [2, 0, 1]]), 0.3, Reason.STEP),
+}
+
+
+@pytest.mark.parametrize("fault", SPANS)
+def test_a_fault_is_marked_from_its_first_sample_to_its_last(trial: Trial, fault: str):
+    spoil, length_s, kind = SPANS[fault]
+    screened = screen_forces(spoilt(trial, spoil))
+    found = [one for one in screened.faults if one.kind is not Reason.MISSING_SAMPLES]
+    assert {one.kind for one in found} == {kind}
+    # a line through noise places a small jump to some samples
+    assert found[0].start_s == pytest.approx(AT_S, abs=0.006)
+    assert found[-1].end_s == pytest.approx(AT_S + length_s, abs=0.008)
+    assert len(screened.forces.time_s) == np.sum(screened.marks == 0)
+
+
+@pytest.mark.parametrize("fault", SPANS)
+@pytest.mark.parametrize("every", [1, 5])
+def test_labels_are_those_of_the_sound_samples(trial: Trial, fault: str, every: int):
+    spoil, length_s, _ = SPANS[fault]
+    labels = label(trial, spoilt(trial, spoil, every=every))
+    time, truth = trial.frame_time_s, 1 - ratio(trial.frame_time_s) / STATIC
+    assert labels.basis.friction.mu == pytest.approx(STATIC, rel=0.03)
+    error = np.abs(labels.safety_margin - truth)[labels.valid]
+    assert np.all(error < 4 * labels.safety_margin_sigma[labels.valid] + 0.01)
+    # frames at the fault say so, the others of the pull keep their labels
+    inside = (time > AT_S) & (time < AT_S + length_s)
+    apart = (time > PULL_S) & (time < SLIP_S - 0.1) & ((time < AT_S - 0.08) | (time > AT_S + length_s + 0.08))
+    assert not labels.valid[inside].any()
+    assert {labels.reason[at] for at in np.flatnonzero(inside)} <= {*SPANS[fault][2:], Reason.MISSING_SAMPLES}
+    assert labels.valid[apart].all()
+    assert labels.basis.flags
+
+
+@pytest.mark.parametrize("every", [1, 5])
+def test_a_sound_trial_has_no_fault_and_the_labels_it_had(trial: Trial, every: int):
+    labels = label(trial, spoilt(trial, lambda _time, _force: None, every=every))
+    assert labels.basis.flags == ()
+
+
+def test_a_slip_in_a_sample_is_no_step_for_the_image_sees_it(trial: Trial):
+    # in conftest the force falls within 30 ms; here from one sample to the next
+    sudden = trial.contact_n.copy()
+    after = trial.time_s >= SLIP_S
+    sudden[after] = trial.contact_n[-1]
+    frames = np.stack([np.interp(trial.frame_time_s, trial.time_s, column) for column in sudden.T], axis=1)
+    motion = 0.7 + np.append(0, 3 * np.linalg.norm(np.diff(frames, axis=0), axis=1))
+    slipped = replace(trial, contact_n=sudden, motion=motion)
+    labels = label(slipped, spoilt(slipped, lambda _time, _force: None))
+    assert labels.basis.faults == ()
+    assert labels.basis.friction.mu == pytest.approx(STATIC, rel=0.02)
+    # the same forces beside an image that rests at the slip
+    rests = replace(slipped, motion=np.where(np.abs(trial.frame_time_s - SLIP_S) < 0.1, 0.74, motion))
+    found = screen_faults(rests)
+    assert [one.kind for one in found] == [Reason.STEP]
+    assert found[0].start_s == pytest.approx(SLIP_S, abs=0.01)
+
+
+def screen_faults(trial: Trial):
+    try:
+        return label(trial, spoilt(trial, lambda _time, _force: None)).basis.faults
+    except RecordingError:
+        return screen_forces(spoilt(trial, lambda _time, _force: None)).faults
+
+
+def test_after_a_step_nothing_is_valid_and_what_is_before_stays(trial: Trial):
+    labels = label(trial, spoilt(trial, add(99, 3.0, 1)))
+    time = trial.frame_time_s
+    assert not labels.valid[time > AT_S].any()
+    assert labels.valid[(time > PULL_S) & (time < AT_S - 0.05)].all()
+    # friction from the forces after it, moved back
+    assert labels.basis.friction.mu == pytest.approx(STATIC, rel=0.03)
+
+
+def test_clipped_tops_are_not_taken_for_forces(trial: Trial):
+    def clip(_time: np.ndarray, force: np.ndarray) -> None:
+        force[:, 0] = np.minimum(force[:, 0], TARE[0] + 1.2)
+
+    screened = screen_forces(spoilt(trial, clip))
+    assert {one.kind for one in screened.faults} == {Reason.CLIPPED}
+    # pressed to 1.2 N of 1.5 after four fifths of half a second
+    assert screened.faults[0].start_s == pytest.approx(1.0, abs=0.03)
+    with pytest.raises(RecordingError, match=r"\(left out were: clipped force "):
+        label(trial, spoilt(trial, clip))
+
+
+def test_coarse_and_repeated_readings_are_no_fault(trial: Trial):
+    def coarse(_time: np.ndarray, force: np.ndarray) -> None:
+        force[:] = np.round(force / 0.05) * 0.05
+
+    def repeated(_time: np.ndarray, force: np.ndarray) -> None:
+        force[:] = np.repeat(force[::5], 5, axis=0)[: len(force)]
+
+    for spoil in (coarse, repeated):
+        assert screen_forces(spoilt(trial, spoil)).faults == ()
+
+
+def test_exact_forces_that_hold_still_are_not_stuck(trial: Trial):
+    assert screen_forces(trial.forces()).faults == ()
+
+
+def test_a_gap_is_told(trial: Trial):
+    forces = spoilt(trial, lambda _time, _force: None)
+    kept = ~span(forces.time_s, 0.3)
+    labels = label(trial, replace(forces, time_s=forces.time_s[kept], force_n=forces.force_n[kept]))
+    assert labels.basis.flags == ("missing samples at 3.00 s, 0.30 s in all: frames there are not valid",)
+
+
+def test_a_drift_counts_as_an_error_of_its_size(trial: Trial):
+    def drift(time: np.ndarray, force: np.ndarray) -> None:
+        force[:, 1] += 0.12 * time
+
+    labels = label(trial, spoilt(trial, drift))
+    assert labels.basis.axes.drift_n_s[1] == pytest.approx(0.12, rel=0.3)
+    assert labels.basis.axes.drift_n_s[::2] == (0, 0)
+    assert any("drifts by" in flag for flag in labels.basis.flags)
+    truth = 1 - ratio(trial.frame_time_s) / STATIC
+    error = np.abs(labels.safety_margin - truth)[labels.valid]
+    assert np.all(error < 3 * labels.safety_margin_sigma[labels.valid])
+    assert error.max() > 0.1
+
+
+def test_a_drift_is_read_from_the_untouched_sensor_at_the_end(trial: Trial):
+    time = trial.time_s
+    lifted = trial.contact_n * np.clip((5.3 - time) / 0.15, 0, 1)[:, None]
+    released = replace(trial, contact_n=lifted)
+
+    def drift(time: np.ndarray, force: np.ndarray) -> None:
+        force += 0.02 * time[:, None]
+
+    moved = np.array(label(released, spoilt(released, drift)).basis.axes.drift_n_s)
+    np.testing.assert_allclose(moved, 0.02, rtol=0.15)
+
+
+def test_a_friction_that_no_fingertip_has_is_refused_or_flagged(trial: Trial):
+    strong = replace(trial, contact_n=trial.contact_n * np.array([1, 20, 20]))
+    forces = strong.forces(noise_n=NOISE_N, rng=np.random.default_rng(0), tare_n=TARE)
+    given = {"normal_axis": "x", "normal_sign": 1}
+
+    def friction(mu: float | None) -> FoundLabels:
+        settings = LabelSettings(mu=mu, **given)
+        return label_trial(trial.frame_time_s, trial.motion, forces, settings=settings, rng=np.random.default_rng(2))
+
+    with pytest.raises(RecordingError, match=r"comes out as 12.., and that of a fingertip lies between 0.05 and 4"):
+        friction(None)
+    assert any(flag.startswith("a friction of 9 was given") for flag in friction(9.0).basis.flags)
+
+
+def test_a_normal_force_that_mostly_pulls_is_flagged(trial: Trial):
+    forces = trial.forces(noise_n=NOISE_N, rng=np.random.default_rng(0), tare_n=TARE, sign=-1)
+    forces.force_n[trial.time_s > 5.4, 0] += 3.0
+    settings = LabelSettings(normal_axis="x", normal_sign=1, mu=STATIC)
+    labels = label_trial(trial.frame_time_s, trial.motion, forces, settings=settings, rng=np.random.default_rng(2))
+    assert any("the normal force is negative in" in flag for flag in labels.basis.flags)
