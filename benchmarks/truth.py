@@ -2,7 +2,8 @@
 
 The truth are Shapley values of the markers over scenes drawn anew (docs/study.md). A method is recommended where its
 signed rank correlation with them leads every control and every other method, both intervals off zero. With networks of
-a second seed the whole is done once more on trials of a second seed, of other days, and the two answers are compared.
+a second seed (`--second-difference`, `--second-raw`) the whole is done once more on trials of a second seed, of other
+days, and the two answers are compared.
 Each seed is a study that can be interrupted and goes on where it stopped (`--keep`).
 """
 
@@ -30,8 +31,8 @@ from sliplens.study import run_study
 INPUTS = ("difference", "raw")
 
 
-def look(networks: dict[str, str], folder: Path, *, seed: int, options: argparse.Namespace) -> Study:
-    """Study the explanations of both networks on test trials of a seed."""
+def look(networks: dict[str, str | None], folder: Path, *, seed: int, options: argparse.Namespace) -> Study:
+    """Study the explanations of the networks that are named on test trials of a seed."""
     terminal = Terminal()
     data = folder / "data"
     frames = options.frames_per_trial
@@ -58,7 +59,7 @@ def interval(gap: Difference | None) -> list[float] | None:
     return None if gap is None else [gap.estimate, gap.low, gap.high]
 
 
-def told(study: Study, name: str) -> dict[str, Any]:
+def judged(study: Study, name: str) -> dict[str, Any]:
     """What the truth says of one network's explanations."""
     truth, best = study.truth[name], recommend(study.truth[name])
     leads = {method: own.lead_over_controls for method, own in truth.methods.items()}
@@ -104,29 +105,27 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="folder to keep data and studies in, and to go on from")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    second = {name: getattr(options, f"second_{name}") for name in INPUTS}
-    if len({network is None for network in second.values()}) > 1:
-        parser.error("a second look needs both networks: give --second-difference and --second-raw")
     first = {name: getattr(options, name) for name in INPUTS}
+    second = {name: getattr(options, f"second_{name}") for name in INPUTS}
     with tempfile.TemporaryDirectory() as scratch:
         work = options.keep or Path(scratch)
         try:
-            studies = [
+            looks = [
                 look(networks, work / str(number), seed=seed, options=options)
                 for number, (networks, seed) in enumerate(zip((first, second), options.seeds, strict=True), start=1)
-                if networks["raw"] is not None
+                if any(networks.values())
             ]
         except SliplensError as error:
             sys.exit(f"{Path(__file__).name}: {error}")
-        looks = [{name: told(study, name) for name in INPUTS} for study in studies]
-    result = {name: dict(looks[0][name]) for name in INPUTS}
-    for name, own in result.items():
-        show(name, own)
-        again = looks[1][name] if len(looks) > 1 else None
-        own["second_seed"] = again
-        own["same_verdict_second_seed"] = again and again["recommended"] == own["recommended"]
-        if again is not None:
-            show(f"{name}, second seed", again)
+    result = {}
+    for name in INPUTS:
+        one, *others = [judged(study, name) for study in looks if name in study.truth]
+        show(name, one)
+        for other in others:
+            show(f"{name}, second seed", other)
+        again = others[0] if others else None
+        same = again and again["recommended"] == one["recommended"]
+        result[name] = {**one, "second_seed": again, "same_verdict_second_seed": same}
     if options.json:
         print(json.dumps(result))
 
