@@ -55,8 +55,8 @@ def look(networks: dict[str, str | None], folder: Path, *, seed: int, options: a
 
 
 def interval(gap: Difference | None) -> list[float] | None:
-    """Estimate, lower and upper end."""
-    return None if gap is None else [gap.estimate, gap.low, gap.high]
+    """Estimate, lower and upper end; None of a single trial."""
+    return None if gap is None or gap.low is None or gap.high is None else [gap.estimate, gap.low, gap.high]
 
 
 def judged(study: Study, name: str) -> dict[str, Any]:
