@@ -2,8 +2,8 @@
 
 The truth are Shapley values of the markers over scenes drawn anew (docs/study.md). A method is recommended where its
 signed rank correlation with them leads every control and every other method, both intervals off zero. With networks of
-a second seed (`--second-difference`, `--second-raw`) the whole is done once more on trials of a second seed, of other
-days, and the two answers are compared.
+a second seed (`--second-difference`, `--second-raw`) the whole is done once more on other trials of the same sensor, of
+four later days, and the two answers are compared.
 Each seed is a study that can be interrupted and goes on where it stopped (`--keep`).
 """
 
@@ -29,17 +29,19 @@ from sliplens.simulation import simulate
 from sliplens.study import run_study
 
 INPUTS = ("difference", "raw")
+LATER: dict[str, Any] = {"dry_trials": 32, "wet_trials": 8, "days": 8, "test_days": 4}
+"""Days 5 to 8 of the preset's sensor, which has four."""
 
 
-def look(networks: dict[str, str | None], folder: Path, *, seed: int, options: argparse.Namespace) -> Study:
-    """Study the explanations of the networks that are named on test trials of a seed."""
+def look(networks: dict[str, str | None], folder: Path, *, days: dict[str, Any], options: argparse.Namespace) -> Study:
+    """Study the explanations of the networks that are named on test trials of the preset, or of other days."""
     terminal = Terminal()
     data = folder / "data"
     frames = options.frames_per_trial
     simulated = (
         load_dataset(data)
         if data.exists()
-        else simulate(data, preset="thesis", frames_per_trial=frames, seed=seed, on_progress=terminal)
+        else simulate(data, preset="thesis", frames_per_trial=frames, seed=0, on_progress=terminal, **days)
     )
     return run_study(
         simulated,
@@ -49,7 +51,6 @@ def look(networks: dict[str, str | None], folder: Path, *, seed: int, options: a
         trials=options.trials,
         tests=("truth",),
         jobs=options.jobs,
-        seed=seed,
         on_progress=terminal,
     )
 
@@ -98,7 +99,6 @@ def main() -> None:
     for name in INPUTS:
         parser.add_argument(f"--{name}", default=f"thesis-{name}", help="network: folder or name")
         parser.add_argument(f"--second-{name}", help="network of another seed")
-    parser.add_argument("--seeds", type=int, nargs=2, default=(0, 1), help="of the trials, and of the second ones")
     parser.add_argument("--trials", type=int, default=14)
     parser.add_argument("--frames-per-trial", type=int, default=80)
     parser.add_argument("--jobs", type=int, default=2)
@@ -111,8 +111,8 @@ def main() -> None:
         work = options.keep or Path(scratch)
         try:
             looks = [
-                look(networks, work / str(number), seed=seed, options=options)
-                for number, (networks, seed) in enumerate(zip((first, second), options.seeds, strict=True), start=1)
+                look(networks, work / folder, days=days, options=options)
+                for networks, folder, days in ((first, "1", {}), (second, "2", LATER))
                 if any(networks.values())
             ]
         except SliplensError as error:
