@@ -131,7 +131,12 @@ def test_null_is_unknown(study):
         ),
         ("remedies-raw", ("variants", "insertion", "mode"), "up", r"invalid enum value 'up' at variants"),
         ("faithfulness-raw", ("scores", 0, "srg"), 0.1, r"expected `object`, got `float` at scores\[0\].srg"),
-        ("faithfulness-raw", ("scores", 0, "srg", "low"), "x", r"expected `float`, got `str` at scores\[0\].srg.low"),
+        (
+            "faithfulness-raw",
+            ("scores", 0, "srg", "low"),
+            "x",
+            r"expected `float \| null`, got `str` at scores\[0\].srg.low",
+        ),
         ("faithfulness-raw", ("scores", 0, "at"), {"all": 1.0}, r"expected `float`, got `str` at .*scores\[0\].at"),
         ("faithfulness-raw", ("scores", 0, "method"), "none", r"lacks the curves of reference / pixel / none"),
         ("score-raw", ("methods", "none"), {"mean": 0, "sd": 0, "last_step_mean": 0, "frames": 1}, r"curves of none"),
