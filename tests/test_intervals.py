@@ -145,3 +145,17 @@ def test_few_units_are_never_sure(rng: np.random.Generator):
     few = paired_difference(np.ones(FEWEST_UNITS - 1), np.zeros(FEWEST_UNITS - 1), clusters=(), rng=rng)
     enough = paired_difference(np.ones(FEWEST_UNITS), np.zeros(FEWEST_UNITS), clusters=(), rng=rng)
     assert (few.sure, enough.sure) == (False, True)
+
+
+@pytest.mark.parametrize("trials", [6, 12])
+def test_of_several_comparisons_all_intervals_hold_together(trials: int, rng: np.random.Generator):
+    values, clusters = rng.normal(size=trials), [np.arange(trials)]
+
+    def width(comparisons: int) -> float:
+        draws = np.random.default_rng(0)
+        return width_of(paired_difference(values, 0 * values, clusters=clusters, rng=draws, comparisons=comparisons))
+
+    assert width(5) > width(2) > width(1)
+    if trials == 6:  # Student's, at a fifth of the error
+        wider = stdtrit(5, 1 - 0.025 / 5) / stdtrit(5, 0.975)
+        assert width(5) == pytest.approx(wider * width(1))

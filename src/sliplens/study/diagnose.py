@@ -19,7 +19,7 @@ from sliplens.extras import require_packages
 from sliplens.faithfulness.removal import answer_whole
 from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.files import output_folder
-from sliplens.intervals import FEWEST_UNITS, Difference, mean_interval
+from sliplens.intervals import FEWEST_UNITS, Difference, mean_interval, paired_difference
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
 from sliplens.plots.style import decimals, signed, tell_ends
@@ -223,7 +223,8 @@ def find_slices(errors: ErrorTable, *, seed: int) -> tuple[tuple[ErrorSlice, ...
     """Find slices in which the error is large, and test each on held-out trials, the largest error first.
 
     They are the leaves of a regression tree (Breiman et al., 1984) of the error and its size, fitted on the trials that
-    are not held out. Gives them, and the table with each frame's.
+    are not held out; their intervals hold together, however many there are. Gives them, and the table with each
+    frame's.
     """
     from sklearn.tree import DecisionTreeRegressor  # noqa: PLC0415 (an extra)
 
@@ -244,7 +245,7 @@ def find_slices(errors: ErrorTable, *, seed: int) -> tuple[tuple[ErrorSlice, ...
             bounds[int(tree.children_right[node])] = {**ranges, at: (cut, high)}
         elif (inside := leaves[held] == node).any():
             name = ", ".join(features[column - 1][1](*ends) for column, ends in ranges.items()) or "all frames"
-            there, excess = tested.where(inside), compare_errors(tested, inside, rng)
+            there, excess = tested.where(inside), compare_errors(tested, inside, rng, comparisons=int(tree.n_leaves))
             error, bias, trials = float(np.abs(there.error).mean()), float(there.error.mean()), len(set(there.trial))
             own = ErrorSlice(name=name, frames=len(there), trials=trials, error=error, bias=bias, excess=excess)
             found.append((node, own))
@@ -264,17 +265,22 @@ def _mean(
     return mean_interval(values, clusters=[table.day.astype(str), table.trial], rng=rng, limits=limits)
 
 
-def compare_errors(table: ErrorTable, inside: Bool[np.ndarray, " frames"], rng: np.random.Generator) -> Difference:
+def compare_errors(
+    table: ErrorTable, inside: Bool[np.ndarray, " frames"], rng: np.random.Generator, *, comparisons: int = 1
+) -> Difference:
     """Mean size of the error inside a group less that outside, with a 95 % interval; 0 where all are of one group.
 
+    Of several `comparisons` all intervals hold together (`paired_difference`).
     A trial may lie in both: each frame counts with its influence on the difference, whose mean is the difference.
     """
     share, sizes = float(inside.mean()), np.abs(table.error)
     if share in {0, 1}:
         return _mean(0 * sizes, table, rng)
+    clusters = [table.day.astype(str), table.trial]
     there, elsewhere = sizes[inside].mean(), sizes[~inside].mean()
     influence = np.where(inside, (sizes - there) / share, (elsewhere - sizes) / (1 - share))
-    return _mean(there - elsewhere + influence, table, rng)
+    gaps = there - elsewhere + influence
+    return paired_difference(gaps, np.zeros(len(gaps)), clusters=clusters, rng=rng, comparisons=comparisons)
 
 
 def _spread_rows(errors: ErrorTable, trials: int) -> Int64[np.ndarray, " rows"]:
