@@ -85,10 +85,10 @@ def test_every_frame_is_read_or_counted_as_dropped(recording: Recording, wait_s:
         heard.append(reading)
 
     source = Burst(recording.frames, list(range(len(recording.frames))), wait_s=wait_s)
-    with sl.LiveReader(source, reference=recording.reference) as reader:
-        reader.subscribe(slowly)
-        for _ in reader.readings():
-            pass
+    reader = sl.LiveReader(source, reference=recording.reference)
+    reader.subscribe(slowly)
+    with reader:
+        list(reader.readings())
     numbers = [reading.number for reading in heard]
     assert numbers == sorted(set(numbers))
     assert numbers[-1] == len(recording.frames) - 1  # the newest is never the one that is dropped

@@ -1,7 +1,7 @@
 """`sliplens live`."""
 
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sliplens.cli.command import Device
-from sliplens.cli.console import print_table, say
+from sliplens.cli.console import ERR, print_table, say
 
 if TYPE_CHECKING:
-    from sliplens.live import LiveReader, Reading, SourceOptions
+    from sliplens.live import LiveReader, Recorder, SourceOptions
+    from sliplens.recordings import TrialFacts
 
 _SOURCE = "simulated, the number of a camera, the address of a stream, or a video, bag, data set or growing folder."
 
@@ -26,6 +27,10 @@ def _parse_size(text: str | None) -> tuple[int, int] | None:
     if not (times and width.isdecimal() and height.isdecimal()):
         raise InputError(f"--size is {text!r}; give width and height as 640x480")
     return int(height), int(width)
+
+
+def _tell(recorder: "Recorder") -> None:
+    ERR.print(f"{recorder.folder}: {recorder.state}", soft_wrap=True, highlight=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +65,18 @@ class Live:
     """Time constant in seconds of a low-pass on margin and interval, which delays them by so much; 0 for none."""
     sink: tuple[str, ...] = ()
     """Where readings go: json prints a line of JSON for each. Without one, a line a second is printed."""
+    record: Path | None = None
+    """Data set to record every frame into, a new one or one that is there."""
+    forces: Path | None = None
+    """File or named pipe into which another program writes force samples (time_s,fx,fy,fz), to be recorded too."""
+    sensor: str = ""
+    """Name of the sensor, for the recording; the network's if not given."""
+    object: str = ""
+    """Name of what is held, for the recording."""
+    condition: str = "dry"
+    """dry or wet, for the recording."""
+    day: int = 1
+    """Day of the recording."""
     engine: Literal["auto", "eager", "folded", "compiled", "onnxruntime", "openvino"] = "auto"
     """What runs the network; auto is the fastest at hand."""
     device: Device = "cpu"
@@ -86,14 +103,20 @@ class Live:
                 device=self.device,
                 smoothing_s=self.smoothing,
                 seconds=self.seconds,
+                forces=self.forces,
             )
             for sink in sinks:
                 reader.subscribe(lambda reading, frame, sink=sink: sink.send(reading, frame and frame.image))
-            try:
-                with reader:
-                    self._watch(reader)
-            except KeyboardInterrupt:
-                return  # the way to end it
+            if self.record is not None:
+                stack.callback(_tell, reader.record(self.record, facts=self._facts))
+            with suppress(KeyboardInterrupt), reader:  # the way to end it
+                self._watch(reader)
+
+    @property
+    def _facts(self) -> "TrialFacts":
+        from sliplens.recordings import TrialFacts
+
+        return TrialFacts(trial="live", sensor=self.sensor, object=self.object, condition=self.condition, day=self.day)
 
     def _options(self) -> "SourceOptions":
         from sliplens.live import SourceOptions
@@ -111,34 +134,16 @@ class Live:
         for reading in reader.readings():
             if not self.sink and time.monotonic() - told_s >= 1:
                 told_s = time.monotonic()
-                say(_in_words(reading))
+                say(str(reading))
 
     def _list(self) -> None:
         from sliplens.live import SOURCES, list_cameras
 
-        rows = [
-            (str(camera.path), camera.name, mode.pixel_format, f"{mode.size[1]}x{mode.size[0]}", _rates(mode.rates_hz))
-            for camera in list_cameras()
-            for mode in camera.modes
-        ]
+        cameras = [(camera, mode) for camera in list_cameras() for mode in camera.modes]
+        rows = [(str(camera.path), camera.name, *mode.in_words()) for camera, mode in cameras]
         if rows:
             print_table("Cameras", ("device", "name", "format", "size", "frames/s"), rows)
         else:
             say("no camera is there that can be read")
         for kind in SOURCES.values():
             say(f"  {kind.words}")
-
-
-def _rates(rates_hz: tuple[float, ...]) -> str:
-    return ", ".join(f"{rate:g}" for rate in rates_hz) or "not told"
-
-
-def _in_words(reading: "Reading") -> str:
-    """One line for people."""
-    if reading.margin is None:
-        told = f"no margin: {reading.withheld}" if reading.withheld else "no network"
-    else:
-        told = f"margin {reading.margin:4.0%}"
-        if reading.low is not None and reading.high is not None:
-            told += f" ({reading.low:.0%} to {reading.high:.0%})"
-    return f"{reading.time_s:8.2f} s  {told}  {reading.latency.total_ms:.0f} ms, {reading.dropped} dropped"

@@ -55,6 +55,11 @@ class CameraMode:
     rates_hz: tuple[float, ...]
     """Frames a second; empty where the camera does not tell."""
 
+    def in_words(self) -> tuple[str, str, str]:
+        """Format, size and rates, for people."""
+        rates = ", ".join(f"{rate:g}" for rate in self.rates_hz)
+        return self.pixel_format, f"{self.size[1]}x{self.size[0]}", rates or "not told"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:

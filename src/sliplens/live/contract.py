@@ -67,6 +67,8 @@ class LiveSource(ABC):
     """Ratio of its time to that of the world: other than 1 where something is replayed."""
     cure: str = "check its cable or connection"
     """What to do where it gives no frame."""
+    simulated: bool = False
+    """Whether no real sensor is behind it."""
     reconnects: bool = False
     """Whether it may come back after a `SourceError`."""
 

@@ -11,18 +11,20 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from sliplens.errors import InputError, SourceError
+from sliplens.errors import InputError, RecordingError, SourceError
 from sliplens.images import read_image
 from sliplens.live.contract import LiveSource, SourceOptions
 from sliplens.live.reading import Check, Latency, LiveFrame, Reading, SlipState
+from sliplens.live.recorder import ForceStream, Recorder
 from sliplens.live.sources import Images, open_live
 from sliplens.markers import Tracker
 from sliplens.models.checkpoint import Run, load
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.predictions import LEVEL
 from sliplens.recordings.capture import Capture, Frame
+from sliplens.recordings.dataset import Dataset
 from sliplens.recordings.labels.lag import soften
-from sliplens.recordings.trial import ContactState, contact_states
+from sliplens.recordings.trial import ContactState, TrialFacts, contact_states
 
 Item = TypeVar("Item")
 Subscriber = Callable[[Reading, LiveFrame | None], None]
@@ -157,6 +159,8 @@ class LiveReader:
         Time after which it ends; with the source if None.
     stall_s
         Time without a frame after which a reading says so, in seconds.
+    forces
+        File or named pipe into which another program writes the samples of a force sensor, as `ForceStream` reads it.
     health
         Called with each new reference and the network, gives what checks the frames; None for no checks.
     slip
@@ -192,6 +196,7 @@ class LiveReader:
         smoothing_s: float = 0.0,
         seconds: float | None = None,
         stall_s: float = 1.0,
+        forces: Path | str | None = None,
         health: Callable[[Frame, Run | None], HealthWatch] | None = None,
         slip: Callable[[Frame], SlipWatch] | None = None,
     ) -> None:
@@ -211,6 +216,9 @@ class LiveReader:
         self._named = read_image(Path(reference)) if isinstance(reference, Path | str) else reference
         self._engine_name, self._seconds, self._stall_s = engine, seconds, stall_s
         self._smooth = LowPass(time_constant_s=smoothing_s)
+        self.recorder: Recorder | None = None
+        """What records, while something is recorded."""
+        self._forces = None if forces is None else ForceStream(forces)
         self._make_health, self._make_slip = health, slip
         self._health: HealthWatch | None = None
         self._slip: SlipWatch | None = None
@@ -230,7 +238,10 @@ class LiveReader:
 
     def __enter__(self) -> "LiveReader":
         with ExitStack() as stack:
+            stack.callback(self.stop_recording)
             stack.enter_context(self.source)
+            if self._forces is not None:
+                stack.enter_context(self._forces)
             if self.network is not None:
                 self.network.require_frame_size(self.source.size, what=f"the frames of {self.source.name}")
                 self.engine = self._make_engine(self.network)
@@ -298,6 +309,35 @@ class LiveReader:
         """Take a new reference as soon as the picture is still; the old one holds until then."""
         self._asked.set()
 
+    def record(self, folder: Path | str, *, facts: TrialFacts | None = None) -> Recorder:
+        """Record every frame from now on, read or not, into a data set, a new one or one that is there.
+
+        Frames before there is a reference are left out. `facts`: who, when and what, as `Recorder` takes them.
+
+        Raises
+        ------
+        RecordingError
+            If something is recorded already, or the folder is something else.
+        """
+        if self.recorder is not None:
+            raise RecordingError(f"{self.recorder.folder} is being recorded; stop that first")
+        facts = facts or TrialFacts(trial="live")
+        if self.network is not None and not facts.sensor:
+            facts = replace(facts, sensor=self.network.manifest.sensor)
+        self.recorder = Recorder(
+            folder,
+            facts=facts,
+            source=self.source.name,
+            simulated=self.source.simulated,
+            reference=self.reference,
+        )
+        return self.recorder
+
+    def stop_recording(self) -> Dataset | None:
+        """End the recording; gives its data set, None where there is none, or no frame of it."""
+        recorder, self.recorder = self.recorder, None
+        return None if recorder is None else recorder.close()
+
     def _make_engine(self, network: Run) -> Engine:
         """The engine that was named, or the fastest that pays for the frames to come."""
         rate_hz, seconds = self.source.rate_hz or 30.0, self._seconds or np.inf
@@ -323,6 +363,10 @@ class LiveReader:
                         if self._stopped.is_set():
                             return
                         self._trouble = None
+                        if self._forces is not None:
+                            frame = self._forces.attach(frame)  # noqa: PLW2901
+                        if self.recorder is not None and self.reference is not None:
+                            self.recorder.add(frame)
                         self._frames.put(frame)
                 except SourceError as error:
                     if not self.source.reconnects:
@@ -381,6 +425,8 @@ class LiveReader:
         )
 
     def _set_reference(self, image: Frame) -> None:
+        if self.recorder is not None:
+            self.recorder.set_reference(image)
         self.reference = image
         self._health = None if self._make_health is None else self._make_health(image, self.network)
         self._begin_anew()

@@ -100,5 +100,13 @@ class Reading:
     true_margin: float | None = None
     """Where the source knows it, to compare with."""
 
+    def __str__(self) -> str:
+        told = "no network" if self.withheld is None else f"no margin: {self.withheld}"
+        if self.margin is not None:
+            told = f"margin {self.margin:4.0%}"
+            if self.low is not None and self.high is not None:
+                told += f" ({self.low:.0%} to {self.high:.0%})"
+        return f"{self.time_s:8.2f} s  {told}  {self.latency.total_ms:.0f} ms, {self.dropped} dropped"
+
 
 __all__ = ["Check", "Latency", "LiveFrame", "Reading", "SlipState"]

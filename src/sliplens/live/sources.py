@@ -50,7 +50,7 @@ class ReplaySource(LiveSource):
         self, capture: Capture, *, speed: float = 1.0, rate_hz: float | None = None, repeat: bool = False
     ) -> None:
         self._capture, self._repeat, self._closed = capture, repeat, Event()
-        self.name = f"{capture.name} of {capture.opened}"
+        self.name, self.simulated = f"{capture.name} of {capture.opened}", capture.simulated
         self.size = capture.frame_size
         self.count = None if repeat else len(capture)
         known = capture.time_s if rate_hz is None else None
@@ -285,6 +285,8 @@ class SimulatedSource(LiveSource):
     >>> frame.size, round(frame.safety_margin, 2)
     ((224, 224), 0.48)
     """
+
+    simulated = True
 
     def __init__(
         self, sensor: str = "chromatouch", *, friction: float = 0.775, rate_hz: float = 30.0, seed: int = 0

@@ -1,6 +1,7 @@
 """A data set on disk: one Parquet file a trial, frames without loss beside their labels."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
@@ -8,6 +9,7 @@ from sliplens.codec import from_builtins, save_record
 from sliplens.errors import RecordingError
 from sliplens.files import hash_file, hash_json, read_json, require_folder
 from sliplens.progress import OnProgress, note
+from sliplens.recordings.journal import JOURNAL_FOLDER, JournalLock, finish_journal, journals_of
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.store import SCHEMA_VERSION, forces_path, load_recording, read_header
 from sliplens.recordings.trial import Labels, Recording, TrialFacts
@@ -97,6 +99,7 @@ class Dataset:
         return load_recording(trial_path(self.folder, info.trial), pixels=False)
 
 
+_RECORDED_SPLIT = "test"  # nothing was trained on it
 _NAMED = 10  # trials named in a message before the rest is counted
 
 
@@ -110,16 +113,70 @@ def load_dataset(folder: Path | str) -> Dataset:
     """
     folder = Path(folder)
     require_folder(folder, what="the data set")
+    if (folder / JOURNAL_FOLDER).is_dir():
+        finish_recording(folder)
+    table = _read_table(folder)
+    if not table.trials:
+        raise RecordingError(f"{folder} lists no trials; make or import a data set first")
+    return Dataset(folder=folder, trials=table.trials, simulated=table.simulated)
+
+
+def _read_table(folder: Path) -> _Table:
     path = folder / DATASET_FILE
     values = read_json(path)
     if not isinstance(values, dict) or values.get("schema_version") != SCHEMA_VERSION:
         raise RecordingError(
             f"{path} is not a sliplens data set of schema {SCHEMA_VERSION}; make it again with this version"
         )
-    table = from_builtins(values, _Table, where=path, command="sliplens import")
-    if not table.trials:
-        raise RecordingError(f"{folder} lists no trials; make or import a data set first")
-    return Dataset(folder=folder, trials=table.trials, simulated=table.simulated)
+    return from_builtins(values, _Table, where=path, command="sliplens import")
+
+
+def begin_recording(folder: Path, *, simulated: bool) -> tuple[JournalLock, tuple[str, ...]]:
+    """Make a data set ready for trials to be recorded into it, a new one or one that is there.
+
+    Gives what holds it until it is closed, and the names of its trials. What was cut off before is finished first.
+
+    Raises
+    ------
+    RecordingError
+        If the folder is something else, is being recorded, or holds trials of the other kind, real or simulated.
+    """
+    if folder.exists() and not (folder / DATASET_FILE).is_file() and (not folder.is_dir() or any(folder.iterdir())):
+        raise RecordingError(f"{folder} exists and is no data set of sliplens; choose another folder")
+    if (folder / JOURNAL_FOLDER).is_dir():
+        finish_recording(folder)
+    table = _read_table(folder) if (folder / DATASET_FILE).is_file() else _Table(trials=(), simulated=simulated)
+    if table.simulated != simulated:
+        kinds = ("simulated", "real") if table.simulated else ("real", "simulated")
+        raise RecordingError(f"{folder} holds {kinds[0]} trials, these are {kinds[1]}; choose another folder")
+    lock = JournalLock(folder)
+    # also where it lists no trial yet: whoever opens the folder sees a data set, and finishes it if it was cut off
+    write_dataset_table(folder, table.trials, simulated=simulated)
+    return lock, tuple(info.trial for info in table.trials)
+
+
+def finish_recording(folder: Path, lock: JournalLock | None = None) -> None:
+    """Make trials of what was recorded into a data set, whether it was ended or cut off.
+
+    `lock`: what `begin_recording` gave; taken here if None, so that nobody finishes what is still being recorded. A
+    data set without a trial is removed.
+    """
+    held = lock or JournalLock(folder)
+    try:
+        table = _read_table(folder)
+        found = {info.trial: info for info in table.trials}
+        for journal in journals_of(folder):
+            path = trial_path(folder, journal.stem)
+            if finish_journal(journal, path) is not None:
+                found[journal.stem] = trial_info(path, split=_RECORDED_SPLIT)
+        write_dataset_table(folder, tuple(found.values()), simulated=table.simulated)
+        held.discard()
+    finally:
+        held.release()
+    if not found:
+        (folder / DATASET_FILE).unlink()
+        with suppress(OSError):  # where something else is in it
+            folder.rmdir()
 
 
 def tell_flags(trial: str, labelling: Labelling | None, on_progress: OnProgress | None) -> None:

@@ -1,0 +1,318 @@
+"""Recording a running source into a data set, frame by frame, and force samples that come as lines of text."""
+
+import time
+from collections import deque
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Condition, Event, Lock, Thread
+from typing import TextIO
+
+import numpy as np
+
+from sliplens.errors import RecordingError
+from sliplens.live.reading import LiveFrame
+from sliplens.recordings.capture import Forces, Frame
+from sliplens.recordings.dataset import Dataset, begin_recording, finish_recording, load_dataset
+from sliplens.recordings.formats.tables import (
+    UNITS,
+    TextTable,
+    guess_force_columns,
+    guess_time_column,
+    require_trial_name,
+    unit_of,
+)
+from sliplens.recordings.journal import Journal, JournalHeader
+from sliplens.recordings.trial import TrialFacts
+
+_MOST_WAITING_BYTES = 256 * 2**20
+_ENDED = 30.0  # seconds that the last frames may take to be written
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingState:
+    """How far a recording is."""
+
+    folder: Path
+    frames: int
+    """Frames that are on disk."""
+    seconds: float
+    """Time that they span."""
+    lost: int
+    """Frames that were not recorded, the disk being too slow or full."""
+    trouble: str | None
+    """Why it stopped, with the cure; None while it goes on."""
+
+    def __str__(self) -> str:
+        lost = f", {self.lost:,} lost" if self.lost else ""
+        trouble = f"; {self.trouble}" if self.trouble else ""
+        return f"{self.frames:,} frames in {self.seconds:.1f} s{lost}{trouble}"
+
+
+class Recorder:
+    """Records frames into a data set, a new one or one that is there, as trials `NAME-1`, `NAME-2` and so on.
+
+    A trial ends, and the next begins, where the reference is taken anew, the size changes or the clock jumps back. A
+    process that is killed loses the frame that it was writing; the next command that opens the data set finishes it.
+
+    Parameters
+    ----------
+    folder
+        Data set.
+    facts
+        Who, when and what; `trial` is the NAME.
+    source
+        Camera, stream or file, for people.
+    simulated
+        Whether no real sensor is behind it.
+    reference
+        The sensor untouched, where it is known.
+
+    Raises
+    ------
+    RecordingError
+        If the folder is something else, or is being recorded.
+    """
+
+    def __init__(
+        self,
+        folder: Path | str,
+        *,
+        facts: TrialFacts | None = None,
+        source: str = "frames in memory",
+        simulated: bool = False,
+        reference: Frame | None = None,
+    ) -> None:
+        self.folder = Path(folder)
+        self._facts = facts or TrialFacts(trial="live")
+        require_trial_name(self._facts.trial)
+        self._source, self._simulated, self._reference = source, simulated, reference
+        self._lock, taken = begin_recording(self.folder, simulated=simulated)
+        self._taken = set(taken)
+        self._waiting: deque[tuple[LiveFrame, Frame | None]] = deque()
+        self._changed, self._closed = Condition(), False
+        self._journal: Journal | None = None
+        self._last: LiveFrame | None = None
+        self._first_s = 0.0
+        self._shown: Frame | None = None
+        self._written, self._lost, self._seconds = 0, 0, 0.0
+        self._trouble: str | None = None
+        self._thread = Thread(target=self._write, daemon=True)
+        self._thread.start()
+
+    @property
+    def state(self) -> RecordingState:
+        """How far it is now."""
+        return RecordingState(
+            folder=self.folder, frames=self._written, seconds=self._seconds, lost=self._lost, trouble=self._trouble
+        )
+
+    def set_reference(self, image: Frame) -> None:
+        """Frames to come are recorded as a new trial, with this image of the untouched sensor."""
+        self._reference = image
+
+    def add(self, frame: LiveFrame) -> None:
+        """Take a frame; it is written in another thread, and lost where that one is far behind."""
+        with self._changed:
+            full = (len(self._waiting) + 1) * frame.image.nbytes > _MOST_WAITING_BYTES
+            if full or self._closed or self._trouble is not None:
+                self._lost += 1
+                return
+            self._waiting.append((frame, self._reference))
+            self._changed.notify()
+
+    def close(self) -> Dataset | None:
+        """Write what waits and make trials of it; None where there is no frame at all.
+
+        Raises
+        ------
+        OSError
+            If there is no room: what was recorded stays, and the next command that opens the data set finishes it.
+        """
+        with self._changed:
+            closed, self._closed = self._closed, True
+            self._changed.notify()
+        self._thread.join(_ENDED)
+        if not closed:
+            finish_recording(self.folder, self._lock)
+        return load_dataset(self.folder) if self._written else None
+
+    def _write(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._closed)
+                if not self._waiting:
+                    break
+                frame, reference = self._waiting.popleft()
+            try:
+                self._append(frame, reference)
+            except OSError as error:
+                with self._changed:
+                    self._lost += 1 + len(self._waiting)
+                    self._waiting.clear()
+                    self._trouble = (
+                        f"recording into {self.folder} stopped after {self._written} frames "
+                        f"({error.strerror or error}); make room, and record again: what is there stays"
+                    )
+        if self._journal is not None:
+            self._journal.close()
+
+    def _append(self, frame: LiveFrame, reference: Frame | None) -> None:
+        last = self._last
+        if (
+            self._journal is None
+            or last is None
+            or frame.size != last.size
+            or frame.time_s <= last.time_s
+            or reference is not self._shown
+        ):
+            self._begin_trial(frame, reference)
+        assert self._journal is not None
+        forces = frame.forces
+        if forces is not None:
+            forces = replace(forces, time_s=forces.time_s - self._first_s)
+        time_s = frame.time_s - self._first_s
+        self._journal.append(frame.image, time_s=time_s, safety_margin=frame.safety_margin, forces=forces)
+        self._seconds += frame.time_s - last.time_s if last is not None and time_s > 0 else 0.0
+        self._last = frame
+        self._written += 1
+
+    def _begin_trial(self, frame: LiveFrame, reference: Frame | None) -> None:
+        if self._journal is not None:
+            self._journal.close()
+        number = 1
+        while f"{self._facts.trial}-{number}" in self._taken:
+            number += 1
+        facts = replace(self._facts, trial=f"{self._facts.trial}-{number}")
+        header = JournalHeader(
+            facts=facts,
+            source=self._source,
+            simulated=self._simulated,
+            size=frame.size,
+            forces=None if frame.forces is None else frame.forces.source,
+        )
+        fits = reference is not None and reference.shape == frame.image.shape
+        self._journal = Journal(self._lock.folder, header, reference=reference if fits else None)
+        self._taken.add(facts.trial)
+        self._first_s, self._shown = frame.time_s, reference
+
+
+_TAIL_S = 0.01
+
+
+class ForceStream:
+    """Samples of a force sensor that another program writes, line by line, into a file or named pipe.
+
+    The first line names the columns, as `import` takes them: `time_s,fx,fy,fz`, or `fn` and `ft`. Times are brought
+    to the clock of the frames by the least delay between a sample's time and its arrival; without a column of times a
+    sample counts from when it arrives. Of a file, only what is written from now on is read.
+
+    Parameters
+    ----------
+    path
+        File or named pipe.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self._lock, self._closed = Lock(), Event()
+        self._samples: list[tuple[float, float, tuple[float, float, float]]] = []
+        self._delay_s = np.inf
+        self.trouble: str | None = None
+        """Why no more samples come, with the cure; None while they may."""
+
+    def __enter__(self) -> "ForceStream":
+        if not self.path.exists():
+            raise RecordingError(f"{self.path} does not exist; begin to write the forces, then record")
+        Thread(target=self._follow, daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closed.set()
+
+    def attach(self, frame: LiveFrame) -> LiveFrame:
+        """The frame, with the samples that came since the one before."""
+        with self._lock:
+            samples, self._samples = self._samples, []
+            delay_s = self._delay_s
+        if not samples:
+            return frame
+        # from the sensor's clock to that of this machine, and on to that of the frames
+        shift_s = frame.time_s - frame.captured_s
+        stamps_s, arrived_s = np.array([sample[:2] for sample in samples]).T
+        time_s: np.ndarray = np.where(np.isnan(stamps_s), arrived_s, stamps_s + delay_s) + shift_s
+        (rising,) = np.nonzero(np.diff(time_s, prepend=-np.inf) > 0)
+        return replace(
+            frame,
+            forces=Forces(
+                time_s=time_s[rising],
+                force_n=np.array([force for *_, force in samples])[rising],
+                source=str(self.path),
+            ),
+        )
+
+    def _follow(self) -> None:
+        try:
+            with self.path.open(encoding="utf-8") as file:
+                parse = _LineParser(self.path, self._next_line(file))
+                if file.seekable():
+                    file.seek(0, 2)
+                while not self._closed.is_set():
+                    line = self._next_line(file)
+                    if line:
+                        self._take(*parse(line))
+        except (RecordingError, OSError, ValueError) as error:
+            self.trouble = f"{error}; the forces of {self.path} end here"
+
+    def _next_line(self, file: TextIO) -> str:
+        """Next whole line; empty when closed."""
+        text = ""
+        while not self._closed.is_set():
+            text += file.readline()
+            if not text.endswith("\n"):
+                self._closed.wait(_TAIL_S)
+            elif text.strip() and not text.startswith(("#", "%")):
+                return text.strip()
+            else:
+                text = ""
+        return ""
+
+    def _take(self, stamp_s: float, force: tuple[float, float, float]) -> None:
+        arrived_s = time.monotonic()
+        with self._lock:
+            self._samples.append((stamp_s, arrived_s, force))
+            if not np.isnan(stamp_s):
+                self._delay_s = min(self._delay_s, arrived_s - stamp_s)
+
+
+class _LineParser:
+    """Reads a line of a table of forces, by the names of its columns."""
+
+    def __init__(self, path: Path, header: str) -> None:
+        separator = next((mark for mark in ("\t", ";", ",") if mark in header), ",")
+        names = tuple(name.strip() for name in header.split(separator))
+        table = TextTable(path=path, encoding="utf-8", separator=separator, header=names, first_line=2)
+        forces = guess_force_columns(table)
+        self._path, self._separator, self._names = path, separator, names
+        self._places = [names.index(name) for name in forces]
+        units = [unit_of(name, quantity="force", path=str(path)) or "N" for name in forces]
+        self._scales = [UNITS["force"][unit][0] for unit in units]
+        try:
+            stamp = guess_time_column(table)
+        except RecordingError:
+            self._stamp, self._stamp_scale = None, 1.0
+        else:
+            self._stamp = names.index(stamp)
+            self._stamp_scale = UNITS["time"][unit_of(stamp, quantity="time", path=str(path)) or "s"][0]
+
+    def __call__(self, line: str) -> tuple[float, tuple[float, float, float]]:
+        fields = line.split(self._separator)
+        if len(fields) < len(self._names):
+            raise RecordingError(f"{self._path} has a line of {len(fields)} columns, {len(self._names)} are named")
+        force = [float(fields[place]) * scale for place, scale in zip(self._places, self._scales, strict=True)]
+        if len(force) == 2:  # normal and tangential, as `import` lays them along z and x
+            force = [force[1], 0.0, force[0]]
+        stamp_s = np.nan if self._stamp is None else float(fields[self._stamp]) * self._stamp_scale
+        return stamp_s, (force[0], force[1], force[2])
+
+
+__all__ = ["ForceStream", "Recorder", "RecordingState"]

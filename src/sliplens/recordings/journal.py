@@ -1,0 +1,209 @@
+"""A trial while it is being recorded: one Arrow stream, appended frame by frame, and how it becomes a trial.
+
+Each frame is handed to the system before the next is taken: a process that is killed loses the one it was writing.
+"""
+
+import shutil
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import chain, islice
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+
+from sliplens.codec import from_builtins, to_builtins
+from sliplens.errors import RecordingError
+from sliplens.images import decode_png, encode_png
+from sliplens.recordings.capture import Forces, Frame
+from sliplens.recordings.labelling import Labelling, ReferenceChoice
+from sliplens.recordings.store import (
+    ROW_GROUP,
+    decode_pixels,
+    encode_pixels,
+    forces_path,
+    one_line,
+    save_forces,
+    write_trial,
+)
+from sliplens.recordings.trial import TrialFacts, labels_of_margins
+
+try:
+    import fcntl
+except ImportError:  # Windows: nobody is kept from recording twice into one folder there
+    fcntl = None
+
+JOURNAL_FOLDER = "recording"
+"""Folder beside the trials of a data set that holds what is being recorded, or was when it was cut off."""
+_LOCK = "lock"
+_HEADER, _REFERENCE = b"sliplens", b"reference"
+_SCHEMA = pa.schema(
+    {
+        "time_s": pa.float64(),
+        "safety_margin": pa.float64(),
+        "force_time_s": pa.list_(pa.float64()),
+        "force_n": pa.list_(pa.float64()),
+        "image": pa.binary(),
+    }
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JournalHeader:
+    """What is known of a trial before its first frame."""
+
+    facts: TrialFacts
+    source: str
+    """Camera, stream or file, for people."""
+    simulated: bool
+    size: tuple[int, int]
+    """Height and width of the frames, in pixels."""
+    forces: str | None = None
+    """What measures the forces, for people; None where nothing does."""
+
+
+class Journal:
+    """A trial being recorded; frames are appended one by one, their times rising.
+
+    `reference`: the sensor untouched; None where nobody knows it: the first frame will stand for it.
+    """
+
+    def __init__(self, folder: Path, header: JournalHeader, *, reference: Frame | None) -> None:
+        metadata = {_HEADER: msgspec.json.encode(to_builtins(header))}
+        if reference is not None:
+            metadata[_REFERENCE] = encode_png(reference)
+        self.path = folder / f"{header.facts.trial}.arrow"
+        self._file = self.path.open("xb")
+        self._writer = pa.ipc.new_stream(pa.PythonFile(self._file, mode="w"), _SCHEMA.with_metadata(metadata))
+
+    def append(
+        self, image: Frame, *, time_s: float, safety_margin: float | None = None, forces: Forces | None = None
+    ) -> None:
+        """Append a frame, whole when this returns; an `OSError` where there is no room."""
+        known = forces is not None
+        self._writer.write_batch(
+            pa.record_batch(
+                [
+                    [time_s],
+                    [safety_margin],
+                    [forces.time_s.tolist() if known else []],
+                    [forces.force_n.ravel().tolist() if known else []],
+                    [encode_pixels(image)],
+                ],
+                schema=_SCHEMA,
+            )
+        )
+        self._file.flush()
+
+    def close(self) -> None:
+        """Give the file back; what is in it stays."""
+        with suppress(OSError):  # of a frame for which there was no room
+            self._file.close()
+
+
+class JournalLock:
+    """Holds a data set while trials are recorded into it; the system lets go of it when the process ends, however.
+
+    A data set that another one holds is a `RecordingError`.
+    """
+
+    def __init__(self, data: Path) -> None:
+        self.folder = data / JOURNAL_FOLDER
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._file = (self.folder / _LOCK).open("w")
+        if fcntl is not None:
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                self._file.close()
+                raise RecordingError(
+                    f"{data} is being recorded; stop the recording first, or choose another folder"
+                ) from None
+
+    def release(self) -> None:
+        """Let go; what is there stays for whoever opens the data set next."""
+        self._file.close()
+
+    def discard(self) -> None:
+        """Remove the folder, everything in it being in trials, and let go."""
+        shutil.rmtree(self.folder)
+        self.release()
+
+
+def journals_of(data: Path) -> list[Path]:
+    """Journals that wait to become trials of a data set."""
+    return sorted((data / JOURNAL_FOLDER).glob("*.arrow"))
+
+
+def finish_journal(journal: Path, trial: Path) -> JournalHeader | None:
+    """Make a trial, and the file of its force samples, of a journal; None where it holds no whole frame.
+
+    Labels are the margins that the source knew. Without any, `label_dataset` finds them from the forces.
+    """
+    try:
+        with pa.memory_map(str(journal)) as file:
+            head = _read_head(file)
+            rows = [] if head is None else [row.drop_columns(["image"]) for row in _rows(file)]
+        if head is None or not rows:
+            return None
+        header, picture = head
+        numbers = pa.Table.from_batches(rows)
+        labels = labels_of_margins(numbers.column("safety_margin").to_numpy())
+        with pa.memory_map(str(journal)) as file:
+            images = (row.column("image")[0].as_py() for row in _rows(file))
+            if picture is None:
+                first = next(images)
+                images = chain([first], images)
+                reference = decode_pixels(first, size=(*header.size, 3), where=f"the first frame of {journal}")
+                notes = ("No picture of the untouched sensor was taken: the first frame stands for it.",)
+                choice = ReferenceChoice(index=0, method="assumed")
+            else:
+                reference, notes = decode_png(picture, where=f"the reference frame of {journal}"), ()
+                choice = ReferenceChoice(method="recorded apart from the frames")
+            labelling = Labelling(source=header.source, forces=header.forces, notes=notes, reference=choice)
+            _save_forces(numbers, header, forces_path(trial.parent.parent, trial.stem))
+            write_trial(
+                trial,
+                iter(lambda: list(islice(images, ROW_GROUP)), []),
+                facts=header.facts,
+                time_s=numbers.column("time_s").to_numpy(),
+                labels=replace(labels, labelling=labelling),
+                reference=reference,
+            )
+    except pa.ArrowException as error:
+        raise RecordingError(f"{journal} is damaged ({one_line(error)}); move it away") from None
+    return header
+
+
+def _read_head(file: pa.NativeFile) -> tuple[JournalHeader, bytes | None] | None:
+    """What is known of the trial, and the picture of the untouched sensor; None where it was cut off before that."""
+    try:
+        metadata = pa.ipc.open_stream(file).schema.metadata or {}
+    except pa.ArrowInvalid:
+        return None
+    file.seek(0)
+    values = msgspec.json.decode(metadata[_HEADER])
+    header = from_builtins(values, JournalHeader, where="the header of a journal", command="sliplens live")
+    return header, metadata.get(_REFERENCE)
+
+
+def _rows(file: pa.NativeFile) -> Iterator[pa.RecordBatch]:
+    """Whole frames, from the first to where the journal was cut off."""
+    reader = pa.ipc.open_stream(file)
+    while True:
+        try:
+            yield reader.read_next_batch()
+        except (StopIteration, pa.ArrowInvalid, OSError):
+            return
+
+
+def _save_forces(numbers: pa.Table, header: JournalHeader, path: Path) -> None:
+    """Write the samples, those that come twice left out."""
+    time_s = numbers.column("force_time_s").combine_chunks().flatten().to_numpy()
+    force_n = numbers.column("force_n").combine_chunks().flatten().to_numpy().reshape(-1, 3)
+    rising = time_s > np.maximum.accumulate(np.concatenate([[-np.inf], time_s]))[:-1]
+    if rising.any():
+        source = header.forces or "the force sensor"
+        save_forces(Forces(time_s=time_s[rising], force_n=force_n[rising], source=source), path)

@@ -1,0 +1,369 @@
+"""What is recorded is there again, whatever ends the recording."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sliplens as sl
+from sliplens.errors import InputError, RecordingError
+from sliplens.live import ForceStream, LiveFrame, Recorder, SimulatedSource, SourceOptions, open_live
+from sliplens.recordings import Dataset, Recording, TrialFacts, load_dataset
+from sliplens.recordings.capture import Forces
+from sliplens.recordings.dataset import begin_recording
+from sliplens.recordings.journal import JOURNAL_FOLDER, Journal, JournalHeader
+from sliplens.recordings.store import forces_path, load_forces
+
+FACTS = TrialFacts(trial="cup", sensor="tip", object="a cup", condition="wet", day=3)
+
+
+def frames_of(recording: Recording, *, begin_s: float = 0.0, first: int = 0) -> list[LiveFrame]:
+    """Frames with their margins and, but for the first, two force samples each."""
+    return [
+        LiveFrame(
+            image=image,
+            number=first + number,
+            time_s=begin_s + 0.1 * number,
+            captured_s=begin_s + 0.1 * number,
+            safety_margin=None if np.isnan(margin) else float(margin),
+            forces=None
+            if number == 0
+            else Forces(
+                time_s=begin_s + 0.1 * number + np.array([-0.05, 0.0]),
+                force_n=np.array([[number, 0.0, 1.0], [number, 0.5, 1.0]]),
+                source="a sensor",
+            ),
+        )
+        for number, (image, margin) in enumerate(zip(recording.frames, recording.safety_margin, strict=True))
+    ]
+
+
+@pytest.fixture
+def recording(small_dataset: Dataset) -> Recording:
+    return small_dataset.load(small_dataset.trials[0])
+
+
+def record(folder: Path, frames: list[LiveFrame], recording: Recording) -> Dataset | None:
+    recorder = Recorder(folder, facts=FACTS, source="a camera", reference=recording.reference)
+    for frame in frames:
+        recorder.add(frame)
+    return recorder.close()
+
+
+def test_a_recording_is_what_was_seen(recording: Recording, tmp_path: Path):
+    data = record(tmp_path / "data", frames_of(recording, begin_s=1000.0), recording)
+    assert data is not None
+    assert sl.check_dataset(data) == ()
+    (info,) = data.trials
+    assert replace(FACTS, trial="cup-1") == TrialFacts(**{name: getattr(info, name) for name in vars(FACTS)})
+    again = data.load(info)
+    np.testing.assert_array_equal(again.frames, recording.frames)
+    np.testing.assert_array_equal(again.reference, recording.reference)
+    np.testing.assert_array_equal(again.safety_margin, recording.safety_margin)
+    np.testing.assert_allclose(again.time_s, 0.1 * np.arange(12), atol=1e-9)
+    forces = load_forces(forces_path(data.folder, "cup-1"))
+    np.testing.assert_array_equal(forces.force_n[:, 0], np.repeat(np.arange(1, 12), 2))
+    np.testing.assert_allclose(forces.time_s, 0.05 * np.arange(1, 23), atol=1e-9)
+    assert not (data.folder / JOURNAL_FOLDER).exists()
+
+
+def test_a_recording_is_imported_again(recording: Recording, tmp_path: Path):
+    record(tmp_path / "data", frames_of(recording), recording)
+    data = sl.import_recordings(tmp_path / "data", out=tmp_path / "again")
+    np.testing.assert_array_equal(data.load(data.trials[0]).frames, recording.frames)
+
+
+def test_a_recording_is_studied(fine_dataset: Dataset, difference_run: Path, tmp_path: Path):
+    whole = fine_dataset.load(fine_dataset.trials[0])
+    recorder = Recorder(tmp_path / "data", facts=TrialFacts(trial="grip"))
+    recorder.set_reference(whole.reference)
+    for frame in frames_of(whole):
+        recorder.add(frame)
+    data = recorder.close()
+    assert data is not None
+    study = sl.run_study(
+        data,
+        difference=difference_run,
+        raw=None,
+        methods=["grad-cam"],
+        trials=1,
+        random_orders=1,
+        out=tmp_path / "study",
+    )
+    assert study.frame().num_rows > 0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.77, 0.999])
+def test_what_is_cut_off_is_whole_up_to_the_cut(recording: Recording, tmp_path: Path, share: float):
+    lock, _ = begin_recording(tmp_path / "data", simulated=False)
+    header = JournalHeader(facts=FACTS, source="a camera", simulated=False, size=(48, 48))
+    journal, ends = Journal(lock.folder, header, reference=recording.reference), []
+    for frame in frames_of(recording):
+        journal.append(frame.image, time_s=frame.time_s, safety_margin=frame.safety_margin, forces=frame.forces)
+        ends.append(journal.path.stat().st_size)
+    journal.close()
+    lock.release()
+    cut = round(share * ends[-1])
+    os.truncate(journal.path, cut)
+    whole = sum(end <= cut for end in ends)
+    if whole == 0:
+        with pytest.raises(InputError):
+            load_dataset(tmp_path / "data")
+        return
+    data = load_dataset(tmp_path / "data")
+    assert sl.check_dataset(data) == ()
+    np.testing.assert_array_equal(data.load(data.trials[0]).frames, recording.frames[:whole])
+
+
+_CHILD = """
+import sys, time
+from pathlib import Path
+import numpy as np
+from sliplens.recordings.dataset import begin_recording
+from sliplens.recordings.journal import Journal, JournalHeader
+from sliplens.recordings.trial import TrialFacts
+lock, _ = begin_recording(Path(sys.argv[1]), simulated=False)
+header = JournalHeader(facts=TrialFacts(trial="a"), source="", simulated=False, size=(48, 48))
+journal = Journal(lock.folder, header, reference=None)
+for number in range(10**6):
+    journal.append(np.full((48, 48, 3), number % 256, dtype=np.uint8), time_s=float(number))
+    print(number, flush=True)
+"""
+
+
+def test_a_process_that_is_killed_loses_no_frame_that_was_written(tmp_path: Path):
+    folder = tmp_path / "data"
+    with subprocess.Popen([sys.executable, "-c", _CHILD, folder], stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        while (last := int(child.stdout.readline())) < 30:
+            pass
+        with pytest.raises(RecordingError, match="is being recorded; stop the recording first"):
+            load_dataset(folder)
+        child.send_signal(signal.SIGKILL)
+        last = max([last, *map(int, child.stdout.read().split()[:-1])])  # the last line may be cut off
+    data = load_dataset(folder)
+    assert data.trials[0].frames >= last + 1
+    assert sl.check_dataset(data) == ()
+    frames = data.load(data.trials[0]).frames
+    np.testing.assert_array_equal(frames[:, 0, 0, 0], np.arange(len(frames)) % 256)
+    notes = data.read_labels(data.trials[0]).labelling
+    assert notes is not None
+    assert "the first frame stands for it" in notes.notes[0]
+
+
+@contextmanager
+def room_for(size: int) -> Iterator[None]:
+    """No file of this process grows beyond some bytes, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_full_disk_stops_the_recording_and_keeps_what_is_there(tmp_path: Path, rng: np.random.Generator):
+    images = rng.integers(0, 255, (12, 48, 48, 3), dtype=np.uint8)  # 7 kB each, however they are coded
+    recorder = Recorder(tmp_path / "data", reference=images[0])
+    with room_for(50_000):
+        for number, image in enumerate(images):
+            recorder.add(LiveFrame(image=image, number=number, time_s=float(number), captured_s=0.0))
+        end_s = time.monotonic() + 10
+        while recorder.state.frames + recorder.state.lost < 12 and time.monotonic() < end_s:
+            time.sleep(0.01)
+    state = recorder.state
+    assert 0 < state.frames < 8
+    assert state.lost == 12 - state.frames
+    assert f"stopped after {state.frames} frames" in str(state.trouble)
+    assert "make room, and record again: what is there stays" in str(state.trouble)
+    data = recorder.close()
+    assert data is not None
+    assert sl.check_dataset(data) == ()
+    kept = data.load(data.trials[0]).frames
+    # the frame that did not fit may do so once there is room
+    assert state.frames <= len(kept) <= state.frames + 1
+    np.testing.assert_array_equal(kept, images[: len(kept)])
+
+
+def test_a_disk_that_is_full_at_the_end_keeps_the_journal(recording: Recording, tmp_path: Path):
+    recorder = Recorder(tmp_path / "data", reference=recording.reference)
+    for frame in frames_of(recording):
+        recorder.add(frame)
+    end_s = time.monotonic() + 10
+    while recorder.state.frames < 12 and time.monotonic() < end_s:
+        time.sleep(0.01)
+    with room_for(5_000), pytest.raises(OSError, match="large"):
+        recorder.close()
+    data = load_dataset(tmp_path / "data")
+    np.testing.assert_array_equal(data.load(data.trials[0]).frames, recording.frames)
+
+
+def test_a_new_reference_a_clock_that_jumps_and_another_size_begin_a_trial(recording: Recording, tmp_path: Path):
+    recorder = Recorder(tmp_path / "data", facts=FACTS, reference=recording.reference)
+    frames = frames_of(recording)
+    for frame in frames:
+        recorder.add(frame)
+    other = recording.reference + np.uint8(1)
+    recorder.set_reference(other)
+    for frame in frames_of(recording, begin_s=50.0):
+        recorder.add(frame)
+    for frame in frames[:3]:  # the clock begins anew
+        recorder.add(frame)
+    recorder.add(LiveFrame(image=np.zeros((24, 24, 3), dtype=np.uint8), number=9, time_s=99.0, captured_s=0.0))
+    data = recorder.close()
+    assert data is not None
+    assert [(info.trial, info.frames) for info in data.trials] == [
+        ("cup-1", 12), ("cup-2", 12), ("cup-3", 3), ("cup-4", 1),
+    ]  # fmt: skip
+    np.testing.assert_array_equal(data.load(data.trials[1]).reference, other)
+    assert sl.check_dataset(data) == ()
+
+
+def test_trials_are_added_to_a_data_set_that_is_there(recording: Recording, tmp_path: Path):
+    before = record(tmp_path / "data", frames_of(recording), recording)
+    after = record(tmp_path / "data", frames_of(recording), recording)
+    assert before is not None
+    assert after is not None
+    assert [info.trial for info in after.trials] == ["cup-1", "cup-2"]
+    assert after.trials[0] == before.trials[0]
+
+
+def test_nothing_recorded_leaves_nothing_behind(tmp_path: Path):
+    assert Recorder(tmp_path / "data").close() is None
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_folder_that_cannot_be_recorded_into_is_told(small_dataset: Dataset, tmp_path: Path):
+    (tmp_path / "file").touch()
+    with pytest.raises(RecordingError, match="exists and is no data set of sliplens"):
+        Recorder(tmp_path)
+    with pytest.raises(RecordingError, match="holds simulated trials, these are real"):
+        Recorder(small_dataset.folder)
+    recorder = Recorder(tmp_path / "data")
+    with pytest.raises(RecordingError, match="is being recorded"):
+        Recorder(tmp_path / "data")
+    recorder.close()
+
+
+def test_a_reader_records_every_frame_whether_it_was_read_or_not(recording: Recording, tmp_path: Path):
+    source = open_live(recording.frames, options=SourceOptions(rate_hz=500.0))
+    reader = sl.LiveReader(source, reference=recording.reference)
+    reader.subscribe(lambda *_: time.sleep(0.05))  # most frames are dropped
+    reader.record(tmp_path / "data")
+    with pytest.raises(RecordingError, match="is being recorded; stop that first"):
+        reader.record(tmp_path / "other")
+    with reader:
+        list(reader.readings())
+        data = reader.stop_recording()
+    assert data is not None
+    assert [info.frames for info in data.trials] == [12]
+    assert sl.check_dataset(data) == ()
+
+
+def test_a_simulated_fingertip_is_recorded_with_its_forces_and_margins(tmp_path: Path):
+    source = SimulatedSource(rate_hz=100.0)
+    source.load(normal_force_n=1.5, tangential_force_n=0.6)
+    with sl.LiveReader(source, seconds=0.3) as reader:
+        reader.record(tmp_path / "data")
+        list(reader.readings())
+    data = load_dataset(tmp_path / "data")
+    assert data.simulated
+    trial = data.load(data.trials[0])
+    np.testing.assert_allclose(trial.safety_margin, 1 - 0.6 / (0.775 * 1.5))
+    forces = load_forces(forces_path(data.folder, data.trials[0].trial))
+    np.testing.assert_allclose(forces.force_n, np.tile([0.6, 0.0, 1.5], (len(forces.time_s), 1)))
+
+
+# force samples that another program writes
+
+
+def frame_at(time_s: float, captured_s: float) -> LiveFrame:
+    return LiveFrame(image=np.zeros((2, 2, 3), dtype=np.uint8), number=0, time_s=time_s, captured_s=captured_s)
+
+
+def samples_of(stream: ForceStream, count: int, *, time_s: float, captured_s: float) -> Forces:
+    """Wait for so many samples, and bring them to the clock of a frame."""
+    end_s = time.monotonic() + 5
+    while len(stream._samples) < count and stream.trouble is None and time.monotonic() < end_s:
+        time.sleep(0.01)
+    forces = stream.attach(frame_at(time_s, captured_s)).forces
+    assert forces is not None
+    return forces
+
+
+def test_samples_keep_their_steps_on_the_clock_of_the_frames(tmp_path: Path):
+    path = tmp_path / "forces.csv"
+    path.write_text("# a logger\ntime [ms];fx [mN];fy [mN];fz [mN]\n5;1;1;1\n")
+    with ForceStream(path) as stream, path.open("a") as file:
+        time.sleep(0.1)
+        begun_s = time.monotonic()
+        file.write("7000;0;0;1500\n7010;250;0;1500\n7030;500;0;15")
+        file.flush()
+        time.sleep(0.05)
+        file.write("00\n")
+        file.flush()
+        # a frame that was captured just now is at 100 s on the source's clock
+        forces = samples_of(stream, 3, time_s=100.0, captured_s=begun_s)
+    np.testing.assert_allclose(forces.force_n, [[0, 0, 1.5], [0.25, 0, 1.5], [0.5, 0, 1.5]])
+    np.testing.assert_allclose(np.diff(forces.time_s), [0.01, 0.02], atol=1e-9)
+    assert 99.9 < forces.time_s[1] < 100.5  # it arrived some hundredths of a second after the frame
+
+
+def test_samples_without_times_count_from_when_they_arrive(tmp_path: Path):
+    path = tmp_path / "forces.csv"
+    path.write_text("fn,ft\n")
+    with ForceStream(path) as stream, path.open("a") as file:
+        time.sleep(0.1)
+        begun_s = time.monotonic()
+        file.write("2.0,0.5\n")
+        file.flush()
+        forces = samples_of(stream, 1, time_s=begun_s, captured_s=begun_s)
+    np.testing.assert_array_equal(forces.force_n, [[0.5, 0.0, 2.0]])
+    assert begun_s <= forces.time_s[0] <= time.monotonic()
+
+
+def test_a_named_pipe_is_read_too(tmp_path: Path):
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    with ForceStream(path) as stream, path.open("w") as file:
+        file.write("time_s,fx,fy,fz\n1.0,0,0,1\n1.5,0,0,2\n")
+        file.flush()
+        forces = samples_of(stream, 2, time_s=0.0, captured_s=0.0)
+    np.testing.assert_array_equal(forces.force_n[:, 2], [1, 2])
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ("a,b\n", "has no columns that look like forces"),
+        ("time_s,fx,fy,fz\n1,2\n", "has a line of 2 columns, 4 are named"),
+        ("time_s,fx,fy,fz\n1,2,3,x\n", "could not convert"),
+    ],
+)
+def test_lines_that_are_no_forces_are_told(tmp_path: Path, lines: str, words: str):
+    path = tmp_path / "forces.csv"
+    header, *rest = lines.splitlines(keepends=True)
+    path.write_text(header)
+    with ForceStream(path) as stream, path.open("a") as file:
+        time.sleep(0.1)
+        file.writelines(rest)
+        file.flush()
+        end_s = time.monotonic() + 5
+        while stream.trouble is None and time.monotonic() < end_s:
+            time.sleep(0.01)
+    assert words in str(stream.trouble)
+    assert "the forces of" in str(stream.trouble)
+
+
+def test_a_stream_of_forces_that_is_not_there_is_told(tmp_path: Path):
+    with pytest.raises(RecordingError, match="does not exist; begin to write the forces, then record"):
+        ForceStream(tmp_path / "none.csv").__enter__()
