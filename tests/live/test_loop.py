@@ -13,7 +13,8 @@ import sliplens as sl
 from sliplens.errors import ImageError, InputError
 from sliplens.live.contract import LiveSource
 from sliplens.live.loop import LowPass
-from sliplens.live.reading import Check, LiveFrame, Reading, SlipState
+from sliplens.live.reading import Check, LiveFrame, MarkerReading, Reading, SlipState
+from sliplens.markers import TrackedFrame
 from sliplens.models import Run
 from sliplens.recordings import Dataset, Recording
 
@@ -153,7 +154,7 @@ class Strict:
         assert reference.shape == (48, 48, 3)
         assert network is not None
 
-    def check(self, frame: LiveFrame) -> tuple[Check, ...]:
+    def check(self, frame: LiveFrame, _: TrackedFrame | None) -> tuple[Check, ...]:
         odd = frame.number % 2
         return (Check(name="even", value=float(odd), limit=0.0, ok=not odd, sentence="odd; wait for the next"),)
 
@@ -175,13 +176,14 @@ def test_markers_are_followed_for_whoever_tells_slip(trials: dict[str, Recording
     trial, seen = trials["chromatouch"], []
 
     class Watch:
-        def __init__(self, reference: np.ndarray) -> None:
-            np.testing.assert_array_equal(reference, trial.reference)
+        def __init__(self, rest_px: np.ndarray) -> None:
+            self.markers = len(rest_px)
 
-        def update(self, positions_px: np.ndarray, time_s: float) -> SlipState:
+        def update(self, positions_px: np.ndarray, time_s: float) -> MarkerReading:
+            assert len(positions_px) == self.markers
             seen.append(positions_px)
             assert time_s >= 0
-            return SlipState.STICKING
+            return MarkerReading(state=SlipState.STICKING)
 
     source = Patient(trial.frames[:3], [0, 1, 2])
     readings = source.all_readings(sl.LiveReader(source, reference=trial.reference, slip=Watch, stall_s=10.0))

@@ -3,12 +3,14 @@
 from sliplens.live.camera import Camera, CameraMode, CameraSource, list_cameras
 from sliplens.live.contract import LiveSource, SourceKind, SourceOptions
 from sliplens.live.loop import LiveReader, read_live
-from sliplens.live.reading import Check, Latency, LiveFrame, Reading, SlipState
+from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading, SlipState
 from sliplens.live.recorder import ForceStream, Recorder, RecordingState
+from sliplens.live.slip import SlipDetector, SlipLimits
 from sliplens.live.sources import SOURCES, FolderSource, ReplaySource, SimulatedSource, StreamSource, open_live
 
 __all__ = [
     "SOURCES", "Camera", "CameraMode", "CameraSource", "Check", "FolderSource", "ForceStream", "Latency", "LiveFrame",
-    "LiveReader", "LiveSource", "Reading", "Recorder", "RecordingState", "ReplaySource", "SimulatedSource", "SlipState",
-    "SourceKind", "SourceOptions", "StreamSource", "list_cameras", "open_live", "read_live",
+    "LiveReader", "LiveSource", "MarkerReading", "Reading", "Recorder", "RecordingState", "ReplaySource",
+    "SimulatedSource", "SlipDetector", "SlipLimits", "SlipState", "SourceKind", "SourceOptions", "StreamSource",
+    "list_cameras", "open_live", "read_live",
 ]  # fmt: skip

@@ -11,13 +11,14 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from sliplens.errors import InputError, RecordingError, SourceError
+from sliplens.errors import ImageError, InputError, RecordingError, SourceError
 from sliplens.images import read_image
 from sliplens.live.contract import LiveSource, SourceOptions
-from sliplens.live.reading import Check, Latency, LiveFrame, Reading, SlipState
+from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading
 from sliplens.live.recorder import ForceStream, Recorder
+from sliplens.live.slip import SlipDetector
 from sliplens.live.sources import Images, open_live
-from sliplens.markers import Tracker
+from sliplens.markers import TrackedFrame, Tracker
 from sliplens.models.checkpoint import Run, load
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.predictions import LEVEL
@@ -35,8 +36,8 @@ Subscriber = Callable[[Reading, LiveFrame | None], None]
 class HealthWatch(Protocol):
     """Judges frames against the reference that it was made for."""
 
-    def check(self, frame: LiveFrame, /) -> tuple[Check, ...]:
-        """Check a frame; a check that is not fine withholds its margin."""
+    def check(self, frame: LiveFrame, markers: TrackedFrame | None, /) -> tuple[Check, ...]:
+        """Check a frame, and its markers where they are followed; a check that is not fine withholds its margin."""
         ...
 
 
@@ -44,7 +45,7 @@ class HealthWatch(Protocol):
 class SlipWatch(Protocol):
     """Tells slip from the motion of the markers, frame after frame."""
 
-    def update(self, positions_px: Float[np.ndarray, "markers 2"], time_s: float, /) -> SlipState:
+    def update(self, positions_px: Float[np.ndarray, "markers 2"], time_s: float, /) -> MarkerReading:
         """Take the markers of a frame, NaN where one is not seen."""
         ...
 
@@ -164,7 +165,8 @@ class LiveReader:
     health
         Called with each new reference and the network, gives what checks the frames; None for no checks.
     slip
-        Called with each new reference, gives what tells slip from the markers; None for not following them.
+        Called with the places of the markers in each new reference, gives what tells slip from their motion; None for
+        not following them. A sensor without markers is read without.
 
     Raises
     ------
@@ -198,7 +200,7 @@ class LiveReader:
         stall_s: float = 1.0,
         forces: Path | str | None = None,
         health: Callable[[Frame, Run | None], HealthWatch] | None = None,
-        slip: Callable[[Frame], SlipWatch] | None = None,
+        slip: Callable[[Float[np.ndarray, "markers 2"]], SlipWatch] | None = SlipDetector,
     ) -> None:
         if not smoothing_s >= 0:
             raise InputError(f"--smoothing must be 0 or more seconds, got {smoothing_s:g}")
@@ -458,13 +460,13 @@ class LiveReader:
         if self.reference is None:
             still = "the picture must be still for a moment: leave the sensor untouched"
             return self._withhold(begin, frame, f"there is no reference frame yet; {still}")
-        slip = None
+        followed = markers = None
         if self._tracker is not None and self._slip is not None:
-            places = self._tracker.update(frame.image).position_px[: len(self._tracker.rest)]
-            slip = self._slip.update(places, frame.time_s)
-        health = () if self._health is None else self._health.check(frame)
+            followed = self._tracker.update(frame.image)
+            markers = self._slip.update(followed.position_px[: len(self._tracker.rest)], frame.time_s)
+        health = () if self._health is None else self._health.check(frame, followed)
         withheld = next((check.sentence for check in health if not check.ok), None)
-        reading = replace(begin, slip=slip, health=health)
+        reading = replace(begin, slip=markers and markers.state, markers=markers, health=health)
         if self.network is None or withheld is not None:
             return self._withhold(reading, frame, withheld)
         return self._estimate(reading, frame)
@@ -493,7 +495,11 @@ class LiveReader:
         """Forget what came before, where frames no longer follow each other."""
         self._smooth.forget()
         if self._make_slip is not None and self.reference is not None:
-            self._tracker, self._slip = Tracker(self.reference), self._make_slip(self.reference)
+            try:
+                self._tracker = Tracker(self.reference)
+                self._slip = self._make_slip(self._tracker.rest.centre_px)
+            except (ImageError, InputError):
+                self._tracker = self._slip = None  # it shows no markers, or too few
 
     def _estimate(self, reading: Reading, frame: LiveFrame) -> Reading:
         assert self.network is not None

@@ -67,6 +67,21 @@ class SlipState(StrEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
+class MarkerReading:
+    """What the markers of one frame tell without any network."""
+
+    state: SlipState
+    contact: bool | None = None
+    """Whether something touches; None while that cannot be told."""
+    shear_px: float | None = None
+    """Mean motion of the contact's middle since it was pressed, in pixels; None without a contact."""
+    stick_share: float | None = None
+    """Share of the contact's markers that move with its middle, from 0 to 1; None without a contact."""
+    slipping_s: float | None = None
+    """Time since the slip began, as the markers tell it afterwards; None where there is none."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Reading:
     """What a running sensor tells at one frame; margins are from 0 to 1, 1 sticks fully, 0 slips.
 
@@ -90,6 +105,8 @@ class Reading:
     contact_state: ContactState = ContactState.UNKNOWN
     slip: SlipState | None = None
     """What the markers tell; None where they are not followed."""
+    markers: MarkerReading | None = None
+    """What else the markers tell; None where they are not followed."""
     health: tuple[Check, ...] = ()
     """Checks of the frame; empty where health is not watched."""
     withheld: str | None = None
@@ -109,4 +126,4 @@ class Reading:
         return f"{self.time_s:8.2f} s  {told}  {self.latency.total_ms:.0f} ms, {self.dropped} dropped"
 
 
-__all__ = ["Check", "Latency", "LiveFrame", "Reading", "SlipState"]
+__all__ = ["Check", "Latency", "LiveFrame", "MarkerReading", "Reading", "SlipState"]
