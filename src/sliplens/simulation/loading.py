@@ -146,14 +146,30 @@ def load_at_margins(margins: Frames, *, grasp: Grasp) -> Loading:
 
     `grasp`: force and friction; drift, creep and the kinetic ratio are left out.
     """
+    return load_at_states(
+        np.where(np.isnan(margins), 0.0, grasp.normal_force_n),
+        friction=np.full(len(margins), grasp.friction),
+        margins=margins,
+    )
+
+
+def load_at_states(
+    normal_force_n: Frames, *, friction: Frames, margins: Frames, held_s: Frames | None = None
+) -> Loading:
+    """Load a contact so that its frames have given normal forces, frictions and margins; nothing of before is told.
+
+    A margin of 0 slips, one of NaN is no contact; `held_s` is the time since the touch, which creep grows with.
+    """
     if np.any((margins < 0) | (margins > 1)):
         raise ContactError("safety margins must lie in [0, 1]; give them as fractions, not in percent")
-    nothing, static = np.zeros(len(margins)), np.full(len(margins), grasp.friction)
+    nothing = np.zeros(len(margins))
     used = 1 - np.nan_to_num(margins, nan=1.0)
-    friction = Friction(coefficient=static, used=used, carried=nothing, slips=margins == 0)
-    normal = np.where(np.isnan(margins), 0.0, grasp.normal_force_n)
+    states = Friction(coefficient=friction, used=used, carried=nothing, slips=margins == 0)
+    normal = np.where(np.isnan(margins), 0.0, normal_force_n)
     time_s = np.arange(len(margins), dtype=np.float64)
-    return _label(time_s, normal=normal, static=static, friction=friction, held_s=nothing)
+    return _label(
+        time_s, normal=normal, static=friction, friction=states, held_s=nothing if held_s is None else held_s
+    )
 
 
 def _label(time_s: Frames, *, normal: Frames, static: Frames, friction: Friction, held_s: Frames) -> Loading:

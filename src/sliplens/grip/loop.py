@@ -1,0 +1,256 @@
+"""The loop of a grip: images are read, a controller answers, the gripper acts, and the object moves or holds."""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from sliplens.grip.controllers import Controller, Observation
+from sliplens.grip.fingertip import Fingertip, mean_shear
+from sliplens.grip.plant import PERIOD_S, Plant, PlantState, World
+from sliplens.grip.readings import ReadingTable
+from sliplens.markers import Tracker
+from sliplens.models import Engine, Run, make_engine
+from sliplens.models.predictions import LEVEL
+
+_SHEAR_NOISE_PX = 0.02
+"""Noise of the mean of 19 markers that are each followed to 0.1 px (docs/limit.md)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sight:
+    """What two fingertips read of one moment; NaN where nothing is read."""
+
+    margin: Float[np.ndarray, "episodes 2"]
+    low: Float[np.ndarray, "episodes 2"]
+    high: Float[np.ndarray, "episodes 2"]
+    shear_px: Float[np.ndarray, "episodes 2"]
+    """Mean displacement of the inner markers the way of the pull, in pixels."""
+
+
+class Eyes(Protocol):
+    """What looks at the fingertips: images and a network, or a table of what the network said of such images."""
+
+    def look(self, state: PlantState) -> Sight:
+        """Read both fingertips of every episode."""
+        ...
+
+
+class TableEyes:
+    """Readings looked up in what was measured of the network, with its noise.
+
+    `fingertips`: which pair of the table's fingertips each episode holds with. `error_scale` makes the network worse on
+    purpose, or better: its errors, and the reach of its interval, times so much.
+    """
+
+    def __init__(
+        self,
+        table: ReadingTable,
+        *,
+        fingertips: Float[np.ndarray, " episodes"],
+        rng: np.random.Generator,
+        error_scale: float = 1.0,
+    ) -> None:
+        pair = fingertips.astype(np.int64) % (len(table) // 2)
+        self._table, self._tips = table, 2 * pair[:, None] + np.arange(2)
+        self._rng, self._scale = rng, error_scale
+
+    def look(self, state: PlantState) -> Sight:
+        """Read both fingertips of every episode."""
+        true = state.margin
+        pressing = np.isfinite(true)
+        known = np.where(pressing, true, 1.0)
+        force = np.broadcast_to(state.force_n[:, None], known.shape)
+        margin, low, high, shear = self._table.read(
+            self._tips, force, friction=state.holding_friction, margins=known
+        )
+        noise = self._rng.standard_normal((2, *known.shape))
+        change = (self._scale - 1) * (margin - known) + self._table.noise * self._scale * noise[0]
+        shear = np.copysign(shear, state.shear_n) if (state.shear_n < 0).any() else shear
+        wider = [(self._scale - 1) * (end - margin) for end in (low, high)]
+        return Sight(
+            margin=np.where(pressing, margin + change, 1.0),
+            low=np.where(pressing, np.clip(low + change + wider[0], 0, 1), 1.0),
+            high=np.where(pressing, np.clip(high + change + wider[1], 0, 1), 1.0),
+            shear_px=np.where(pressing, shear, 0.0) + _SHEAR_NOISE_PX * noise[1],
+        )
+
+
+class RenderedEyes:
+    """Two fingertips filmed and read by a network, markers followed: the loop closed through pixels, one episode.
+
+    Markers are followed in one finger an image, turn by turn; in between a finger keeps its last displacement.
+    """
+
+    def __init__(self, run: Run, *, seed: int, engine: str | Engine = "auto", frames: int = 4000) -> None:
+        first = Fingertip(seed=seed)
+        self.fingertips = (first, Fingertip(seed=seed + 1, day=first.day))
+        self._run = run
+        self._engine = make_engine(engine, run, frames=frames, batch_size=2) if isinstance(engine, str) else engine
+        self._trackers = [Tracker(tip.reference) for tip in self.fingertips]
+        self._shear, self._turn = np.zeros(2), 0
+        self.frames = np.stack([tip.reference for tip in self.fingertips])
+        """What the two cameras saw last, (2, height, width, 3)."""
+
+    @property
+    def references(self) -> np.ndarray:
+        """The two untouched sensors, T_0, (2, height, width, 3)."""
+        return np.stack([tip.reference for tip in self.fingertips])
+
+    def look(self, state: PlantState) -> Sight:
+        """Film both fingertips and read them."""
+        margins, friction, shear = state.margin[0], state.holding_friction[0], state.shear_n[0]
+        self.frames = np.stack(
+            [
+                tip.draw(
+                    float(state.force_n[0]),
+                    friction=float(friction[finger]),
+                    margin=float(np.nan_to_num(margins[finger], nan=1.0)),
+                    held_s=float(state.held_s[0]),
+                    pulled_back=bool(shear[finger] < 0),
+                )
+                for finger, tip in enumerate(self.fingertips)
+            ]
+        )
+        parts = [self._run.encode(frame[None], tip.reference) for frame, tip in zip(self.frames, self.fingertips, strict=True)]
+        import torch
+
+        estimate = self._engine.estimate(self._run, torch.cat(parts))
+        low, high = estimate.interval(LEVEL) or (estimate.margin, estimate.margin)
+        self._turn = 1 - self._turn
+        tracker = self._trackers[self._turn]
+        tracked = tracker.update(self.frames[self._turn])
+        rest = tracker.rest.centre_px
+        self._shear[self._turn] = mean_shear(rest, tracked.position_px[: len(rest)])
+        return Sight(
+            margin=estimate.margin[None], low=low[None], high=high[None], shear_px=self._shear[None].copy()
+        )
+
+_SPAN = 3
+"""Images whose markers are averaged before and after a slip."""
+
+
+class SlipWatch:
+    """Tells gross slip from the markers: as the friction falls from static to kinetic, the skin springs back.
+
+    It is a slip where the pull on the markers of both fingers, their mean, falls by more than an eighth from three images
+    to the next three while the grip is not loosened. A pull that ends at once looks the same, and is answered as a slip. What pressing alone displaced before
+    the lift is subtracted.
+    """
+
+    def __init__(self, *, share: float = 0.12, floor_px: float = 0.05) -> None:
+        self._share, self._floor = share, floor_px
+        self._past: list[tuple[np.ndarray, np.ndarray]] = []
+        self._pressed: np.ndarray | float = 0.0
+
+    def update(
+        self,
+        shear_px: Float[np.ndarray, "episodes 2"],
+        force_n: Float[np.ndarray, " episodes"],
+        *,
+        lifted: bool,
+    ) -> Bool[np.ndarray, " episodes"]:
+        """Whether a finger begins to slip, from the markers' displacement in pixels and the grip force in newtons."""
+        self._past = [*self._past[1 - 2 * _SPAN :], (shear_px, force_n)]
+        if not lifted:
+            self._pressed = np.nan_to_num(shear_px)
+        if len(self._past) < 2 * _SPAN or not lifted:
+            return np.zeros(len(shear_px), dtype=bool)
+        before, now = (
+            np.mean([shear for shear, _ in part], axis=0) for part in (self._past[:_SPAN], self._past[_SPAN:])
+        )
+        seen = np.isfinite(before) & np.isfinite(now)
+        pull, left = (
+            np.abs(np.where(seen, shear - self._pressed, 0).sum(axis=1)) / np.maximum(seen.sum(axis=1), 1)
+            for shear in (before, now)
+        )
+        loosened = force_n < 0.97 * self._past[0][1]
+        return (pull - left > np.maximum(self._floor, self._share * pull)) & ~loosened
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tick:
+    """One turn of the loop."""
+
+    state: PlantState
+    """After the step."""
+    command_n: Float[np.ndarray, " episodes"]
+    sight: Sight
+    """What was read before the step; `seen` is what the controller knew of it, later."""
+    seen: Observation
+
+
+class GripLoop:
+    """Plant, eyes and controller in a loop of 60 Hz; a command answers what was seen `latency_s` before.
+
+    Parameters
+    ----------
+    plant
+        What is stepped.
+    eyes
+        `TableEyes`, or `RenderedEyes` for a single episode.
+    controller
+        Anything with `command(observation)`.
+    latency_s
+        From an image to the command that answers it, rounded up to whole images; the actuator's lag comes on top.
+    lift_s
+        When the hand begins to rise: markers tell slip from then on.
+
+    Examples
+    --------
+    Squeeze a cup that stands on the table with the force that a controller asks for:
+
+    >>> import numpy as np
+    >>> from sliplens.grip import CONTROLLERS, GripLoop, Plant, draw_scripts, pick_object
+    >>> from sliplens.grip.loop import NoEyes
+    >>> scripts = draw_scripts("cup", "dry", episodes=1, seed=0)
+    >>> loop = GripLoop(Plant(pick_object("cup")), NoEyes(), CONTROLLERS["fixed"](force_n=2.0))
+    >>> for _ in range(30):
+    ...     tick = loop.tick(scripts.world(loop.plant.state.time_s))
+    >>> tick.state.force_n.round(1)
+    array([2.])
+    """
+
+    def __init__(
+        self, plant: Plant, eyes: Eyes, controller: Controller, *, latency_s: float = 0.02, lift_s: float = 0.5
+    ) -> None:
+        self.plant, self.eyes, self.controller = plant, eyes, controller
+        self._delay, self._lift_s = math.ceil(latency_s / PERIOD_S - 1e-9), lift_s
+        self._past: list[tuple[PlantState, Sight]] = []
+        self._watch = SlipWatch()
+        self._command = np.zeros(len(plant.state.force_n))
+
+    def tick(
+        self, world: World, *, dark: Bool[np.ndarray, "episodes 2"] | None = None, command_n: np.ndarray | None = None
+    ) -> Tick:
+        """Look, command and step once; `dark` fingers read nothing, `command_n` is told in place of the controller's."""
+        now, sight = self.plant.state, self.eyes.look(self.plant.state)
+        if dark is not None and dark.any():
+            parts = {name: np.where(dark, np.nan, value) for name, value in vars(sight).items()}
+            sight = Sight(**parts)
+        self._past = [*self._past[-self._delay :], (now, sight)] if self._delay else [(now, sight)]
+        then, read = self._past[0]
+        seen = Observation(
+            time_s=now.time_s,
+            force_n=then.force_n,
+            command_n=self._command,
+            load_n=then.load_n,
+            margin=read.margin,
+            low=read.low,
+            slip=self._watch.update(read.shear_px, then.force_n, lifted=then.time_s > self._lift_s),
+            true_margin=np.nan_to_num(then.margin, nan=1.0),
+        )
+        self._command = np.asarray(self.controller.command(seen) if command_n is None else command_n, dtype=np.float64)
+        state = self.plant.step(self._command, world)
+        return Tick(state=state, command_n=self._command, sight=sight, seen=seen)
+
+
+class NoEyes:
+    """No fingertips at all: for controllers that read nothing."""
+
+    def look(self, state: PlantState) -> Sight:
+        """Read nothing."""
+        nothing = np.full(state.shear_n.shape, np.nan)
+        return Sight(margin=nothing, low=nothing, high=nothing, shear_px=nothing)

@@ -1,0 +1,154 @@
+"""What a network says of a grip's frames: measured once for many fingertips, then looked up."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Float32, Int
+
+from sliplens.errors import InputError
+from sliplens.grip.fingertip import Fingertip, draw_film, mean_shear
+from sliplens.models import Run, make_engine
+from sliplens.models.predictions import LEVEL
+from sliplens.progress import OnProgress
+
+FRICTIONS = (0.1, 0.18, 0.3, 0.5, 0.8, 1.3)
+"""Coefficients of friction at which readings are measured; between them they are interpolated in the logarithm."""
+FORCES_N = (0.3, 0.7, 1.5, 2.5, 4.0)
+"""Normal forces, the same; the networks were trained from 0.5 to 2 N, and far above they read nonsense."""
+MARGINS = (0.0, 0.04, 0.12, 0.3, 0.55, 0.8, 1.0)
+"""Margins, interpolated as they are."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadingTable:
+    """Error model of a network: what it read of many fingertips at each friction, force and margin.
+
+    Fingertips are the first axis: each has its own sensor and touch, and its errors stay with it as long as it holds, as
+    they do in the rendered loop; noise comes anew with each frame. Fingertips 0 and 1, 2 and 3, ... are those of one
+    gripper and share a day.
+    """
+
+    network: str
+    """Hash of the weights that were measured."""
+    seed: int
+    """Seed of the first fingertip; the others follow."""
+    margin: Float32[np.ndarray, "fingertips frictions forces margins"]
+    low: Float32[np.ndarray, "fingertips frictions forces margins"]
+    """Lower end of the 90 % interval."""
+    high: Float32[np.ndarray, "fingertips frictions forces margins"]
+    shear_px: Float32[np.ndarray, "fingertips frictions forces margins"]
+    """Mean displacement of the inner markers down the image, in pixels: the way of the pull."""
+    noise: float
+    """Standard deviation of the margin read anew of the same state, in margin units."""
+
+    def __len__(self) -> int:
+        return len(self.margin)
+
+    def of(self, fingertips: slice) -> "ReadingTable":
+        """Table of some of the fingertips."""
+        parts = {name: getattr(self, name)[fingertips] for name in ("margin", "low", "high", "shear_px")}
+        return replace(self, seed=self.seed + (fingertips.start or 0), **parts)
+
+    def read(
+        self,
+        fingertips: Int[np.ndarray, "*contacts"],
+        normal_force_n: Float[np.ndarray, "*contacts"],
+        *,
+        friction: Float[np.ndarray, "*contacts"],
+        margins: Float[np.ndarray, "*contacts"],
+    ) -> tuple[Float[np.ndarray, "*contacts"], ...]:
+        """Margin, both ends of its interval, and shear in pixels, of contacts in these states, without noise.
+
+        Forces and frictions beyond the measured ones are read as the outermost.
+        """
+        places = [
+            _place(np.log(FRICTIONS), np.log(np.maximum(friction, 1e-6))),
+            _place(np.log(FORCES_N), np.log(np.maximum(normal_force_n, 1e-6))),
+            _place(np.asarray(MARGINS), margins),
+        ]
+        stacked = self._stacked
+        total = np.zeros((*np.shape(fingertips), stacked.shape[-1]))
+        for corner in range(8):
+            weight, index = 1.0, [fingertips]
+            for axis, (at, part) in enumerate(places):
+                upper = corner >> axis & 1
+                weight = weight * (part if upper else 1 - part)
+                index.append(at + upper)
+            total += np.asarray(weight)[..., None] * stacked[tuple(index)]
+        return tuple(np.moveaxis(total, -1, 0))
+
+    @property
+    def _stacked(self) -> Float32[np.ndarray, "fingertips frictions forces margins 4"]:
+        cached = self.__dict__.get("_cache")
+        if cached is None:
+            cached = np.stack([self.margin, self.low, self.high, self.shear_px], axis=-1)
+            object.__setattr__(self, "_cache", cached)
+        return cached
+
+
+def _place(grid: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cell of a grid that each value lies in, and how far in it, 0 to 1."""
+    at = np.clip(np.searchsorted(grid, values, side="right") - 1, 0, len(grid) - 2)
+    return at, np.clip((values - grid[at]) / (grid[at + 1] - grid[at]), 0, 1)
+
+
+def measure_readings(
+    run: Run, *, fingertips: int = 96, seed: int = 0, engine: str = "auto", on_progress: OnProgress | None = None
+) -> ReadingTable:
+    """Measure what a network says of fingertips at every friction, force and margin of the table.
+
+    Some 3 s a fingertip on one core. The noise is that of 12 states of each fingertip, filmed twice.
+
+    Parameters
+    ----------
+    run
+        Network with a calibration, which gives its intervals.
+    fingertips
+        How many, an even number; each has a seed of its own, counted from `seed`.
+    engine
+        Row of `ENGINES`.
+
+    Raises
+    ------
+    InputError
+        If the network was never calibrated, and so cannot say how sure it is.
+    """
+    if run.manifest.calibration is None:
+        raise InputError("the network was never calibrated and tells no interval to grip by; train it with validation")
+    mu, force, gamma = np.meshgrid(FRICTIONS, FORCES_N, MARGINS, indexing="ij")
+    # full stick shows no friction: one of them is enough
+    shown = (gamma < 1) | (mu == FRICTIONS[0])
+    states = {"friction": mu[shown], "margins": gamma[shown]}
+    again = np.random.default_rng(seed).choice(shown.sum(), 12, replace=False)
+    ready = make_engine(engine, run, frames=fingertips * int(shown.sum()))
+    found: list[np.ndarray] = []
+    repeats: list[np.ndarray] = []
+    tip = None
+    for number in range(fingertips):
+        tip = Fingertip(seed=seed + number, day=tip.day if tip is not None and number % 2 else None)
+        film = tip.film(force[shown], held_s=np.ones(int(shown.sum())), **states)
+        frames = draw_film(film)
+        twice = draw_film(
+            tip.film(force[shown][again], held_s=np.ones(12), **{name: part[again] for name, part in states.items()})
+        )
+        estimate = ready.estimate(run, run.encode(np.concatenate([frames, twice]), tip.reference))
+        ends = estimate.interval(LEVEL)
+        assert ends is not None  # it is calibrated
+        count, table = len(frames), np.empty((4, *mu.shape), dtype=np.float32)
+        for row, values in zip(table, (estimate.margin, *ends, mean_shear(film.motion.rest_px, film.motion.centres_px)), strict=True):
+            row[shown] = values[:count]
+            row[1:, :, -1] = row[0, :, -1]
+        found.append(table)
+        repeats.append(estimate.margin[count:] - estimate.margin[:count][again])
+        if on_progress is not None:
+            on_progress(number + 1, fingertips)
+    margin, low, high, shear = np.stack(found, axis=1)
+    return ReadingTable(
+        network=run.manifest.weights_sha256,
+        seed=seed,
+        margin=margin,
+        low=low,
+        high=high,
+        shear_px=shear,
+        noise=float(np.std(np.concatenate(repeats)) / np.sqrt(2)),
+    )

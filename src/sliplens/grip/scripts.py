@@ -1,0 +1,209 @@
+"""What happens in an episode: mass, friction, pulls, jolts, a wet patch, water, a lamp that goes out."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+
+from sliplens.codec import Columns
+from sliplens.errors import InputError
+from sliplens.extras import Table
+from sliplens.grip.plant import GRAVITY_M_S2, OBJECTS, HeldObject, World
+
+EPISODE_S = 6.0
+"""Length of an episode in seconds."""
+LIFT_S = 0.5
+"""When the hand begins to rise."""
+_RISE_S, _RISE_M = 1.5, 0.2
+_NEVER = 1e9
+_JOLT_S = 0.08
+_POUR_S = 2.0
+_FADE_S = 3.0
+_PULL_S, _PULL_RAMP_S = 1.5, 0.15
+_WOBBLE, _WOBBLE_HZ = 0.2, 2.0
+
+Values: TypeAlias = Float[np.ndarray, " episodes"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scripts(Columns):
+    """What happens in each of some episodes, a row an episode; what never happens has a time beyond the end.
+
+    Masses are in kilograms, times in seconds, forces in newtons, factors are ratios.
+    """
+
+    mass_kg: Values
+    friction: Values
+    """Static, mean of both fingers, as the episode begins."""
+    friction_gap: Values
+    """Difference between the fingers, as a share of it."""
+    kinetic_ratio: Values
+    drift: Values
+    """Relative change of the friction over three seconds from 2 s on."""
+    patch_factor: Values
+    """Friction on a wet patch over that before."""
+    patch_at_s: Values
+    pull_n: Values
+    """Steady pull, which wobbles by a fifth at 2 Hz and lasts 1.5 s."""
+    pull_at_s: Values
+    jolt_n: Values
+    """Height of a half-sine of 80 ms."""
+    jolt_at_s: Values
+    water_kg: Values
+    """Poured in within 2 s."""
+    water_at_s: Values
+    lamp_at_s: Values
+    """When the lamp of one fingertip goes out, whose readings are withheld from then on."""
+    fingertips: Values
+    """Which pair of fingertips holds, counted from 0."""
+
+    def world(self, time_s: float) -> World:
+        """What acts on the objects from this time on for one period."""
+        fade = np.clip((time_s - 2.0) / _FADE_S, 0, 1) * self.drift
+        friction = self.friction * (1 + fade) * np.where(time_s >= self.patch_at_s, self.patch_factor, 1.0)
+        gap = self.friction_gap[:, None] * np.array([-0.5, 0.5])
+        since = time_s - self.pull_at_s
+        ramp = np.clip(since / _PULL_RAMP_S, 0, 1) * np.clip((_PULL_S - since) / _PULL_RAMP_S, 0, 1)
+        pull = self.pull_n * ramp * (1 + _WOBBLE * np.sin(2 * np.pi * _WOBBLE_HZ * since))
+        jolted = np.clip((time_s - self.jolt_at_s) / _JOLT_S, 0, 1)
+        hand, speed, _ = hand_motion(time_s)
+        return World(
+            mass_kg=self.mass_kg + self.water_kg * np.clip((time_s - self.water_at_s) / _POUR_S, 0, 1),
+            friction=friction[:, None] * (1 + gap),
+            kinetic_ratio=self.kinetic_ratio,
+            pull_n=pull + self.jolt_n * np.sin(np.pi * jolted),
+            hand_m=np.full(len(self), hand),
+            hand_speed_m_s=np.full(len(self), speed),
+        )
+
+
+def hand_motion(time_s: float) -> tuple[float, float, float]:
+    """Height in metres, speed and acceleration of the hand, in metres a second (squared): a lift of least jerk.
+
+    Flash and Hogan, *J. Neurosci.* 5 (1985) 1688, eq. 2.
+    """
+    part = min(max((time_s - LIFT_S) / _RISE_S, 0.0), 1.0)
+    height = _RISE_M * part**3 * (10 - 15 * part + 6 * part**2)
+    speed = _RISE_M / _RISE_S * 30 * part**2 * (1 - part) ** 2
+    return height, speed, _RISE_M / _RISE_S**2 * 60 * part * (1 - part) * (1 - 2 * part)
+
+
+Draw: TypeAlias = Callable[[Scripts, HeldObject, np.random.Generator], Scripts]
+"""Changes ordinary dry episodes of an object into those of a condition."""
+
+
+def _wet(scripts: Scripts, _: HeldObject, rng: np.random.Generator) -> Scripts:
+    count = len(scripts)
+    return replace(scripts, friction=rng.uniform(0.15, 0.7, count), drift=rng.uniform(-0.15, 0.15, count))
+
+
+def _unknown(scripts: Scripts, _: HeldObject, rng: np.random.Generator) -> Scripts:
+    return replace(scripts, friction=np.exp(rng.uniform(np.log(0.15), np.log(1.2), len(scripts))))
+
+
+def _jolt(scripts: Scripts, held: HeldObject, rng: np.random.Generator) -> Scripts:
+    count, weight = len(scripts), scripts.mass_kg * GRAVITY_M_S2
+    return replace(scripts, jolt_n=weight * rng.uniform(0.5, 1.5, count), jolt_at_s=rng.uniform(3, 5, count))
+
+
+CONDITIONS: Table[Draw] = Table(
+    "condition",
+    "sliplens.conditions",
+    {
+        "dry": lambda scripts, *_: scripts,
+        "wet": _wet,
+        "drifting": lambda scripts, _, rng: replace(scripts, drift=rng.uniform(-0.6, -0.2, len(scripts))),
+        "unknown": _unknown,
+        "patch": lambda scripts, _, rng: replace(
+            scripts, patch_factor=rng.uniform(0.4, 0.75, len(scripts)), patch_at_s=np.full(len(scripts), 2.5)
+        ),
+        "jolt": _jolt,
+        "poured": lambda scripts, held, rng: replace(
+            scripts,
+            mass_kg=np.full(len(scripts), held.mass_kg[0]),
+            water_kg=rng.uniform(0, 1, len(scripts)) * (held.mass_kg[1] - held.mass_kg[0]),
+            water_at_s=rng.uniform(2, 3, len(scripts)),
+        ),
+        "lamp": lambda scripts, _, rng: replace(scripts, lamp_at_s=rng.uniform(2, 4, len(scripts))),
+    },
+)
+"""Conditions by name: dry objects of another friction each; wet ones; a friction that falls; one of which nothing is
+known; a wet patch at 2.5 s; a jolt; water poured in; a fingertip's lamp that goes out."""
+
+
+def draw_scripts(
+    held: HeldObject | str,
+    condition: str,
+    *,
+    episodes: int,
+    seed: int,
+    fingertips: int = 64,
+    **fixed: float | None,
+) -> Scripts:
+    """Draw what happens in some episodes, the same for the same seed.
+
+    Parameters
+    ----------
+    held
+        Object, or row of `OBJECTS`.
+    condition
+        Row of `CONDITIONS`.
+    episodes, seed
+        How many, and the seed they are drawn from.
+    fingertips
+        How many pairs of fingertips to choose from.
+    fixed
+        Columns of `Scripts` that are the same in all episodes rather than drawn, such as `mass_kg` or `friction`; None
+        leaves one to chance.
+
+    Raises
+    ------
+    InputError
+        If there is no such object or condition, or a fixed value cannot be.
+
+    Examples
+    --------
+    >>> from sliplens.grip import draw_scripts
+    >>> scripts = draw_scripts("cup", "patch", episodes=2, seed=0, mass_kg=0.06)
+    >>> scripts.mass_kg, scripts.patch_at_s
+    (array([0.06, 0.06]), array([2.5, 2.5]))
+    """
+    if isinstance(held, str):
+        held = pick_object(held)
+    if episodes < 1:
+        raise InputError(f"{episodes} episodes cannot be run; ask for 1 or more")
+    rng, own = np.random.default_rng(seed).spawn(2)
+
+    def uniform(low: float, high: float) -> Values:
+        return rng.uniform(low, high, episodes)
+
+    mass = uniform(*held.mass_kg)
+    nothing, never = np.zeros(episodes), np.full(episodes, _NEVER)
+    scripts = Scripts(
+        mass_kg=mass, friction=uniform(0.5, 1.2), friction_gap=uniform(-0.1, 0.1), kinetic_ratio=uniform(0.7, 0.9),
+        drift=nothing, patch_factor=np.ones(episodes), patch_at_s=never,
+        pull_n=mass * GRAVITY_M_S2 * uniform(0, 0.5), pull_at_s=uniform(2, 3), jolt_n=nothing, jolt_at_s=never,
+        water_kg=nothing, water_at_s=never, lamp_at_s=never,
+        fingertips=rng.integers(fingertips, size=episodes).astype(np.float64),
+    )  # fmt: skip
+    scripts = CONDITIONS.pick(condition)(scripts, held, own)
+    given = {name: value for name, value in fixed.items() if value is not None}
+    names = {field.name for field in fields(Scripts)}
+    for name, value in given.items():
+        if name not in names:
+            raise InputError(f"an episode has no {name}; choose of {', '.join(sorted(names))}")
+        if not np.isfinite(value) or (name in _POSITIVE and value <= 0):
+            raise InputError(f"{name} must be {'positive' if name in _POSITIVE else 'a number'}, got {value:g}")
+    return replace(scripts, **{name: np.full(episodes, float(value)) for name, value in given.items()})
+
+
+_POSITIVE = {"mass_kg", "friction", "kinetic_ratio", "patch_factor"}
+
+
+def pick_object(name: str) -> HeldObject:
+    """Object of a name that a user gave."""
+    if name not in OBJECTS:
+        raise InputError(f"there is no object named {name!r}; choose one of {', '.join(OBJECTS)}")
+    return OBJECTS[name]

@@ -1,0 +1,89 @@
+"""Grips: what became of each episode, and one of them tick by tick."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
+
+from sliplens.codec import Columns
+
+__all__ = ["EpisodeTable", "Grip", "GripTrace"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeTable(Columns):
+    """Episodes, a row each; forces in newtons, lengths in metres, times in seconds."""
+
+    condition: Shaped[np.ndarray, " episodes"]
+    mass_kg: Float64[np.ndarray, " episodes"]
+    friction: Float64[np.ndarray, " episodes"]
+    """Least static friction of the episode, mean of both fingers."""
+    dropped: Bool[np.ndarray, " episodes"]
+    crushed: Bool[np.ndarray, " episodes"]
+    slip_m: Float64[np.ndarray, " episodes"]
+    """Way slid by the finger that slid farther."""
+    mean_force_n: Float64[np.ndarray, " episodes"]
+    """Grip force, mean from the lift until the end or the drop."""
+    peak_force_n: Float64[np.ndarray, " episodes"]
+    least_force_n: Float64[np.ndarray, " episodes"]
+    """Least force that would have held, mean over the same time."""
+    peak_least_force_n: Float64[np.ndarray, " episodes"]
+    """The highest that was needed at any moment."""
+    force_excess: Float64[np.ndarray, " episodes"]
+    """Mean force over the mean least force, less 1: a ratio."""
+    peak_excess: Float64[np.ndarray, " episodes"]
+    """The same of the peaks."""
+    under_20_s: Float64[np.ndarray, " episodes"]
+    """Time with a true margin under 20 %."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GripTrace(Columns):
+    """One episode, a row a tick; margins are means of both fingers that read, NaN where none does."""
+
+    time_s: Float64[np.ndarray, " ticks"]
+    command_n: Float64[np.ndarray, " ticks"]
+    force_n: Float64[np.ndarray, " ticks"]
+    least_force_n: Float64[np.ndarray, " ticks"]
+    """Least force that holds: the load over both frictions."""
+    load_n: Float64[np.ndarray, " ticks"]
+    """Tangential force of both fingers."""
+    true_margin: Float64[np.ndarray, " ticks"]
+    """Of the finger with less."""
+    margin: Float64[np.ndarray, " ticks"]
+    """Read."""
+    low: Float64[np.ndarray, " ticks"]
+    high: Float64[np.ndarray, " ticks"]
+    slip_m: Float64[np.ndarray, " ticks"]
+    slip_seen: Bool[np.ndarray, " ticks"]
+    """Whether the markers told of a slip."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grip:
+    """Episodes of one controller."""
+
+    object: str
+    controller: str
+    settings: dict[str, float]
+    """Constants of the controller that were changed."""
+    network: str
+    latency_s: float
+    """From an image to the command that answers it."""
+    rendered: bool
+    """Whether the fingertips were filmed and read, rather than looked up in the network's measured errors."""
+    seed: int
+    seconds: float
+    """Time the episodes took to run."""
+    episodes: EpisodeTable
+    trace: GripTrace
+    """The first episode."""
+    moments_s: tuple[float, ...] = ()
+    """Times of the pictures; none where nothing was rendered."""
+    pictures: UInt8[np.ndarray, "moments height width 3"] | None = None
+    maps: Float32[np.ndarray, "moments height width"] | None = None
+
+    @property
+    def drop_rate(self) -> float:
+        """Share of the episodes in which the object fell."""
+        return float(self.episodes.dropped.mean())
