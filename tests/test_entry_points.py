@@ -9,6 +9,7 @@ from sliplens.errors import InputError
 from sliplens.explainers import EXPLAINERS
 from sliplens.extras import Table
 from sliplens.faithfulness import FILLS
+from sliplens.grip import CONDITIONS, CONTROLLERS
 from sliplens.live.sinks import SINKS
 from sliplens.live.sources import SOURCES
 from sliplens.markers import KINDS
@@ -25,6 +26,8 @@ TABLES = {
     "sliplens.backbones": BACKBONES,
     "sliplens.encodings": ENCODINGS,
     "sliplens.engines": ENGINES,
+    "sliplens.conditions": CONDITIONS,
+    "sliplens.controllers": CONTROLLERS,
     "sliplens.explainers": EXPLAINERS,
     "sliplens.fills": FILLS,
     "sliplens.formats": FORMATS,

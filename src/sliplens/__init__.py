@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from sliplens.errors import SliplensError
     from sliplens.explainers.table import explain
     from sliplens.faithfulness.scoring import score
+    from sliplens.grip.episodes import run_episodes
     from sliplens.live.loop import LiveReader, read_live
     from sliplens.markers.tracking import track
     from sliplens.models.checkpoint import load
@@ -47,6 +48,7 @@ _MODULES = {
     "plot": "sliplens.plots.figure",
     "predict": "sliplens.models.predictions",
     "read_live": "sliplens.live.loop",
+    "run_episodes": "sliplens.grip.episodes",
     "run_study": "sliplens.study.run",
     "score": "sliplens.faithfulness.scoring",
     "simulate": "sliplens.simulation.trials",
@@ -75,6 +77,7 @@ __all__ = [
     "plot",
     "predict",
     "read_live",
+    "run_episodes",
     "run_study",
     "score",
     "simulate",

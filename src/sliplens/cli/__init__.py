@@ -14,6 +14,7 @@ from sliplens.cli.diagnose import Diagnose
 from sliplens.cli.evaluate import Evaluate
 from sliplens.cli.explain import Explain
 from sliplens.cli.export import Export
+from sliplens.cli.grip import Grip
 from sliplens.cli.import_ import Import
 from sliplens.cli.label import Label
 from sliplens.cli.live import Live
@@ -30,7 +31,7 @@ from sliplens.errors import SliplensError
 
 _Recordings = Simulate | Import | Label | Split | Check | View | Track
 _Networks = Train | Evaluate | Predict | Export
-Command = Demo | Live | _Recordings | _Networks | Explain | Score | Diagnose | Study | Report
+Command = Demo | Live | _Recordings | _Networks | Explain | Score | Diagnose | Study | Grip | Report
 
 _DESCRIPTION = """sliplens tells how close a soft robotic fingertip is to losing its grip, from the images of the camera
 inside it, and shows why the network says so. Start with `sliplens demo runs/demo`; every stage it runs is a command

@@ -1,8 +1,40 @@
 """Grips that hold what would slip, with the safety margin in the loop: simulated, and out to a real gripper."""
 
 from sliplens.grip.controllers import CONTROLLERS, Controller, Observation
+from sliplens.grip.episodes import make_controller, run_episodes, run_scripts
 from sliplens.grip.fingertip import Fingertip
-from sliplens.grip.loop import Eyes, GripLoop, RenderedEyes, Sight, SlipWatch, TableEyes, Tick
+from sliplens.grip.loop import Eyes, GripLoop, NoEyes, RenderedEyes, Sight, SlipWatch, TableEyes, Tick
 from sliplens.grip.plant import OBJECTS, GripperModel, HeldObject, Plant, PlantState, World
-from sliplens.grip.readings import ReadingTable, measure_readings
+from sliplens.grip.readings import ReadingTable, load_readings, measure_readings
 from sliplens.grip.scripts import CONDITIONS, Scripts, draw_scripts, pick_object
+
+__all__ = [
+    "CONDITIONS",
+    "CONTROLLERS",
+    "OBJECTS",
+    "Controller",
+    "Eyes",
+    "Fingertip",
+    "GripLoop",
+    "GripperModel",
+    "HeldObject",
+    "NoEyes",
+    "Observation",
+    "Plant",
+    "PlantState",
+    "ReadingTable",
+    "RenderedEyes",
+    "Scripts",
+    "Sight",
+    "SlipWatch",
+    "TableEyes",
+    "Tick",
+    "World",
+    "draw_scripts",
+    "load_readings",
+    "make_controller",
+    "measure_readings",
+    "pick_object",
+    "run_episodes",
+    "run_scripts",
+]

@@ -1,7 +1,7 @@
 """Controllers of the grip force: what to press with, told from what the fingertips read."""
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -38,6 +38,7 @@ class Observation:
     """Margin as it is, for the oracle; None outside a simulation."""
 
 
+@runtime_checkable
 class Controller(Protocol):
     """Tells a grip force, one command an image; made anew for each batch of episodes, it may remember."""
 
@@ -87,15 +88,16 @@ class MarginGrip:
     as the fingers began to slide, if that is more. After a slip nothing is loosened for a while.
     """
 
-    target: float = 0.3
+    target: float = 0.2
     """Margin Gamma* aimed at, as a share of the friction: 0.2 presses 25 % more than the least force that holds."""
-    caution: float = 1.0
-    """Share of the way from the margin read to the lower end of its interval."""
-    zero: float = 0.0
+    caution: float = 0.0
+    """Share of the way from the margin read to the lower end of its interval; with 1 a `zero` of 0.2 and a `target` of
+    0.1 suit."""
+    zero: float = 0.5
     """r_0 before any slip, a share: what may be read where the object already slides."""
     trained_n: float = 2.0
     """Largest normal force that the network was trained with."""
-    sag_per_n: float = 0.12
+    sag_per_n: float = 0.18
     """Margin by which it reads too low for each newton beyond, as a share (measured)."""
     start_n: float = 2.0
     """Force to lift with."""
@@ -105,7 +107,7 @@ class MarginGrip:
     """Share of the force within which nothing changes."""
     up_n_s: float = 40.0
     """Newtons a second that the force may grow by."""
-    down_n_s: float = 1.0
+    down_n_s: float = 5.0
     """Newtons a second that it may fall by."""
     boost: float = 1.5
     """Force after a slip over that before it, a ratio."""
@@ -175,7 +177,7 @@ class MarginLaw(MarginGrip):
 class ProportionalLaw(MarginGrip):
     """dF/dt = K (Gamma* - Gamma): the force grows as long as the margin is below the one aimed at."""
 
-    gain_n_s: float = 10.0
+    gain_n_s: float = 20.0
     """K, in newtons a second for a margin of 1."""
 
     def law(
@@ -190,24 +192,20 @@ _HORIZON_S = 0.1
 
 
 @dataclass(kw_only=True)
-class Reflex(MarginGrip):
+class Reflex:
     """F = const until a slip, then `boost` times as much, again and again: no margin, markers alone."""
 
     start_n: float = 1.0
-
-    def margin_of(self, seen: Observation) -> Float[np.ndarray, " episodes"]:
-        """No margin: 0, a share, whatever is read."""
-        return np.zeros_like(seen.force_n)
-
-    def law(
-        self, force_n: Float[np.ndarray, " episodes"], margin: Float[np.ndarray, " episodes"]
-    ) -> Float[np.ndarray, " episodes"]:
-        """Grip force in newtons: none is asked for, so that it stays as it is."""
-        return np.zeros_like(force_n)
+    boost: float = 1.5
+    """Force after a slip over that before it, a ratio."""
+    _slipped_s: np.ndarray = field(init=False, default_factory=lambda: np.full(1, -np.inf))
 
     def command(self, seen: Observation) -> Float[np.ndarray, " episodes"]:
         """Grip force in newtons."""
-        return np.maximum(super().command(seen), seen.command_n)
+        slip = seen.slip & (seen.time_s - self._slipped_s > _DEAF_S)
+        self._slipped_s = np.where(slip, seen.time_s, self._slipped_s)
+        kept = np.maximum(seen.command_n, self.start_n)
+        return np.where(slip, self.boost * kept, kept)
 
 
 @dataclass(kw_only=True)

@@ -1,10 +1,12 @@
 """The loop of a grip: images are read, a controller answers, the gripper acts, and the object moves or holds."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 
 from sliplens.grip.controllers import Controller, Observation
@@ -30,6 +32,7 @@ class Sight:
     """Mean displacement of the inner markers the way of the pull, in pixels."""
 
 
+@runtime_checkable
 class Eyes(Protocol):
     """What looks at the fingertips: images and a network, or a table of what the network said of such images."""
 
@@ -63,9 +66,7 @@ class TableEyes:
         pressing = np.isfinite(true)
         known = np.where(pressing, true, 1.0)
         force = np.broadcast_to(state.force_n[:, None], known.shape)
-        margin, low, high, shear = self._table.read(
-            self._tips, force, friction=state.holding_friction, margins=known
-        )
+        margin, low, high, shear = self._table.read(self._tips, force, friction=state.holding_friction, margins=known)
         noise = self._rng.standard_normal((2, *known.shape))
         change = (self._scale - 1) * (margin - known) + self._table.noise * self._scale * noise[0]
         shear = np.copysign(shear, state.shear_n) if (state.shear_n < 0).any() else shear
@@ -87,12 +88,17 @@ class RenderedEyes:
     def __init__(self, run: Run, *, seed: int, engine: str | Engine = "auto", frames: int = 4000) -> None:
         first = Fingertip(seed=seed)
         self.fingertips = (first, Fingertip(seed=seed + 1, day=first.day))
-        self._run = run
+        self._run, self._pool = run, ThreadPoolExecutor(2)
         self._engine = make_engine(engine, run, frames=frames, batch_size=2) if isinstance(engine, str) else engine
         self._trackers = [Tracker(tip.reference) for tip in self.fingertips]
         self._shear, self._turn = np.zeros(2), 0
         self.frames = np.stack([tip.reference for tip in self.fingertips])
         """What the two cameras saw last, (2, height, width, 3)."""
+
+    def _follow(self, finger: int) -> float:
+        tracker = self._trackers[finger]
+        tracked = tracker.update(self.frames[finger])
+        return float(mean_shear(tracker.rest.centre_px, tracked.position_px[: len(tracker.rest.centre_px)]))
 
     @property
     def references(self) -> np.ndarray:
@@ -102,31 +108,29 @@ class RenderedEyes:
     def look(self, state: PlantState) -> Sight:
         """Film both fingertips and read them."""
         margins, friction, shear = state.margin[0], state.holding_friction[0], state.shear_n[0]
-        self.frames = np.stack(
-            [
-                tip.draw(
-                    float(state.force_n[0]),
-                    friction=float(friction[finger]),
-                    margin=float(np.nan_to_num(margins[finger], nan=1.0)),
-                    held_s=float(state.held_s[0]),
-                    pulled_back=bool(shear[finger] < 0),
-                )
-                for finger, tip in enumerate(self.fingertips)
-            ]
-        )
-        parts = [self._run.encode(frame[None], tip.reference) for frame, tip in zip(self.frames, self.fingertips, strict=True)]
-        import torch
 
+        def draw(finger: int) -> np.ndarray:
+            return self.fingertips[finger].draw(
+                float(state.force_n[0]),
+                friction=float(friction[finger]),
+                margin=float(np.nan_to_num(margins[finger], nan=1.0)),
+                held_s=float(state.held_s[0]),
+                pulled_back=bool(shear[finger] < 0),
+            )
+
+        # a core each: drawing is mostly torch, which lets go of the interpreter
+        self.frames = np.stack(list(self._pool.map(draw, range(2))))
+        self._turn = 1 - self._turn
+        following = self._pool.submit(self._follow, self._turn)
+        parts = [
+            self._run.encode(frame[None], tip.reference)
+            for frame, tip in zip(self.frames, self.fingertips, strict=True)
+        ]
         estimate = self._engine.estimate(self._run, torch.cat(parts))
         low, high = estimate.interval(LEVEL) or (estimate.margin, estimate.margin)
-        self._turn = 1 - self._turn
-        tracker = self._trackers[self._turn]
-        tracked = tracker.update(self.frames[self._turn])
-        rest = tracker.rest.centre_px
-        self._shear[self._turn] = mean_shear(rest, tracked.position_px[: len(rest)])
-        return Sight(
-            margin=estimate.margin[None], low=low[None], high=high[None], shear_px=self._shear[None].copy()
-        )
+        self._shear[self._turn] = following.result()
+        return Sight(margin=estimate.margin[None], low=low[None], high=high[None], shear_px=self._shear[None].copy())
+
 
 _SPAN = 3
 """Images whose markers are averaged before and after a slip."""
@@ -135,9 +139,9 @@ _SPAN = 3
 class SlipWatch:
     """Tells gross slip from the markers: as the friction falls from static to kinetic, the skin springs back.
 
-    It is a slip where the pull on the markers of both fingers, their mean, falls by more than an eighth from three images
-    to the next three while the grip is not loosened. A pull that ends at once looks the same, and is answered as a slip. What pressing alone displaced before
-    the lift is subtracted.
+    It is a slip where the pull on the markers of both fingers, their mean, falls by more than an eighth from three
+    images to the next three while the grip is not loosened. A pull that ends at once looks the same, and is answered as
+    a slip. What pressing alone displaced before the lift is subtracted.
     """
 
     def __init__(self, *, share: float = 0.12, floor_px: float = 0.05) -> None:
@@ -225,7 +229,7 @@ class GripLoop:
     def tick(
         self, world: World, *, dark: Bool[np.ndarray, "episodes 2"] | None = None, command_n: np.ndarray | None = None
     ) -> Tick:
-        """Look, command and step once; `dark` fingers read nothing, `command_n` is told in place of the controller's."""
+        """Look, command, step; `dark` fingers read nothing, `command_n` comes in place of the controller's."""
         now, sight = self.plant.state, self.eyes.look(self.plant.state)
         if dark is not None and dark.any():
             parts = {name: np.where(dark, np.nan, value) for name, value in vars(sight).items()}

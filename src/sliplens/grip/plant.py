@@ -213,7 +213,7 @@ class Plant:
         return self.state
 
     def least_force(self, world: World, *, hand_acceleration_m_s2: Episodes | float = 0.0) -> Episodes:
-        """Least grip force, in newtons, that holds the load against both frictions: (m (g + a) + pull) / sum of mu_s."""
+        """Least grip force that holds, in newtons: (m (g + a) + pull) over the sum of both mu_s."""
         load = world.mass_kg * (GRAVITY_M_S2 + hand_acceleration_m_s2) + world.pull_n
         return np.maximum(load, 0) / world.friction.sum(axis=1)
 

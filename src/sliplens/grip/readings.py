@@ -1,13 +1,16 @@
 """What a network says of a grip's frames: measured once for many fingertips, then looked up."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
+from sliplens.codec import load_result
 from sliplens.errors import InputError
 from sliplens.grip.fingertip import Fingertip, draw_film, mean_shear
 from sliplens.models import Run, make_engine
+from sliplens.models.checkpoint import find_run, shipped_names
 from sliplens.models.predictions import LEVEL
 from sliplens.progress import OnProgress
 
@@ -23,9 +26,9 @@ MARGINS = (0.0, 0.04, 0.12, 0.3, 0.55, 0.8, 1.0)
 class ReadingTable:
     """Error model of a network: what it read of many fingertips at each friction, force and margin.
 
-    Fingertips are the first axis: each has its own sensor and touch, and its errors stay with it as long as it holds, as
-    they do in the rendered loop; noise comes anew with each frame. Fingertips 0 and 1, 2 and 3, ... are those of one
-    gripper and share a day.
+    Fingertips are the first axis: each has its own sensor and touch, and its errors stay with it as long as it holds,
+    as they do in the rendered loop; noise comes anew with each frame. Fingertips 0 and 1, 2 and 3, ... are those of
+    one gripper and share a day.
     """
 
     network: str
@@ -135,7 +138,9 @@ def measure_readings(
         ends = estimate.interval(LEVEL)
         assert ends is not None  # it is calibrated
         count, table = len(frames), np.empty((4, *mu.shape), dtype=np.float32)
-        for row, values in zip(table, (estimate.margin, *ends, mean_shear(film.motion.rest_px, film.motion.centres_px)), strict=True):
+        for row, values in zip(
+            table, (estimate.margin, *ends, mean_shear(film.motion.rest_px, film.motion.centres_px)), strict=True
+        ):
             row[shown] = values[:count]
             row[1:, :, -1] = row[0, :, -1]
         found.append(table)
@@ -152,3 +157,18 @@ def measure_readings(
         shear_px=shear,
         noise=float(np.std(np.concatenate(repeats)) / np.sqrt(2)),
     )
+
+
+_FOLDER = "readings"
+"""Folder beside a network's weights with the table that was measured of it."""
+
+
+def load_readings(run: Run) -> ReadingTable | None:
+    """Table that comes with a network of the package; None where there is none of these weights."""
+    for name in shipped_names():
+        folder = find_run(Path(name)) / _FOLDER
+        if folder.is_dir():
+            table = load_result(folder, ReadingTable, command="make weights")
+            if table.network == run.manifest.weights_sha256:
+                return table
+    return None

@@ -103,7 +103,7 @@ def _unknown(scripts: Scripts, _: HeldObject, rng: np.random.Generator) -> Scrip
     return replace(scripts, friction=np.exp(rng.uniform(np.log(0.15), np.log(1.2), len(scripts))))
 
 
-def _jolt(scripts: Scripts, held: HeldObject, rng: np.random.Generator) -> Scripts:
+def _jolt(scripts: Scripts, _: HeldObject, rng: np.random.Generator) -> Scripts:
     count, weight = len(scripts), scripts.mass_kg * GRAVITY_M_S2
     return replace(scripts, jolt_n=weight * rng.uniform(0.5, 1.5, count), jolt_at_s=rng.uniform(3, 5, count))
 
@@ -184,7 +184,7 @@ def draw_scripts(
     scripts = Scripts(
         mass_kg=mass, friction=uniform(0.5, 1.2), friction_gap=uniform(-0.1, 0.1), kinetic_ratio=uniform(0.7, 0.9),
         drift=nothing, patch_factor=np.ones(episodes), patch_at_s=never,
-        pull_n=mass * GRAVITY_M_S2 * uniform(0, 0.5), pull_at_s=uniform(2, 3), jolt_n=nothing, jolt_at_s=never,
+        pull_n=mass * GRAVITY_M_S2 * uniform(0.0, 0.5), pull_at_s=uniform(2.0, 3.0), jolt_n=nothing, jolt_at_s=never,
         water_kg=nothing, water_at_s=never, lamp_at_s=never,
         fingertips=rng.integers(fingertips, size=episodes).astype(np.float64),
     )  # fmt: skip

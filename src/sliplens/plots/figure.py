@@ -15,6 +15,7 @@ from sliplens.codec import Columns
 from sliplens.errors import InputError
 from sliplens.intervals import Difference
 from sliplens.plots.errors import MARGIN_LABEL, plot_answers, plot_faithfulness, plot_learning_curves
+from sliplens.plots.grip import plot_grip_force
 from sliplens.plots.saliency import full_colour, overlay_relevance, overlay_saliency, stretch_saliency
 from sliplens.plots.strip import plot_readings
 from sliplens.plots.style import (
@@ -42,8 +43,8 @@ def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
 
     An evaluation shows answers against labels; a training its learning curve; an explanation the map over the image;
     scores of explanations their curves or gains; predictions the margin over time; tracked markers how far they moved;
-    a study the gain of each method with its 95 % interval; a diagnosis where the error is larger than elsewhere.
-    Margins are in percent, gains in margin units.
+    a study the gain of each method with its 95 % interval; a diagnosis where the error is larger than elsewhere;
+    a grip the force over the least that holds. Margins are in percent, gains in margin units.
 
     Parameters
     ----------
@@ -239,6 +240,7 @@ DRAWERS: dict[str, Callable[[Any, Axes, int], object]] = {
     "Diagnosis": _diagnosis,
     "Predictions": _predictions,
     "Tracking": _tracking,
+    "Grip": lambda result, ax, _: plot_grip_force(result.trace, ax=ax).set_title(result.controller),
     "Strip": lambda result, ax, _: plot_readings(result, ax=ax),
 }
 """What draws a record, by the name of its class."""

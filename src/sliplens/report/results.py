@@ -12,6 +12,7 @@ from sliplens.results.diagnosis import Diagnosis
 from sliplens.results.evaluation import Evaluation
 from sliplens.results.explanation import Explained, Strip, load_explained
 from sliplens.results.faithfulness import DeletionScores
+from sliplens.results.grip import Grip
 from sliplens.results.study import STAGES, TABLES, Choice, Study
 from sliplens.results.training import Simulation, Training, describe_simulation
 
@@ -19,6 +20,7 @@ _OF_A_COMMAND: dict[str, type] = {
     "train": Training,
     "evaluate": Evaluation,
     "diagnose": Diagnosis,
+    "grip": Grip,
     "score": DeletionScores,
     "strip": Strip,
 }
@@ -43,6 +45,8 @@ class Results:
     explanations: dict[tuple[str, str], Explained] = field(default_factory=dict)
     scores: dict[tuple[str, str], DeletionScores] = field(default_factory=dict)
     """By input and source ("simulated", "real")."""
+    grip: Grip | None = None
+    """An object held with the margin in the loop."""
     strip: Strip | None = None
     """One trial from stick to slip."""
     study: Study = field(default_factory=Study)
@@ -116,6 +120,7 @@ def load_results(workspace: Path) -> Results:
         trainings=of("train"),
         evaluations=of("evaluate"),
         diagnoses=of("diagnose"),
+        grip=of("grip").get(""),
         explanations={key[1:]: value for key, value in found.items() if key[0] == "explain"},
         scores={key[1:]: value for key, value in found.items() if key[0] == "score"},
         strip=next(iter(of("strip").values()), None),

@@ -11,6 +11,7 @@ from sliplens.report import charts, pictures, tables
 from sliplens.report.claims import Claim, judge_claims
 from sliplens.report.comparisons import tell_sample
 from sliplens.report.diagnosis import show_diagnosis
+from sliplens.report.grip import show_grip
 from sliplens.report.plates import Plate, explained_of
 from sliplens.report.results import Results
 from sliplens.report.verdict import alarms_of, group_alarms
@@ -61,7 +62,7 @@ def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Secti
     for section in SECTIONS:
         blocks = tuple(block for block in section.build(results, rng) if block is not None)
         command = f"sliplens {'study' if results.study else section.command}"
-        if not blocks and results.study and section.apart:
+        if not blocks and ((results.study and section.apart) or (results.grip is not None and not results.inputs)):
             continue
         if not blocks:
             absent.setdefault(command, []).append(section.short_title)
@@ -254,6 +255,18 @@ SECTIONS: tuple[Section, ...] = (
         apart=True,
         build=_diagnosis,
         needs=lambda results: results.diagnoses,
+    ),
+    Section(
+        id="grip",
+        title="What the margin holds",
+        short_title="Grip",
+        intro="A simulated gripper lifts an object and holds it while something happens; what the fingertips read "
+        "decides how hard it presses. The least force that holds is the load over both frictions, which no controller "
+        "knows.",
+        command="grip",
+        apart=True,
+        build=lambda results, _: () if results.grip is None else show_grip(results.grip),
+        needs=lambda results: results.inputs,
     ),
     Section(
         id="faithfulness",

@@ -7,8 +7,6 @@ from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
 
 from sliplens.codec import Columns
 
-__all__ = ["EpisodeTable", "Grip", "GripTrace"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeTable(Columns):
@@ -64,6 +62,7 @@ class Grip:
     """Episodes of one controller."""
 
     object: str
+    condition: str
     controller: str
     settings: dict[str, float]
     """Constants of the controller that were changed."""
@@ -78,10 +77,11 @@ class Grip:
     episodes: EpisodeTable
     trace: GripTrace
     """The first episode."""
-    moments_s: tuple[float, ...] = ()
+    moments_s: tuple[float, ...]
     """Times of the pictures; none where nothing was rendered."""
-    pictures: UInt8[np.ndarray, "moments height width 3"] | None = None
-    maps: Float32[np.ndarray, "moments height width"] | None = None
+    pictures: UInt8[np.ndarray, "moments height width 3"]
+    maps: Float32[np.ndarray, "moments side side"]
+    """Relevance of the first finger's frames, in margin units, signed."""
 
     @property
     def drop_rate(self) -> float:

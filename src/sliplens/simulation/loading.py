@@ -167,9 +167,7 @@ def load_at_states(
     states = Friction(coefficient=friction, used=used, carried=nothing, slips=margins == 0)
     normal = np.where(np.isnan(margins), 0.0, normal_force_n)
     time_s = np.arange(len(margins), dtype=np.float64)
-    return _label(
-        time_s, normal=normal, static=friction, friction=states, held_s=nothing if held_s is None else held_s
-    )
+    return _label(time_s, normal=normal, static=friction, friction=states, held_s=nothing if held_s is None else held_s)
 
 
 def _label(time_s: Frames, *, normal: Frames, static: Frames, friction: Friction, held_s: Frames) -> Loading:

@@ -1,0 +1,96 @@
+"""`sliplens grip`."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from sliplens.cli.command import Command, Output
+from sliplens.cli.console import print_table
+from sliplens.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grip(Command):
+    """Grip, lift and hold a simulated object with the safety margin in the loop, and tell what became of it.
+
+    One episode is closed through pixels: both fingertips are filmed, read by the network, and the force answers. It is
+    written as a data set with both fingertips, a clip, and a page with force, margin, slip and map. Of more episodes
+    the readings are looked up in the network's measured errors, hundreds a second. Interrupted, it goes on.
+    """
+
+    output: Output
+    """Folder to make; the page is report.html in it."""
+    object: Literal["cup", "egg", "berries"] = "cup"
+    """What is held."""
+    controller: str = "margin"
+    """fixed, assumed-friction, margin, proportional, reflex or oracle, or one of an installed package."""
+    condition: str = "dry"
+    """What happens: dry, wet, drifting, unknown, patch (a wet patch at 2.5 s), jolt, poured or lamp (one goes out)."""
+    episodes: int = 1
+    """How many, each drawn anew."""
+    rendered: bool | None = None
+    """Close the loop through pixels; if not given, for a single episode."""
+    network: str = "chromatouch-difference"
+    """Folder of a trained network, or the name of one that comes with sliplens."""
+    set: tuple[str, ...] = ()
+    """Constants of the controller to change, such as --set target=0.3 down_n_s=2."""
+    mass: float | None = None
+    """Mass of the object in kilograms; drawn if not given."""
+    friction: float | None = None
+    """Coefficient of friction at the beginning; drawn if not given."""
+    pull: float | None = None
+    """Pull on the object in newtons, for 1.5 s; drawn if not given."""
+    wet_patch: float | None = None
+    """Friction from 2.5 s on over that before, such as 0.5; none if not given."""
+    water: float | None = None
+    """Water poured in from 2.5 s on, in kilograms; none if not given."""
+    latency: float = 0.02
+    """Time from an image to the command that answers it, in seconds."""
+    method: str | None = "integrated-gradients"
+    """Explainer of the page's maps; none for no maps."""
+    seed: int = 0
+    """Seed: the same seed gives every controller the same episodes."""
+
+    def run(self) -> None:
+        """Run the episodes, and draw the page."""
+        from sliplens.cli.report import Report
+        from sliplens.grip import run_episodes
+
+        rendered = self.episodes == 1 if self.rendered is None else self.rendered
+        script = {
+            "mass_kg": self.mass,
+            "friction": self.friction,
+            "pull_n": self.pull,
+            "patch_factor": self.wet_patch,
+            "patch_at_s": None if self.wet_patch is None else 2.5,
+            "water_kg": self.water,
+            "water_at_s": None if self.water is None else 2.5,
+        }
+        grip = self.call(
+            run_episodes,
+            rendered=rendered,
+            script={name: value for name, value in script.items() if value is not None},
+            settings=dict(map(_constant, self.set)),
+            latency_s=self.latency,
+            method=self.method if rendered and self.method != "none" else None,
+            out=self.output / "grip",
+        )
+        table = grip.episodes
+        rows = [
+            ("dropped", f"{int(table.dropped.sum())} of {len(table)}"),
+            ("crushed", f"{int(table.crushed.sum())}"),
+            ("slip, in the middle", f"{1e3 * float(sorted(table.slip_m)[len(table) // 2]):.1f} mm"),
+            ("mean force", f"{table.mean_force_n.mean():.2f} N"),
+            ("over the least that holds", f"{100 * table.force_excess.mean():.0f} %"),
+            ("time with a margin under 20 %", f"{table.under_20_s.mean():.2f} s"),
+        ]
+        print_table(f"{self.controller} on a {self.object}, {self.condition}", ("", ""), rows)
+        Report(workspace=self.output).run()
+
+
+def _constant(text: str) -> tuple[str, float]:
+    """Name and value of a constant."""
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError:
+        raise InputError(f"{text!r} sets no constant; write --set NAME=NUMBER, such as --set target=0.3") from None

@@ -1,0 +1,399 @@
+"""Episodes of a grip: many in parallel by the network's measured errors, or one after another through pixels."""
+
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from sliplens.codec import keep_part, load_result, save_result
+from sliplens.errors import InputError
+from sliplens.explainers import explain
+from sliplens.files import output_folder
+from sliplens.grip.controllers import CONTROLLERS, Controller
+from sliplens.grip.loop import GripLoop, RenderedEyes, TableEyes, Tick
+from sliplens.grip.plant import GRAVITY_M_S2, PERIOD_S, HeldObject, Plant
+from sliplens.grip.readings import ReadingTable, load_readings, measure_readings
+from sliplens.grip.scripts import EPISODE_S, LIFT_S, Scripts, draw_scripts, hand_motion, pick_object
+from sliplens.mechanics import stick_ratio
+from sliplens.models import Run, load
+from sliplens.plots.clip import write_clip
+from sliplens.progress import OnProgress, note, stage, wrote
+from sliplens.recordings import Recording
+from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.store import save_recording
+from sliplens.recordings.trial import ContactState, contact_states
+from sliplens.results.grip import EpisodeTable, Grip, GripTrace
+
+_BATCH = 500
+"""Episodes stepped together: few enough for a processor's caches."""
+_MEASURED = 32
+"""Fingertips that a network without a table of readings is measured with."""
+_TICKS = round(EPISODE_S / PERIOD_S)
+_LIFTED_S = LIFT_S + 0.1
+"""From here on the least force is asked for: the object hangs in the hand."""
+MOMENTS_S = (0.4, 1.4, 2.8, 5.0)
+"""Times, in seconds, at which a rendered episode is explained."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Batch:
+    """Episodes that were run together."""
+
+    episodes: EpisodeTable
+    trace: GripTrace
+    pictures: UInt8[np.ndarray, "moments height width 3"]
+    maps: Float32[np.ndarray, "moments side side"]
+
+
+def make_controller(name: str, settings: Mapping[str, float] | None = None) -> Controller:
+    """Make a controller of the table, some of its constants changed.
+
+    Raises
+    ------
+    InputError
+        If there is no such controller, or it has no such constant.
+
+    Examples
+    --------
+    >>> from sliplens.grip import make_controller
+    >>> make_controller("fixed", {"force_n": 1.5})
+    FixedForce(force_n=1.5)
+    """
+    kind, settings = CONTROLLERS.pick(name), dict(settings or {})
+    known = [field.name for field in fields(kind) if field.init]  # pyright: ignore[reportArgumentType]
+    for one, value in settings.items():
+        if one not in known:
+            raise InputError(f"the controller {name} has no constant {one!r}; choose of {', '.join(known)}")
+        if not np.isfinite(value) or value < 0:
+            raise InputError(f"{one} of the controller {name} must be a number not below 0, got {value:g}")
+    if settings.get("target", 0) >= 1 or settings.get("zero", 0) >= 1:
+        raise InputError("margins are shares of the friction: give a target and a zero below 1")
+    return kind(**settings)
+
+
+def run_episodes(
+    object: str = "cup",
+    controller: str | Controller = "margin",
+    *,
+    condition: str = "dry",
+    episodes: int = 1,
+    network: str | Path | Run = "chromatouch-difference",
+    rendered: bool = False,
+    readings: ReadingTable | None = None,
+    error_scale: float = 1.0,
+    latency_s: float = 0.02,
+    seed: int = 0,
+    script: Mapping[str, float | None] | None = None,
+    settings: Mapping[str, float] | None = None,
+    method: str | None = None,
+    out: Path | str | None = None,
+    overwrite: bool = False,
+    on_progress: OnProgress | None = None,
+) -> Grip:
+    """Grip, lift and hold an object, again and again, and tell what became of it.
+
+    Each episode lasts 6 s: the fingers close, lift from 0.5 s on, and hold while something happens. Rendered, both
+    fingertips are filmed, read by the network and their markers followed, 60 times a second; otherwise readings are
+    looked up in what was measured of the network on such images, hundreds of episodes a second.
+
+    Parameters
+    ----------
+    object
+        Row of `OBJECTS`.
+    controller
+        Row of `CONTROLLERS`, or anything with `command(observation)`; one of your own is kept over all episodes, so
+        run those in which it remembers one at a time.
+    condition
+        Row of `CONDITIONS`, from which the episodes are drawn.
+    episodes, seed
+        How many, and the seed they are drawn from: the same seed gives every controller the same episodes.
+    network
+        Network, its folder, or the name of one that comes with sliplens; it needs a calibration.
+    rendered
+        Close the loop through pixels.
+    readings
+        Errors of the network; those that come with it if None, and measured first (minutes) where there are none.
+    error_scale
+        Ratio by which the network's errors are made worse, or better; only where they are looked up.
+    latency_s
+        From an image to the command that answers it, in seconds.
+    script
+        Columns of `Scripts` to set rather than to draw, such as `{"mass_kg": 0.06, "patch_factor": 0.5}`.
+    settings
+        Constants of the controller to change, such as `{"target": 0.3}`.
+    method
+        Explainer whose maps are drawn at four moments of the first rendered episode; none if None.
+    out
+        Folder to write: the record, and of rendered episodes a data set with both fingertips and a clip of the first.
+
+    Raises
+    ------
+    InputError
+        If something named is not there or cannot be.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> grip = sl.run_episodes("cup", "fixed", settings={"force_n": 3.0}, script={"mass_kg": 0.05, "friction": 0.6})
+    >>> bool(grip.episodes.dropped[0]), grip.episodes.mean_force_n.round(1)
+    (False, array([3.]))
+    """
+    if error_scale < 0 or latency_s < 0:
+        raise InputError("latency and error scale must not be negative; give 0 or more")
+    held = pick_object(object)
+    if isinstance(controller, str):
+        make_controller(controller, settings)  # a mistake is told before anything is measured
+    elif settings:
+        raise InputError("settings are for the controllers of the table; set those of your own where you make it")
+    scripts = draw_scripts(held, condition, episodes=episodes, seed=seed, **dict(script or {}))
+    run = _load_calibrated(network)
+    if not rendered and readings is None:
+        readings = _readings_of(run, on_progress)
+    facts: dict[str, Any] = {
+        "object": object,
+        "condition": condition,
+        "controller": controller if isinstance(controller, str) else type(controller).__name__,
+        "settings": dict(settings or {}),
+        "latency_s": latency_s,
+        "seed": seed,
+        "network": run.manifest.weights_sha256[:12],
+        "rendered": rendered,
+    }
+    job = _Job(
+        held=held, scripts=scripts, controller=controller, settings=settings, run=run, readings=readings,
+        rendered=rendered, error_scale=error_scale, latency_s=latency_s, seed=seed, condition=condition, method=method,
+    )  # fmt: skip
+    if out is None:
+        return job.all(facts, None, on_progress)
+    known = None if readings is None else (readings.network, readings.seed, len(readings))
+    config = facts | {"episodes": episodes, "error_scale": error_scale, "method": method, "script": dict(script or {})}
+    with output_folder(Path(out), stage="grip", config={**config, "readings": known}, overwrite=overwrite) as output:
+        if output.complete:
+            grip = load_result(output.folder, Grip, command="sliplens grip")
+        else:
+            grip = job.all(facts, output.folder, on_progress)
+    told = f"{episodes} episodes, {100 * grip.drop_rate:.1f} % dropped"
+    wrote(on_progress, Path(out), told, kept=output.complete)
+    return grip
+
+
+def _load_calibrated(network: str | Path | Run) -> Run:
+    run = network if isinstance(network, Run) else load(network)
+    if run.manifest.calibration is None:
+        raise InputError("the network was never calibrated and tells no interval to grip by; choose another network")
+    return run
+
+
+def _readings_of(run: Run, on_progress: OnProgress | None) -> ReadingTable:
+    """Readings that come with a network; measured where there are none."""
+    readings = load_readings(run)
+    if readings is None:
+        note(on_progress, "The network's errors on grips were not measured before: this takes minutes.")
+        with stage(on_progress, "Measuring readings") as count:
+            readings = measure_readings(run, fingertips=_MEASURED, on_progress=count)
+    return readings
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Job:
+    """All that the episodes need."""
+
+    held: HeldObject
+    scripts: Scripts
+    controller: str | Controller
+    settings: Mapping[str, float] | None
+    run: Run
+    readings: ReadingTable | None
+    rendered: bool
+    error_scale: float
+    latency_s: float
+    seed: int
+    condition: str
+    method: str | None
+
+    def all(self, facts: dict[str, Any], folder: Path | None, on_progress: OnProgress | None) -> Grip:
+        """Run every batch that is not in the folder yet, and write what they add up to."""
+        begin, size, total = time.perf_counter(), 1 if self.rendered else _BATCH, len(self.scripts)
+        done: list[_Batch] = []
+        with stage(on_progress, "Gripping") as count:
+            for number, first in enumerate(range(0, total, size)):
+                part = None if folder is None else folder / "parts" / str(number)
+                chosen = self.scripts.where(np.arange(first, min(first + size, total)))
+                done.append(keep_part(part, _Batch, partial(self.batch, number, chosen, folder)))
+                count(first + len(chosen), total)
+        grip = Grip(
+            **facts,
+            seconds=time.perf_counter() - begin,
+            episodes=EpisodeTable.joined([one.episodes for one in done]),
+            trace=done[0].trace,
+            moments_s=MOMENTS_S[: len(done[0].maps)],
+            pictures=done[0].pictures,
+            maps=done[0].maps,
+        )
+        if folder is not None:
+            _finish(folder, grip, on_progress)
+        return grip
+
+    def batch(self, number: int, scripts: Scripts, folder: Path | None) -> _Batch:
+        """Run some episodes; what the cameras saw is saved where there is a folder."""
+        chosen = self.controller
+        if isinstance(chosen, str):
+            chosen = make_controller(chosen, self.settings)
+        own = np.random.SeedSequence((self.seed, number))
+        filmed: list[np.ndarray] = []
+        if self.rendered:
+            eyes = RenderedEyes(self.run, seed=int(own.generate_state(1)[0]), frames=2 * _TICKS * len(self.scripts))
+        else:
+            assert self.readings is not None
+            rng, tips = np.random.default_rng(own), scripts.fingertips
+            eyes = TableEyes(self.readings, fingertips=tips, rng=rng, error_scale=self.error_scale)
+        loop = GripLoop(Plant(self.held, episodes=len(scripts)), eyes, chosen, latency_s=self.latency_s, lift_s=LIFT_S)
+        keep = self.rendered and (folder is not None or self.method is not None)
+        table, ticks = run_scripts(loop, scripts, condition=self.condition, filmed=filmed if keep else None)
+        pictures, maps = np.zeros((0, 1, 1, 3), dtype=np.uint8), np.zeros((0, 1, 1), dtype=np.float32)
+        if keep and isinstance(eyes, RenderedEyes):
+            frames = np.stack(filmed)
+            if folder is not None:
+                _save_trials(folder, eyes, ticks, frames, condition=self.condition, number=number)
+            if self.method is not None and number == 0:
+                pictures = np.ascontiguousarray(frames[[round(at / PERIOD_S) for at in MOMENTS_S], 0])
+                why = explain(self.run, pictures, reference=eyes.references[0], method=self.method)
+                maps = why.relevance.cpu().numpy()
+        return _Batch(episodes=table, trace=_trace(ticks, scripts), pictures=pictures, maps=maps)
+
+
+def run_scripts(
+    loop: GripLoop, scripts: Scripts, *, condition: str | Sequence[str] = "", filmed: list[np.ndarray] | None = None
+) -> tuple[EpisodeTable, list[Tick]]:
+    """Run episodes to their end in a loop of your own; gives what became of each, and every tick.
+
+    Parameters
+    ----------
+    loop
+        Plant, eyes and controller for as many episodes as there are scripts.
+    scripts
+        What happens in each.
+    condition
+        Name to note for all of them, or one for each.
+    filmed
+        List that the images of a rendered episode are added to.
+    """
+    count = len(scripts)
+    force, least, lasted, under = np.zeros((4, count))
+    peak, peak_least, friction = np.zeros(count), np.zeros(count), np.full(count, np.inf)
+    ticks: list[Tick] = []
+    for _ in range(_TICKS):
+        time_s, holds = loop.plant.state.time_s, ~loop.plant.state.dropped
+        world = scripts.world(time_s)
+        needed = loop.plant.least_force(world, hand_acceleration_m_s2=hand_motion(time_s)[2])
+        dark = np.stack([time_s >= scripts.lamp_at_s, np.zeros(count, dtype=bool)], axis=1)
+        tick = loop.tick(world, dark=dark)
+        if filmed is not None and isinstance(loop.eyes, RenderedEyes):
+            filmed.append(loop.eyes.frames)
+        if time_s >= _LIFTED_S:
+            on = holds * PERIOD_S
+            force += on * tick.state.force_n
+            least += on * needed
+            lasted += on
+            # the object slips when both fingers do: what counts is what is left of both frictions together
+            whole = 1 - np.abs(tick.state.load_n) / np.maximum(tick.state.force_n * world.friction.sum(axis=1), 1e-9)
+            under += on * (whole < 0.2)
+            peak = np.maximum(peak, np.where(holds, tick.state.force_n, 0))
+            peak_least = np.maximum(peak_least, np.where(holds, needed, 0))
+        friction = np.minimum(friction, world.friction.mean(axis=1))
+        ticks.append(tick)
+    state = loop.plant.state
+    names = np.broadcast_to(np.asarray(condition, dtype=str), count).copy()
+    table = EpisodeTable(
+        condition=names, mass_kg=scripts.mass_kg + scripts.water_kg, friction=friction,
+        dropped=state.dropped, crushed=state.crushed, slip_m=state.slipped_m,
+        mean_force_n=force / lasted, peak_force_n=peak, least_force_n=least / lasted, peak_least_force_n=peak_least,
+        force_excess=force / least - 1, peak_excess=peak / peak_least - 1, under_20_s=under,
+    )  # fmt: skip
+    return table, ticks
+
+
+def _trace(ticks: list[Tick], scripts: Scripts) -> GripTrace:
+    """Trace of the first episode."""
+
+    def mean(values: Float[np.ndarray, "episodes 2"]) -> float:
+        own = values[0][np.isfinite(values[0])]
+        return float(own.mean()) if len(own) else float("nan")
+
+    needed = []
+    for tick in ticks:
+        time_s = tick.state.time_s - PERIOD_S
+        world = scripts.world(time_s)
+        load = world.mass_kg[0] * (GRAVITY_M_S2 + hand_motion(time_s)[2]) + world.pull_n[0]
+        needed.append(max(float(load), 0.0) / float(world.friction[0].sum()) if time_s >= _LIFTED_S else 0.0)
+    states = [tick.state for tick in ticks]
+    return GripTrace(
+        time_s=np.array([one.time_s for one in states]),
+        command_n=np.array([float(tick.command_n[0]) for tick in ticks]),
+        force_n=np.array([float(one.force_n[0]) for one in states]),
+        least_force_n=np.array(needed),
+        load_n=np.array([float(one.load_n[0]) for one in states]),
+        true_margin=np.array([float(np.nan_to_num(one.margin[0], nan=1.0).min()) for one in states]),
+        margin=np.array([mean(tick.sight.margin) for tick in ticks]),
+        low=np.array([mean(tick.sight.low) for tick in ticks]),
+        high=np.array([mean(tick.sight.high) for tick in ticks]),
+        slip_m=np.array([float(one.slipped_m[0]) for one in states]),
+        slip_seen=np.array([bool(tick.seen.slip[0]) for tick in ticks]),
+    )
+
+
+def _save_trials(
+    folder: Path,
+    eyes: RenderedEyes,
+    ticks: list[Tick],
+    frames: UInt8[np.ndarray, "ticks 2 height width 3"],
+    *,
+    condition: str,
+    number: int,
+) -> None:
+    """Save what both fingertips of a rendered episode saw, with the plant's forces and margins as labels."""
+    # an image shows the state before the step of its tick
+    states = [tick.state for tick in ticks[:-1]]
+    force = np.array([float(one.force_n[0]) for one in states])
+    for finger in range(2):
+        shear = np.array([abs(float(one.shear_n[0, finger])) for one in states])
+        margin = np.array([float(one.margin[0, finger]) for one in states])
+        recording = Recording(
+            trial=f"episode-{number + 1:04d}-finger-{finger + 1}",
+            sensor=f"simulated-{finger + 1}",
+            condition="wet" if condition == "wet" else "dry",
+            object=condition,
+            reference=eyes.references[finger],
+            frames=frames[1:, finger],
+            time_s=np.array([one.time_s for one in states]),
+            normal_force_n=force,
+            tangential_force_n=shear,
+            friction_coefficient=np.array([float(one.holding_friction[0, finger]) for one in states]),
+            safety_margin=margin,
+            stick_ratio=stick_ratio(margin),
+            contact_state=contact_states(margin, without=ContactState.NO_CONTACT),
+        )
+        path = trial_path(folder / "data", recording.trial)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_recording(recording, path)
+        if number == 0 and finger == 0:
+            write_clip(recording, folder / "clip.mp4")
+
+
+def _finish(folder: Path, grip: Grip, on_progress: OnProgress | None) -> None:
+    """Write the record, and the table of the data set where there is one."""
+    if grip.rendered:
+        paths = sorted((folder / "data").glob("trials/*.parquet"))
+        write_dataset_table(folder / "data", [trial_info(path, split="test") for path in paths], simulated=True)
+        note(on_progress, "The clip is for the eye only: lossy video moves markers; measure in the data set.")
+    save_result(grip, folder)
+    shutil.rmtree(folder / "parts")
+
+
+__all__ = ["MOMENTS_S", "make_controller", "run_episodes", "run_scripts"]

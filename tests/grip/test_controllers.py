@@ -1,0 +1,138 @@
+"""Laws of the controllers: the force each formula asks for, and what every one of them owes a grip."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sliplens.errors import InputError
+from sliplens.grip import CONTROLLERS, Observation, make_controller
+from sliplens.grip.plant import PERIOD_S
+
+LATE_S = 2.0
+"""After the lift."""
+
+
+def seen(margin: float = 0.5, *, force_n: float = 1.0, time_s: float = LATE_S, slip: bool = False) -> Observation:
+    both = np.full((1, 2), margin)
+    return Observation(
+        time_s=time_s,
+        force_n=np.array([force_n]),
+        command_n=np.array([force_n]),
+        load_n=np.array([0.6]),
+        margin=both,
+        low=both - 0.2,
+        slip=np.array([slip]),
+        true_margin=both,
+    )
+
+
+def settle(controller, *, load_over_friction_n: float, seconds: float = 4.0) -> float:
+    """Force at which a controller comes to rest where the margin is 1 - Q / (mu F), Q / mu in newtons, read exactly."""
+    force = 2.0
+    for tick in range(round(seconds / PERIOD_S)):
+        margin = max(0.0, 1 - load_over_friction_n / force)
+        force = float(controller.command(seen(margin, force_n=force, time_s=LATE_S + tick * PERIOD_S))[0])
+    return force
+
+
+@pytest.mark.parametrize("name", ["margin", "proportional", "oracle"])
+@pytest.mark.parametrize("least_n", [0.6, 1.2])
+def test_a_law_comes_to_rest_at_the_margin_aimed_at(name, least_n):
+    settings = {"target": 0.25, "zero": 0.0, "dead_band": 0.0}
+    force = settle(make_controller(name, settings), load_over_friction_n=least_n)
+    assert force == pytest.approx(least_n / (1 - 0.25), rel=0.01)
+
+
+def test_the_dead_band_is_how_far_from_it_a_law_may_rest():
+    force = settle(make_controller("margin", {"zero": 0.0, "target": 0.25, "dead_band": 0.1}), load_over_friction_n=1.0)
+    assert 1.0 / 0.75 <= force <= 1.1 * 1.0 / 0.75 / 0.9
+
+
+def test_with_full_caution_the_lower_end_of_the_interval_is_what_counts():
+    careful = make_controller("margin", {"caution": 1.0, "zero": 0.0, "dead_band": 0.0, "up_n_s": 1e6})
+    bold = make_controller("margin", {"zero": 0.0, "dead_band": 0.0, "up_n_s": 1e6})
+    assert careful.command(seen(0.5))[0] == pytest.approx(bold.command(seen(0.3))[0])
+
+
+@pytest.mark.parametrize("name", ["margin", "proportional"])
+def test_force_grows_faster_than_it_falls(name):
+    up = make_controller(name).command(seen(0.0))[0] - 1.0
+    down = 1.0 - make_controller(name, {"zero": 0.0}).command(seen(1.0))[0]
+    assert 0 < down < up
+
+
+@pytest.mark.parametrize("name", ["margin", "proportional"])
+def test_nothing_is_loosened_on_a_withheld_reading_and_blindness_ends_at_the_safe_force(name):
+    controller, force, blind = make_controller(name), 1.0, np.full((1, 2), np.nan)
+    controller.command(seen(0.5, time_s=LATE_S))
+    told = []
+    for tick in range(1, 60):
+        now = replace(seen(force_n=force, time_s=LATE_S + tick * PERIOD_S), margin=blind, low=blind)
+        force = float(controller.command(now)[0])
+        told.append(force)
+    assert np.all(np.diff(told) >= 0)
+    assert told[5] == 1.0  # held until blind_s has passed
+    assert told[-1] == pytest.approx(controller.safe_n)
+
+
+def test_one_finger_that_reads_is_enough():
+    half = replace(seen(0.6), margin=np.array([[0.6, np.nan]]), low=np.array([[0.4, np.nan]]))
+    assert make_controller("margin").command(half) == pytest.approx(make_controller("margin").command(seen(0.6)))
+
+
+@pytest.mark.parametrize("name", ["margin", "proportional", "reflex"])
+def test_a_slip_is_answered_at_once_and_not_loosened_after(name):
+    controller = make_controller(name)
+    force = float(controller.command(seen(0.9, force_n=1.5, slip=True))[0])
+    assert force >= controller.boost * 1.5
+    after = controller.command(seen(1.0, force_n=force, time_s=LATE_S + 0.1))[0]
+    assert after >= force
+
+
+def test_after_a_slip_what_was_read_there_counts_as_nothing_left():
+    controller, told = make_controller("margin", {"zero": 0.0, "calm_s": 0.0, "boost": 1.0, "dead_band": 0.0}), 0.6
+    controller.command(seen(told))
+    controller.command(seen(told, slip=True, time_s=LATE_S + 0.1))
+    again = controller.command(seen(told, time_s=LATE_S + 0.5))[0]
+    # a margin of 0 asks for F / (1 - target), as far as the rate allows
+    assert again == pytest.approx(min(1 / (1 - controller.target), 1 + controller.up_n_s * PERIOD_S))
+
+
+def test_an_assumed_friction_presses_by_the_load_alone():
+    controller = make_controller("assumed-friction", {"friction": 0.3, "target": 0.2})
+    assert controller.command(seen(0.0))[0] == controller.command(seen(1.0))[0]
+    assert controller.command(seen())[0] == pytest.approx(0.6 / (2 * 0.3 * 0.8))
+
+
+@pytest.mark.parametrize("name", list(CONTROLLERS))
+def test_every_controller_tells_a_force_for_each_episode(name):
+    controller, many = make_controller(name), 7
+    told = controller.command(
+        Observation(
+            time_s=0.0,
+            force_n=np.ones(many),
+            command_n=np.ones(many),
+            load_n=np.ones(many),
+            margin=np.full((many, 2), np.nan),
+            low=np.full((many, 2), np.nan),
+            slip=np.zeros(many, dtype=bool),
+            true_margin=np.ones((many, 2)),
+        )
+    )
+    assert told.shape == (many,)
+    assert np.isfinite(told).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "told"),
+    [
+        ("magic", {}, "there is no controller named 'magic'; choose one of fixed"),
+        ("fixed", {"gain": 1.0}, "the controller fixed has no constant 'gain'; choose of force_n"),
+        ("fixed", {"force_n": -1.0}, "force_n of the controller fixed must be a number not below 0, got -1"),
+        ("margin", {"target": 1.0}, "give a target and a zero below 1"),
+    ],
+)
+def test_a_wrong_controller_is_told_in_a_sentence(name, settings, told):
+    with pytest.raises(InputError, match=told):
+        make_controller(name, settings)

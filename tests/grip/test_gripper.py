@@ -1,0 +1,148 @@
+"""A gripper that misbehaves: nothing passes the ceiling, what falls silent is held, and nothing opens by itself."""
+
+import math
+import socket
+import threading
+import time
+
+import pytest
+
+from sliplens.errors import InputError
+from sliplens.grip.gripper import DryRun, GripperError, GuardedGripper, open_gripper
+
+SOON_S = 0.03
+
+
+class FakeGripper:
+    """A gripper on a port of this machine that speaks the line protocol, or as badly as it is told to."""
+
+    def __init__(self) -> None:
+        self.answer: bytes | None = b"OK 1.000 0.0400\n"
+        self.heard: list[str] = []
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.address = f"tcp://127.0.0.1:{self._server.getsockname()[1]}"
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        connection, _ = self._server.accept()
+        with connection, connection.makefile("rwb") as stream:
+            for line in stream:
+                self.heard.append(line.decode().strip())
+                if self.answer is not None:
+                    stream.write(self.answer)
+                    stream.flush()
+
+    def close(self) -> None:
+        self._server.close()
+
+
+@pytest.fixture
+def fake():
+    gripper = FakeGripper()
+    yield gripper
+    gripper.close()
+
+
+def wait_until(true) -> None:
+    end = time.monotonic() + 5
+    while not true() and time.monotonic() < end:
+        time.sleep(0.005)
+    assert true()
+
+
+def test_a_force_a_width_and_a_question_are_lines(fake):
+    gripper = open_gripper(fake.address, timeout_s=2)
+    gripper.set_force(1.25)
+    gripper.set_width(0.04)
+    state = gripper.read_state()
+    gripper.close()
+    assert fake.heard == ["F 1.250", "W 0.0400", "S"]
+    assert (state.force_n, state.width_m) == (1.0, 0.04)
+
+
+@pytest.mark.parametrize(
+    ("answer", "told"),
+    [
+        (b"ERR too hot\n", "refused 'F 1.000': too hot"),
+        (b"OK nan 0.04\n", "not `OK force_n width_m`"),
+        (b"OK 1.0\n", "not `OK force_n width_m`"),
+        (b"hello\n", "answered 'hello'"),
+        (b"\xff\xfe\n", "not `OK force_n width_m`"),
+        (b"x" * 500 + b"\n", "did not answer"),
+        (None, "cannot be reached|did not answer"),
+    ],
+)
+def test_a_wrong_answer_is_told_in_a_sentence(fake, answer, told):
+    fake.answer = answer
+    gripper = open_gripper(fake.address, timeout_s=0.1)
+    with pytest.raises(GripperError, match=told):
+        gripper.set_force(1.0)
+    gripper.close()
+
+
+@pytest.mark.parametrize("force_n", [4.0001, 1e9, math.inf])
+def test_no_force_passes_the_ceiling(force_n):
+    dry = DryRun()
+    with GuardedGripper(dry, ceiling_n=4.0) as gripper:
+        gripper.set_force(force_n)
+    assert dry.sent[-1] == "F 4.000"
+
+
+@pytest.mark.parametrize("force_n", [-1.0, -math.inf])
+def test_no_force_is_negative(force_n):
+    dry = DryRun()
+    with GuardedGripper(dry) as gripper:
+        gripper.set_force(force_n)
+    assert dry.sent[0] == "F 0.000"
+
+
+def test_a_force_that_is_no_number_holds():
+    dry = DryRun()
+    with GuardedGripper(dry) as gripper:
+        gripper.set_force(2.0)
+        gripper.set_force(math.nan)
+    assert set(dry.sent) == {"F 2.000"}
+
+
+def test_a_reader_that_stops_makes_the_gripper_hold_and_not_open():
+    dry = DryRun()
+    with GuardedGripper(dry, watchdog_s=SOON_S) as gripper:
+        gripper.set_force(2.0)
+        wait_until(lambda: gripper.holding)
+        assert set(dry.sent) == {"F 2.000"}
+        with pytest.raises(GripperError, match="opens nothing"):
+            gripper.set_width(0.08)
+        gripper.set_force(1.0)
+        assert not gripper.holding
+    assert set(dry.sent) == {"F 2.000", "F 1.000"}
+
+
+def test_a_gripper_that_fails_is_told_again_until_it_takes_the_force(fake):
+    with GuardedGripper(open_gripper(fake.address, timeout_s=2), watchdog_s=SOON_S) as gripper:
+        fake.answer = b"ERR busy\n"
+        gripper.set_force(1.5)
+        assert gripper.holding
+        assert "busy" in str(gripper.failure)
+        fake.answer = b"OK 1.500 0.0400\n"
+        wait_until(lambda: gripper.failure is None)
+    assert set(fake.heard) == {"F 1.500"}
+
+
+@pytest.mark.parametrize("address", ["tcp://nowhere", "tcp://:80", "/dev/no-such-device"])
+def test_an_address_that_is_none_is_refused(address):
+    with pytest.raises(InputError, match=r"no address|no serial device"):
+        open_gripper(address)
+
+
+def test_nobody_at_an_address_is_told():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    with pytest.raises(GripperError, match="no gripper answers"):
+        open_gripper(f"tcp://127.0.0.1:{port}")
+
+
+@pytest.mark.parametrize("limits", [{"ceiling_n": 0.0}, {"ceiling_n": math.inf}, {"watchdog_s": -1.0}])
+def test_a_guard_without_limits_is_refused(limits):
+    with pytest.raises(InputError, match="must be positive and finite"):
+        GuardedGripper(DryRun(), **limits)

@@ -1,0 +1,166 @@
+"""Laws of the plant: momentum, friction's limits, closed forms, and commands that no gripper may follow."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sliplens.errors import ContactError
+from sliplens.grip import OBJECTS, GripperModel, Plant, World
+from sliplens.grip.plant import GRAVITY_M_S2, PERIOD_S
+
+CUP = OBJECTS["cup"]
+
+
+def world(count: int = 1, *, mass_kg: float = 0.06, friction: float = 0.6, pull_n: float = 0.0) -> World:
+    full = np.full(count, 1.0)
+    return World(
+        mass_kg=mass_kg * full,
+        friction=np.full((count, 2), friction),
+        kinetic_ratio=0.8 * full,
+        pull_n=pull_n * full,
+        hand_m=0.0 * full,
+        hand_speed_m_s=0.0 * full,
+    )
+
+
+def held_in_air(*, force_n: float, height_m: float = 1.0, episodes: int = 1, substeps: int = 16) -> Plant:
+    """Plant whose object hangs in the air between fingers that press already, all springs at rest."""
+    plant, full = Plant(CUP, episodes=episodes, substeps=substeps), np.ones(episodes)
+    anchor = np.full((episodes, 2), -height_m)  # the hand is at 0
+    plant.state = replace(plant.state, force_n=force_n * full, height_m=height_m * full, anchor_m=anchor)
+    return plant
+
+
+def test_what_nothing_holds_falls_freely():
+    plant, steps = held_in_air(force_n=0.0), 4  # what slid farther has left the fingers
+    for _ in range(steps):
+        plant.step(np.zeros(1), world())
+    time_s = steps * PERIOD_S
+    # semi-implicit Euler falls g t dt / 2 farther
+    dt = PERIOD_S / plant.substeps
+    assert 1 - plant.state.height_m[0] == pytest.approx(GRAVITY_M_S2 * time_s * (time_s + dt) / 2, rel=1e-9)
+
+
+def test_the_object_moves_by_the_momentum_that_the_forces_give():
+    plant, mass = held_in_air(force_n=2.0, substeps=1), 0.06
+    for _ in range(40):
+        before = plant.state
+        after = plant.step(np.array([2.0]), world(mass_kg=mass, pull_n=0.3), duration_s=1e-3)
+        gained = mass * (after.speed_m_s - before.speed_m_s)
+        assert gained == pytest.approx(1e-3 * (after.shear_n.sum(axis=1) - mass * GRAVITY_M_S2 - 0.3), abs=1e-12)
+
+
+def test_a_step_of_load_answers_as_a_damped_spring_in_closed_form():
+    plant, mass, substeps = held_in_air(force_n=4.0, substeps=512), 0.06, 60
+    model = plant.model
+    stiffness, damping = 2 * model.shear_stiffness_n_m, 2 * model.shear_damping_n_s_m
+    rate, omega = damping / (2 * mass), np.sqrt(stiffness / mass)
+    ringing = np.sqrt(omega**2 - rate**2)
+    for number in range(1, substeps + 1):
+        state = plant.step(np.array([4.0]), world(mass_kg=mass, friction=1.2), duration_s=1e-3)
+        time_s = number * 1e-3
+        shape = np.cos(ringing * time_s) + rate / ringing * np.sin(ringing * time_s)
+        sunk = mass * GRAVITY_M_S2 / stiffness * (1 - np.exp(-rate * time_s) * shape)
+        assert 1 - state.height_m[0] == pytest.approx(sunk, abs=2e-3 * mass * GRAVITY_M_S2 / stiffness)
+
+
+def test_a_sliding_object_falls_with_what_kinetic_friction_leaves():
+    plant, mass, force = held_in_air(force_n=0.5), 0.06, 0.5
+    speeds = [plant.step(np.array([force]), world(mass_kg=mass, friction=0.3)).speed_m_s[0] for _ in range(6)]
+    held = 2 * 0.8 * 0.3 * force  # kinetic friction of both fingers
+    assert np.diff(speeds[2:]) / PERIOD_S == pytest.approx(held / mass - GRAVITY_M_S2, rel=1e-6)
+    assert plant.state.sliding.all()
+    assert plant.state.margin.max() == 0
+
+
+@pytest.mark.parametrize("force_n", [0.0, 0.3, 1.0, 3.9])
+def test_no_finger_carries_more_than_its_friction(force_n):
+    plant, rng = held_in_air(force_n=force_n, episodes=20), np.random.default_rng(0)
+    for _ in range(60):
+        now = world(20, friction=0.5, pull_n=float(rng.uniform(-1, 2)))
+        state = plant.step(np.full(20, force_n), now)
+        # the skin's shear was checked against the force before its last change
+        slack = plant.model.force_rate(CUP) * PERIOD_S / plant.substeps
+        assert np.all(np.abs(state.shear_n) <= 0.5 * (state.force_n[:, None] + slack) + 1e-12)
+
+
+def test_friction_only_takes_energy():
+    plant, mass = held_in_air(force_n=0.6, substeps=256), 0.05
+    stiffness = plant.model.shear_stiffness_n_m
+
+    def energy() -> float:
+        state = plant.state
+        stretch = -state.height_m[:, None] - state.anchor_m
+        kinetic, weight = 0.5 * mass * state.speed_m_s**2, mass * GRAVITY_M_S2 * state.height_m
+        return float((kinetic + weight + 0.5 * stiffness * (stretch**2).sum(axis=1))[0])
+
+    levels = []
+    for _ in range(30):
+        plant.step(np.array([0.6]), world(mass_kg=mass, friction=0.3), duration_s=2e-3)
+        levels.append(energy())
+    assert np.all(np.diff(levels) < 1e-7)
+
+
+def test_the_force_follows_its_command_with_the_lag_and_no_faster_than_the_fingers_close():
+    model, slow = GripperModel(closing_speed_m_s=10.0), GripperModel(closing_speed_m_s=1e-3)
+    quick, limited = Plant(CUP, model=model), Plant(CUP, model=slow)
+    for _ in range(3):
+        quick.step(np.array([2.0]), world())
+        limited.step(np.array([2.0]), world())
+    assert quick.state.force_n[0] == pytest.approx(2 * (1 - np.exp(-3 * PERIOD_S / model.lag_s)), rel=1e-9)
+    assert limited.state.force_n[0] == pytest.approx(3 * PERIOD_S * slow.force_rate(CUP), rel=1e-9)
+
+
+@pytest.mark.parametrize("command_n", [1e9, np.inf, -5.0, -np.inf])
+def test_no_command_passes_ceiling_or_floor(command_n):
+    plant = Plant(CUP)
+    for _ in range(120):
+        plant.step(np.array([command_n]), world())
+    assert plant.state.force_n[0] == pytest.approx(plant.model.ceiling_n if command_n > 0 else 0, abs=1e-6)
+
+
+def test_a_command_that_is_no_number_holds():
+    plant = held_in_air(force_n=2.0)
+    for _ in range(10):
+        plant.step(np.array([np.nan]), world())
+    assert plant.state.force_n[0] == pytest.approx(2.0, abs=plant.model.resolution_n)
+
+
+def test_an_object_on_the_table_stays_there():
+    plant = Plant(CUP)
+    for _ in range(30):
+        state = plant.step(np.array([1.0]), world(pull_n=5.0))
+    assert state.height_m[0] == state.speed_m_s[0] == 0
+
+
+def test_a_dropped_object_stays_dropped_while_others_go_on():
+    plant = held_in_air(force_n=2.0, episodes=2)
+    now = replace(world(2), friction=np.array([[0.05, 0.05], [0.9, 0.9]]))
+    for _ in range(40):
+        plant.step(np.full(2, 2.0), now)
+    fallen = plant.state
+    assert fallen.dropped.tolist() == [True, False]
+    after = plant.step(np.full(2, 3.0), now)
+    assert after.height_m[0] == fallen.height_m[0]
+    assert after.force_n[1] > fallen.force_n[1]
+
+
+def test_a_berry_box_is_crushed_by_what_a_cup_bears():
+    for name, crushed in (("cup", False), ("berries", True)):
+        plant = Plant(OBJECTS[name])
+        for _ in range(120):
+            plant.step(np.array([4.0]), world())
+        assert bool(plant.state.crushed[0]) is crushed
+
+
+def test_the_least_force_leaves_no_margin():
+    plant, now = held_in_air(force_n=1.0), world(mass_kg=0.06, friction=0.5)
+    least = plant.least_force(now)[0]
+    # each finger carries half the weight
+    assert pytest.approx(0.5 * least) == 0.06 * GRAVITY_M_S2 / 2
+
+
+def test_a_gripper_that_cannot_be_is_refused():
+    with pytest.raises(ContactError, match="ceiling_n of the gripper must be positive, got 0"):
+        GripperModel(ceiling_n=0.0)
