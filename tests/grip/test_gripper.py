@@ -52,7 +52,7 @@ def wait_until(true) -> None:
 
 
 def test_a_force_a_width_and_a_question_are_lines(fake):
-    gripper = open_gripper(fake.address, timeout_s=2)
+    gripper = open_gripper(fake.address, timeout_s=2.0)
     gripper.set_force(1.25)
     gripper.set_width(0.04)
     state = gripper.read_state()
@@ -119,7 +119,7 @@ def test_a_reader_that_stops_makes_the_gripper_hold_and_not_open():
 
 
 def test_a_gripper_that_fails_is_told_again_until_it_takes_the_force(fake):
-    with GuardedGripper(open_gripper(fake.address, timeout_s=2), watchdog_s=SOON_S) as gripper:
+    with GuardedGripper(open_gripper(fake.address, timeout_s=2.0), watchdog_s=SOON_S) as gripper:
         fake.answer = b"ERR busy\n"
         gripper.set_force(1.5)
         assert gripper.holding
