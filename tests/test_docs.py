@@ -17,7 +17,10 @@ PAGE = pytest.mark.parametrize(
 
 
 NO_MODULES = (
-    {f"sliplens.{name}" for name in ("fills", "formats", "encodings", "backbones", "engines")}
+    {
+        f"sliplens.{name}"
+        for name in ("fills", "formats", "encodings", "backbones", "engines", "controllers", "conditions")
+    }
     | {
         f"sliplens.{name}"
         for name in ("manifest", "input", "output", "recipes", "augmentations", "sources", "estimators")

@@ -22,12 +22,11 @@ from sliplens.grip import (
     draw_scripts,
     load_readings,
     make_controller,
-    measure_readings,
     pick_object,
     run_episodes,
 )
 from sliplens.grip import episodes as episodes_module
-from sliplens.grip.fingertip import mean_shear
+from sliplens.grip.fingertip import draw_film, mean_shear
 from sliplens.grip.readings import FORCES_N, FRICTIONS, MARGINS
 from sliplens.grip.scripts import EPISODE_S, hand_motion
 from sliplens.results.grip import Grip
@@ -71,7 +70,8 @@ def test_a_fixed_grip_drops_what_weighs_more_than_its_friction_holds_and_no_othe
     scripts = {"kinetic_ratio": 0.99, "friction_gap": 0.0, "pull_n": 0.0, "friction": 0.5}
     force = 1.0
     limit = 2 * 0.5 * force / 9.81
-    for mass, falls in ((0.97 * limit, False), (1.03 * limit, True)):
+    # the lift itself asks for 5 % more
+    for mass, falls in ((0.9 * limit, False), (1.03 * limit, True)):
         told = few("fixed", episodes=1, settings={"force_n": force}, script=scripts | {"mass_kg": mass})
         assert bool(told.episodes.dropped[0]) is falls
 
@@ -94,13 +94,13 @@ def test_between_its_nodes_the_table_lies_between_what_was_measured(table):
     assert np.all(margin >= table.margin[tips].min(axis=(1, 2, 3)) - 1e-6)
 
 
-def test_what_is_measured_now_is_what_the_package_has(network, table):
-    made = measure_readings(network, fingertips=2, seed=table.seed, engine="folded")
-    # the blur of a frame is drawn by a rule that has changed since: readings agree but for it and the noise
-    error = made.margin - table.margin[:2]
-    assert np.abs(np.median(error)) < 0.01
-    assert np.sqrt((error**2).mean()) < 3 * table.noise
-    assert np.corrcoef(made.margin.ravel(), table.margin[:2].ravel())[0, 1] > 0.95
+def test_what_the_network_reads_of_a_fingertip_is_what_its_table_has(network, table):
+    tip, margins = Fingertip(seed=table.seed), np.array(MARGINS[:-1])
+    full = np.ones(len(margins))
+    film = tip.film(FORCES_N[2] * full, friction=FRICTIONS[3] * full, margins=margins, held_s=full)
+    read = network.predict(network.encode(draw_film(film), tip.reference)).numpy()
+    # of one state, twice filmed, the answers differ by the noise
+    assert np.abs(read - table.margin[0, 3, 2, :-1]).max() < 5 * table.noise
 
 
 def test_a_network_without_errors_reads_the_truth(table):
@@ -206,20 +206,21 @@ def test_a_lamp_that_goes_out_takes_one_finger_s_readings():
 
 
 def test_an_interrupted_run_goes_on_to_the_same_record(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(episodes_module, "_BATCH", 10)
-    whole = few("margin", episodes=30)
+    monkeypatch.setattr(episodes_module, "_BATCH", 2)
+    monkeypatch.setattr(episodes_module, "_TICKS", 60)
+    whole = few("margin", episodes=6)
     made = []
 
     def breaks(done: int, total: int) -> None:
         made.append(done)
-        if done == 20:
+        if done == 4:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        few("margin", episodes=30, out=tmp_path / "grip", on_progress=breaks)
+        few("margin", episodes=6, out=tmp_path / "grip", on_progress=breaks)
     assert not (tmp_path / "grip").exists()
     again: list[int] = []
-    found = few("margin", episodes=30, out=tmp_path / "grip", on_progress=lambda done, _: again.append(done))
+    found = few("margin", episodes=6, out=tmp_path / "grip", on_progress=lambda done, _: again.append(done))
     assert np.array_equal(found.episodes.mean_force_n, whole.episodes.mean_force_n)
     stored = load_result(tmp_path / "grip", Grip, command="sliplens grip")
     assert np.array_equal(stored.episodes.force_excess, whole.episodes.force_excess)

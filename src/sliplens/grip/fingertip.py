@@ -107,4 +107,4 @@ def mean_shear(
     away = np.linalg.norm(rest_px - np.median(rest_px, axis=0), axis=1)
     moved = (now_px - rest_px)[..., np.argsort(away, kind="stable")[:_INNER], 1]
     seen = np.isfinite(moved)
-    return np.where(seen, moved, 0).sum(axis=-1) / np.where(seen.any(axis=-1), seen.sum(axis=-1), np.nan)
+    return np.asarray(np.where(seen, moved, 0).sum(axis=-1) / np.where(seen.any(axis=-1), seen.sum(axis=-1), np.nan))

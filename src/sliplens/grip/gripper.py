@@ -10,10 +10,12 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from io import BufferedIOBase, RawIOBase
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from sliplens.errors import InputError, SliplensError
 
@@ -68,7 +70,7 @@ class LineGripper:
         Anything that reads and writes bytes line by line; see `open_gripper`.
     """
 
-    def __init__(self, stream: IO[bytes], *, close: Callable[[], None] | None = None) -> None:
+    def __init__(self, stream: BufferedIOBase | RawIOBase, *, close: Callable[[], None] | None = None) -> None:
         self._stream, self._close = stream, close or stream.close
 
     def set_force(self, force_n: float) -> None:
@@ -141,6 +143,8 @@ def open_gripper(address: str, *, timeout_s: float = 0.1) -> LineGripper:
         stream = connection.makefile("rwb")
 
         def close() -> None:
+            with suppress(OSError):  # what was not sent to a gripper that is gone
+                stream.close()
             connection.close()
 
         return LineGripper(stream, close=close)

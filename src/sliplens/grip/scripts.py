@@ -155,8 +155,8 @@ def draw_scripts(
     fingertips
         How many pairs of fingertips to choose from.
     fixed
-        Columns of `Scripts` that are the same in all episodes rather than drawn, such as `mass_kg` or `friction`; None
-        leaves one to chance.
+        Columns of `Scripts`, in their units (kilograms, seconds, newtons, ratios), that are the same in all episodes
+        rather than drawn, such as `mass_kg`; None leaves one to chance.
 
     Raises
     ------
