@@ -142,9 +142,10 @@ def rendered_rate(ticks: int = 120) -> float:
     """Ticks a second of plant, both fingertips drawn, read and followed."""
     scripts, eyes = draw_scripts("cup", "dry", episodes=1, seed=SEED), RenderedEyes(RUN, seed=SEED)
     loop = GripLoop(Plant(OBJECTS["cup"]), eyes, make_controller("margin"))
-    for number in range(ticks + 20):
-        if number == 20:
-            begin = time.perf_counter()
+    for _ in range(20):
+        loop.tick(scripts.world(loop.plant.state.time_s))
+    begin = time.perf_counter()
+    for _ in range(ticks):
         loop.tick(scripts.world(loop.plant.state.time_s))
     return ticks / (time.perf_counter() - begin)
 
@@ -210,9 +211,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for value in values:
                 settings = {name: value} if where.get("of") == "settings" else {}
                 given = {} if settings else {name: value}
-                told[f"{value:g}"] = compare(
-                    hold("margin", settings, conditions, episodes=fewer, **given), beside, rows, rng
-                )
+                told[f"{value:g}"] = compare(hold("margin", settings, fewer, **given), beside, rows, rng)
             return told
 
         found["latency_s"] = swept("latency_s", LATENCIES_S)

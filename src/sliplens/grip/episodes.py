@@ -151,7 +151,8 @@ def run_episodes(
         make_controller(controller, settings)  # a mistake is told before anything is measured
     elif settings:
         raise InputError("settings are for the controllers of the table; set those of your own where you make it")
-    scripts = draw_scripts(held, condition, episodes=episodes, seed=seed, **dict(script or {}))
+    fixed: dict[str, Any] = dict(script or {})
+    scripts = draw_scripts(held, condition, episodes=episodes, seed=seed, **fixed)
     run = _load_calibrated(network)
     if not rendered and readings is None:
         readings = _readings_of(run, on_progress)

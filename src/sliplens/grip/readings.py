@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
@@ -78,7 +79,7 @@ class ReadingTable:
                 weight = weight * (part if upper else 1 - part)
                 index.append(at + upper)
             total += np.asarray(weight)[..., None] * stacked[tuple(index)]
-        return tuple(np.moveaxis(total, -1, 0))
+        return tuple(np.asarray(values) for values in np.moveaxis(total, -1, 0))
 
     @property
     def _stacked(self) -> Float32[np.ndarray, "fingertips frictions forces margins 4"]:
@@ -121,7 +122,7 @@ def measure_readings(
     mu, force, gamma = np.meshgrid(FRICTIONS, FORCES_N, MARGINS, indexing="ij")
     # full stick shows no friction: one of them is enough
     shown = (gamma < 1) | (mu == FRICTIONS[0])
-    states = {"friction": mu[shown], "margins": gamma[shown]}
+    states: dict[str, Any] = {"friction": mu[shown], "margins": gamma[shown]}
     again = np.random.default_rng(seed).choice(shown.sum(), 12, replace=False)
     ready = make_engine(engine, run, frames=fingertips * int(shown.sum()))
     found: list[np.ndarray] = []
