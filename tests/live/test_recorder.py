@@ -99,7 +99,7 @@ def test_a_recording_is_studied(fine_dataset: Dataset, difference_run: Path, tmp
         random_orders=1,
         out=tmp_path / "study",
     )
-    assert study.frame().num_rows > 0
+    assert set(study.deletion) == {"difference"}
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.77, 0.999])
