@@ -179,7 +179,7 @@ def run_episodes(
             grip = load_result(output.folder, Grip, command="sliplens grip")
         else:
             grip = job.all(facts, output.folder, on_progress)
-    told = f"{episodes} episodes, {100 * grip.drop_rate:.1f} % dropped"
+    told = f"{episodes} episode{'s' * (episodes > 1)}, {100 * grip.drop_rate:.1f} % dropped"
     wrote(on_progress, Path(out), told, kept=output.complete)
     return grip
 

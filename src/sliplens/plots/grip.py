@@ -15,8 +15,9 @@ def plot_grip_force(trace: GripTrace, *, ax: Axes) -> Axes:
     ax.fill_between(trace.time_s, trace.least_force_n, trace.force_n, color=BLUE, alpha=0.12, linewidth=0)
     for number, time_s in enumerate(trace.time_s[trace.slip_seen]):
         ax.axvline(time_s, color=VERMILLION, linewidth=1, linestyle=":", label="slip seen" if number == 0 else None)
-    ax.set(xlabel="Time (s)", ylabel="Force (N)", ylim=(0, None))
-    ax.legend(loc="upper right")
+    # room for the legend above what is drawn
+    ax.set(xlabel="Time (s)", ylabel="Force (N)", ylim=(0, 1.4 * float(trace.force_n.max()) or 1.0))
+    ax.legend(loc="upper right", ncols=2)
     return ax
 
 

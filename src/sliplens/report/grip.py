@@ -55,7 +55,7 @@ def plate_moments(grip: Grip) -> Plate:
         name="grip-moments",
         figure=draw_grid([("camera", frames), ("why", maps)], heads=heads).figure,
         alt=f"Camera frames and maps at {', '.join(heads)}",
-        caption="What the first finger's camera saw, and what moved the answer: red lowers the margin against the "
+        caption="What the first finger's camera saw, and what moved the answer: orange lowers the margin against the "
         "untouched sensor, blue raises it. How far such maps can be believed is for `sliplens study` to say.",
         numbers=named_columns(
             ("time_s", "relevance"), rows_of(np.array(grip.moments_s), grip.maps.sum(axis=(1, 2)).astype(np.float64))
@@ -69,7 +69,8 @@ def table_episodes(grip: Grip) -> Table:
     table = grip.episodes
     quartiles = np.quantile(table.force_excess, (0.25, 0.5, 0.75))
     return make_table(
-        f"What became of {len(table)} episodes: {grip.object}, {grip.condition}, controller {grip.controller}.",
+        f"What became of {len(table):,} episode{'s' * (len(table) > 1)}: {grip.object}, {grip.condition}, controller "
+        f"{grip.controller}.",
         ("Episodes", "Dropped", "Crushed", "Slip, median", "Mean force", "Over the least (quartiles)", "Under 20 %"),
         [
             (

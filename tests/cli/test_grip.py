@@ -1,0 +1,44 @@
+"""`sliplens grip`: what it writes, and what is said to mistakes."""
+
+from pathlib import Path
+
+import pytest
+from command_line import refused, run
+
+import sliplens as sl
+from sliplens.codec import load_result
+from sliplens.results.grip import Grip
+
+
+def test_many_episodes_make_a_record_and_a_page_and_are_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    words = ("grip", "-o", tmp_path, "--controller", "fixed", "--episodes", 4, "--set", "force_n=3.5", "--mass", "0.05")
+    assert run(*words) == 0
+    told = capsys.readouterr().out
+    assert "0 of 4" in told
+    assert "4 episodes, 0.0 % dropped" in told
+    grip = load_result(tmp_path / "grip", Grip, command="sliplens grip")
+    assert grip.settings == {"force_n": 3.5}
+    assert set(grip.episodes.mass_kg) == {0.05}
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "What the margin holds" in page
+    assert "What became of 4 episodes" in page
+    assert (tmp_path / "figures" / "grip-episode.pdf").is_file()
+    assert len(sl.plot(grip).axes[0].lines) >= 2
+    assert run(*words) == 0
+    assert "kept" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--controller", "magic"), "there is no controller named 'magic'"),
+        (("--condition", "oily"), "there is no condition named 'oily'"),
+        (("--set", "target"), "write --set NAME=NUMBER"),
+        (("--set", "speed=3"), "has no constant 'speed'"),
+        (("--mass", "-1"), "mass_kg must be positive"),
+        (("--network", "nothing"), "the run nothing does not exist"),
+    ],
+)
+def test_mistakes_are_one_sentence_and_nothing_is_written(tmp_path: Path, capsys, words, told):
+    assert told in refused(capsys, "grip", "-o", tmp_path / "out", "--episodes", 3, *words)
+    assert not (tmp_path / "out").exists()
