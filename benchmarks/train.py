@@ -32,6 +32,8 @@ def make_frames(count: int, *, size: int, trial: str, generator: torch.Generator
         encoding=get_encoding("difference"),
         images=torch.randint(0, 256, (count, 3, size, size), dtype=torch.uint8, generator=generator),
         safety_margin=torch.rand(count, generator=generator),
+        traction_ratio=torch.rand(count, generator=generator),
+        friction=np.full(count, 0.6),
         trial=(trial,) * count,
         frame=tuple(range(count)),
         condition=("dry",) * count,
@@ -56,11 +58,11 @@ class BareSteps:
 
     def step(self, *, augment: bool) -> None:
         """Take one step."""
-        images, labels = self.batches[self.done % len(self.batches)]
+        images, labels, ratios = self.batches[self.done % len(self.batches)]
         self.done += 1
         if augment and self.augmentation is not None:
             images = self.augmentation(images, generator=self.generator)
-        loss, _ = margin_loss(self.model, images, labels)
+        loss, _ = margin_loss(self.model, images, labels, ratios)
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()

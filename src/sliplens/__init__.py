@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from sliplens.errors import SliplensError
     from sliplens.explainers.table import explain
     from sliplens.faithfulness.scoring import score
+    from sliplens.friction import Friction
     from sliplens.grip.episodes import run_episodes
     from sliplens.live.loop import LiveReader, read_live
     from sliplens.markers.tracking import track
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 # where each name lives: importing sliplens alone imports neither torch nor NumPy
 _MODULES = {
     "LiveReader": "sliplens.live.loop",
+    "Friction": "sliplens.friction",
     "SliplensError": "sliplens.errors",
     "check_dataset": "sliplens.recordings.check",
     "compare_datasets": "sliplens.simulation.sharing",
@@ -59,6 +61,7 @@ _MODULES = {
 }
 
 __all__ = [
+    "Friction",
     "LiveReader",
     "SliplensError",
     "__version__",

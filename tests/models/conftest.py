@@ -9,11 +9,15 @@ from torch.nn import functional
 
 from sliplens.models import Manifest, Run, build_model, load_checkpoint, save_checkpoint
 from sliplens.models.backbones import HistogramRegressor
-from sliplens.models.calibration import Calibration
+from sliplens.models.calibration import Calibration, Traction
 from sliplens.models.onnx import export_onnx
 
 FRAME_SIZE, IMAGE_SIZE = 48, 32
 CALIBRATION = Calibration(temperature=1.0, offsets={"0.68": 0.02, "0.9": 0.05}, frames=100, mse=0.01)
+TRACTION = Traction(
+    calibration=CALIBRATION, told=CALIBRATION, friction=tuple(0.15 + 0.105 * part for part in range(11))
+)
+HEADS = ("point", "histogram", "margin-and-ratio")
 
 
 def some_images(count: int, *, seed: int) -> Tensor:
@@ -50,7 +54,8 @@ def save_run(folder: Path, *, head: str, kind: str = "difference") -> Path:
         sensor="test-sensor",
         data_hash="none",
         head=head,
-        calibration=CALIBRATION if head == "histogram" else None,
+        calibration=None if head == "point" else CALIBRATION,
+        traction=TRACTION if head == "margin-and-ratio" else None,
     )
     save_checkpoint(folder, model.eval(), manifest)
     return folder
@@ -59,7 +64,7 @@ def save_run(folder: Path, *, head: str, kind: str = "difference") -> Path:
 @pytest.fixture(scope="session")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A run for each head."""
-    return {head: save_run(tmp_path_factory.mktemp(head), head=head) for head in ("point", "histogram")}
+    return {head: save_run(tmp_path_factory.mktemp(head), head=head) for head in HEADS}
 
 
 @pytest.fixture(scope="session")

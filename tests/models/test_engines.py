@@ -60,7 +60,7 @@ def assert_alike(name: str, trained: Run, images: Tensor, *, onnx_file: Path | N
         np.testing.assert_array_equal(found.edges, expected.edges)
 
 
-@pytest.mark.parametrize("head", ["point", "histogram"])
+@pytest.mark.parametrize("head", ["point", "histogram", "margin-and-ratio"])
 def test_eager_answers_as_the_network(head: str, networks: dict[str, Run], images: Tensor):
     found = make_engine("eager", networks[head]).estimate(networks[head], images)
     expected = networks[head].estimate(images)
@@ -72,12 +72,12 @@ def test_eager_answers_as_the_network(head: str, networks: dict[str, Run], image
         np.testing.assert_allclose(found.sigma, expected.sigma, atol=1e-6)
 
 
-@pytest.mark.parametrize("head", ["point", "histogram"])
+@pytest.mark.parametrize("head", ["point", "histogram", "margin-and-ratio"])
 def test_folded_answers_as_eager(head: str, networks: dict[str, Run], images: Tensor):
     assert_alike("folded", networks[head], images)
 
 
-@pytest.mark.parametrize("head", ["point", "histogram"])
+@pytest.mark.parametrize("head", ["point", "histogram", "margin-and-ratio"])
 @pytest.mark.parametrize("name", ["onnxruntime", "openvino"])
 def test_engines_of_onnx_files_answer_as_eager(
     name: str, head: str, networks: dict[str, Run], onnx_files: dict[str, Path], images: Tensor

@@ -1,6 +1,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -9,7 +10,7 @@ from sliplens.models import load_checkpoint
 from sliplens.models.encodings import get_encoding
 from sliplens.recordings import Dataset
 from sliplens.results.training import Training
-from sliplens.training import TrainConfig, evaluate_frames, fit
+from sliplens.training import TrainConfig, evaluate_frames, fit, get_recipe
 from sliplens.training.data import EpochShuffle, FrameSet, load_frames
 from sliplens.training.fitting import require_same_kind
 
@@ -152,3 +153,81 @@ def test_it_does_not_start_from_a_network_of_another_kind(
         run(tmp_path / "b", frames, replace(CONFIG, backbone="resnet18"), start=start)
     with pytest.raises(ModelError, match="has the input difference, and raw is to be trained"):
         require_same_kind(start, CONFIG, "raw")
+
+
+RATIO = replace(get_recipe("ratio"), image_size=32, epochs=30, batch_size=11, seed=3)
+
+
+@pytest.fixture(scope="module")
+def histogram_run(tmp_path_factory: pytest.TempPathFactory, frames: tuple[FrameSet, FrameSet]) -> Path:
+    folder = tmp_path_factory.mktemp("histogram")
+    # so long that its features tell frames apart
+    run(folder, frames, replace(CONFIG, head="histogram", epochs=20))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def ratio_run(tmp_path_factory: pytest.TempPathFactory, frames: tuple[FrameSet, FrameSet], histogram_run: Path) -> Path:
+    folder = tmp_path_factory.mktemp("ratio")
+    run(folder, frames, RATIO, start=load_checkpoint(histogram_run))
+    return folder
+
+
+def test_a_second_answer_leaves_the_first_to_the_bit(
+    frames: tuple[FrameSet, FrameSet], histogram_run: Path, ratio_run: Path
+):
+    before, after = load_checkpoint(histogram_run), load_checkpoint(ratio_run)
+    kept, grown = before.model.state_dict(), after.model.state_dict()
+    assert all(
+        torch.equal(value, grown[name][: len(value)] if value.ndim else grown[name]) for name, value in kept.items()
+    )
+    assert before.manifest.calibration == after.manifest.calibration
+    assert before.manifest.traction is None
+    assert after.manifest.traction is not None
+    assert after.manifest.traction.calibration.frames == len(frames[1])
+    # what the training trials have of friction
+    assert after.manifest.traction.friction[0] == pytest.approx(np.nanmin(frames[0].friction))
+    inputs, *_ = frames[1].__getitems__(range(len(frames[1])))
+    torch.testing.assert_close(after.predict(inputs), before.predict(inputs), atol=1e-6, rtol=0)
+
+
+def test_a_second_answer_is_learnt(frames: tuple[FrameSet, FrameSet], ratio_run: Path):
+    ratios = frames[1].traction_ratio.double().numpy()
+    inputs, *_ = frames[1].__getitems__(range(len(frames[1])))
+    answer = load_checkpoint(ratio_run).estimate(inputs).ratio
+    assert answer is not None
+    # better than the mean of the training, which is the best of those who see nothing
+    blind = np.mean((frames[0].traction_ratio.double().numpy().mean() - ratios) ** 2)
+    assert np.mean((answer.mean - ratios) ** 2) < 0.7 * blind
+
+
+def test_an_evaluation_tells_what_was_told(frames: tuple[FrameSet, FrameSet], ratio_run: Path, histogram_run: Path):
+    trained = load_checkpoint(ratio_run)
+    untold, each = evaluate_frames(trained, frames[1]), evaluate_frames(trained, frames[1], friction="each")
+    assert (untold.friction, each.friction) == ("", "that of each trial, told exactly")
+    assert untold.ratio_r2.keys() == untold.conditions.keys()
+    # one by one, as a slow reader would
+    for value in np.unique(frames[1].friction):
+        rows = np.flatnonzero(frames[1].friction == value)
+        inputs, *_ = frames[1].__getitems__(rows.tolist())
+        expected = trained.estimate(inputs, friction=float(value)).margin
+        np.testing.assert_allclose(each.predictions.prediction[rows], expected, atol=1e-6)
+    assert evaluate_frames(load_checkpoint(histogram_run), frames[1]).ratio_r2 == {}
+
+
+def test_both_answers_are_learnt_together(tmp_path: Path, frames: tuple[FrameSet, FrameSet]):
+    run(tmp_path / "run", frames, replace(CONFIG, head="margin-and-ratio", epochs=1))
+    assert load_checkpoint(tmp_path / "run").manifest.traction is not None
+
+
+def test_without_forces_there_is_no_second_answer(tmp_path: Path, frames: tuple[FrameSet, FrameSet]):
+    train, validation = (
+        replace(one, traction_ratio=torch.full_like(one.traction_ratio, float("nan"))) for one in frames
+    )
+    with pytest.raises(InputError, match="no training frame tells its forces"):
+        run(tmp_path / "run", (train, validation), replace(CONFIG, head="margin-and-ratio"))
+
+
+def test_a_frozen_network_learns_the_ratio_alone():
+    with pytest.raises(InputError, match="a frozen network learns F_t / F_n alone"):
+        replace(RATIO, head="histogram")

@@ -23,7 +23,7 @@ def test_a_batch_is_what_encoding_the_frames_one_by_one_gives(small_dataset: Dat
     encoding = get_encoding("difference")
     frames = load_frames(small_dataset, trials, encoding=encoding, image_size=24)
     recording = small_dataset.load(trials[1])
-    images, labels = frames.__getitems__([11, 15])
+    images, labels, _ = frames.__getitems__([11, 15])
     assert frames.trial[11] == recording.trial
     expected = encoding.encode(recording.frames[[1, 5]], recording.reference, image_size=24)
     assert torch.equal(images, expected)

@@ -21,6 +21,8 @@ Output = Annotated[Path, tyro.conf.arg(aliases=("-o",))]
 _SOURCE = "Data set, folder of images, video, ROS 2 bag, or whatever `sliplens import` reads."
 Source = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE", help=_SOURCE)]
 TableFile = Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="FILE.parquet", help="File to write.")]
+_FRICTION = "Coefficient of friction of the object, where it is known: 0.62, or a range such as 0.5..0.8."
+Friction = Annotated[str | None, tyro.conf.arg(metavar="MU|LOW..HIGH", help=_FRICTION)]
 Device = Annotated[str, tyro.conf.arg(help="Where the network runs: cpu, cuda or cuda:1.")]
 
 

@@ -1,7 +1,9 @@
 """`sliplens evaluate`."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
 
 from sliplens.cli.command import Command, Data, Device, Network, Output
 from sliplens.cli.console import print_table, say
@@ -25,6 +27,9 @@ class Evaluate(Command):
     """Folder to make: the table and every prediction."""
     split: str = "test"
     """Which trials of the data set."""
+    friction: Annotated[str | None, tyro.conf.arg(metavar="MU|LOW..HIGH|each")] = None
+    """Coefficient of friction that the network is told: 0.62, a range such as 0.5..0.8, or each for that of every
+    trial."""
     baselines: tuple[str, ...] = ()
     """Estimators to put beside it, by name or all: they read the motion of the markers, fitted on training trials."""
     baseline_trials: int = 40
@@ -59,6 +64,11 @@ def _print_scores(evaluation: "Evaluation") -> None:
         ("condition", "frames", "MSE", "R2", "MAE", "in 90 %", "warns\nbefore", "false\n/min"),
         [_row(name, evaluation) for name in evaluation.conditions],
     )
+    if evaluation.friction:
+        say(f"friction: {evaluation.friction}")
+    if evaluation.ratio_r2:
+        told = (f"{name} {'none' if r2 is None else f'{r2:.3f}'}" for name, r2 in evaluation.ratio_r2.items())
+        say(f"F_t / F_n is read with R2 {', '.join(told)}")
     if evaluation.wet_auroc is not None:
         say(f"wet is told from dry by the network's own uncertainty: AUROC {evaluation.wet_auroc:.2f}")
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from sliplens.cli.command import Device, Network, Source, SourceCommand, TableFile
+from sliplens.cli.command import Device, Friction, Network, Source, SourceCommand, TableFile
 from sliplens.cli.console import wrote
 
 
@@ -25,6 +25,7 @@ class Predict(SourceCommand):
     """What runs the network: eager, folded, compiled, onnxruntime or openvino; auto takes the fastest at hand."""
     onnx: Annotated[Path | None, tyro.conf.arg(metavar="FILE.onnx")] = None
     """The network as `sliplens export` wrote it; without it onnxruntime and openvino convert the network first."""
+    friction: Friction = None
     batch_size: int = 8
     """Frames predicted together; on a CPU more are slower, as they no longer fit its cache."""
     device: Device = "cpu"

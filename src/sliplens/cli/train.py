@@ -19,8 +19,9 @@ class Train(Command):
     output: Output
     """Folder to make: weights, manifest, learning curve."""
     recipe: str = "default"
-    """default: a distribution over the margin, AdamW. thesis: as the thesis trained, one output and Ranger21. The
-    options below change it."""
+    """default: a distribution over the margin, AdamW. thesis: as the thesis trained, one output and Ranger21. ratio:
+    teaches the network of --start-from F_t / F_n, for where friction is told; its margins stay. The options below
+    change it."""
     input: str = "difference"
     """What the network sees of a frame T_n and of the untouched sensor T_0. difference: |T_n - T_0|, each image divided
     by its own maximum. raw: T_n. signed: T_n - T_0. amplitude: |T_n - T_0| as strong as it is."""
@@ -31,8 +32,9 @@ class Train(Command):
     """Train and validate on the trials of one condition alone, such as dry."""
     backbone: str | None = None
     """A TorchVision classifier, such as resnet18."""
-    head: Literal["point", "histogram"] | None = None
-    """What the network answers with: one number, or a distribution, which tells how sure it is."""
+    head: Literal["point", "histogram", "margin-and-ratio"] | None = None
+    """What the network answers with: one number; a distribution, which tells how sure it is; or two, the second over
+    F_t / F_n, for where friction is told."""
     image_size: int | None = None
     """Height and width of the network's input, in pixels."""
     epochs: int | None = None

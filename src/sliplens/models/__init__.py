@@ -1,7 +1,7 @@
 """Networks that read the safety margin, their checkpoints, and the engines that run them."""
 
 from sliplens.models.backbones import build_model
-from sliplens.models.checkpoint import Estimate, Manifest, Run, load, load_checkpoint, save_checkpoint
+from sliplens.models.checkpoint import Estimate, Manifest, Ratio, Run, load, load_checkpoint, save_checkpoint
 from sliplens.models.engines import ENGINES, Engine, make_engine, prepare
 from sliplens.models.onnx import export_onnx
 from sliplens.models.predictions import Predictions, predict
@@ -12,6 +12,7 @@ __all__ = [
     "Estimate",
     "Manifest",
     "Predictions",
+    "Ratio",
     "Run",
     "build_model",
     "export_onnx",

@@ -1,7 +1,7 @@
 """Backbones: any TorchVision classifier, with the outputs that its head needs."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
@@ -16,6 +16,9 @@ from sliplens.extras import Table
 BINS = 60
 LOWEST, HIGHEST = -0.1, 1.1
 """Ends of the histogram, in margin units: a label's width beyond [0, 1], so that its mean is not pulled inwards."""
+RATIO_BINS = 80
+RATIO_LOWEST, RATIO_HIGHEST = -0.1, 1.5
+"""Ends of the histogram over the traction ratio F_t / F_n: below 0 as below a margin of 0, above what rubber holds."""
 _WIDTH_RATIO = 0.75
 """Standard deviation of a label over the width of a bin, as Farebrother et al. recommend."""
 
@@ -24,7 +27,8 @@ class HistogramRegressor(nn.Module):
     """A network whose answer is a histogram over the safety margin; it returns the mean (HL-Gauss).
 
     `backbone`: takes (batch, 3, height, width) and returns (batch, `bins`) logits; `bins`, `lowest`, `highest`: bins of
-    one width, and the margins between which they lie.
+    one width, and the margins between which they lie. With `ratio` it answers with a second histogram, over the
+    traction ratio F_t / F_n; the backbone returns `RATIO_BINS` logits more then.
 
     Imani & White, *Improving Regression Performance with Distributional Losses* (2018); Farebrother et al., *Stop
     Regressing* (2024), whose width of a label is taken.
@@ -32,57 +36,94 @@ class HistogramRegressor(nn.Module):
 
     edges: Tensor
     temperature: Tensor
+    ratio_edges: Tensor | None
+    ratio_temperature: Tensor | None
 
     def __init__(
-        self, backbone: nn.Module, *, bins: int = BINS, lowest: float = LOWEST, highest: float = HIGHEST
+        self,
+        backbone: nn.Module,
+        *,
+        bins: int = BINS,
+        lowest: float = LOWEST,
+        highest: float = HIGHEST,
+        ratio: bool = False,
     ) -> None:
         super().__init__()
         self.backbone = backbone
         self.register_buffer("edges", torch.linspace(lowest, highest, bins + 1))
         self.register_buffer("temperature", torch.tensor(1.0))
+        # None is not part of the weights: networks with one answer are kept as they always were
+        ratio_edges = torch.linspace(RATIO_LOWEST, RATIO_HIGHEST, RATIO_BINS + 1) if ratio else None
+        self.register_buffer("ratio_edges", ratio_edges)
+        self.register_buffer("ratio_temperature", torch.tensor(1.0) if ratio else None)
 
     @property
     def centres(self) -> Float[Tensor, " bins"]:
         """Margins in the middle of the bins."""
         return (self.edges[1:] + self.edges[:-1]) / 2
 
-    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch 1"]:
+    def forward(self, images: Float[Tensor, "batch *input"]) -> Float[Tensor, "batch 1"]:
         """Mean of the distribution: the safety margin."""
         return (self.probabilities(images) @ self.centres)[:, None]
 
-    def probabilities(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch bins"]:
+    def logits(
+        self, images: Float[Tensor, "batch *input"]
+    ) -> tuple[Float[Tensor, "batch bins"], Float[Tensor, "batch ratio_bins"]]:
+        """Logits over the margin and over the ratio; of a network with one answer the second has no columns."""
+        logits, bins = self.backbone(images), len(self.edges) - 1
+        return logits[:, :bins], logits[:, bins:]
+
+    def probabilities(self, images: Float[Tensor, "batch *input"]) -> Float[Tensor, "batch bins"]:
         """Distribution over the bins, at the temperature that was fitted."""
-        return torch.softmax(self.backbone(images) / self.temperature, dim=-1)
+        return torch.softmax(self.logits(images)[0] / self.temperature, dim=-1)
 
     def loss(
-        self, images: Float[Tensor, "batch 3 height width"], labels: Float[Tensor, " batch"]
+        self,
+        images: Float[Tensor, "batch *input"],
+        labels: Float[Tensor, " batch"],
+        ratios: Float[Tensor, " batch"] | None = None,
     ) -> tuple[Float[Tensor, ""], Float[Tensor, " batch"]]:
-        """Cross-entropy against each label as a Gaussian of the bins' width, and the predicted margins."""
-        logits = self.backbone(images).float()
+        """Cross-entropy against each label as a Gaussian of the bins' width, and the predicted margins.
+
+        `ratios`: F_t / F_n of the frames; those whose forces are not known (NaN) teach the margin alone.
+        """
+        logits, ratio_logits = (part.float() for part in self.logits(images))
         loss = functional.cross_entropy(logits, histogram_targets(labels, self.edges))
+        if self.ratio_edges is not None and ratios is not None and (known := torch.isfinite(ratios)).any():
+            targets = histogram_targets(ratios[known], self.ratio_edges)
+            loss = loss + functional.cross_entropy(ratio_logits[known], targets)
         return loss, torch.softmax(logits / self.temperature, dim=-1) @ self.centres
 
 
 class Answers(nn.Module):
-    """A network that returns all it answers: margins, and the probabilities behind them where it has a histogram."""
+    """A network that returns all it answers: margins, and the probabilities behind them where it has histograms."""
 
     def __init__(self, model: nn.Module) -> None:
         super().__init__()
         self.model = model
 
     def forward(
-        self, image: Float[Tensor, "batch 3 height width"]
-    ) -> tuple[Float[Tensor, " batch"]] | tuple[Float[Tensor, " batch"], Float[Tensor, "batch bins"]]:
-        """Margins, and probabilities if any."""
-        if isinstance(self.model, HistogramRegressor):
-            probabilities = self.model.probabilities(image)
-            return probabilities @ self.model.centres, probabilities
-        return (self.model(image).flatten(),)
+        self, image: Float[Tensor, "batch *input"]
+    ) -> (
+        tuple[Float[Tensor, " batch"]]
+        | tuple[Float[Tensor, " batch"], Float[Tensor, "batch bins"]]
+        | tuple[Float[Tensor, " batch"], Float[Tensor, "batch bins"], Float[Tensor, "batch ratio_bins"]]
+    ):
+        """Margins (batch,), and of histograms probabilities (batch, bins): of the margin, then of the ratio if any."""
+        if not isinstance(self.model, HistogramRegressor):
+            return (self.model(image).flatten(),)
+        logits, ratio_logits = self.model.logits(image)
+        probabilities = torch.softmax(logits / self.model.temperature, dim=-1)
+        margins = probabilities @ self.model.centres
+        if self.model.ratio_temperature is None:
+            return margins, probabilities
+        return margins, probabilities, torch.softmax(ratio_logits / self.model.ratio_temperature, dim=-1)
 
 
 def answer_names(model: nn.Module) -> tuple[str, ...]:
     """Names of what `Answers` returns, in its order."""
-    return ("margin", "probabilities") if isinstance(model, HistogramRegressor) else ("margin",)
+    names = ("margin", "probabilities", "ratio_probabilities")
+    return names[: 1 if not isinstance(model, HistogramRegressor) else 2 if model.ratio_edges is None else 3]
 
 
 def bin_edges(model: nn.Module) -> Float[np.ndarray, " edges"] | None:
@@ -90,25 +131,54 @@ def bin_edges(model: nn.Module) -> Float[np.ndarray, " edges"] | None:
     return model.edges.double().cpu().numpy() if isinstance(model, HistogramRegressor) else None
 
 
-def histogram_targets(margins: Float[Tensor, " batch"], edges: Float[Tensor, " edges"]) -> Float[Tensor, "batch bins"]:
+def ratio_edges(model: nn.Module) -> Float[np.ndarray, " edges"] | None:
+    """Edges of the bins over F_t / F_n; None for a network that answers with the margin alone."""
+    edges = model.ratio_edges if isinstance(model, HistogramRegressor) else None
+    return None if edges is None else edges.double().cpu().numpy()
+
+
+def histogram_targets(values: Float[Tensor, " batch"], edges: Float[Tensor, " edges"]) -> Float[Tensor, "batch bins"]:
     """Share of a Gaussian round each label that falls into each bin; each row sums to 1."""
     sigma = _WIDTH_RATIO * (edges[1] - edges[0])
-    below = 0.5 * (1 + torch.erf((edges - margins[:, None]) / (math.sqrt(2) * sigma)))
+    below = 0.5 * (1 + torch.erf((edges - values[:, None]) / (math.sqrt(2) * sigma)))
     return (below[:, 1:] - below[:, :-1]) / (below[:, -1:] - below[:, :1])
 
 
 def margin_loss(
-    model: nn.Module, images: Float[Tensor, "batch 3 height width"], labels: Float[Tensor, " batch"]
+    model: nn.Module,
+    images: Float[Tensor, "batch *input"],
+    labels: Float[Tensor, " batch"],
+    ratios: Float[Tensor, " batch"] | None = None,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, " batch"]]:
-    """Loss of training, cross-entropy for a histogram, else the mean squared error; and the predicted margins."""
+    """Loss of training, cross-entropy for histograms, else the mean squared error; and the predicted margins."""
     if isinstance(model, HistogramRegressor):
-        return model.loss(images, labels)
+        return model.loss(images, labels, ratios)
     margins = model(images).reshape(len(images)).float()
     return functional.mse_loss(margins, labels), margins
 
 
-HEADS = {"point": 1, "histogram": BINS}
+HEADS = {"point": 1, "histogram": BINS, "margin-and-ratio": BINS + RATIO_BINS}
 """Outputs of the backbone by head."""
+
+
+def last_layer(model: nn.Module) -> nn.Linear:
+    """The last linear layer, which makes the answers; `ModelError` if there is none."""
+    layers = [module for module in model.modules() if isinstance(module, nn.Linear)]
+    if not layers:
+        raise ModelError(f"{type(model).__name__} has no linear layer; choose a backbone such as resnet18")
+    return layers[-1]
+
+
+def with_ratio(model: nn.Module, weights: Mapping[str, Tensor]) -> nn.Module:
+    """Fill a network of two answers with the weights of one that has the margin alone; its ratio begins as unknown.
+
+    The margins stay what they were; the new rows of the last layer are zero: every ratio is as likely.
+    """
+    state = model.state_dict()
+    for name, value in weights.items():
+        state[name] = torch.cat([value, torch.zeros_like(state[name][len(value) :])]) if value.ndim else value
+    model.load_state_dict(state)
+    return model
 
 
 def head_outputs(head: str) -> int:
@@ -140,7 +210,8 @@ def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point") -> nn.
     backbone
         Row of `BACKBONES`; `ModelError` if there is none of that name.
     head
-        `point` for one number, `histogram` for the mean of a distribution (`HistogramRegressor`).
+        `point` for one number, `histogram` for the mean of a distribution (`HistogramRegressor`), `margin-and-ratio`
+        for a second distribution beside it, over F_t / F_n.
 
     References
     ----------
@@ -157,4 +228,4 @@ def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point") -> nn.
     if backbone not in BACKBONES:
         raise ModelError(f"there is no backbone named {backbone!r}; choose a TorchVision classifier such as resnet18")
     model = BACKBONES[backbone](num_classes=head_outputs(head))
-    return HistogramRegressor(model) if head == "histogram" else model
+    return model if head == "point" else HistogramRegressor(model, ratio=head == "margin-and-ratio")

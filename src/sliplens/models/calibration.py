@@ -46,6 +46,29 @@ class Calibration:
         return self.offsets[str(level)]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Traction:
+    """What the second answer of a network, the traction ratio F_t / F_n, is and how it turns into a margin."""
+
+    calibration: Calibration
+    """Of the ratio; its errors are ratios, not margins."""
+    told: Calibration
+    """Of the margin where each validation trial's friction is told; the temperature is that of the first answer."""
+    friction: tuple[float, ...]
+    """Evenly spaced quantiles of the coefficient of friction over the training frames, from the least to the largest:
+    what the network expects where it is told none."""
+
+
+def spread(
+    values: Float[np.ndarray, " frames"],
+    probabilities: Float[np.ndarray, "frames bins"],
+    edges: Float[np.ndarray, " edges"],
+) -> Float[np.ndarray, " frames"]:
+    """Standard deviation of each distribution around a value, such as its mean."""
+    squares = ((edges[1:] + edges[:-1]) / 2 - values[:, None]) ** 2
+    return np.sqrt((probabilities * squares).sum(axis=1))
+
+
 def fit_temperature(logits: Float[Tensor, "frames bins"], targets: Float[Tensor, "frames bins"]) -> float:
     """Temperature of least cross-entropy, by golden-section search on its logarithm; the loss is convex in 1/T."""
 

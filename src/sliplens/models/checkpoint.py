@@ -16,9 +16,11 @@ from sliplens.codec import load_record, load_result, save_record
 from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.extras import require_device
 from sliplens.files import hash_file, require_folder
-from sliplens.models.backbones import Answers, bin_edges, build_model
-from sliplens.models.calibration import Calibration, raw_interval
+from sliplens.friction import Friction, FrictionLike, as_friction
+from sliplens.models.backbones import Answers, bin_edges, build_model, ratio_edges
+from sliplens.models.calibration import Calibration, Traction, raw_interval, spread
 from sliplens.models.encodings import Encoding, get_encoding
+from sliplens.models.told import told_probabilities
 from sliplens.results.training import Training
 
 WEIGHTS_FILE = "model.safetensors"
@@ -43,6 +45,8 @@ class Manifest:
     schema_version: int = SCHEMA_VERSION
     metrics: dict[str, float] = field(default_factory=dict)
     calibration: Calibration | None = None
+    traction: Traction | None = None
+    """Of the second answer, F_t / F_n; None for a network that answers with the margin alone."""
     versions: dict[str, str] = field(default_factory=dict)
     trained_on: tuple[str, ...] = ()
     """First 12 hex digits of the hash of every trial that trained or validated it, or what it started from."""
@@ -102,20 +106,85 @@ class Run:
         """Safety margin of encoded frames; not clipped, so that an answer outside [0, 1] shows as what it is."""
         return self.answers(inputs.split(batch_size))[0].cpu()
 
-    def estimate(self, inputs: Float[Tensor, "batch 3 size size"], *, batch_size: int = 64) -> "Estimate":
-        """Safety margin of encoded frames, with how sure it is."""
-        return self.to_estimate(*self.answers(inputs.split(batch_size)))
+    def estimate(
+        self,
+        inputs: Float[Tensor, "batch 3 size size"],
+        *,
+        friction: FrictionLike | None = None,
+        batch_size: int = 64,
+    ) -> "Estimate":
+        """Safety margin of encoded frames, with how sure it is.
+
+        `friction`: what is known of the coefficient of friction, as `predict` takes it.
+        """
+        return self.to_estimate(*self.answers(inputs.split(batch_size)), friction=friction)
 
     def to_estimate(
-        self, margin: Float[Tensor, " batch"], probabilities: Float[Tensor, "batch bins"] | None = None
+        self,
+        margin: Float[Tensor, " batch"],
+        probabilities: Float[Tensor, "batch bins"] | None = None,
+        ratio: Float[Tensor, "batch ratio_bins"] | None = None,
+        *,
+        friction: FrictionLike | None = None,
     ) -> "Estimate":
-        """Estimate from what the network answered (`Answers`)."""
-        return Estimate(
+        """Estimate from what the network answered (`Answers`), and from friction where it is told."""
+        traction, of_ratio = self.manifest.traction, ratio_edges(self.model)
+        estimate = Estimate(
             margin=margin.double().cpu().numpy(),
             probabilities=None if probabilities is None else probabilities.double().cpu().numpy(),
             edges=bin_edges(self.model),
             calibration=self.manifest.calibration,
+            ratio=None
+            if ratio is None or of_ratio is None
+            else Ratio(
+                probabilities=ratio.double().cpu().numpy(),
+                edges=of_ratio,
+                calibration=None if traction is None else traction.calibration,
+            ),
         )
+        if friction is None:
+            return estimate
+        traction = self.require_ratio()
+        return estimate.told(
+            as_friction(friction), trained_friction=np.array(traction.friction), calibration=traction.told
+        )
+
+    def require_ratio(self) -> Traction:
+        """What the second answer is; `InputError` for a network that answers with the margin alone."""
+        if self.manifest.traction is None:
+            raise InputError(
+                "friction was told, but this network answers with the margin alone and cannot use it; leave it out, or "
+                "teach the network F_t / F_n with `sliplens train DATA -o RUN --start-from NETWORK --recipe ratio`"
+            )
+        return self.manifest.traction
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ratio:
+    """Traction ratio F_t / F_n of some frames, and how sure it is."""
+
+    probabilities: Float[np.ndarray, "frames bins"]
+    edges: Float[np.ndarray, " edges"]
+    """Of the bins, as ratios."""
+    calibration: Calibration | None = None
+
+    @property
+    def mean(self) -> Float[np.ndarray, " frames"]:
+        """Expected F_t / F_n; not clipped."""
+        return self.probabilities @ ((self.edges[1:] + self.edges[:-1]) / 2)
+
+    @property
+    def sigma(self) -> Float[np.ndarray, " frames"]:
+        """Standard deviation of each distribution."""
+        return spread(self.mean, self.probabilities, self.edges)
+
+    def interval(self, level: float) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]] | None:
+        """Ratios between which each true one lies with a level of confidence, none negative; None if not calibrated."""
+        if self.calibration is None:
+            return None
+        offset = self.calibration.offset(level)
+        low, high = raw_interval(self.mean, self.probabilities, self.edges, level)
+        return np.maximum(low - offset, 0), np.maximum(high + offset, 0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,14 +197,17 @@ class Estimate:
     """Over the margin; None for a network that answers with one number."""
     edges: Float[np.ndarray, " edges"] | None = None
     """Of the bins, in margin units."""
+    ratio: Ratio | None = None
+    """Second answer, F_t / F_n; None for a network without it."""
+    friction: Friction | None = None
+    """What was told of the friction; None where nothing was."""
 
     @property
     def sigma(self) -> Float[np.ndarray, " frames"] | None:
         """Standard deviation of each distribution; None where there is none."""
         if self.probabilities is None or self.edges is None:
             return None
-        spread = ((self.edges[1:] + self.edges[:-1]) / 2 - self.margin[:, None]) ** 2
-        return np.sqrt((self.probabilities * spread).sum(axis=1))
+        return spread(self.margin, self.probabilities, self.edges)
 
     def interval(self, level: float) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]] | None:
         """Margins between which each label lies with a level of confidence, within [0, 1]; None if not calibrated."""
@@ -145,6 +217,53 @@ class Estimate:
         low, high = raw_interval(self.margin, self.probabilities, self.edges, level)
         # a label lies in [0, 1], so cutting there loses none
         return np.clip(low - offset, 0, 1), np.clip(high + offset, 0, 1)
+
+    def told(
+        self,
+        friction: Friction,
+        *,
+        trained_friction: Float[np.ndarray, " quantiles"],
+        calibration: Calibration | None = None,
+    ) -> "Estimate":
+        """The same frames once friction is told (`told_probabilities`); margins then lie within [0, 1].
+
+        `calibration`: of the intervals of such margins; there are none if None.
+        """
+        assert self.probabilities is not None
+        assert self.edges is not None
+        assert self.ratio is not None
+        probabilities = told_probabilities(
+            self.probabilities,
+            self.ratio.probabilities,
+            edges=self.edges,
+            ratio_edges=self.ratio.edges,
+            friction=friction,
+            trained_friction=trained_friction,
+        )
+        # bins beyond 0 and 1 mean the ends
+        margin = probabilities @ np.clip((self.edges[1:] + self.edges[:-1]) / 2, 0, 1)
+        return replace(self, margin=margin, probabilities=probabilities, calibration=calibration, friction=friction)
+
+
+def tell_each(
+    estimate: Estimate,
+    friction: Float[np.ndarray, " frames"],
+    *,
+    trained_friction: Float[np.ndarray, " quantiles"],
+    calibration: Calibration | None = None,
+) -> Estimate:
+    """Tell each frame the friction of its own trial, exactly; frames of which it is not known (NaN) stay untold."""
+    assert estimate.probabilities is not None
+    assert estimate.ratio is not None
+    margin, probabilities = estimate.margin.copy(), estimate.probabilities.copy()
+    for value in np.unique(friction[np.isfinite(friction)]):
+        rows = friction == value
+        ratio = replace(estimate.ratio, probabilities=estimate.ratio.probabilities[rows])
+        some = replace(estimate, margin=margin[rows], probabilities=probabilities[rows], ratio=ratio)
+        told = some.told(Friction(float(value)), trained_friction=trained_friction)
+        assert told.probabilities is not None
+        margin[rows], probabilities[rows] = told.margin, told.probabilities
+    return replace(estimate, margin=margin, probabilities=probabilities, calibration=calibration)
 
 
 def save_checkpoint(folder: Path, model: nn.Module, manifest: Manifest) -> None:

@@ -21,6 +21,7 @@ from torch.fx.proxy import TraceError
 
 from sliplens.errors import InputError, ModelError
 from sliplens.extras import ONNX_PACKAGES, Table, import_onnxruntime, import_openvino, missing_packages
+from sliplens.friction import FrictionLike
 from sliplens.models.backbones import Answers, HistogramRegressor, answer_names
 from sliplens.models.checkpoint import Estimate, Run
 from sliplens.models.onnx import INPUT, TOLERANCE, convert_network, difference, require_file_of, trial_inputs
@@ -38,16 +39,21 @@ class Engine:
     batch_size: int
     """Images in a batch; the last one may be shorter."""
     answers: RunBatches
-    """Margins and, of a histogram, probabilities, of batches of images; a few batches are under way at once."""
+    """What `Answers` gives, of batches of images; a few batches are under way at once."""
 
     def run(self, batches: Iterable[Tensor]) -> Iterator[Float[Tensor, " batch"]]:
         """Safety margins of batches of images, in their order; a few batches are under way at once."""
         return (margins for margins, *_ in self.answers(batches))
 
-    def estimate(self, trained: Run, inputs: Float[Tensor, "batch 3 size size"]) -> Estimate:
-        """Safety margins of images that the network of the engine has encoded, with how sure it is."""
+    def estimate(
+        self, trained: Run, inputs: Float[Tensor, "batch 3 size size"], *, friction: FrictionLike | None = None
+    ) -> Estimate:
+        """Safety margins of images that the network of the engine has encoded, with how sure it is.
+
+        `friction`: what is known of the coefficient of friction, as `predict` takes it.
+        """
         answers = zip(*self.answers(inputs.split(self.batch_size)), strict=True)
-        return trained.to_estimate(*(torch.cat(parts) for parts in answers))
+        return trained.to_estimate(*(torch.cat(parts) for parts in answers), friction=friction)
 
 
 @dataclass(frozen=True, kw_only=True)

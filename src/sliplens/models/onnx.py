@@ -17,7 +17,7 @@ from sliplens._version import __version__
 from sliplens.errors import InputError, ModelError
 from sliplens.extras import ONNX_PACKAGES, import_onnxruntime, require_packages
 from sliplens.files import require_new_file, to_builtins
-from sliplens.models.backbones import Answers, answer_names, bin_edges
+from sliplens.models.backbones import Answers, answer_names, bin_edges, ratio_edges
 from sliplens.models.checkpoint import Run, load
 
 if TYPE_CHECKING:
@@ -46,9 +46,10 @@ _COMPARED = {
 def export_onnx(run: Run | Path | str, out: Path | str, *, overwrite: bool = False) -> Path:
     """Write a network as an ONNX file, which appears once ONNX Runtime gives the same answers as the network.
 
-    Input `image` is float32 (batch, 3, size, size), encoded and normalised; outputs are `margin` (batch,) and, for a
-    histogram, `probabilities` (batch, bins). The batch may be of any size. Properties of the model, as JSON:
-    `sliplens.manifest`, `sliplens.input` (how frames become an input) and `sliplens.output` (edges of the bins).
+    Input `image` is float32 (batch, 3, size, size), encoded and normalised; outputs are `margin` (batch,), for a
+    histogram `probabilities` (batch, bins), and `ratio_probabilities` of a network that tells F_t / F_n. The batch may
+    be of any size. Properties of the model, as JSON: `sliplens.manifest`, `sliplens.input` (how frames become an input)
+    and `sliplens.output` (edges of the bins).
 
     Parameters
     ----------
@@ -123,7 +124,7 @@ def _describe(proto: "ModelProto", trained: Run) -> None:
         part.doc_string = ""
     proto.producer_name, proto.producer_version = "sliplens", __version__
     manifest, encoding = trained.manifest, trained.encoding
-    edges = bin_edges(trained.model)
+    edges, of_ratio = bin_edges(trained.model), ratio_edges(trained.model)
     properties: dict[str, Any] = {
         MANIFEST: asdict(manifest),
         INPUT_NOTES: {
@@ -139,6 +140,7 @@ def _describe(proto: "ModelProto", trained: Run) -> None:
         OUTPUT_NOTES: {
             "margin": "safety margin; 1 full stick, 0 onset of full slip; not clipped",
             "bin_edges": None if edges is None else edges.tolist(),
+            "ratio_bin_edges": None if of_ratio is None else of_ratio.tolist(),
         },
     }
     for key, value in properties.items():

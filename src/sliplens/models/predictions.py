@@ -15,6 +15,7 @@ from sliplens._version import __version__
 from sliplens.codec import write_tables
 from sliplens.errors import InputError
 from sliplens.files import hash_json, require_new_file
+from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.models.checkpoint import Estimate, Run, load
 from sliplens.models.engines import Engine, make_engine
 from sliplens.progress import OnProgress, note, stage
@@ -36,6 +37,8 @@ _COLUMNS = {
     "sigma": pa.float64(),
     "low_90": pa.float64(),
     "high_90": pa.float64(),
+    "traction_ratio": pa.float64(),
+    "traction_ratio_sigma": pa.float64(),
 }
 
 
@@ -57,9 +60,9 @@ class Predictions:
         """Arrow table; `.to_pandas()` where pandas is installed.
 
         Columns are `trial`, `frame`, `file` (of a folder of images), `time_s`, `safety_margin` (where the source has
-        labels), `prediction`, `sigma`, `low_90` and `high_90`. What is not known is null: the time of images without a
-        rate, sigma of a network that answers with one number, intervals of one that was never calibrated. Predictions
-        are not clipped to [0, 1].
+        labels), `prediction`, `sigma`, `low_90` and `high_90`, and `traction_ratio` and `traction_ratio_sigma` of a
+        network that tells F_t / F_n. What is not known is null: the time of images without a rate, sigma of a network
+        that answers with one number, intervals of one that was never calibrated. Predictions are not clipped to [0, 1].
         """
         return pq.read_table(self.path) if self.rows is None else self.rows
 
@@ -73,6 +76,7 @@ def predict(
     split: str | None = None,
     format: str | None = None,
     options: ReadOptions | None = None,
+    friction: FrictionLike | None = None,
     engine: str = "auto",
     onnx_file: Path | None = None,
     batch_size: int = 8,
@@ -94,6 +98,9 @@ def predict(
         The sensor untouched: image, or number of the frame that shows it.
     split, format, options
         As `open_source` takes them.
+    friction
+        What is known of the object's coefficient of friction, for a network that tells F_t / F_n: a number, (low,
+        high), or a `Friction`, such as one learnt from slips. If None, it may be any that the training had.
     engine
         Row of `ENGINES`; `auto` for the fastest at hand that pays.
     onnx_file
@@ -131,6 +138,9 @@ def predict(
     if onnx_file is not None and engine not in {"auto", "onnxruntime", "openvino"}:
         raise InputError(f"--onnx is for onnxruntime and openvino, not for {engine}; leave it out")
     trained = run if isinstance(run, Run) else load(run, device=device)
+    known = None if friction is None else as_friction(friction)
+    if known is not None:
+        trained.require_ratio()
     if isinstance(source, Path | str | np.ndarray | Dataset):
         with stage(on_progress, "Opening the source"):
             source = open_source(
@@ -142,6 +152,8 @@ def predict(
                 options=options,
             )
     notes = tuple(dict.fromkeys(words for one in source for words in (*one.notes, *_require_comparable(trained, one))))
+    if known is not None:
+        notes = (*notes, f"The coefficient of friction is taken for {known}.")
     for sentence in notes:
         note(on_progress, sentence)
     total = sum(trial.frames for trial in source)
@@ -153,9 +165,11 @@ def predict(
         "sliplens.manifest_hash": hash_json(trained.manifest),
         "sliplens.weights_sha256": trained.manifest.weights_sha256,
     }
-    schema = _schema(source, metadata)
+    if known is not None:
+        metadata["sliplens.friction"] = str(known)
+    schema = _schema(source, metadata, ratio=trained.manifest.traction is not None)
     with stage(on_progress, f"Predicting frames ({trained.manifest.input}, {ready.name})") as count:
-        rows = write_tables(_tables(ready, trained, source, schema, count), path, schema)
+        rows = write_tables(_tables(ready, trained, source, schema, friction=known, on_progress=count), path, schema)
     return Predictions(frames=total, engine=ready.name, path=path, rows=rows, notes=notes)
 
 
@@ -174,17 +188,25 @@ def _require_comparable(trained: Run, trial: Capture) -> Iterator[str]:
     yield f"{trial.name}: no reference was given, so its images were taken for difference images."
 
 
-def _schema(trials: Sequence[Capture], metadata: dict[str, str]) -> pa.Schema:
+def _schema(trials: Sequence[Capture], metadata: dict[str, str], *, ratio: bool) -> pa.Schema:
     known = {
         "file": any(trial.files is not None for trial in trials),
         "safety_margin": any(trial.safety_margin is not None for trial in trials),
+        "traction_ratio": ratio,
+        "traction_ratio_sigma": ratio,
     }
     columns = [pa.field(name, kind) for name, kind in _COLUMNS.items() if known.get(name, True)]
     return pa.schema(columns, metadata={"sliplens.version": __version__, **metadata})
 
 
 def _tables(
-    engine: Engine, trained: Run, trials: Sequence[Capture], schema: pa.Schema, on_progress: OnProgress
+    engine: Engine,
+    trained: Run,
+    trials: Sequence[Capture],
+    schema: pa.Schema,
+    *,
+    friction: Friction | None,
+    on_progress: OnProgress,
 ) -> Iterator[pa.Table]:
     # plain numbers: small arrays kept between the large ones of each batch would leave holes in the memory
     waiting: dict[str, list] = {name: [] for name in schema.names}
@@ -193,7 +215,7 @@ def _tables(
     encoded: deque[tuple[Capture, int]] = deque()
     for answers in engine.answers(_encode(trained, trials, engine.batch_size, encoded)):
         trial, first = encoded.popleft()
-        estimate = trained.to_estimate(*answers)
+        estimate = trained.to_estimate(*answers, friction=friction)
         for name, values in _columns(estimate, trial, first).items():
             if name in waiting:
                 waiting[name].extend(values)
@@ -224,7 +246,11 @@ def _columns(estimate: Estimate, trial: Capture, first: int) -> dict[str, list]:
     here, unknown = slice(first, first + count), [None] * count
     low, high = estimate.interval(LEVEL) or (None, None)
     times, margins = (None if values is None else values[here] for values in (trial.time_s, trial.safety_margin))
-    numbers = {"time_s": times, "safety_margin": margins, "sigma": estimate.sigma, "low_90": low, "high_90": high}
+    ratio = estimate.ratio
+    numbers = {"traction_ratio": None, "traction_ratio_sigma": None}
+    if ratio is not None:
+        numbers = {"traction_ratio": ratio.mean, "traction_ratio_sigma": ratio.sigma}
+    numbers |= {"time_s": times, "safety_margin": margins, "sigma": estimate.sigma, "low_90": low, "high_90": high}
     return {
         "trial": [trial.name] * count,
         "frame": list(range(first, first + count)),

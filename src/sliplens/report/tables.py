@@ -120,9 +120,14 @@ def table_accuracy(results: Results) -> Table:
             r2, mae, counts = decimals(score.r2, 3), decimals(100 * score.mae, 1), f"{score.frames} / {score.trials}"
             thesis = decimals(thesis_mse, 4), decimals(thesis_r2, 2)
             rows.append((condition.capitalize(), input_name(name), mse, thesis[0], r2, thesis[1], mae, counts))
+    told = "".join(
+        f" {input_name(name)}: the network was told the friction, {evaluations[name].friction}."
+        for name in inputs_in_order(evaluations)
+        if evaluations[name].friction
+    )
     return make_table(
         "How well each network reads the safety margin on test trials. MSE in squared margin units (Γ from 0 to 1), "
-        f"MAE in percentage points of Γ; the lower MSE of each condition is bold. Grey columns: the {MARK}.",
+        f"MAE in percentage points of Γ; the lower MSE of each condition is bold. Grey columns: the {MARK}.{told}",
         ("Objects", "Input", "MSE", "MSE, thesis", "R²", "R², thesis", "MAE (points)", "Frames / trials"),
         rows,
         names=2,

@@ -1,6 +1,6 @@
 """How well a network reads the safety margin."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pyarrow as pa
@@ -145,6 +145,11 @@ class Evaluation:
     lead_times: dict[str, LeadTimes]
     """Warnings by condition."""
     predictions: Predictions
+    friction: str = ""
+    """What the network was told of the coefficient of friction; empty where nothing was."""
+    ratio_r2: dict[str, float | None] = field(default_factory=dict)
+    """R2 of the traction ratio F_t / F_n by condition; empty for a network that answers with the margin alone, None
+    where the ratio does not vary or no force is known."""
     baselines: Baselines | None = None
     """Scores of estimators that read the markers of the same frames; None where none were asked for."""
     baseline_predictions: BaselinePredictions | None = None

@@ -33,6 +33,9 @@ class TrainConfig:
     augmentation: str = "default"
     untouched_share: float = 0.05
     """Images of the untouched sensor, as full stick, for each labelled frame."""
+    frozen: bool = False
+    """Leave all as it is but the rows of the last layer that answer with F_t / F_n: margins stay to the bit.
+    What that layer sees is computed once, without augmentation."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -50,6 +53,12 @@ class TrainConfig:
             raise InputError(f"untouched_share must lie in [0, 1], got {self.untouched_share:g}")
         if self.optimizer not in {"adamw", "ranger21"}:
             raise InputError(f"there is no optimizer named {self.optimizer!r}; choose adamw or ranger21")
+        wrong = self.head != "margin-and-ratio" or self.optimizer != "adamw" or self.augmentation != "none"
+        if self.frozen and (wrong or self.weight_decay):
+            raise InputError(
+                "a frozen network learns F_t / F_n alone, by AdamW without weight decay and augmentation; leave out "
+                "--head, --optimizer and --augmentation"
+            )
         head_outputs(self.head)
         get_augmentation(self.augmentation)
 
@@ -65,11 +74,15 @@ _RECIPES = {
         augmentation="thesis",
         untouched_share=0.0,
     ),
+    "ratio": TrainConfig(
+        recipe="ratio", head="margin-and-ratio", epochs=20, weight_decay=0.0, augmentation="none", frozen=True
+    ),
 }
 RECIPES = Table("recipe", "sliplens.recipes", _RECIPES)
 """`thesis` is that of Polak, section 4: ShuffleNetV2 x1.0 from scratch, one output, Ranger21 with its defaults, mean
 squared error, 25 epochs, batches of 124, 224 x 224 pixels, a learning rate of 8e-4, mixed precision, the best
-checkpoint on validation, rotation, noise and blur. `default` is ours; docs/networks.md tells why."""
+checkpoint on validation, rotation, noise and blur. `default` is ours; docs/networks.md tells why. `ratio` teaches a
+network that is there its second answer, F_t / F_n, in minutes."""
 
 
 def get_recipe(name: str) -> TrainConfig:

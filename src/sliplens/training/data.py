@@ -4,14 +4,14 @@ import math
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
-from torch import Tensor
+from jaxtyping import Float, Float32, Float64, UInt8
+from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.data import DataLoader, Sampler
 from torch.utils.data import Dataset as TorchDataset
@@ -19,9 +19,10 @@ from torchvision.transforms.v2 import functional as transforms
 
 from sliplens.errors import RecordingError
 from sliplens.extras import Table
+from sliplens.models.backbones import last_layer
 from sliplens.models.encodings import Encoding
 from sliplens.progress import OnProgress
-from sliplens.recordings import Dataset, TrialInfo
+from sliplens.recordings import Dataset, Labels, TrialInfo
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +99,10 @@ class FrameSet(TorchDataset):
     """Compared and resized frames, uint8, as `Encoding.resize` returns them."""
     safety_margin: Float32[Tensor, " frames"]
     """Labels in [0, 1]."""
+    traction_ratio: Float32[Tensor, " frames"]
+    """F_t / F_n; NaN where the forces are not known."""
+    friction: Float64[np.ndarray, " frames"]
+    """Coefficient of static friction of each frame's trial, see `trial_friction`; NaN where it is not known."""
     trial: tuple[str, ...]
     frame: tuple[int, ...]
     condition: tuple[str, ...]
@@ -109,15 +114,15 @@ class FrameSet(TorchDataset):
         """Count the frames."""
         return len(self.images)
 
-    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
-        """Return one input and its label."""
-        images, labels = self.__getitems__([index])
-        return images[0], labels[0]
+    def __getitem__(self, index: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return one input, its margin and its traction ratio."""
+        images, margins, ratios = self.__getitems__([index])
+        return images[0], margins[0], ratios[0]
 
-    def __getitems__(self, indices: Sequence[int] | Tensor) -> tuple[Tensor, Tensor]:
-        """Return a batch of inputs and their labels; torch's loader asks for it by this name."""
+    def __getitems__(self, indices: Sequence[int] | Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return a batch of inputs, their margins and their ratios; torch's loader asks for it by this name."""
         rows = torch.as_tensor(indices)
-        return self.encoding.normalise(self.images[rows]), self.safety_margin[rows]
+        return self.encoding.normalise(self.images[rows]), self.safety_margin[rows], self.traction_ratio[rows]
 
     def batches(self, size: int, on_progress: OnProgress | None = None) -> Iterator[Tensor]:
         """Inputs of all frames, in their order."""
@@ -125,6 +130,50 @@ class FrameSet(TorchDataset):
             yield self.__getitems__(rows)[0]
             if on_progress is not None:
                 on_progress(int(rows[-1]) + 1, len(self))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureSet(FrameSet):
+    """Frames as the last layer of a network sees them, computed once: for a training that leaves the rest as it is."""
+
+    images: Float32[Tensor, "frames features"]  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def __getitems__(self, indices: Sequence[int] | Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return a batch of features, their margins and their ratios."""
+        rows = torch.as_tensor(indices)
+        return self.images[rows], self.safety_margin[rows], self.traction_ratio[rows]
+
+
+@torch.no_grad()
+def extract_features(
+    model: nn.Module, frames: FrameSet, *, batch_size: int, on_progress: OnProgress | None = None
+) -> FeatureSet:
+    """What the last linear layer of a network, taken in evaluation mode, is given for each frame."""
+    seen: list[Tensor] = []
+    was_training, device = model.training, next(model.parameters()).device
+    hook = last_layer(model).register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].float().cpu()))
+    try:
+        model.eval()
+        for images in frames.batches(batch_size, on_progress):
+            model(images.to(device))
+    finally:
+        hook.remove()
+        model.train(was_training)
+    columns = {field.name: getattr(frames, field.name) for field in fields(frames)}
+    return FeatureSet(**{**columns, "images": torch.cat(seen)})
+
+
+def trial_friction(labels: Labels) -> float:
+    """Coefficient of static friction of a trial, the median over labelled frames that do not slip; NaN if unknown."""
+    sticks = labels.labelled & (labels.safety_margin > 0)
+    known = labels.friction_coefficient[sticks & np.isfinite(labels.friction_coefficient)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def _ratios(labels: Labels) -> Float[np.ndarray, " frames"]:
+    """F_t / F_n of each frame; NaN where a force is not known or nothing presses."""
+    pressed = labels.normal_force_n > 0
+    return np.where(pressed, labels.tangential_force_n / np.where(pressed, labels.normal_force_n, 1), np.nan)
 
 
 def load_frames(
@@ -158,21 +207,24 @@ def load_frames(
         raise RecordingError(f"{data.folder}: no frame of the {len(trials)} trials has a label; label them first")
     total = sum(count + copies_of(count) for count in counts)
     images = _allocate((total, 3, image_size, image_size), scratch)
-    labels, times, rows = [], [], []
+    labels, ratios, frictions, times, rows = [], [], [], [], []
     for done, info in enumerate(trials, start=1):
         recording = data.load(info, truth=False)
         labelled = np.flatnonzero(recording.labelled)
         compared = encoding.compare(recording.frames[labelled], recording.reference)
         images[len(rows) : len(rows) + len(labelled)] = encoding.resize(compared, image_size=image_size)
         labels.append(recording.safety_margin[labelled])
+        ratios.append(_ratios(recording)[labelled])
         times.append(recording.time_s[labelled])
         rows += [(recording.trial, int(frame), recording.condition, recording.day) for frame in labelled]
         if copies := copies_of(len(labelled)):
             compared = encoding.compare(recording.reference[None], recording.reference)
             images[len(rows) : len(rows) + copies] = encoding.resize(compared, image_size=image_size)
             labels.append(np.ones(copies))
+            ratios.append(np.zeros(copies))
             times.append(np.full(copies, recording.time_s[0]))
             rows += [(recording.trial, UNTOUCHED, recording.condition, recording.day)] * copies
+        frictions.append(np.full(len(rows) - sum(map(len, frictions)), trial_friction(recording)))
         if on_progress is not None:
             on_progress(done, len(trials))
     trial, frame, condition, day = zip(*rows, strict=True)
@@ -180,6 +232,8 @@ def load_frames(
         encoding=encoding,
         images=images,
         safety_margin=torch.from_numpy(np.concatenate(labels)).float(),
+        traction_ratio=torch.from_numpy(np.concatenate(ratios)).float(),
+        friction=np.concatenate(frictions),
         trial=trial,
         frame=frame,
         condition=condition,

@@ -7,16 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError, RecordingError
 from sliplens.extras import import_cv2
 from sliplens.files import output_folder, scratch_folder
+from sliplens.friction import FrictionLike, as_friction
 from sliplens.markers.detect import get_kind
 from sliplens.markers.estimators import ESTIMATORS, get_estimator
 from sliplens.models import Run
-from sliplens.models.checkpoint import load
+from sliplens.models.checkpoint import load, tell_each
 from sliplens.progress import OnProgress, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset
@@ -25,6 +26,9 @@ from sliplens.training.baselines import BaselinePlan, choose_training, evaluate_
 from sliplens.training.data import FrameSet, load_frames
 from sliplens.training.metrics import auroc, coverage, find_lead_times, score_predictions
 
+EACH = "each"
+"""What `friction` may be where every trial is told its own."""
+
 
 def evaluate(
     run: Run | Path | str,
@@ -32,6 +36,7 @@ def evaluate(
     out: Path | str | None = None,
     *,
     split: str = "test",
+    friction: FrictionLike | None = None,
     baselines: Sequence[str] = (),
     baseline_trials: int = 40,
     markers: str | None = None,
@@ -50,6 +55,9 @@ def evaluate(
         Folder to write, with `result.json` and `predictions.parquet`; nothing is written if None.
     split
         Which trials of the data set.
+    friction
+        What the network is told of the coefficient of friction, as `predict` takes it; `each` tells it that of every
+        trial, exactly, as its labels have it. A network without the answer F_t / F_n cannot be told.
     baselines, baseline_trials
         Estimators to put beside the network, rows of `markers.estimators.ESTIMATORS` or `all`, and how many training
         trials they are fitted on, spread evenly over those of the data set.
@@ -66,6 +74,9 @@ def evaluate(
         If no frame has a label.
     """
     run = run if isinstance(run, Run) else load(run)
+    told = friction if friction is None or friction == EACH else as_friction(friction)
+    if told is not None:
+        run.require_ratio()
     data = data if isinstance(data, Dataset) else load_dataset(data)
     trials = data.select(split=split)
     for trial in trials:
@@ -73,10 +84,12 @@ def evaluate(
     plan = _plan_baselines(baselines, data, trials, count=baseline_trials, markers=markers) if baselines else None
     if out is None:
         with scratch_folder() as folder:
-            return _evaluate(run, data, trials, plan, folder, split=split, on_progress=on_progress)
+            return _evaluate(run, data, trials, plan, folder, split=split, friction=told, on_progress=on_progress)
     kept = run.manifest
     recipe: dict[str, Any] = {"weights_sha256": kept.weights_sha256, "data_hash": data.hash, "input": kept.input}
     recipe["split"] = split
+    if told is not None:
+        recipe["friction"] = str(told)
     if plan is not None:
         trained_on = [trial.trial for trial in plan.training]
         recipe["baselines"] = {"estimators": plan.estimators, "markers": plan.markers, "trials": trained_on}
@@ -84,7 +97,9 @@ def evaluate(
         if output.complete:
             evaluation = load_result(output.folder, Evaluation, command="sliplens evaluate")
         else:
-            evaluation = _evaluate(run, data, trials, plan, output.folder, split=split, on_progress=on_progress)
+            evaluation = _evaluate(
+                run, data, trials, plan, output.folder, split=split, friction=told, on_progress=on_progress
+            )
             save_result(evaluation, output.folder)
     wrote(on_progress, Path(out), "scores and predictions", kept=output.complete)
     return evaluation
@@ -98,13 +113,14 @@ def _evaluate(
     folder: Path,
     *,
     split: str,
+    friction: FrictionLike | None,
     on_progress: OnProgress | None,
 ) -> Evaluation:
     size = run.manifest.image_size
     with stage(on_progress, f"Reading {split} trials ({run.manifest.input})") as count:
         frames = load_frames(data, trials, encoding=run.encoding, image_size=size, on_progress=count)
     with stage(on_progress, "Predicting frames") as count:
-        evaluation = evaluate_frames(run, frames, split=split, on_progress=count)
+        evaluation = evaluate_frames(run, frames, split=split, friction=friction, on_progress=count)
     evaluation = replace(evaluation, known_trials=len(find_known(trials, run)))
     if plan is None:
         return evaluation
@@ -145,6 +161,7 @@ def evaluate_frames(
     frames: FrameSet,
     *,
     split: str = "test",
+    friction: FrictionLike | None = None,
     batch_size: int = 64,
     on_progress: OnProgress | None = None,
 ) -> Evaluation:
@@ -156,16 +173,26 @@ def evaluate_frames(
         Labelled frames in the network's encoding and size, as `load_frames` gives them.
     split
         What they are called in the result.
+    friction
+        Coefficient of friction that is told, as `evaluate` takes it.
 
     Raises
     ------
     RecordingError
-        If there is no frame.
+        If there is no frame, or one of a trial whose friction is not known and is to be told.
     """
     count = len(frames)
     if not count:
         raise RecordingError("there is no labelled frame to evaluate; check the split and the condition")
-    estimate = run.to_estimate(*run.answers(frames.batches(batch_size, on_progress)))
+    answers = run.answers(frames.batches(batch_size, on_progress))
+    estimate = run.to_estimate(*answers, friction=None if friction == EACH else friction)
+    if friction == EACH:
+        if not np.isfinite(frames.friction).all():
+            raise RecordingError("not every trial has a coefficient of friction to tell; name one, or leave it out")
+        traction = run.require_ratio()
+        estimate = tell_each(
+            estimate, frames.friction, trained_friction=np.array(traction.friction), calibration=traction.told
+        )
     levels = estimate.calibration.offsets if estimate.calibration else ()
     intervals = {level: ends for level in levels if (ends := estimate.interval(float(level)))}
     unknown, sigma = np.full(count, np.nan), estimate.sigma
@@ -214,4 +241,16 @@ def evaluate_frames(
         wet_auroc=None if sigma is None or wet is None or dry is None else auroc(sigma[wet], sigma[dry]),
         lead_times={name: find_lead_times(predictions.where(rows)) for name, rows in conditions.items()},
         predictions=predictions,
+        friction="that of each trial, told exactly" if friction == EACH else str(estimate.friction or ""),
+        ratio_r2={} if estimate.ratio is None else _ratio_r2(estimate.ratio.mean, frames),
     )
+
+
+def _ratio_r2(ratio: Float[np.ndarray, " frames"], frames: FrameSet) -> dict[str, float | None]:
+    truth, condition = frames.traction_ratio.double().numpy(), np.array(frames.condition)
+    scores: dict[str, float | None] = {}
+    for name in sorted(set(frames.condition)):
+        rows = (condition == name) & np.isfinite(truth)
+        variance = float(truth[rows].var()) if rows.any() else 0.0
+        scores[name] = 1 - float(np.mean((ratio - truth)[rows] ** 2)) / variance if variance > 0 else None
+    return scores

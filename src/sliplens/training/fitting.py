@@ -12,24 +12,32 @@ from typing import Any, Literal
 import lightning
 import numpy as np
 import torch
+from jaxtyping import Float
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import Logger
-from torch import nn
+from torch import Tensor, nn
 
 from sliplens.codec import save_result
 from sliplens.errors import InputError, ModelError, RecordingError
 from sliplens.files import output_folder, partial_folder, scratch_folder, versions
 from sliplens.models import Manifest, Run, build_model, load_checkpoint, save_checkpoint
-from sliplens.models.backbones import HistogramRegressor, bin_edges, histogram_targets
-from sliplens.models.calibration import LEVELS, Calibration, conformal_offset, fit_temperature, raw_interval
-from sliplens.models.checkpoint import load
+from sliplens.models.backbones import HistogramRegressor, bin_edges, histogram_targets, last_layer, with_ratio
+from sliplens.models.calibration import (
+    LEVELS,
+    Calibration,
+    Traction,
+    conformal_offset,
+    fit_temperature,
+    raw_interval,
+)
+from sliplens.models.checkpoint import Estimate, Ratio, load, tell_each
 from sliplens.models.encodings import get_encoding
 from sliplens.progress import OnProgress, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset
 from sliplens.results.training import Training
 from sliplens.training.config import TrainConfig, get_recipe
-from sliplens.training.data import EpochShuffle, FrameSet, get_augmentation, load_frames, make_loaders
+from sliplens.training.data import EpochShuffle, FrameSet, extract_features, get_augmentation, load_frames, make_loaders
 from sliplens.training.loggers import open_logger
 from sliplens.training.module import Clock, DivergedError, Regressor
 from sliplens.training.trainer import make_trainer, run_trainer, share_of_batch
@@ -93,6 +101,8 @@ def train(
     start = load(start_from) if isinstance(start_from, str | Path) else start_from
     if start is not None:
         require_same_kind(start, config, input)
+    elif config.frozen:
+        raise InputError(f"the recipe {recipe} teaches a network that is there; name it with --start-from")
     data = data if isinstance(data, Dataset) else load_dataset(data)
     encoding, trials = get_encoding(input), _choose_trials(data, condition)
     _require_varied_labels(data, trials[0])
@@ -183,27 +193,85 @@ def _require_varied_labels(data: Dataset, trials: Sequence[TrialInfo]) -> None:
 
 
 @torch.no_grad()
-def calibrate(model: nn.Module, validation: FrameSet, *, batch_size: int) -> Calibration:
-    """Fit the temperature of a distribution, which is set in the model, and the offsets of its intervals."""
+def calibrate(
+    model: nn.Module,
+    validation: FrameSet,
+    *,
+    batch_size: int,
+    trained_friction: Float[np.ndarray, " _"] | None = None,
+    kept: Calibration | None = None,
+) -> tuple[Calibration, Traction | None]:
+    """Fit the temperatures of the distributions, which are set in the model, and the offsets of the intervals.
+
+    `trained_friction`: coefficients of friction of the training frames, for a network of two answers; the second of
+    what is given is None for all others. `kept`: calibration of the margin that is to stay as it is.
+    """
     was_training, device = model.training, next(model.parameters()).device
     model.eval()
     network = model.backbone if isinstance(model, HistogramRegressor) else model
     outputs = torch.cat([network(inputs.to(device)).float().cpu() for inputs in validation.batches(batch_size)])
     model.train(was_training)
-    labels, margins = validation.safety_margin, validation.safety_margin.double().numpy()
-    if isinstance(model, HistogramRegressor):
-        temperature = fit_temperature(outputs, histogram_targets(labels, model.edges.cpu()))
-        model.temperature.fill_(temperature)
-        probabilities = torch.softmax(outputs / temperature, dim=-1).double().numpy()
-        predictions = probabilities @ model.centres.double().cpu().numpy()
-    else:
-        temperature, predictions, probabilities = 1.0, outputs.reshape(-1).double().numpy(), None
-    ends = {level: raw_interval(predictions, probabilities, bin_edges(model), level) for level in LEVELS}
+    labels = validation.safety_margin
+    if not isinstance(model, HistogramRegressor):
+        margins = outputs.reshape(-1).double().numpy()
+        return _offsets(margins, None, None, labels, temperature=1.0), None
+    logits, ratio_logits = outputs[:, : len(model.edges) - 1], outputs[:, len(model.edges) - 1 :]
+    calibration, probabilities = _calibrate_histogram(logits, model.edges, model.temperature, labels, kept=kept)
+    if model.ratio_edges is None or model.ratio_temperature is None or trained_friction is None:
+        return calibration, None
+    known = torch.isfinite(validation.traction_ratio) & torch.from_numpy(np.isfinite(validation.friction))
+    ratios = validation.traction_ratio[known]
+    of_ratio, ratio_probabilities = _calibrate_histogram(
+        ratio_logits[known], model.ratio_edges, model.ratio_temperature, ratios
+    )
+    quantiles = np.quantile(trained_friction[np.isfinite(trained_friction)], np.linspace(0, 1, 11))
+    edges = bin_edges(model)
+    untold = Estimate(
+        margin=probabilities[known.numpy()] @ model.centres.double().cpu().numpy(),
+        probabilities=probabilities[known.numpy()],
+        edges=edges,
+        calibration=None,
+        ratio=Ratio(probabilities=ratio_probabilities, edges=model.ratio_edges.double().cpu().numpy()),
+    )
+    told = tell_each(untold, validation.friction[known.numpy()], trained_friction=quantiles)
+    told_calibration = _offsets(
+        told.margin, told.probabilities, edges, labels[known], temperature=calibration.temperature
+    )
+    return calibration, Traction(calibration=of_ratio, told=told_calibration, friction=tuple(quantiles.tolist()))
+
+
+def _calibrate_histogram(
+    logits: Float[Tensor, "frames bins"],
+    edges: Tensor,
+    temperature: Tensor,
+    labels: Float[Tensor, " frames"],
+    *,
+    kept: Calibration | None = None,
+) -> tuple[Calibration, Float[np.ndarray, "frames bins"]]:
+    """Fit and set the temperature of a histogram, unless it is kept; its calibration, and its probabilities then."""
+    if kept is None:
+        temperature.fill_(fit_temperature(logits, histogram_targets(labels, edges.cpu())))
+    probabilities = torch.softmax(logits / temperature.cpu(), dim=-1).double().numpy()
+    numbers = edges.double().cpu().numpy()
+    values = probabilities @ ((numbers[1:] + numbers[:-1]) / 2)
+    return kept or _offsets(values, probabilities, numbers, labels, temperature=float(temperature)), probabilities
+
+
+def _offsets(
+    values: Float[np.ndarray, " frames"],
+    probabilities: Float[np.ndarray, "frames bins"] | None,
+    edges: Float[np.ndarray, " edges"] | None,
+    labels: Float[Tensor, " frames"],
+    *,
+    temperature: float,
+) -> Calibration:
+    truth = labels.double().numpy()
+    ends = {level: raw_interval(values, probabilities, edges, level) for level in LEVELS}
     return Calibration(
         temperature=temperature,
-        offsets={str(level): conformal_offset(*ends[level], margins, level=level) for level in LEVELS},
-        frames=len(margins),
-        mse=float(np.mean((predictions - margins) ** 2)),
+        offsets={str(level): conformal_offset(*ends[level], truth, level=level) for level in LEVELS},
+        frames=len(truth),
+        mse=float(np.mean((values - truth) ** 2)),
     )
 
 
@@ -263,7 +331,8 @@ def fit(
         model = build_model(config.backbone, head=config.head).to(memory_format=torch.channels_last)
     if start is not None:
         require_same_kind(start, config, train.encoding.name)
-        model.load_state_dict(start.model.state_dict())
+        fill = model.load_state_dict if start.manifest.head == config.head else partial(with_ratio, model)
+        fill(start.model.state_dict())
     per_epoch = len(train) // config.batch_size
     clock = Clock(
         steps=config.epochs * per_epoch,
@@ -277,8 +346,11 @@ def fit(
         rows = [(train.frame[row], train.trial[row]) for row in order[batch * share : (batch + 1) * share]]
         return [f"{'the reference frame' if frame < 0 else f'frame {frame}'} of {trial}" for frame, trial in rows]
 
+    network: nn.Module = model
+    if config.frozen:
+        network, train, validation = _last_layer_alone(model, train, validation, config=config, report=on_progress)
     module = Regressor(
-        model,
+        network,
         config=config,
         augmentation=get_augmentation(config.augmentation, neutral=train.encoding.neutral),
         clock=clock,
@@ -297,7 +369,13 @@ def fit(
         module.load_state_dict(kept["state_dict"])
         # as the file itself has it: after a crash between two files the callback may remember an older one
         best_mse = float(kept["callbacks"][best.state_key]["current_score"])
-        calibration = calibrate(module.model, validation, batch_size=config.batch_size)
+        calibration, traction = calibrate(
+            network,
+            validation,
+            batch_size=config.batch_size,
+            trained_friction=train.friction,
+            kept=start.manifest.calibration if start and config.frozen else None,
+        )
         manifest = Manifest(
             backbone=config.backbone,
             head=config.head,
@@ -311,9 +389,11 @@ def fit(
             started_from=start.manifest.weights_sha256 if start else "",
             metrics={"validation_mse": calibration.mse},
             calibration=calibration,
+            traction=traction,
             versions=versions(),
         )
-        save_checkpoint(folder, module.model, manifest)
+        _put_back(network, model)
+        save_checkpoint(folder, model, manifest)
         return best_mse
 
     def describe(best_mse: float) -> Training:
@@ -351,9 +431,35 @@ def fit(
     return training
 
 
+def _last_layer_alone(
+    model: nn.Module, *frames: FrameSet, config: TrainConfig, report: OnProgress | None
+) -> tuple[HistogramRegressor, FrameSet, FrameSet]:
+    """The last layer of a network of two answers as a network of its own, and training and validation frames for it."""
+    alone, seen = HistogramRegressor(last_layer(model), ratio=True), []
+    alone.temperature.copy_(model.get_buffer("temperature"))
+    for some, what in zip(frames, ("training", "validation"), strict=True):
+        with stage(report, f"Passing {what} frames through the network") as count:
+            seen.append(extract_features(model, some, batch_size=config.batch_size, on_progress=count))
+    return alone, *seen
+
+
+def _put_back(network: nn.Module, model: nn.Module) -> None:
+    """Give a network the last layer and the temperatures that were fitted by themselves, if they were."""
+    if network is not model:
+        model.load_state_dict(network.state_dict(), strict=False)
+        last_layer(model).load_state_dict(last_layer(network).state_dict())
+
+
 def _check_frames(config: TrainConfig, train: FrameSet, validation: FrameSet, processes: int) -> None:
     if len(train) < config.batch_size:
         raise InputError(f"{len(train)} training frames do not fill a batch of {config.batch_size}; lower batch_size")
+    if config.head == "margin-and-ratio":
+        for what, frames in (("training", train), ("validation", validation)):
+            if not (torch.isfinite(frames.traction_ratio).numpy() & np.isfinite(frames.friction)).any():
+                raise InputError(
+                    f"no {what} frame tells its forces and its friction, from which F_t / F_n is learnt; import them "
+                    "with the forces, or choose another --head"
+                )
     if len(validation) < processes:
         raise InputError(f"{len(validation)} validation frames are too few for {processes} processes; lower --devices")
     shared = set(train.trial) & set(validation.trial)
@@ -365,7 +471,8 @@ def require_same_kind(start: Run, config: TrainConfig, encoding: str) -> None:
     """Refuse to start from a network whose weights would mean something else."""
     for name, value in (("input", encoding), ("backbone", config.backbone), ("head", config.head)):
         kept = getattr(start.manifest, name)
-        if kept != value:
+        # a second answer can be learnt beside the first
+        if kept != value and (kept, value) != ("histogram", "margin-and-ratio"):
             raise ModelError(
                 f"the network to start from has the {name} {kept}, and {value} is to be trained; "
                 f"train {kept}, or start from another network"

@@ -19,7 +19,7 @@ from torch import Tensor, distributed, nn
 from torchmetrics import MeanSquaredError
 
 from sliplens.errors import ModelError
-from sliplens.models.backbones import margin_loss
+from sliplens.models.backbones import BINS, Answers, last_layer, margin_loss, ratio_edges
 from sliplens.progress import OnProgress
 from sliplens.results.training import LearningCurve
 from sliplens.training.config import TrainConfig
@@ -40,6 +40,8 @@ class Regressor(lightning.LightningModule):
     training cut short by its time limit still ends on a small step.
     """
 
+    ratio_centres: Tensor | None
+
     def __init__(
         self,
         model: nn.Module,
@@ -58,20 +60,28 @@ class Regressor(lightning.LightningModule):
         # sums and counts, added up over the processes: exact however the frames are shared
         self.train_mse = MeanSquaredError()
         self.validation_mse = MeanSquaredError()
+        edges = ratio_edges(model)
+        centres = None if edges is None else torch.from_numpy((edges[1:] + edges[:-1]) / 2).float()
+        self.register_buffer("ratio_centres", centres, persistent=False)
 
-    def forward(self, images: Float[Tensor, "batch 3 size size"]) -> Float[Tensor, " batch"]:
+        if config.frozen:
+            # without weight decay, a row without a slope stays as it is to the bit
+            for value in last_layer(model).parameters():
+                value.register_hook(lambda slope: torch.cat([torch.zeros_like(slope[:BINS]), slope[BINS:]]))
+
+    def forward(self, images: Float[Tensor, "batch *input"]) -> Float[Tensor, " batch"]:
         """Predict the safety margin."""
         return self.model(images).reshape(len(images))
 
-    def training_step(self, batch: tuple[Tensor, Tensor], batch_idx: int) -> Tensor:
+    def training_step(self, batch: tuple[Tensor, Tensor, Tensor], batch_idx: int) -> Tensor:
         """One step; a loss that is not finite stops the training."""
-        images, labels = batch
+        images, labels, ratios = batch
         if self.augmentation is not None:
             # seeded by the step, so that a resumed training draws what it would have drawn; and by the process
             seed = self.config.seed * 1_000_003 + self.global_step + (self.global_rank << 40)
             generator = torch.Generator(device=images.device).manual_seed(seed)
             images = self.augmentation(images, generator=generator)
-        loss, margins = margin_loss(self.model, images, labels)
+        loss, margins = margin_loss(self.model, images, labels, ratios)
         finite = bool(torch.isfinite(loss))
         # all stop or none: a process that goes on alone waits for ever
         if not self.trainer.strategy.reduce_boolean_decision(finite):
@@ -96,10 +106,14 @@ class Regressor(lightning.LightningModule):
             f"of {', '.join(rows[:_NAMED_ROWS])}{more}; lower the learning rate, or look at these frames, and try again"
         )
 
-    def validation_step(self, batch: tuple[Tensor, Tensor], batch_idx: int) -> None:
-        """Log the validation error."""
-        images, labels = batch
-        self.validation_mse.update(self(images), labels)
+    def validation_step(self, batch: tuple[Tensor, Tensor, Tensor], batch_idx: int) -> None:
+        """Log the validation error, of a network with two answers that over both."""
+        images, labels, ratios = batch
+        margins, *histograms = Answers(self.model)(images)
+        if self.ratio_centres is not None and (known := torch.isfinite(ratios)).any():
+            margins = torch.cat([margins, (histograms[1] @ self.ratio_centres)[known]])
+            labels = torch.cat([labels, ratios[known]])
+        self.validation_mse.update(margins, labels)
         self.log("validation_mse", self.validation_mse, on_epoch=True)
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:

@@ -1,0 +1,203 @@
+"""What is known of the coefficient of friction: told exactly, within a range, or learnt from slips."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+
+from sliplens.errors import InputError
+
+__all__ = ["Friction", "FrictionLike", "as_friction"]
+
+LOWEST, HIGHEST = 0.05, 2.0
+"""Coefficients between which friction is looked for where only slips tell it: ice on steel to clean rubber on glass."""
+GRASP_SPREAD = 0.06
+"""Standard deviation of an object's friction from one grasp to the next, as a share of it: the trials of a simulated
+day lie evenly within a tenth of its friction."""
+_NODES = 400
+"""Over two decades a step is then 1 %, finer than any slip tells."""
+_NEGLIGIBLE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Friction:
+    """A coefficient of friction mu, as far as it is known: values and how likely each is.
+
+    `Friction(0.62)` is known exactly, `Friction.between(0.5, 0.8)` lies anywhere in a range, and
+    `Friction.from_slips([0.58])` was learnt from slips seen before on the same object.
+
+    Parameters
+    ----------
+    values
+        Coefficient of static friction: one number, or several of which any may be right.
+    weights
+        How likely each value is, as a share: they are scaled to sum to 1, and are even if None.
+    note
+        Where it comes from, for tables and pages.
+
+    Raises
+    ------
+    InputError
+        If a value is not positive and finite, or weights are negative, all zero or of another number.
+
+    Examples
+    --------
+    >>> from sliplens.friction import Friction
+    >>> str(Friction(0.62)), str(Friction.between(0.5, 0.8))
+    ('0.62, told exactly', '0.5 to 0.8, told as a range')
+    >>> learnt = Friction.from_slips([0.58], sigma=0.03)
+    >>> round(learnt.mean, 2), round(learnt.sigma, 2)
+    (0.58, 0.06)
+    """
+
+    values: Float[np.ndarray, " values"] | float
+    weights: Float[np.ndarray, " values"] | None = None
+    note: str = field(default="told exactly", kw_only=True)
+
+    def __post_init__(self) -> None:
+        values = np.atleast_1d(np.asarray(self.values, dtype=np.float64))
+        weights = np.ones(len(values)) if self.weights is None else np.asarray(self.weights, dtype=np.float64)
+        for value in values.tolist():
+            if not (math.isfinite(value) and value > 0):
+                raise InputError(
+                    f"a coefficient of friction is a positive number, got {value:g}; give F_t / F_n at which the "
+                    "object slips, such as 0.6"
+                )
+        if weights.shape != values.shape or not (np.all(weights >= 0) and 0 < weights.sum() < math.inf):
+            raise InputError(f"{len(values)} values of friction need as many weights, none negative and not all zero")
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "weights", weights / weights.sum())
+
+    @classmethod
+    def between(cls, low: float, high: float, *, values: int = 41) -> "Friction":
+        """Friction anywhere in a range, evenly; at so many values, each in the middle of its share of the range."""
+        if not 0 < low < high < math.inf:
+            raise InputError(f"a range of friction runs from a positive low to a larger high, got {low:g}..{high:g}")
+        middles = low + (high - low) * (np.arange(values) + 0.5) / values
+        return cls(middles, note=f"{low:g} to {high:g}, told as a range")
+
+    @classmethod
+    def from_slips(
+        cls,
+        ratios: Sequence[float] | Float[np.ndarray, " slips"],
+        *,
+        sigma: float = 0.05,
+        grasp_spread: float = GRASP_SPREAD,
+        prior: "Friction | None" = None,
+    ) -> "Friction":
+        """Friction of the next grasp of an object that slipped in earlier ones.
+
+        At gross slip F_t / F_n is the friction of that grasp, which differs from the object's by a Gaussian share, as
+        that of the next grasp will.
+
+        Parameters
+        ----------
+        ratios
+            F_t / F_n at which the object slipped, one a slip.
+        sigma
+            Standard deviation of each such ratio, as it was read.
+        grasp_spread
+            Standard deviation of friction from one grasp to the next, as a share of it.
+        prior
+            What was known of the object before; evenly anything (in the logarithm) if None.
+        """
+        known = _anything() if prior is None else prior
+        for ratio in np.asarray(ratios, dtype=np.float64).tolist():
+            known = known.update(ratio, math.hypot(sigma, grasp_spread * ratio))
+        return known.next_grasp(grasp_spread)
+
+    def update(self, ratio: float, sigma: float) -> "Friction":
+        """Friction after a gross slip at F_t / F_n = `ratio`, read with the standard deviation `sigma` (Bayes' rule).
+
+        What is known exactly stays; a slip far outside what was held possible leaves the value nearest to it.
+        """
+        if not (math.isfinite(ratio) and ratio > 0 and math.isfinite(sigma) and sigma > 0):
+            raise InputError(f"a slip is told by a positive ratio F_t / F_n and its sigma, got {ratio:g} and {sigma:g}")
+        values, weights = self.nodes
+        exponent = -0.5 * ((values - ratio) / sigma) ** 2
+        with np.errstate(divide="ignore"):
+            posterior = np.log(weights) + exponent
+        posterior = np.exp(posterior - posterior.max())
+        return Friction(values, posterior, note="learnt from slips").without_the_negligible()
+
+    def next_grasp(self, spread: float = GRASP_SPREAD) -> "Friction":
+        """Friction of another grasp of the same object, which differs by a Gaussian share of deviation `spread`."""
+        if not 0 <= spread < 1:
+            raise InputError(f"the spread from grasp to grasp is a share of the friction, from 0 to 1, got {spread:g}")
+        if spread == 0:
+            return self
+        # in the logarithm, where no friction becomes negative
+        values, weights = self.nodes
+        grid, _ = _anything().nodes
+        share = np.exp(-0.5 * (np.log(grid / values[:, None]) / spread) ** 2)
+        moved = weights @ (share / np.maximum(share.sum(axis=1, keepdims=True), 1e-300))
+        return Friction(grid, moved, note=self.note).without_the_negligible()
+
+    def without_the_negligible(self) -> "Friction":
+        """The same without values that are a million times less likely than the likeliest."""
+        values, weights = self.nodes
+        kept = weights > _NEGLIGIBLE * weights.max()
+        return Friction(values[kept], weights[kept], note=self.note)
+
+    @property
+    def nodes(self) -> tuple[Float[np.ndarray, " values"], Float[np.ndarray, " values"]]:
+        """Values and their weights, which sum to 1."""
+        assert isinstance(self.values, np.ndarray)
+        assert self.weights is not None
+        return self.values, self.weights
+
+    @property
+    def mean(self) -> float:
+        """Expected coefficient of friction."""
+        values, weights = self.nodes
+        return float(values @ weights)
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the coefficient of friction."""
+        values, weights = self.nodes
+        return float(np.sqrt(weights @ (values - self.mean) ** 2))
+
+    def __str__(self) -> str:
+        if self.note.endswith("range"):
+            return self.note
+        return f"{self.mean:.3g}{f' +- {self.sigma:.2g}' if len(self.nodes[0]) > 1 else ''}, {self.note}"
+
+
+FrictionLike: TypeAlias = Friction | float | tuple[float, float] | str
+"""Friction as a caller may give it: `Friction`, one number, (low, high), or as text 0.62 or 0.5..0.8."""
+
+
+def as_friction(told: FrictionLike) -> Friction:
+    """Coefficient of friction from what a caller gave.
+
+    Raises
+    ------
+    InputError
+        If it is none.
+
+    Examples
+    --------
+    >>> from sliplens.friction import as_friction
+    >>> str(as_friction("0.5..0.8"))
+    '0.5 to 0.8, told as a range'
+    """
+    if isinstance(told, Friction):
+        return told
+    if isinstance(told, tuple):
+        return Friction.between(*told)
+    try:
+        numbers = [float(part) for part in told.split("..")] if isinstance(told, str) else [float(told)]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in {1, 2}:
+        raise InputError(f"{told!r} is no friction; give a number such as 0.62, or a range such as 0.5..0.8")
+    return Friction(numbers[0]) if len(numbers) == 1 else Friction.between(*numbers)
+
+
+def _anything() -> Friction:
+    """Friction of which nothing is known, evenly in the logarithm."""
+    return Friction(np.geomspace(LOWEST, HIGHEST, _NODES), note="not told")
