@@ -16,7 +16,7 @@ from sliplens.live.loop import LowPass
 from sliplens.live.reading import Check, LiveFrame, MarkerReading, Reading, SlipState
 from sliplens.markers import TrackedFrame
 from sliplens.models import Run
-from sliplens.recordings import Dataset, Recording
+from sliplens.recordings import ContactState, Dataset, Recording
 
 
 class Burst(LiveSource):
@@ -192,6 +192,30 @@ def test_markers_are_followed_for_whoever_tells_slip(trials: dict[str, Recording
     # markers of the untouched sensor, seen within a pixel
     nearest = np.linalg.norm(trial.truth.marker_px[0][:, None] - seen[0][None], axis=-1).min(axis=0)
     assert np.nanmax(nearest) < 1
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_without_a_contact_there_is_no_margin(trials: dict[str, Recording], named: bool):
+    trial = trials["chromatouch"]
+
+    class Watch:
+        def __init__(self, rest_px: np.ndarray) -> None:
+            self.markers = len(rest_px)
+
+        def update(self, positions_px: np.ndarray, time_s: float) -> MarkerReading:
+            assert len(positions_px) == self.markers
+            return MarkerReading(state=SlipState.CANNOT_TELL, contact=time_s > 0)
+
+    source = Patient(trial.frames[:2], [0, 1])
+    network = "chromatouch-difference" if named else None
+    first, second = source.all_readings(
+        sl.LiveReader(source, network, reference=trial.reference, engine="eager", slip=Watch, stall_s=10.0)
+    )
+    assert first.contact_state is ContactState.NO_CONTACT
+    assert first.margin is None
+    assert (first.withheld is not None) == named
+    assert (second.margin is not None) == named
+    assert second.contact_state is not ContactState.NO_CONTACT
 
 
 def test_a_network_of_another_sensor_is_refused_before_anything_runs(difference_run: Path):

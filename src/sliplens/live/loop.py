@@ -81,6 +81,7 @@ class _Newest(Generic[Item]):
 _MOST_FRAMES = 10**6
 _RETRY_S = 1.0  # between two tries to open a source that was lost
 _JUMP_S = 1.0
+_NO_CONTACT = "nothing touches the sensor, and without a contact there is no margin; press it"
 _PATIENCE_S = 3.0
 _STILL_S = 0.3
 _STILL_FRAMES = 5
@@ -467,6 +468,9 @@ class LiveReader:
         health = () if self._health is None else self._health.check(frame, followed)
         withheld = next((check.sentence for check in health if not check.ok), None)
         reading = replace(begin, slip=markers and markers.state, markers=markers, health=health)
+        if markers is not None and markers.contact is False:
+            reading = replace(reading, contact_state=ContactState.NO_CONTACT)
+            withheld = withheld or (None if self.network is None else _NO_CONTACT)
         if self.network is None or withheld is not None:
             return self._withhold(reading, frame, withheld)
         return self._estimate(reading, frame)
