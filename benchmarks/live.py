@@ -57,7 +57,7 @@ def make_frames() -> tuple[np.ndarray, np.ndarray]:
     trial = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=60))
 
     def enlarge(image: np.ndarray) -> np.ndarray:
-        return np.asarray(Image.fromarray(image).resize(SIZE[::-1], Image.Resampling.BILINEAR))
+        return np.asarray(Image.fromarray(image).resize((SIZE[1], SIZE[0]), Image.Resampling.BILINEAR))
 
     return np.stack([enlarge(image) for image in trial.frames]), enlarge(trial.reference)
 
