@@ -11,7 +11,7 @@ from sliplens.recordings import Dataset
 
 def test_a_line_of_json_a_reading(small_dataset: Dataset, difference_run: Path, capfdbinary: pytest.CaptureFixture):
     words = ["live", str(small_dataset.folder), "--network", str(difference_run), "--engine", "eager"]
-    assert main([*words, "--speed", "2.0", "--sink", "json"]) == 0
+    assert main([*words, "--speed", "2.0", "--sink", "json", "--no-page"]) == 0
     lines = [json.loads(line) for line in capfdbinary.readouterr().out.splitlines()]
     assert lines
     for line in lines:
@@ -22,7 +22,7 @@ def test_a_line_of_json_a_reading(small_dataset: Dataset, difference_run: Path, 
 
 
 def test_a_line_for_people(small_dataset: Dataset, capsys: pytest.CaptureFixture[str]):
-    assert main(["live", str(small_dataset.folder), "--speed", "4"]) == 0
+    assert main(["live", str(small_dataset.folder), "--speed", "4", "--no-page"]) == 0
     assert "no network" in capsys.readouterr().out
 
 

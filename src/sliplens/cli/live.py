@@ -1,9 +1,11 @@
 """`sliplens live`."""
 
 import time
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
@@ -12,33 +14,22 @@ from sliplens.cli.command import Device
 from sliplens.cli.console import ERR, print_table, say
 
 if TYPE_CHECKING:
-    from sliplens.live import LiveReader, Recorder, SourceOptions
+    from sliplens.live import LiveReader, SourceOptions
     from sliplens.recordings import TrialFacts
 
 _SOURCE = "simulated, the number of a camera, the address of a stream, or a video, bag, data set or growing folder."
 
 
-def _parse_size(text: str | None) -> tuple[int, int] | None:
-    from sliplens.errors import InputError
-
-    if text is None:
-        return None
-    width, times, height = text.lower().partition("x")
-    if not (times and width.isdecimal() and height.isdecimal()):
-        raise InputError(f"--size is {text!r}; give width and height as 640x480")
-    return int(height), int(width)
-
-
-def _tell(recorder: "Recorder") -> None:
-    ERR.print(f"{recorder.folder}: {recorder.state}", soft_wrap=True, highlight=False)
+def _tell(message: str) -> None:
+    ERR.print(message, soft_wrap=True, highlight=False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Live:
     """Read the safety margin of a running sensor, frame by frame.
 
-    Without a source it is a simulated fingertip that grips, pulls until it slips, and lets go. Ends with its source,
-    after --seconds, or with Ctrl-C.
+    Without a source it is a simulated fingertip to press and pull in a browser; its page is at the address that is
+    printed. Ends with Ctrl-C or after --seconds; with --no-page or --sink also when the source ends.
     """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE", help=_SOURCE)] = "simulated"
@@ -65,8 +56,15 @@ class Live:
     """Time constant in seconds of a low-pass on margin and interval, which delays them by so much; 0 for none."""
     sink: tuple[str, ...] = ()
     """Where readings go: json prints a line of JSON for each. Without one, a line a second is printed."""
+    page: bool = True
+    """Show it in browsers, with buttons to freeze, explain and record."""
+    host: str = "127.0.0.1"
+    """Address on which the page listens: this machine alone, or others too, 0.0.0.0 for all; they need the token of
+    the address that is printed."""
+    port: int | None = None
+    """Port of the page; 8090 if not given."""
     record: Path | None = None
-    """Data set to record every frame into, a new one or one that is there."""
+    """Data set to record every frame into, from the start on; the page's button records into `recorded` without it."""
     forces: Path | None = None
     """File or named pipe into which another program writes force samples (time_s,fx,fy,fz), to be recorded too."""
     sensor: str = ""
@@ -108,9 +106,26 @@ class Live:
             for sink in sinks:
                 reader.subscribe(lambda reading, frame, sink=sink: sink.send(reading, frame and frame.image))
             if self.record is not None:
-                stack.callback(_tell, reader.record(self.record, facts=self._facts))
+                recorder = reader.record(self.record, facts=self._facts)
+                stack.callback(lambda: _tell(f"{recorder.folder}: {recorder.state}"))
             with suppress(KeyboardInterrupt), reader:  # the way to end it
                 self._watch(reader)
+
+    @contextmanager
+    def _shown(self, reader: "LiveReader") -> Iterator[None]:
+        """Page of it, if it is wanted; alone it stays when the source has ended."""
+        from sliplens.app import LivePage
+
+        if not self.page:
+            yield
+            return
+        into = self.record or Path("recorded")
+        with LivePage(reader, host=self.host, port=self.port, record_into=into, facts=self._facts) as page:
+            _tell(f"open {page.address}")
+            yield
+            if self.seconds is None and not self.sink:
+                _tell(f"{reader.source.name} has ended; the page stays until Ctrl-C")
+                Event().wait()
 
     @property
     def _facts(self) -> "TrialFacts":
@@ -119,13 +134,13 @@ class Live:
         return TrialFacts(trial="live", sensor=self.sensor, object=self.object, condition=self.condition, day=self.day)
 
     def _options(self) -> "SourceOptions":
-        from sliplens.live import SourceOptions
+        from sliplens.live.contract import SourceOptions, parse_size
 
         return SourceOptions(
             rate_hz=self.rate,
             speed=self.speed,
             trial=self.trial,
-            size=_parse_size(self.size),
+            size=parse_size(self.size),
             pixel_format=self.pixel_format,
         )
 

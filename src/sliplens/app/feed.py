@@ -1,0 +1,510 @@
+"""What those who look at the page are sent: readings, pictures and maps, each made once for all of them."""
+
+import asyncio
+import io
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from threading import Event, Lock, Thread
+
+import msgspec
+import numpy as np
+import torch
+from PIL import Image
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from sliplens.errors import ImageError, SliplensError
+from sliplens.explainers.explanation import CLOSE, Explanation
+from sliplens.explainers.occlusion import marker_regions, to_network_px
+from sliplens.explainers.table import explain
+from sliplens.files import to_builtins
+from sliplens.live.loop import LiveReader
+from sliplens.live.reading import LiveFrame, Reading
+from sliplens.live.recorder import RecordingState
+from sliplens.markers import Tracker
+from sliplens.models.checkpoint import Run
+from sliplens.plots.saliency import full_colour
+from sliplens.recordings.capture import Frame
+
+CHART_S = 30.0
+"""Time that the chart of the page spans, in seconds."""
+LIVE_METHOD = "grad-cam"
+"""Explainer of the running picture, one of the cheapest; any other explains a frozen one."""
+_PICTURES_HZ, _ARROWS_HZ, _MAPS_HZ = 30.0, 10.0, 2.0
+_LONGEST_PX = 800
+_QUALITY = 85
+_UNANSWERED = 2  # messages under way to one viewer: one is drawn while the next one travels
+_RATE_S = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Point:
+    """A reading on the chart: margins from 0 to 1, None where there is none."""
+
+    at_s: float
+    """When it was told, as `time.monotonic` counts."""
+    margin: float | None
+    low: float | None
+    """Lower end of the interval, in margin units."""
+    high: float | None
+    """Upper end of it, in margin units."""
+    true_margin: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arrow:
+    """Way of a marker from where it rests, x and y in pixels of the frame."""
+
+    start_px: tuple[float, float]
+    end_px: tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Picture:
+    """Frame as it is shown."""
+
+    reading: Reading
+    frame: LiveFrame
+    reference: Frame | None
+    """The sensor untouched, with which the frame was compared."""
+    jpeg: bytes
+    arrows: tuple[Arrow, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkerRelevance:
+    """Relevance around a marker."""
+
+    place_px: tuple[float, float]
+    """x and y in pixels of the frame."""
+    relevance: float
+    """Sum over the pixels that are nearest to it, in margin units."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapFacts:
+    """What a map explains, and how its cells are read."""
+
+    number: int
+    """Frame that is explained."""
+    method: str
+    prediction: float
+    """Margin that is explained, in margin units."""
+    reference_prediction: float
+    """Margin of the untouched sensor, in margin units."""
+    rows: int
+    columns: int
+    full: float
+    """Relevance of a cell of 127, in margin units; cells are signed bytes, row by row."""
+    alike: bool
+    """Whether both margins are the same but for the network's error, so that there is nothing to explain."""
+    markers: tuple[MarkerRelevance, ...]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Map:
+    """Relevance of a frame's pixels."""
+
+    facts: MapFacts
+    cells: bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureFacts:
+    """Size of the frame that a JPEG shows, and what is drawn over it."""
+
+    width: int
+    height: int
+    arrows: tuple[Arrow, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Update:
+    """Header of a message to a viewer; the JPEG and the cells of the map follow where they are new."""
+
+    serial: int
+    now_s: float
+    """When it was made, as `time.monotonic` counts."""
+    reading: Reading | None
+    points: tuple[Point, ...]
+    """Readings since the message before."""
+    rate_hz: float
+    """Readings a second, over the last two."""
+    drawn_ms: float | None
+    """From the capture of a frame until this viewer had drawn it and said so, in milliseconds."""
+    viewers: int
+    waiting: str
+    """What is being waited for, in words; empty for nothing."""
+    ended: str | None
+    """Why no more readings come; None while they may."""
+    recording: RecordingState | None
+    frozen: Reading | None
+    """Reading of the picture, where it is frozen."""
+    has_map: bool
+    """Whether a map lies over the picture: this one, or the one sent before."""
+    picture: PictureFacts | None
+    picture_bytes: int
+    map: MapFacts | None
+    map_bytes: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """What a viewer says to a message."""
+
+    serial: int
+    drawn: bool = True
+    """Whether it was drawn, and not passed over in a hidden window."""
+
+
+class Feed:
+    """Readings, pictures and maps of a reader, for any number of viewers.
+
+    Everything is made once, in threads of its own, and only while somebody waits for it: a viewer that does not answer
+    is sent no more, and nobody waits for it.
+
+    Parameters
+    ----------
+    reader
+        Reader that is entered.
+    """
+
+    def __init__(self, reader: LiveReader) -> None:
+        self.reader = reader
+        self.viewers: set[Viewer] = set()
+        """Those who look now."""
+        self.expected: dict[str, Viewer] = {}
+        """Those who may, by the name under which they will ask for frames."""
+        self.reading: Reading | None = None
+        """Newest reading."""
+        self.picture: Picture | None = None
+        """Newest picture."""
+        self.map: Map | None = None
+        """Newest map of the running picture."""
+        self.ended: str | None = None
+        """Why no more readings come; None while they may."""
+        self._points: deque[Point] = deque()
+        self._lock = Lock()
+        self._newest: tuple[Reading, LiveFrame] | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._closed = Event()
+        self._end_subscription: Callable[[], None] = lambda: None
+        self._followed_s = -np.inf
+        self._tracker: tuple[Frame, Tracker | None] | None = None
+        self._arrows: tuple[Arrow, ...] = ()
+        self._before: Frame | None = None
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="explain")
+        # explainers listen inside the network: not in the one that reads
+        network = reader.network
+        self._network: Run | None = None if network is None else replace(network, model=deepcopy(network.model))
+        self._thread = Thread(target=self._run, daemon=True)
+        self._mapper = Thread(target=self._map_on, daemon=True)
+
+    def start(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Begin; viewers are served in this loop."""
+        self._loop = loop
+        self._end_subscription = self.reader.subscribe(self._take)
+        self._thread.start()
+        if self._network is not None:
+            self._mapper.start()
+
+    def close(self) -> None:
+        """Make nothing more; the reader goes on."""
+        self._closed.set()
+        self._end_subscription()
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    @property
+    def rate_hz(self) -> float:
+        """Readings of frames a second, over the last two seconds."""
+        since_s = time.monotonic() - _RATE_S
+        with self._lock:
+            return sum(point.at_s > since_s for point in self._points) / _RATE_S
+
+    @property
+    def waiting(self) -> str:
+        """What all viewers wait for, in words."""
+        if self._before is not None and self._before is self.reader.reference:
+            return "waiting for a still picture: leave the sensor untouched"
+        self._before = None
+        return ""
+
+    def points_since(self, at_s: float) -> tuple[Point, ...]:
+        """Points of the chart after a time, as `time.monotonic` counts."""
+        with self._lock:
+            return tuple(point for point in self._points if point.at_s > at_s)
+
+    def take_reference(self) -> None:
+        """Have the reader take a new reference, and say so until it has."""
+        self._before = self.reader.reference
+        self.reader.take_reference()
+
+    async def explain(self, picture: Picture, method: str) -> Map:
+        """Explain a picture by any method; one explanation runs at a time.
+
+        Raises
+        ------
+        SliplensError
+            If it cannot be explained.
+        """
+        return await asyncio.get_running_loop().run_in_executor(self._pool, self._explain, picture, method)
+
+    def _take(self, reading: Reading, frame: LiveFrame | None) -> None:
+        now_s = time.monotonic()
+        point = Point(
+            at_s=now_s,
+            margin=reading.margin,
+            low=reading.low,
+            high=reading.high,
+            true_margin=reading.true_margin,
+        )
+        with self._lock:
+            self._points.append(point)
+            while self._points[0].at_s < now_s - CHART_S:
+                self._points.popleft()
+        self.reading = reading
+        self._newest = None if frame is None else (reading, frame)
+
+    def _run(self) -> None:
+        """Draw the newest reading, again and again, until there are no more."""
+        drawn_s = -np.inf
+        try:
+            for _ in self.reader.readings():
+                if self._closed.is_set():
+                    return
+                # frames that come as fast as pictures are drawn are never early
+                if time.monotonic() - drawn_s < 0.7 / _PICTURES_HZ:
+                    continue
+                drawn_s = time.monotonic()
+                newest = self._newest
+                if newest is not None and any(viewer.ready for viewer in tuple(self.viewers)):
+                    self.picture = self._draw(*newest)
+                self._wake()
+            self.ended = f"{self.reader.source.name} has ended"
+        except Exception as error:  # whatever it was: who looks must not take the last margin for a new one
+            self.ended = str(error) or type(error).__name__
+        if self.reading is not None:
+            self.reading = replace(self.reading, margin=None, low=None, high=None, withheld=self.ended)
+        self._wake()
+
+    def _wake(self) -> None:
+        loop = self._loop
+        assert loop is not None
+        with suppress(RuntimeError):  # the server has gone
+            loop.call_soon_threadsafe(lambda: [viewer.wake() for viewer in tuple(self.viewers)])
+
+    def _draw(self, reading: Reading, frame: LiveFrame) -> Picture:
+        shown = Image.fromarray(frame.image)
+        shown.thumbnail((_LONGEST_PX, _LONGEST_PX), reducing_gap=1.0)
+        buffer = io.BytesIO()
+        shown.save(buffer, "JPEG", quality=_QUALITY)
+        reference = self.reader.reference
+        return Picture(
+            reading=reading,
+            frame=frame,
+            reference=reference,
+            jpeg=buffer.getvalue(),
+            arrows=self._follow(frame, reference) if any(viewer.shows_arrows for viewer in tuple(self.viewers)) else (),
+        )
+
+    def _follow(self, frame: LiveFrame, reference: Frame | None) -> tuple[Arrow, ...]:
+        """Arrows of a frame, or of one just before."""
+        if reference is None or reference.shape != frame.image.shape:
+            return ()
+        if self._tracker is None or self._tracker[0] is not reference:
+            try:
+                self._tracker = reference, Tracker(reference)
+            except ImageError:
+                self._tracker = reference, None  # a sensor without markers
+            self._followed_s = -np.inf
+        _, tracker = self._tracker
+        if tracker is None:
+            return ()
+        if frame.captured_s - self._followed_s < 0.7 / _ARROWS_HZ:
+            return self._arrows
+        self._followed_s = frame.captured_s
+        rest = tracker.rest.centre_px
+        place = tracker.update(frame.image).position_px[: len(rest)]
+        self._arrows = tuple(
+            Arrow(start_px=(x, y), end_px=(to_x, to_y))
+            for x, y, to_x, to_y in np.column_stack([rest, place]).round(1).tolist()
+            if np.isfinite(to_x)
+        )
+        return self._arrows
+
+    def _map_on(self) -> None:
+        """Explain the newest picture at a few hertz, while somebody wants that."""
+        explained = None
+        while not self._closed.wait(1 / _MAPS_HZ):
+            picture = self.picture
+            wanted = any(viewer.shows_map and viewer.ready for viewer in tuple(self.viewers))
+            if self.ended is not None or not wanted or picture is None or picture is explained:
+                continue
+            explained = picture
+            try:
+                if picture.reading.margin is None:
+                    self.map = None  # nothing is told, so there is nothing to explain
+                else:
+                    self.map = self._pool.submit(self._explain, picture, LIVE_METHOD).result()
+            except (SliplensError, RuntimeError):
+                self.map = None
+            self._wake()
+
+    def _explain(self, picture: Picture, method: str) -> Map:
+        assert self._network is not None
+        # the pixels of maps by hand, not a graph that other threads compile
+        explanation = explain(self._network, picture.frame.image[None], reference=picture.reference, method=method)
+        relevance = explanation.relevance[0].cpu().numpy()
+        full = full_colour(relevance)
+        # where both margins are the same but for the network's error, the strongest of nothing is not shown in colour
+        alike = abs(float(explanation.change[0])) < CLOSE
+        rows, columns = relevance.shape
+        return Map(
+            facts=MapFacts(
+                number=picture.frame.number,
+                method=method,
+                prediction=float(explanation.prediction[0]),
+                reference_prediction=float(explanation.reference_prediction[0]),
+                rows=rows,
+                columns=columns,
+                full=full,
+                alike=alike,
+                markers=() if alike else _marker_relevance(explanation, picture),
+                warnings=explanation.warnings,
+            ),
+            cells=np.round(127 * (not alike) * np.clip(relevance / full, -1, 1)).astype(np.int8).tobytes(),
+        )
+
+
+def _marker_relevance(explanation: Explanation, picture: Picture) -> tuple[MarkerRelevance, ...]:
+    """Sum of the relevance around each marker."""
+    if len(picture.arrows) < 2:
+        return ()
+    places = np.array([arrow.end_px for arrow in picture.arrows])
+    relevance = explanation.relevance[0].cpu().double()
+    centres = to_network_px(places, picture.frame.size, image_size=len(relevance))
+    regions = marker_regions((relevance.shape[0], relevance.shape[1]), centres)
+    sums = torch.bincount(regions.flatten(), weights=relevance.flatten(), minlength=len(places) + 1)
+    return tuple(
+        MarkerRelevance(place_px=(x, y), relevance=value)
+        for (x, y), value in zip(places.tolist(), sums[: len(places)].tolist(), strict=True)
+    )
+
+
+class Viewer:
+    """One who looks: what was sent and answered, what is frozen and wished."""
+
+    def __init__(self, feed: Feed) -> None:
+        self.feed = feed
+        self.frozen: Picture | None = None
+        """Picture that stays until `thaw`; number and chart go on."""
+        self.explained: Map | None = None
+        """Why, of the frozen picture."""
+        self.waiting = ""
+        """What this viewer waits for, in words."""
+        self.shows_map = self.shows_arrows = True
+        self._changed = asyncio.Event()
+        self._serial = 0
+        self._unanswered: dict[int, float] = {}
+        self._forget()
+
+    def _forget(self) -> None:
+        self._told_s, self._drawn_ms = -np.inf, None
+        self._picture: Picture | None = None
+        self._map: Map | None = None
+        self._unanswered.clear()
+
+    def wake(self) -> None:
+        """Send what is new as soon as this viewer has answered; called in the thread of the server."""
+        self._changed.set()
+
+    @property
+    def ready(self) -> bool:
+        """Whether it has answered what it was sent."""
+        return len(self._unanswered) < _UNANSWERED
+
+    def freeze(self) -> Picture | None:
+        """Keep the picture that is seen; None before the first."""
+        self.frozen = self.frozen or self._picture or self.feed.picture
+        self.wake()
+        return self.frozen
+
+    def thaw(self) -> None:
+        """Let the picture run again."""
+        self.frozen = self.explained = None
+        self.wake()
+
+    async def serve(self, socket: WebSocket) -> None:
+        """Send what is new whenever the message before the last was answered, until the viewer is gone."""
+        await socket.accept()
+        self._forget()
+        self.feed.viewers.add(self)
+        sending = asyncio.create_task(self._send(socket))
+        try:
+            while True:
+                answer = msgspec.json.decode(await socket.receive_text(), type=Answer)
+                captured_s = self._unanswered.pop(answer.serial, None)
+                if captured_s is not None and answer.drawn and np.isfinite(captured_s):
+                    self._drawn_ms = 1e3 * (time.monotonic() - captured_s)
+                self.wake()
+        except (WebSocketDisconnect, msgspec.MsgspecError, KeyError):
+            pass  # it has gone, or speaks another language
+        finally:
+            self.feed.viewers.discard(self)
+            sending.cancel()
+            await asyncio.gather(sending, return_exceptions=True)
+            with suppress(RuntimeError, WebSocketDisconnect, OSError):
+                await socket.close()
+
+    async def _send(self, socket: WebSocket) -> None:
+        self.wake()
+        while True:
+            await self._changed.wait()
+            self._changed.clear()
+            if self.ready:
+                await socket.send_bytes(self._message())
+
+    def _message(self) -> bytes:
+        """Length of the header in 4 bytes, the header as JSON, the JPEG and the cells of the map."""
+        feed, reader = self.feed, self.feed.reader
+        picture = self.frozen or feed.picture
+        overlay = self.explained if self.frozen is not None else feed.map
+        overlay = overlay if self.shows_map else None
+        jpeg = picture.jpeg if picture is not None and picture is not self._picture else b""
+        cells = overlay.cells if overlay is not None and overlay is not self._map else b""
+        points = feed.points_since(self._told_s)
+        self._serial += 1
+        update = Update(
+            serial=self._serial,
+            now_s=time.monotonic(),
+            reading=feed.reading,
+            points=points,
+            rate_hz=feed.rate_hz,
+            drawn_ms=self._drawn_ms,
+            viewers=len(feed.viewers),
+            waiting=self.waiting or feed.waiting,
+            ended=feed.ended,
+            recording=None if reader.recorder is None else reader.recorder.state,
+            frozen=None if self.frozen is None else self.frozen.reading,
+            has_map=overlay is not None,
+            picture=_picture_facts(picture, arrows=self.shows_arrows) if picture is not None and jpeg else None,
+            picture_bytes=len(jpeg),
+            map=overlay.facts if overlay is not None and cells else None,
+            map_bytes=len(cells),
+        )
+        # what was not drawn anew tells nothing of how long drawing takes
+        self._unanswered[self._serial] = picture.frame.captured_s if jpeg and picture is not None else np.nan
+        self._picture, self._map = picture, overlay
+        self._told_s = points[-1].at_s if points else self._told_s
+        header = msgspec.json.encode(to_builtins(update))
+        return b"".join([len(header).to_bytes(4, "little"), header, jpeg, cells])
+
+
+def _picture_facts(picture: Picture, *, arrows: bool) -> PictureFacts:
+    height, width = picture.frame.size
+    return PictureFacts(width=width, height=height, arrows=picture.arrows if arrows else ())

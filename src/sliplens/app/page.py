@@ -1,0 +1,244 @@
+"""What a browser shows: controls made with NiceGUI around a view that draws what the feed sends."""
+
+import secrets
+from collections.abc import Awaitable, Callable
+from functools import cache, wraps
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fastapi import FastAPI
+from nicegui import binding, run, ui
+from nicegui.events import GenericEventArguments, KeyEventArguments
+from starlette.websockets import WebSocket
+
+from sliplens.app.feed import CHART_S, LIVE_METHOD, Viewer
+from sliplens.errors import InputError, SliplensError
+from sliplens.explainers.table import EXPLAINERS
+from sliplens.live.sources import SimulatedSource
+from sliplens.plots.saliency import LOWERS, RAISES
+from sliplens.plots.style import BLUE, METHOD_NAMES
+
+if TYPE_CHECKING:
+    from sliplens.app.server import LivePage
+
+TARGET = 0.2, 0.4
+"""Margins that people keep when they hold something."""
+_MOST_PRESS_N, _MOST_PULL_N = 3.0, 2.4
+_ICON = (
+    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 16 16"><path d="M2 12a6 6 0 1 1 12 0" fill="none" '
+    'stroke="#009E73" stroke-width="3"/><path d="M8 12 5 6" stroke="#D55E00" stroke-width="2"/></svg>'
+)
+
+
+class LiveView(ui.element, component="live_view.js"):
+    """Number, picture, chart and lamps: whatever changes with each reading."""
+
+    def __init__(self, page: "LivePage", name: str) -> None:
+        super().__init__()
+        network = page.reader.network
+        self._props.update({
+            "path": f"/frames/{name}",
+            "chart-s": CHART_S,
+            "target": TARGET,
+            "lowers": LOWERS,
+            "raises": RAISES,
+            "methods": METHOD_NAMES,
+            "network": network is not None,
+        })  # fmt: skip
+
+
+@binding.bindable_dataclass
+class Hand:
+    """What presses and pulls the simulated fingertip, the same for all viewers."""
+
+    press_n: float = 1.5
+    pull_n: float = 0.0
+
+
+def make_app(page: "LivePage") -> FastAPI:
+    """Application that shows a page: the only one of its process, as NiceGUI has but one."""
+    app = _application()
+    if getattr(app.state, "page", None) is not None:
+        raise InputError("a page is being shown by this process already; close that one first")
+    app.state.page, app.state.hand = page, Hand()
+    return app
+
+
+def release_app() -> None:
+    """Let the next page be shown."""
+    _application().state.page = None
+
+
+@cache
+def _application() -> FastAPI:
+    app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
+
+    @app.websocket("/frames/{name}")
+    async def frames(socket: WebSocket, name: str) -> None:
+        viewer = app.state.page.feed.expected.get(name)
+        if viewer is None:
+            await socket.close(code=1008)
+        else:
+            await viewer.serve(socket)
+
+    @ui.page("/", title="sliplens", dark=None)
+    def index() -> None:
+        _build(app.state.page, app.state.hand)
+
+    ui.run_with(
+        app,
+        title="sliplens",
+        favicon=_ICON,
+        dark=None,
+        tailwind=False,
+        binding_refresh_interval=0.25,
+        show_welcome_message=False,
+    )
+    return app
+
+
+class _Acts:
+    """What one viewer can do, by button or key."""
+
+    def __init__(self, page: "LivePage", viewer: Viewer) -> None:
+        self._page, self._feed, self._reader, self.viewer = page, page.feed, page.reader, viewer
+        self.method = LIVE_METHOD
+        """Explainer of a frozen picture."""
+        self.freeze_words = ""
+        self._name_freezing()
+
+    def _name_freezing(self) -> None:
+        self.freeze_words = "Freeze (F)" if self.viewer.frozen is None else "Go on (F)"
+
+    async def take_reference(self) -> None:
+        """Take a new reference as soon as the picture is still."""
+        self._feed.take_reference()
+
+    async def freeze(self) -> None:
+        """Keep the picture, or let it run again."""
+        if self.viewer.frozen is None:
+            self.viewer.freeze()
+        else:
+            self.viewer.thaw()
+        self._name_freezing()
+
+    async def explain(self) -> None:
+        """Keep the picture and say why."""
+        if self._reader.network is None:
+            raise InputError("there is no network to explain; start with --network")
+        viewer, method = self.viewer, self.method
+        picture = viewer.freeze()
+        self._name_freezing()
+        if picture is None or viewer.waiting:
+            return
+        viewer.waiting = f"explaining frame {picture.frame.number} by {METHOD_NAMES.get(method, method)}"
+        viewer.wake()
+        try:
+            explained = await self._feed.explain(picture, method)
+            if viewer.frozen is picture:
+                viewer.explained = explained
+        finally:
+            viewer.waiting = ""
+            viewer.wake()
+
+    async def record(self) -> None:
+        """Record, or end that."""
+        if self._reader.recorder is None:
+            await run.io_bound(self._reader.record, self._page.record_into, facts=self._page.facts)
+            return
+        data = await run.io_bound(self._reader.stop_recording)
+        if data is None:
+            ui.notify("nothing was recorded: no frame came", type="warning")
+        else:
+            ui.notify(f"recorded into {data.folder}; look with `sliplens check {data.folder}`", type="positive")
+
+
+def _told(act: Callable[[], Awaitable[None]]) -> Callable[[], Awaitable[None]]:
+    """Tell the viewer why something could not be done."""
+
+    @wraps(act)
+    async def acted() -> None:
+        try:
+            await act()
+        except (SliplensError, OSError) as error:
+            ui.notify(str(error), type="warning", multi_line=True, timeout=10_000)
+
+    return acted
+
+
+def _build(page: "LivePage", hand: Hand) -> None:
+    """Page of one viewer."""
+    feed, reader = page.feed, page.reader
+    viewer, name = Viewer(feed), secrets.token_urlsafe(9)
+    feed.expected[name] = viewer
+    ui.context.client.on_delete(lambda: feed.expected.pop(name, None))
+    acts = _Acts(page, viewer)
+    ui.add_css(Path(__file__).with_name("live_view.css"))
+    ui.colors(primary=BLUE)
+    ui.query(".nicegui-content").classes("sl-page")
+    with LiveView(page, name):
+        if isinstance(reader.source, SimulatedSource):
+            _build_hand(hand, reader.source)
+        with ui.element("div").classes("sl-buttons"):
+            ui.button("Reference (R)", on_click=_told(acts.take_reference)).tooltip(
+                "take a new image of the untouched sensor, as soon as the picture is still"
+            )
+            ui.button(on_click=_told(acts.freeze)).bind_text_from(acts, "freeze_words").tooltip(
+                "keep this picture; the margin runs on"
+            )
+            ui.button(on_click=_told(acts.record)).bind_text_from(
+                reader, "recorder", lambda recorder: "Record (C)" if recorder is None else "Stop recording (C)"
+            ).tooltip(f"every frame into {page.record_into}")
+        _build_overlays(acts, network=reader.network is not None)
+    by_key = {"r": acts.take_reference, "f": acts.freeze, "e": acts.explain, "c": acts.record}
+
+    async def press_key(event: KeyEventArguments) -> None:
+        modifiers = event.modifiers
+        held = modifiers.ctrl or modifiers.alt or modifiers.meta
+        act = by_key.get(str(event.key.name).lower())
+        if act is not None and event.action.keydown and not event.action.repeat and not held:
+            await _told(act)()
+
+    ui.keyboard(on_key=press_key, repeating=False, ignore=["input", "select", "textarea"])
+
+
+def _build_overlays(acts: _Acts, *, network: bool) -> None:
+    """What lies over the picture."""
+
+    def show() -> None:
+        acts.viewer.shows_map, acts.viewer.shows_arrows = bool(map_switch.value), bool(arrow_switch.value)
+        acts.viewer.wake()
+
+    with ui.element("div").classes("sl-buttons"):
+        map_switch = ui.switch("Map", value=network, on_change=show)
+        map_switch.set_enabled(network)
+        arrow_switch = ui.switch("Markers", value=True, on_change=show)
+        if network:
+            names = {method: METHOD_NAMES.get(method, method) for method in EXPLAINERS}
+            ui.select(names, label="explain by").props("dense outlined options-dense").bind_value(acts, "method")
+            ui.button("Explain (E)", on_click=_told(acts.explain)).tooltip("why, of this picture, by the method beside")
+
+
+def _build_hand(hand: Hand, source: SimulatedSource) -> None:
+    """Sliders that press and pull, which all viewers share."""
+
+    def press(event: GenericEventArguments) -> None:
+        hand.press_n = float(event.args)
+        source.load(normal_force_n=hand.press_n, tangential_force_n=hand.pull_n)
+
+    def pull(event: GenericEventArguments) -> None:
+        hand.pull_n = float(event.args)
+        source.load(normal_force_n=hand.press_n, tangential_force_n=hand.pull_n)
+
+    with ui.element("div").classes("sl-hand"):
+        for word, field, most_n, act in (
+            ("Press", "press_n", _MOST_PRESS_N, press),
+            ("Pull", "pull_n", _MOST_PULL_N, pull),
+        ):
+            ui.label().bind_text_from(hand, field, lambda force_n, word=word: f"{word} {force_n:.2f} N")
+            slider = ui.slider(min=0, max=most_n, step=0.05).props(f'aria-label="{word} the fingertip, in newtons"')
+            slider.bind_value_from(hand, field)
+            slider.on("update:model-value", act, throttle=0.05)
+        ui.button("Grip by itself", on_click=source.let_go).tooltip(
+            "touch, press, pull until it slips, let go, and again"
+        )

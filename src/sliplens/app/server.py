@@ -1,0 +1,260 @@
+"""Server of the page: on this machine alone, or with a token."""
+
+import asyncio
+import errno
+import secrets
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from http.cookies import CookieError, SimpleCookie
+from ipaddress import ip_address
+from pathlib import Path
+from threading import Thread
+from typing import TYPE_CHECKING
+from urllib.parse import parse_qs, urlsplit
+
+from sliplens.app.feed import Feed
+from sliplens.errors import InputError
+from sliplens.extras import require_packages
+from sliplens.live.loop import LiveReader
+from sliplens.recordings.trial import TrialFacts
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+_PORT = 8090
+_PATIENCE_S = 10.0
+_DAY_S = 24 * 3600
+
+
+class LivePage:
+    """Page of a reader, for browsers; a context manager that serves it while it is entered.
+
+    Several may look at once: they see the same frames, and cost one inference. One page at a time runs in a process.
+
+    Parameters
+    ----------
+    reader
+        Reader that is entered, and stays so for longer than the page.
+    host
+        Address to listen on; on any other than this machine's own, the page asks for the token that its address holds.
+    port
+        Port to listen on, 0 for any; 8090, or any where that is taken, if None.
+    record_into
+        Data set into which the page's button records, a new one or one that is there.
+    facts
+        Who, when and what of its trials.
+
+    Raises
+    ------
+    InputError
+        If the packages of the extra `live` are missing, or the port is taken.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> from sliplens.app import LivePage
+    >>> with sl.LiveReader("simulated") as reader, LivePage(reader, port=0) as page:
+    ...     page.address.startswith("http://127.0.0.1:")
+    True
+    """
+
+    def __init__(
+        self,
+        reader: LiveReader,
+        *,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+        record_into: Path | str = "recorded",
+        facts: TrialFacts | None = None,
+    ) -> None:
+        require_packages("nicegui", extra="live", purpose="the page")
+        if port is not None and not 0 <= port <= 65535:
+            raise InputError(f"--port must be from 0 to 65535, got {port}")
+        self.reader, self.record_into, self.facts = reader, Path(record_into), facts
+        self._host, self._port = host, port
+        self.token = None if is_loopback(host) else secrets.token_urlsafe(24)
+        """What a visitor must show; None where only this machine can visit."""
+        self._stack = ExitStack()
+
+    @property
+    def address(self) -> str:
+        """Where a browser finds it, with the token where it needs one; known while it is entered."""
+        port = self._socket.getsockname()[1]
+        host = self._host
+        if not is_loopback(host) and _is_unspecified(host):
+            host = socket.gethostname()
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{port}/" + ("" if self.token is None else f"?token={self.token}")
+
+    def __enter__(self) -> "LivePage":
+        # an extra, and a second to import
+        from sliplens.app.page import make_app, release_app  # noqa: PLC0415
+
+        with ExitStack() as stack:
+            self._socket = stack.enter_context(_listen(self._host, self._port))
+            self.feed = Feed(self.reader)
+            stack.callback(self.feed.close)
+            app = make_app(self)
+            stack.callback(release_app)
+            gate = Gate(app, token=self.token, port=self._socket.getsockname()[1])
+            stack.enter_context(_serving(gate, self._socket, self.feed))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+
+@contextmanager
+def _serving(app: "ASGIApp", listening: socket.socket, feed: Feed) -> Iterator[None]:
+    """Serve in a thread of its own, which has started when this is entered and ended when it is left."""
+    import nicegui  # noqa: PLC0415 (the extra)
+    import uvicorn  # noqa: PLC0415 (comes with it)
+
+    config = uvicorn.Config(
+        app,
+        log_level="error",
+        access_log=False,
+        loop="asyncio",
+        lifespan="off",
+        ws="websockets-sansio",
+        timeout_graceful_shutdown=1,
+    )
+    server = uvicorn.Server(config)
+
+    async def serve() -> None:
+        feed.start(asyncio.get_running_loop())
+        # not by the lifespan that `ui.run_with` makes: it walks over all objects of the process, and a tuple that
+        # another thread is just making then fails with a SystemError
+        async with nicegui.app.router.lifespan_context(nicegui.app):
+            await server.serve([listening])
+
+    thread = Thread(target=lambda: asyncio.run(serve()), daemon=True)
+    thread.start()
+    try:
+        while not server.started:
+            thread.join(0.01)
+            if not thread.is_alive():
+                raise InputError("the page could not be served; run without it, with --no-page")
+        yield
+    finally:
+        server.should_exit = True
+        thread.join(_PATIENCE_S)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach an address."""
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _is_unspecified(host: str) -> bool:
+    try:
+        return ip_address(host).is_unspecified
+    except ValueError:
+        return False
+
+
+def _listen(host: str, port: int | None) -> socket.socket:
+    """Socket that listens on a port, or on any where none was named and the usual one is taken."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    reason = ""
+    for wanted in (_PORT, 0) if port is None else (port,):
+        try:
+            return socket.create_server((host, wanted), family=family)
+        except OSError as error:
+            if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+                raise InputError(
+                    f"--host {host} is no address of this machine; name one, such as 0.0.0.0 for all"
+                ) from None
+            reason = error.strerror or str(error)
+    raise InputError(f"port {port} of {host} cannot be listened on ({reason}); name another with --port")
+
+
+class Gate:
+    """Lets in who may see the page: ASGI middleware around everything, websockets included.
+
+    Without a token, who speaks to this machine by its own name: a page of another site that leads a name of its own
+    here is refused. With one, who shows it, once in the address and from then on in a cookie. A page of another site
+    may in no case open a socket or send anything.
+    """
+
+    def __init__(self, app: "ASGIApp", *, token: str | None, port: int) -> None:
+        self.app, self._token, self._cookie = app, token, f"sliplens-{port}"
+
+    async def __call__(self, scope: "Scope", receive: "Receive", send: "Send") -> None:
+        """Pass on, send to the same address without its token, or refuse."""
+        if scope["type"] == "lifespan":
+            await self.app(scope, receive, send)
+            return
+        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        if (why := self._refusal(headers)) is not None:
+            await _refuse(scope, send, 403, why)
+        elif self._token is None or self._shows(_cookie(headers.get("cookie", ""), self._cookie)):
+            await self.app(scope, receive, _guarded(send, headers.get("host", "")))
+        elif scope["type"] == "http" and self._shows(_token_of(scope)):
+            kept = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict; Max-Age={_DAY_S}"
+            await _answer(send, 303, [("location", scope["path"]), ("set-cookie", kept)], "")
+        else:
+            await _refuse(scope, send, 401, "open the whole address that `sliplens live` printed, with its token")
+
+    def _refusal(self, headers: dict[str, str]) -> str | None:
+        host = headers.get("host", "")
+        if self._token is None and not is_loopback(urlsplit(f"//{host}").hostname or ""):
+            return f"this page is for this machine alone, and not at {host}; start it with --host to open it to others"
+        origin = headers.get("origin")
+        if origin is not None and urlsplit(origin).netloc != host:
+            return f"a page of {origin} may not use this one"
+        return None
+
+    def _shows(self, token: str) -> bool:
+        return self._token is not None and secrets.compare_digest(token.encode(), self._token.encode())
+
+
+def _cookie(header: str, name: str) -> str:
+    try:
+        kept = SimpleCookie(header).get(name)
+    except CookieError:
+        return ""
+    return "" if kept is None else kept.value
+
+
+def _token_of(scope: "Scope") -> str:
+    return parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+
+
+def _guarded(send: "Send", host: str) -> "Send":
+    """Add to every answer that its page may load nothing from elsewhere, nor be shown within another one."""
+    policy = (
+        "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval'; "  # Vue makes its templates in the browser
+        f"connect-src 'self' ws://{host} wss://{host}; frame-ancestors 'none'; form-action 'none'; base-uri 'self'"
+    )
+
+    async def sent(message: "Message") -> None:
+        if message["type"] == "http.response.start":
+            more = {
+                "content-security-policy": policy,
+                "referrer-policy": "no-referrer",
+                "x-content-type-options": "nosniff",
+            }
+            named = [(name.encode(), value.encode("latin-1")) for name, value in more.items()]
+            message = {**message, "headers": [*message.get("headers", []), *named]}
+        await send(message)
+
+    return sent
+
+
+async def _refuse(scope: "Scope", send: "Send", status: int, why: str) -> None:
+    if scope["type"] == "websocket":
+        await send({"type": "websocket.close", "code": 1008, "reason": why[:120]})
+    else:
+        await _answer(send, status, [("content-type", "text/plain; charset=utf-8")], f"sliplens: {why}\n")
+
+
+async def _answer(send: "Send", status: int, headers: list[tuple[str, str]], text: str) -> None:
+    named = [(name.encode(), value.encode("latin-1")) for name, value in headers]
+    await send({"type": "http.response.start", "status": status, "headers": named})
+    await send({"type": "http.response.body", "body": text.encode()})
