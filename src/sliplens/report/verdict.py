@@ -521,6 +521,7 @@ _KINDS = {
     r"masked passes chose nothing": "Layers in which the passes of Poly-CAM chose nothing: activity only",
     r"so the map is zero": "Maps in which nothing speaks for the answer",
     r"expected to correlate": "Maps from some of the channels that may differ from the exact ones",
+    r"hardly surer than they differ": "Maps whose contributions are hardly surer than they differ, for want of pairs",
     r"so small that rounding": "Maps so faint that another engine or machine may give another",
 }
 
