@@ -42,7 +42,7 @@ class Section:
     short_title: str
     intro: str | Callable[[Results], str]
     command: str = ""
-    """Command that makes its results, in a workspace that is no study."""
+    """Command that makes its results, in a workspace that is no study; empty where none misses them."""
     apart: bool = False
     """Whether they are no part of a study, which does not miss them."""
     build: Callable[[Results, np.random.Generator], Iterable[Block | None]] = lambda *_: ()
@@ -62,7 +62,8 @@ def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Secti
     for section in SECTIONS:
         blocks = tuple(block for block in section.build(results, rng) if block is not None)
         command = f"sliplens {'study' if results.study else section.command}"
-        if not blocks and ((results.study and section.apart) or (results.grip is not None and not results.inputs)):
+        alone = results.grip is not None and not results.inputs
+        if not blocks and (not section.command or alone or (results.study and section.apart)):
             continue
         if not blocks:
             absent.setdefault(command, []).append(section.short_title)
@@ -263,7 +264,6 @@ SECTIONS: tuple[Section, ...] = (
         intro="A simulated gripper lifts an object and holds it while something happens; what the fingertips read "
         "decides how hard it presses. The least force that holds is the load over both frictions, which no controller "
         "knows.",
-        command="grip",
         apart=True,
         build=lambda results, _: () if results.grip is None else show_grip(results.grip),
         needs=lambda results: results.inputs,
