@@ -7,6 +7,7 @@ import platform
 import shutil
 import sys
 import tempfile
+import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -113,6 +114,17 @@ def read_json(
         raise InputError(f"{path} does not exist; {missing}") from None
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path} is not valid JSON ({error}); {damaged}") from None
+
+
+def read_toml(path: Path, *, what: str) -> dict[str, Any]:
+    """Read a TOML file; what is missing or damaged is told with its cure. `what` says what it holds."""
+    try:
+        # Windows editors put a mark before the text that TOML does not know
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path} is not valid TOML: {error}; mend it there") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); name a TOML file of {what}") from None
 
 
 def require_folder(path: Path, *, what: str) -> Path:

@@ -58,6 +58,8 @@ class SourceCommand(Command):
     """Topic of the images; the only one if not given."""
     camera_key: str | None = None
     """Feature of a LeRobot data set with the images."""
+    sensor: Path | None = None
+    """Profile of the sensor: a file that `sliplens sensor new` made, or chromatouch, digit, gelsight-mini or tactip."""
 
     @property
     def options(self) -> "ReadOptions":

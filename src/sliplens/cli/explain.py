@@ -29,6 +29,8 @@ class Explain(Command):
     """Folder of 8-bit RGB images: difference images, or camera frames together with --reference."""
     reference: Path | None = None
     """Image of the untouched sensor, for camera frames in --frames."""
+    sensor: Path | None = None
+    """Profile of the sensor for --frames: a file that `sliplens sensor new` made, or a name such as digit."""
     labels_in_names: bool = False
     """Read the safety margin in percent from names such as image_433_20.png."""
     method: tuple[str, ...] = ("grad-cam", "integrated-gradients", "poly-cam")

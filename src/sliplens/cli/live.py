@@ -38,6 +38,9 @@ class Live:
     simulated fingertip; none if not given."""
     reference: Path | None = None
     """Image of the untouched sensor; taken when the picture is still at first if not given."""
+    sensor: Path | None = None
+    """Profile of the sensor: a file that `sliplens sensor new` made, or chromatouch, digit, gelsight-mini or tactip. It
+    may name the network."""
     list: bool = False
     """List the cameras with their formats, sizes and rates, and what else can be read, and end."""
     rate: float | None = None
@@ -83,10 +86,12 @@ class Live:
         """Read until the source ends."""
         from sliplens.live import LiveReader
         from sliplens.live.sinks import open_sink
+        from sliplens.recordings.sensor import load_profile
 
         if self.list:
             self._list()
             return
+        profile = None if self.sensor is None else load_profile(self.sensor)
         shipped = "chromatouch-difference" if self.source in {"simulated", "simulated:chromatouch"} else None
         with ExitStack() as stack:
             sinks = [open_sink(name) for name in self.sink]
@@ -94,8 +99,9 @@ class Live:
                 stack.callback(sink.close)
             reader = LiveReader(
                 self.source,
-                self.network or shipped,
+                self.network or (profile and profile.network) or shipped,
                 reference=self.reference,
+                sensor=profile,
                 options=self._options(),
                 engine=self.engine,
                 device=self.device,

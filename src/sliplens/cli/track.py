@@ -23,8 +23,8 @@ class Track(SourceCommand):
 
     source: Source
     output: TableFile
-    markers: str = "auto"
-    """What the markers look like: chromatouch, gelsight-mini, tactip, or auto."""
+    markers: str | None = None
+    """What the markers look like: chromatouch, gelsight-mini, tactip, or auto; as --sensor says if not given."""
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE.mp4")] = None
     """Also write a clip with rings and arrows, of one trial."""
     trial: str | None = None
@@ -34,9 +34,12 @@ class Track(SourceCommand):
         """Follow and write."""
         from sliplens.markers.tracking import track
         from sliplens.plots.clip import clip_writer
+        from sliplens.recordings.sensor import load_profile
         from sliplens.recordings.source import open_source
 
-        trials = self.call(open_source, options=self.options)
+        profile = None if self.sensor is None else load_profile(self.sensor)
+        markers = self.markers or (profile and profile.markers) or "auto"
+        trials = self.call(open_source, options=self.options, sensor=profile)
         clip = nullcontext()
         if self.video is not None:
             if len(trials) != 1:
@@ -45,7 +48,7 @@ class Track(SourceCommand):
             require_new_file(self.video, overwrite=self.overwrite)
             clip = clip_writer(self.video, size=trial.frame_size, frames_per_s=trial.frame_rate_hz)
         with clip as draw:
-            tracking = self.call(track, source=trials, out=self.output, on_tracked=draw)
+            tracking = self.call(track, source=trials, markers=markers, out=self.output, on_tracked=draw)
         for trial in tracking.trials:
             say(str(trial))
         count = len(tracking.trials)

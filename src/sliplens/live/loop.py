@@ -150,6 +150,8 @@ class LiveReader:
         is still at first: leave the sensor untouched until then.
     options
         Wishes for the source.
+    sensor
+        Profile of the sensor that frames and reference go through, its file, or the name of one that comes along.
     engine
         Row of `ENGINES`; `auto` for the fastest at hand that pays for `seconds`, or for hours where that is None, and
         that may take seconds to be made.
@@ -194,6 +196,7 @@ class LiveReader:
         *,
         reference: Path | str | Frame | None = None,
         options: SourceOptions | None = None,
+        sensor: SensorProfile | Path | str | None = None,
         engine: str = "auto",
         device: str = "cpu",
         smoothing_s: float = 0.0,
@@ -209,14 +212,19 @@ class LiveReader:
             raise InputError(f"--seconds must be positive, got {seconds:g}")
         self.network = load(network, device=device) if isinstance(network, Path | str) else network
         options = options or SourceOptions()
-        if self.network is not None:
+        profile = None if sensor is None else load_profile(sensor)
+        if self.network is not None and profile is None:
             options = replace(options, fit_size=self.network.manifest.frame_size)
         self.source = open_live(source, options=options)
+        named = read_image(Path(reference)) if isinstance(reference, Path | str) else reference
+        if profile is not None:
+            self.source = ProfiledSource(self.source, profile)
+            named = None if named is None else profile.apply(named)
         self.reference: Frame | None = None
         """The sensor untouched, as the next frame is compared with it."""
         self.engine: Engine | None = None
         """What runs the network, while it is entered."""
-        self._named = read_image(Path(reference)) if isinstance(reference, Path | str) else reference
+        self._named = named
         self._engine_name, self._seconds, self._stall_s = engine, seconds, stall_s
         self._smooth = LowPass(time_constant_s=smoothing_s)
         self.recorder: Recorder | None = None
@@ -547,6 +555,7 @@ def read_live(
     *,
     reference: Path | str | Frame | None = None,
     options: SourceOptions | None = None,
+    sensor: SensorProfile | Path | str | None = None,
     engine: str = "auto",
     device: str = "cpu",
     smoothing_s: float = 0.0,
@@ -574,6 +583,7 @@ def read_live(
         network,
         reference=reference,
         options=options,
+        sensor=sensor,
         engine=engine,
         device=device,
         smoothing_s=smoothing_s,

@@ -24,6 +24,7 @@ from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.formats import recognise
 from sliplens.recordings.formats.images import frame_size, read_frame
 from sliplens.recordings.options import ReadOptions
+from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import open_source
 from sliplens.simulation.filming import Film, prepare_film
 from sliplens.simulation.loading import load_at_margins
@@ -180,6 +181,45 @@ _QUICK = {
     "flags": "low_delay",
     "analyzeduration": "500000",
 }
+
+
+class ProfiledSource(LiveSource):
+    """Source whose frames, and whose image of the untouched sensor, go through a sensor's profile.
+
+    Parameters
+    ----------
+    source
+        Source of the camera's frames.
+    profile
+        What they go through.
+    """
+
+    def __init__(self, source: LiveSource, profile: SensorProfile) -> None:
+        self._source, self._profile, self.name = source, profile, source.name
+        self.cure, self.reconnects = source.cure, source.reconnects
+
+    def __enter__(self) -> "ProfiledSource":
+        source = self._source.__enter__()
+        self.size = self._profile.output_size(source.size)
+        self.rate_hz, self.count, self.speed = source.rate_hz, source.count, source.speed
+        self.reference = None if source.reference is None else self._profile.apply(source.reference)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._source.__exit__(*error)
+
+    def close(self) -> None:
+        """Stop giving frames, soon."""
+        self._source.close()
+
+    def frames(self) -> Iterator[LiveFrame]:
+        """Frames as the profile makes them; a frame of another size than the camera's comes as it is, to be told."""
+        for frame in self._source.frames():
+            begun_s = time.perf_counter()
+            fits = frame.size == self._source.size
+            image = self._profile.apply(frame.image) if fits else frame.image
+            spent_ms = 1e3 * (time.perf_counter() - begun_s)
+            yield replace(frame, image=image, decode_ms=frame.decode_ms + spent_ms)
 
 
 class StreamSource(LiveSource):
@@ -477,4 +517,4 @@ def open_live(
     raise InputError(f"{name} is no source that is known, nor a path that exists; name a {known}")
 
 
-__all__ = ["SOURCES", "FolderSource", "ReplaySource", "SimulatedSource", "StreamSource", "open_live"]
+__all__ = ["SOURCES", "FolderSource", "ProfiledSource", "ReplaySource", "SimulatedSource", "StreamSource", "open_live"]

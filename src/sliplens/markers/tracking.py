@@ -22,6 +22,7 @@ from sliplens.progress import OnProgress, note, stage
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.options import ReadOptions
+from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import Frame, Frames, open_source
 
 OnTracked: TypeAlias = Callable[[Frame, TrackedFrame, Float[np.ndarray, "markers 2"]], None]
@@ -94,6 +95,7 @@ def track(
     trial: str | None = None,
     format: str | None = None,
     options: ReadOptions | None = None,
+    sensor: SensorProfile | Path | str | None = None,
     out: Path | str | None = None,
     overwrite: bool = False,
     on_tracked: OnTracked | None = None,
@@ -110,7 +112,7 @@ def track(
     reference, reference_frame
         The sensor untouched: image, or number of the frame that shows it. Where neither is named and the source brings
         none, displacements count from the first frame.
-    split, trial, format, options
+    split, trial, format, options, sensor
         As `open_source` takes them.
     out
         Parquet file to write, whole or not at all; rows are kept in memory if None.
@@ -138,6 +140,7 @@ def track(
             trial=trial,
             format=format,
             options=options,
+            sensor=sensor,
         )
     for sentence in dict.fromkeys(words for one in source for words in (*one.notes, *_require_movement(one))):
         note(on_progress, sentence)

@@ -22,6 +22,7 @@ from sliplens.progress import OnProgress, note, stage
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.options import ReadOptions
+from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import Frame, Frames, open_source
 
 LEVEL = 0.9
@@ -77,6 +78,7 @@ def predict(
     format: str | None = None,
     options: ReadOptions | None = None,
     friction: FrictionLike | None = None,
+    sensor: SensorProfile | Path | str | None = None,
     engine: str = "auto",
     onnx_file: Path | None = None,
     batch_size: int = 8,
@@ -96,7 +98,7 @@ def predict(
         Images without a reference are taken for difference images, compared before.
     reference, reference_frame
         The sensor untouched: image, or number of the frame that shows it.
-    split, format, options
+    split, format, options, sensor
         As `open_source` takes them.
     friction
         What is known of the object's coefficient of friction, for a network that tells F_t / F_n: a number, (low,
@@ -150,6 +152,7 @@ def predict(
                 split=split,
                 format=format,
                 options=options,
+                sensor=sensor,
             )
     notes = tuple(dict.fromkeys(words for one in source for words in (*one.notes, *_require_comparable(trained, one))))
     if known is not None:

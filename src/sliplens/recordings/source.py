@@ -17,6 +17,7 @@ from sliplens.recordings.formats.images import frame_size, read_frame
 from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
 from sliplens.recordings.options import ReadOptions, spoken
+from sliplens.recordings.sensor import SensorProfile, load_profile
 
 Frames: TypeAlias = UInt8[np.ndarray, "frames height width 3"]
 """RGB images of the camera, one after another."""
@@ -31,6 +32,7 @@ def open_source(
     trial: str | None = None,
     format: str | None = None,
     options: ReadOptions | None = None,
+    sensor: SensorProfile | Path | str | None = None,
     whole: bool = False,
 ) -> tuple[Capture, ...]:
     """Open frames wherever they are; no frame is read yet.
@@ -47,6 +49,9 @@ def open_source(
         Row of `FORMATS`; recognised if None.
     options
         What is known of a source that is no data set.
+    sensor
+        Profile of the sensor, its file (TOML), or the name of one that comes with sliplens: what frames and reference
+        go through before they are read. Those of a data set went through it on import.
     whole
         With the samples of forces that a data set keeps; images must then have times.
 
@@ -67,6 +72,7 @@ def open_source(
     if reference is not None and reference_frame is not None:
         raise InputError("the untouched sensor is named twice; give --reference or --reference-frame, not both")
     options = ReadOptions() if options is None else options
+    profile = None if sensor is None else load_profile(sensor)
     source = Path(source) if isinstance(source, str) else source
     if isinstance(source, Path) and format in {None, "sliplens"} and (source / DATASET_FILE).is_file():
         source = load_dataset(source)
@@ -75,6 +81,11 @@ def open_source(
             raise InputError(f"the trials of {source.folder} bring their reference frames; leave out --reference")
         if given := options.given():
             raise InputError(f"{source.folder} is a data set of sliplens, which does not take {spoken(given)}")
+        if profile is not None:
+            raise InputError(
+                f"{source.folder} is a data set of sliplens, whose frames went through their profile on import; "
+                "leave out --sensor"
+            )
         infos = source.select(split=split)
         names = [info.trial for info in infos]
         opened = [
@@ -83,10 +94,14 @@ def open_source(
         return tuple(replace(one, opened=str(source.folder)) for one in opened)
     if split is not None:
         raise InputError(f"{_words(source)} is no data set of sliplens and has no splits; leave out --split")
+    if profile is not None and profile.frame_rate_hz is not None and options.frame_rate is None:
+        options = replace(options, frame_rate=profile.frame_rate_hz)
     opened = [
         replace(_with_reference(one, reference, reference_frame), opened=_words(source))
         for one in _open(source, format, options, whole=whole)
     ]
+    if profile is not None:
+        opened = [profile.prepare(one) for one in opened]
     return tuple(_chosen(opened, [one.name for one in opened], trial, source))
 
 

@@ -3,7 +3,6 @@
 import hashlib
 import math
 import re
-import tomllib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -17,7 +16,7 @@ import msgspec
 
 from sliplens._version import __version__
 from sliplens.errors import InputError
-from sliplens.files import write_json
+from sliplens.files import read_toml, write_json
 from sliplens.images import natural_key
 from sliplens.recordings.dataset import Dataset, load_dataset, write_dataset_table
 from sliplens.recordings.trial import TrialFacts
@@ -103,13 +102,7 @@ def read_splits(path: Path) -> SplitPlan:
 
     An `InputError` names what of the file or of which rule, counted from 1, is wrong.
     """
-    try:
-        # Windows editors put a mark before the text that TOML does not know
-        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path} is not valid TOML: {error}; mend it there") from None
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}); name a TOML file of rules") from None
+    table = read_toml(path, what="rules")
     other = sorted(set(table) - {"split"})
     if other:
         raise InputError(f"{path} has {other[0]!r} outside of a rule; put it under a line [[split]], or leave it out")

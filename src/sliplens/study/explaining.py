@@ -22,6 +22,7 @@ from sliplens.plots.saliency import NOMINAL_MARGINS
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
+from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import open_source
 from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
 
@@ -116,13 +117,18 @@ def nearest_frame(margin: Float[np.ndarray, " frames"], level: float) -> int:
 
 
 def frames_from_folder(
-    trained: Run, folder: Path, *, reference: Path | None = None, labels_in_names: bool = False
+    trained: Run,
+    folder: Path,
+    *,
+    reference: Path | None = None,
+    labels_in_names: bool = False,
+    sensor: SensorProfile | Path | str | None = None,
 ) -> ChosenFrames:
     """Images of a folder, in natural order, or the frames of whatever recording `open_source` opens.
 
     They have the size of the network's sensor: camera frames if `reference` is given or the source brings one, else
     absolute difference images |T_n - T_0|. `labels_in_names` reads the safety margin in percent from names that end in
-    `_GG`, as in `image_433_20.png`.
+    `_GG`, as in `image_433_20.png`; `sensor` as `open_source` takes it.
 
     Raises
     ------
@@ -133,7 +139,7 @@ def frames_from_folder(
         If an image cannot be read, or has another size or kind of pixels.
     """
     parts = []
-    for opened in open_source(folder, reference=reference):
+    for opened in open_source(folder, reference=reference, sensor=sensor):
         name = folder.name if opened.files else opened.name
         part = _take(trained, opened, range(opened.frames), trial=name, day=1, source="real", condition="unknown")
         if labels_in_names:

@@ -25,6 +25,7 @@ from sliplens.plots.saliency import draw_panel, overlay_jet, overlay_saliency, s
 from sliplens.plots.style import drawing_style, method_name, percent
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, Recording
+from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import open_source
 from sliplens.results.explanation import Explained, Strip, StripReadings, load_explained
 from sliplens.results.faithfulness import DeletionScores
@@ -52,6 +53,7 @@ def explain_source(
     *,
     reference: Path | None = None,
     labels_in_names: bool = False,
+    sensor: SensorProfile | Path | str | None = None,
     methods: Sequence[str] = DEFAULT_METHODS,
     budget: float = 1.0,
     split: str = "test",
@@ -73,6 +75,8 @@ def explain_source(
         or the recording brings one, else absolute difference images.
     labels_in_names
         Read the safety margin in percent from names of images such as `image_433_20.png`.
+    sensor
+        Profile of the sensor, its file, or the name of one that comes with sliplens; None for a data set.
     methods, budget
         Rows of `EXPLAINERS`, and the share of the channels that `poly-cam` measures at first.
     split, condition, trials, levels
@@ -93,12 +97,18 @@ def explain_source(
         raise InputError(f"--trials must be at least 1, got {trials}")
     trained = open_run(run, device=device)
     if isinstance(source, Dataset):
+        if sensor is not None:
+            raise InputError("a data set's frames went through their profile on import; leave out --sensor")
         chosen = frames_from_dataset(
             trained, source, split=split, condition=condition, trials=trials, levels=tuple(levels)
         )
     else:
-        chosen = frames_from_folder(trained, source, reference=reference, labels_in_names=labels_in_names)
-    explainers = _choose_explainers(trained, chosen, source, reference=reference, methods=methods, budget=budget)
+        sensor = None if sensor is None else load_profile(sensor)
+        chosen = frames_from_folder(
+            trained, source, reference=reference, labels_in_names=labels_in_names, sensor=sensor
+        )
+    opened = source if isinstance(source, Dataset) else partial(open_source, source, reference=reference, sensor=sensor)
+    explainers = _choose_explainers(trained, chosen, opened, methods=methods, budget=budget)
     explain = partial(explain_frames, trained, chosen, methods=methods, explainers=explainers)
     title = f"Explaining {len(chosen.ids)} frames ({trained.manifest.input}, {chosen.source})"
     if out is None:
@@ -192,9 +202,8 @@ def draw_explained(explained: Explained, folder: Path, *, colours: Literal["infe
 def _choose_explainers(
     trained: Run,
     chosen: ChosenFrames,
-    source: Dataset | Path,
+    source: Dataset | Callable[[], Sequence[Capture]],
     *,
-    reference: Path | None,
     methods: Sequence[str],
     budget: float,
 ) -> Mapping[str, Explainer]:
@@ -204,11 +213,11 @@ def _choose_explainers(
     own: dict[str, Explainer] = {"expected-gradients": ExpectedGradients(background=background)}
     own["poly-cam"], inputs = get_explainer("poly-cam", budget=budget), trained.encoding.normalise(chosen.images)
     named = {name: own.get(name) or EXPLAINERS[name] for name in methods}
-    return with_markers(named, inputs, lambda: _find_markers(trained, chosen, source, reference=reference))
+    return with_markers(named, inputs, lambda: _find_markers(trained, chosen, source))
 
 
 def _find_markers(
-    trained: Run, chosen: ChosenFrames, source: Dataset | Path, *, reference: Path | None
+    trained: Run, chosen: ChosenFrames, source: Dataset | Callable[[], Sequence[Capture]]
 ) -> list[Float[Tensor, "_markers 2"]]:
     """Places of the markers, frame by frame: where the simulator put them, else where they are found."""
     size = trained.manifest.image_size
@@ -218,7 +227,7 @@ def _find_markers(
             markers_in_recording(opened[trial], int(name.removeprefix(f"{trial}-f")), image_size=size)
             for name, trial in zip(chosen.ids, chosen.trial, strict=True)
         ]
-    opened_trials = open_source(source, reference=reference)
+    opened_trials = source()
     if any(trial.read_reference is None for trial in opened_trials):
         raise InputError(
             "markers are found in camera frames, which difference images are not; give camera frames and --reference, "

@@ -1,0 +1,296 @@
+"""Sensor profiles: what a camera's frames go through before anybody reads them, as one small TOML file."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from sliplens.errors import ImageError, InputError
+from sliplens.extras import import_cv2
+from sliplens.files import read_toml
+from sliplens.recordings.capture import Capture, Frame
+from sliplens.recordings.options import LabelSettings, ReferenceMethod
+
+_MOST_STRETCH = 0.02  # of width against height: markers stay round, and distances mean the same along both
+_SHIPPED = Path(str(files("sliplens"))) / "sensors"
+SENSORS_FOLDER = "sensors"
+"""Keeps, in the folder of a data set, the profiles that its frames went through."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens:
+    """Pinhole camera with the lens distortion of Brown and Conrady, as camera calibrations give it.
+
+    References
+    ----------
+    Zhang, *A flexible new technique for camera calibration*, IEEE Transactions on Pattern Analysis and Machine
+    Intelligence 22 (2000).
+    """
+
+    focal_px: tuple[float, float]
+    """Focal lengths along x and y, in pixels of a frame of the camera's size."""
+    centre_px: tuple[float, float]
+    """Principal point (x, y)."""
+    distortion: tuple[float, ...]
+    """Coefficients k1, k2, p1, p2, and k3 if there is one."""
+
+    def __post_init__(self) -> None:
+        if len(self.distortion) not in {4, 5} or min(self.focal_px) <= 0:
+            raise ValueError("a lens has positive focal lengths and 4 or 5 distortion coefficients")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorProfile:
+    """What is known of a sensor and its camera: how its frames are made alike, and what its labels rest on.
+
+    A frame is first brought to red, green and blue, then undistorted, cropped, rotated, flipped and resized, in this
+    order. What is not said stays as the camera gave it.
+    """
+
+    name: str
+    """Name of the sensor, as trials and networks tell it."""
+    camera_size_px: tuple[int, int] | None = None
+    """Width and height of the frames that crop and lens are told for. Frames of another size and the same shape are
+    read alike, with both scaled."""
+    colours: Literal["rgb", "rbg", "grb", "gbr", "brg", "bgr"] = "rgb"
+    """Order in which the channels arrive."""
+    undistort: Lens | None = None
+    """Lens whose distortion is taken out."""
+    crop_px: tuple[int, int, int, int] | None = None
+    """Left, top, width and height of what is kept: the gel."""
+    rotate_deg: Literal[0, 90, 180, 270] = 0
+    """Clockwise."""
+    flip: Literal["none", "horizontal", "vertical", "both"] = "none"
+    """Horizontal swaps left and right."""
+    resize_px: tuple[int, int] | None = None
+    """Width and height that frames are brought to, of the same shape; those a network was trained on."""
+    markers: str | None = None
+    """What markers look like, a row of `markers.KINDS`; None where there are none, or nobody says."""
+    reference: ReferenceMethod = "least contact energy"
+    """How to choose the untouched frame among those before the contact, where forces tell the contact."""
+    reference_frame: int | None = None
+    """Number of the untouched frame where the source names none, as of a video without forces."""
+    frame_rate_hz: float | None = None
+    """Where a video's stamps are missing or wrong, and for images."""
+    normal_axis: Literal["x", "y", "z"] | None = None
+    """Axis of the force sensor that presses; found if None."""
+    normal_sign: Literal[1, -1] | None = None
+    """1 if pressing is positive as recorded, -1 if negative; found if None."""
+    network: str | None = None
+    """Network that reads these frames: a folder, or the name of one that comes with sliplens."""
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise ValueError("a sensor has a name")
+        for what, size in (("camera_size_px", self.camera_size_px), ("resize_px", self.resize_px)):
+            if size is not None and min(size) <= 0:
+                raise ValueError(f"{what} is {size}; widths and heights are positive")
+        if self.crop_px is not None:
+            left, top, width, height = self.crop_px
+            if self.camera_size_px is None:
+                raise ValueError("a crop is told in pixels of a frame; tell its camera_size_px, width and height, too")
+            inside = left + width <= self.camera_size_px[0] and top + height <= self.camera_size_px[1]
+            if min(left, top) < 0 or min(width, height) <= 0 or not inside:
+                raise ValueError(f"crop_px is {list(self.crop_px)}, not inside a frame of {list(self.camera_size_px)}")
+        if self.undistort is not None and self.camera_size_px is None:
+            raise ValueError("a lens is told in pixels of a frame; tell its camera_size_px, width and height, too")
+
+    def output_size(self, size: tuple[int, int]) -> tuple[int, int]:
+        """Height and width of what becomes of a camera's frame, from its height and width.
+
+        An `ImageError` says where a frame has another shape than the camera's, or would be stretched.
+        """
+        height, width = size
+        left, top, right, bottom = self._box(size)
+        if self.crop_px is not None:
+            height, width = bottom - top, right - left
+        if self.rotate_deg in {90, 270}:
+            height, width = width, height
+        if self.resize_px is None:
+            return height, width
+        wanted_width, wanted_height = self.resize_px
+        if abs(wanted_width * height / (wanted_height * width) - 1) > _MOST_STRETCH:
+            raise ImageError(
+                f"the profile {self.name} makes {width} x {height} pixels (width x height) to {wanted_width} x "
+                f"{wanted_height}, which stretches them; crop to the same shape with crop_px in its file"
+            )
+        return wanted_height, wanted_width
+
+    def apply(self, frame: Frame) -> Frame:
+        """Frame as networks and markers' trackers read it.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from sliplens.recordings.sensor import SensorProfile
+        >>> tip = SensorProfile(name="tip", camera_size_px=(640, 480), crop_px=(80, 0, 480, 480), resize_px=(224, 224))
+        >>> tip.apply(np.zeros((480, 640, 3), dtype=np.uint8)).shape
+        (224, 224, 3)
+        """
+        size = frame.shape[0], frame.shape[1]
+        height, width = self.output_size(size)
+        if self.colours != "rgb":
+            frame = frame[..., [self.colours.index(channel) for channel in "rgb"]]
+        if self.undistort is not None:
+            cv2 = import_cv2()
+            frame = cv2.remap(np.ascontiguousarray(frame), *_undistorting(self.undistort, self._scale(size), size), 1)
+        if self.crop_px is not None:
+            left, top, right, bottom = self._box(size)
+            frame = frame[top:bottom, left:right]
+        frame = np.rot90(frame, k=-self.rotate_deg // 90)
+        if self.flip in {"horizontal", "both"}:
+            frame = frame[:, ::-1]
+        if self.flip in {"vertical", "both"}:
+            frame = frame[::-1]
+        frame = np.ascontiguousarray(frame)
+        if frame.shape[:2] == (height, width):
+            return frame
+        # a triangle as wide as the step between new pixels: the noise of neighbours averages out instead of aliasing
+        return np.asarray(Image.fromarray(frame).resize((width, height), Image.Resampling.BILINEAR))
+
+    def prepare(self, capture: Capture) -> Capture:
+        """Recording as its frames become; its untouched image goes the same way, and it gets the sensor's name."""
+        size = self.output_size(capture.frame_size)
+
+        def read_frames() -> Iterator[Frame]:
+            return map(self.apply, capture.read_frames())
+
+        named = capture.reference is not None or capture.reference_index is not None
+        index = capture.reference_index if named else self.reference_frame
+        if index is not None and not 0 <= index < len(capture):
+            raise InputError(
+                f"{capture.source} has {len(capture)} frames but the profile {self.name} takes frame {index} for the "
+                "untouched sensor; name one that is there with --reference-frame, or change reference_frame in its file"
+            )
+        return replace(
+            capture,
+            sensor=self.name,
+            frame_size=size,
+            read_frames=read_frames,
+            reference=None if capture.reference is None else self.apply(capture.reference),
+            reference_index=index,
+        )
+
+    def settings(self, given: LabelSettings) -> LabelSettings:
+        """Add what the profile knows of forces to what a user says; what is said counts."""
+        more = {
+            name: getattr(self, name)
+            for name in ("normal_axis", "normal_sign")
+            if getattr(given, name) is None and getattr(self, name) is not None
+        }
+        if given.reference == LabelSettings.reference:
+            more["reference"] = self.reference
+        return replace(given, **more)
+
+    def _scale(self, size: tuple[int, int]) -> tuple[float, float]:
+        """How many times wider and higher a frame is than the profile was told for."""
+        if self.camera_size_px is None:
+            return 1.0, 1.0
+        across, down = size[1] / self.camera_size_px[0], size[0] / self.camera_size_px[1]
+        if abs(across / down - 1) > _MOST_STRETCH:
+            raise ImageError(
+                f"frames are {size[1]} x {size[0]} pixels (width x height) but the profile {self.name} is for a "
+                f"camera of {self.camera_size_px[0]} x {self.camera_size_px[1]}; make one for this camera with "
+                "`sliplens sensor new`"
+            )
+        return across, down
+
+    def _box(self, size: tuple[int, int]) -> tuple[int, int, int, int]:
+        across, down = self._scale(size)
+        if self.crop_px is None:
+            return 0, 0, size[1], size[0]
+        left, top, width, height = self.crop_px
+        box = (round(left * across), round(top * down), round((left + width) * across), round((top + height) * down))
+        return box[0], box[1], min(box[2], size[1]), min(box[3], size[0])
+
+
+@lru_cache(maxsize=4)
+def _undistorting(
+    lens: Lens, scale: tuple[float, float], size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where each pixel of the straight image lies in the camera's, as OpenCV remaps."""
+    cv2 = import_cv2()
+    (across, down), (focal_x, focal_y), (centre_x, centre_y) = scale, lens.focal_px, lens.centre_px
+    camera = np.array(
+        # pixel centres are whole numbers in both sizes
+        [[focal_x * across, 0, (centre_x + 0.5) * across - 0.5], [0, focal_y * down, (centre_y + 0.5) * down - 0.5],
+         [0, 0, 1]]
+    )  # fmt: skip
+    distortion, straight = np.array(lens.distortion), np.eye(3)
+    return cv2.initUndistortRectifyMap(camera, distortion, straight, camera, (size[1], size[0]), 5)
+
+
+def shipped_profiles() -> tuple[str, ...]:
+    """Names of the profiles that come with sliplens."""
+    return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
+
+
+def load_profile(profile: Path | str | SensorProfile) -> SensorProfile:
+    """Read a sensor profile: a TOML file, or the name of one that comes with sliplens.
+
+    Raises
+    ------
+    InputError
+        If there is none, or its file says what no profile has, or a value that cannot be.
+
+    Examples
+    --------
+    >>> from sliplens.recordings.sensor import load_profile
+    >>> load_profile("digit").camera_size_px
+    (320, 240)
+    """
+    if isinstance(profile, SensorProfile):
+        return profile
+    path = Path(profile)
+    if not path.exists() and str(profile) in shipped_profiles():
+        path = _SHIPPED / f"{profile}.toml"
+    if not path.is_file():
+        raise InputError(
+            f"there is no sensor profile {profile}; name a file that `sliplens sensor new` made, or one of "
+            f"{', '.join(shipped_profiles())}"
+        )
+    values = read_toml(path, what="a sensor profile")
+    known = [field.name for field in fields(SensorProfile)]
+    if strange := sorted(set(values) - set(known)):
+        raise InputError(f"{path} has {strange[0]!r}, which no sensor profile has; choose from {', '.join(known)}")
+    try:
+        return msgspec.convert(values, SensorProfile)
+    except (msgspec.ValidationError, ValueError) as error:
+        text, _, place = str(error).partition(" - at ")
+        where = f" at {place.strip('`').removeprefix('$.')}" if place.strip("`") not in {"", "$"} else ""
+        raise InputError(f"{path} is no sensor profile: {text}{where}; mend it there") from None
+
+
+def is_profile(name: str) -> bool:
+    """Whether a word that names a sensor names a profile: a TOML file, or one that comes with sliplens."""
+    return name.endswith(".toml") or name in shipped_profiles()
+
+
+def profile_text(profile: SensorProfile, *, notes: tuple[str, ...] = ()) -> str:
+    """Profile as TOML, for `load_profile` and for people; notes stand before it as comments."""
+    rows, tables = [f"# {note}" for note in notes], []
+    for field in fields(SensorProfile):
+        value = getattr(profile, field.name)
+        if value is None:
+            continue
+        if isinstance(value, Lens):
+            tables += ["", f"[{field.name}]", *(f"{name} = {_toml(part)}" for name, part in vars(value).items())]
+        else:
+            rows.append(f"{field.name} = {_toml(value)}")
+    return "\n".join([*rows, *tables]) + "\n"
+
+
+def _toml(value: object) -> str:
+    # texts, numbers and lists of numbers are written alike in JSON and TOML
+    return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)
+
+
+__all__ = ["Lens", "SensorProfile", "load_profile", "profile_text", "shipped_profiles"]
