@@ -80,3 +80,33 @@ def test_frames_of_another_sensor_are_refused(run: Path):
     frames = np.zeros((1, 64, 64, 3), np.uint8)
     with pytest.raises(ImageError, match="frames are 64 x 64 pixels but the network was trained on 48 x 48"):
         trained.encode(frames, frames[0])
+
+
+def test_images_that_are_no_8_bit_rgb_are_refused(run: Path):
+    trained = load_checkpoint(run)
+    height, width = trained.manifest.frame_size
+    with pytest.raises(ImageError, match="multiply them by 255"):
+        trained.encode(np.zeros((1, height, width, 3), dtype=np.float32), None)
+
+
+def test_images_of_the_other_kind_are_noticed(run: Path, raw_run: Path):
+    size = load_checkpoint(run).manifest.frame_size
+    difference, frame = np.zeros((*size, 3), dtype=np.uint8), np.full((*size, 3), 120, dtype=np.uint8)
+    difference[4:9, 4:9] = 60
+    load_checkpoint(run).require_kind(difference, what="a.png")
+    load_checkpoint(raw_run).require_kind(frame, what="a.png")
+    with pytest.raises(ImageError, match="as bright as a camera frame"):
+        load_checkpoint(run).require_kind(frame, what="a.png")
+    with pytest.raises(ImageError, match="as dark as a difference image"):
+        load_checkpoint(raw_run).require_kind(difference, what="a.png")
+
+
+def test_frames_of_another_sensor_are_told_those_of_another_piece_are_not(run: Path):
+    edit_manifest(run, sensor="chromatouch-1")
+    trained = load_checkpoint(run)
+    assert trained.doubt("chromatouch-7") is None
+    assert trained.doubt("") is None
+    told = trained.doubt("tip")
+    assert told is not None
+    assert "chromatouch-1" in told
+    assert "tip" in told

@@ -21,6 +21,7 @@ from sliplens.cli.live import Live
 from sliplens.cli.predict import Predict
 from sliplens.cli.report import Report
 from sliplens.cli.score import Score
+from sliplens.cli.sensor import Sensor
 from sliplens.cli.simulate import Simulate
 from sliplens.cli.split import Split
 from sliplens.cli.study import Study
@@ -29,7 +30,7 @@ from sliplens.cli.train import Train
 from sliplens.cli.view import View
 from sliplens.errors import SliplensError
 
-_Recordings = Simulate | Import | Label | Split | Check | View | Track
+_Recordings = Sensor | Simulate | Import | Label | Split | Check | View | Track
 _Networks = Train | Evaluate | Predict | Export
 Command = Demo | Live | _Recordings | _Networks | Explain | Score | Diagnose | Study | Grip | Report
 

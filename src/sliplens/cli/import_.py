@@ -27,11 +27,13 @@ class Import(Command):
     """
 
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-    """Recordings: one trial each, or all episodes of a LeRobot data set."""
+    """Recordings: one trial each, or all episodes of a LeRobot data set; a folder of them, paired with tables of forces
+    by name; or a manifest (CSV: trial, video, forces, sensor, day, object, condition, mu, reference)."""
     output: Output
     """Folder to make: a data set for `sliplens train`."""
     sensor: str | None = None
-    """Name of the sensor; a network is trained for one. Needed unless the source tells it."""
+    """Name of the sensor, or its profile: a file that `sliplens sensor new` made, or chromatouch, digit, gelsight-mini
+    or tactip. A network is trained for one sensor. Needed unless the source tells it."""
     condition: str | None = None
     """State of the surface, such as dry or wet; as the source tells, else dry."""
     day: int | None = None
@@ -44,6 +46,8 @@ class Import(Command):
     """How many trials test, the last ones; all others train. Trials are never split."""
     splits: Path | None = None
     """File of rules that deal the trials to splits (TOML; see docs/splits.md), in place of the two numbers above."""
+    add: bool = False
+    """Add to the data set in the output folder; trials that are there already stay as they are."""
     format: str | None = None
     """rosbag, lerobot, sliplens, thesis, gelsight, images or video; recognised if not given."""
     reading: Annotated[ReadOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ReadOptions)
@@ -54,12 +58,17 @@ class Import(Command):
     def run(self) -> None:
         """Read, label, write, and show what was found."""
         from sliplens.recordings.importing import import_recordings
+        from sliplens.report.trials import write_trials_page
 
         terminal = Terminal()
         data = self.call(import_recordings, out=self.output, on_progress=terminal)
         if self.audit:
             draw_audits(data, data.folder / "audit", terminal)
         show_labelling("Imported", data)
+        wrote(write_trials_page(data), "all trials at a glance: margins, friction, flags")
+        if data.left_out:
+            print_table("Left out", ("trial", "why"), [(one.trial, one.why) for one in data.left_out])
+            raise SystemExit(1)
 
 
 def draw_audits(data: "Dataset", folder: Path, terminal: Terminal) -> None:

@@ -17,7 +17,7 @@ from sliplens.live.contract import LiveSource, SourceOptions
 from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading
 from sliplens.live.recorder import ForceStream, Recorder
 from sliplens.live.slip import SlipDetector
-from sliplens.live.sources import Images, open_live
+from sliplens.live.sources import Images, ProfiledSource, open_live
 from sliplens.markers import TrackedFrame, Tracker
 from sliplens.models.checkpoint import Run, load
 from sliplens.models.engines import Engine, make_engine
@@ -25,6 +25,7 @@ from sliplens.models.predictions import LEVEL
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import Dataset
 from sliplens.recordings.labels.lag import soften
+from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.trial import ContactState, TrialFacts, contact_states
 
 Item = TypeVar("Item")

@@ -1,5 +1,6 @@
 """Trained networks: with their manifest, on disk, and those that come with the package."""
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
@@ -7,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Shaped, UInt8
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
@@ -54,6 +55,15 @@ class Manifest:
     """Hash of the weights it started from; empty for random ones."""
 
 
+_DARKEST_FRAME, _BRIGHTEST_DIFFERENCE = 8.0, 64.0
+"""Medians, in grey levels: no camera frame that shows something is darker, no difference image brighter."""
+
+
+def sensor_kind(sensor: str) -> str:
+    """Name of a sensor without the number of the piece."""
+    return re.sub(r"-\d+$", "", sensor)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Run:
     """A trained network, in evaluation mode, with what it is and how it was trained."""
@@ -74,13 +84,19 @@ class Run:
         return get_encoding(self.manifest.input)
 
     def encode(
-        self, frames: UInt8[np.ndarray, "batch height width 3"], reference: UInt8[np.ndarray, "_ _ 3"] | None
+        self, frames: Shaped[np.ndarray, "batch height width 3"], reference: Shaped[np.ndarray, "_ _ 3"] | None
     ) -> Float[Tensor, "batch 3 size size"]:
         """Encode frames as the network was trained on them.
 
         `reference`: the sensor untouched; None for frames that were compared before, or that need not be. Frames of
-        another size than the network's sensor has raise `ImageError`.
+        another size than the network's sensor has raise `ImageError`, and so do those that are no 8-bit images.
         """
+        for images in (frames, reference):
+            if images is not None and images.dtype != np.uint8:
+                raise ImageError(
+                    f"images are {images.dtype}, networks read uint8 RGB; if they are in [0, 1], multiply them by 255, "
+                    "round, and convert them"
+                )
         self.require_frame_size(frames.shape[1:3])
         size = self.manifest.image_size
         if reference is None:
@@ -94,6 +110,38 @@ class Run:
                 f"{what} are {size[0]} x {size[1]} pixels but the network was trained on "
                 f"{self.manifest.frame_size[0]} x {self.manifest.frame_size[1]}; use frames of the same sensor"
             )
+
+    def require_kind(self, frame: UInt8[np.ndarray, "height width 3"], *, what: str) -> None:
+        """Refuse an image without a reference that is plainly of the other kind than the network reads.
+
+        A difference image is black but where something moved, a camera's is not.
+        """
+        level, kind = float(np.median(frame)), self.encoding.name
+        if kind == "raw" and level < _DARKEST_FRAME and frame.any():
+            raise ImageError(
+                f"{what} is as dark as a difference image (median {level:.0f} of 255 grey levels), and this network "
+                "reads camera frames; give those, or a network on difference images such as chromatouch-difference"
+            )
+        if self.encoding.empty_is_black and level > _BRIGHTEST_DIFFERENCE:
+            raise ImageError(
+                f"{what} is as bright as a camera frame (median {level:.0f} of 255 grey levels), and without the "
+                "untouched sensor this network takes it for a difference image; name it with --reference IMAGE or "
+                "--reference-frame N"
+            )
+
+    def doubt(self, sensor: str) -> str | None:
+        """Say that frames are of another sensor than those it was trained on; None where they are not.
+
+        Sensors are of one kind if their names differ in a number at the end, such as chromatouch-1 and chromatouch-2.
+        """
+        own = self.manifest.sensor
+        if not sensor or not own or sensor_kind(sensor) == sensor_kind(own):
+            return None
+        return (
+            f"the network was trained on {own} and reads frames of {sensor}: its intervals were not measured on that "
+            "sensor, so take the margins for a trend until trials with forces say how far they can be trusted "
+            "(`sliplens import`, then `sliplens evaluate`)"
+        )
 
     @torch.no_grad()
     def answers(self, batches: Iterable[Tensor]) -> tuple[Tensor, ...]:
@@ -282,10 +330,7 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> Run:
     weights were changed or damaged, or they do not fit the backbone.
     """
     require_folder(folder, what="the run")
-    path, weights = folder / MANIFEST_FILE, folder / WEIGHTS_FILE
-    manifest = load_record(path, Manifest, command="sliplens train")
-    if manifest.schema_version != SCHEMA_VERSION:
-        raise CheckpointError(f"{path} is not a sliplens manifest of schema {SCHEMA_VERSION}; train the network again")
+    weights, manifest = folder / WEIGHTS_FILE, read_manifest(folder)
     get_encoding(manifest.input)
     if not weights.is_file():
         raise CheckpointError(f"{weights} is missing; train the network again or copy the whole folder")
@@ -309,6 +354,15 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> Run:
 
 # the package is installed as files, never as an archive: its weights are mapped into memory from there
 _WEIGHTS = Path(str(files("sliplens"))) / "weights"
+
+
+def read_manifest(run: str | Path) -> Manifest:
+    """Read what a network is without its weights, by the name or folder that `load` takes."""
+    path = find_run(Path(run)) / MANIFEST_FILE
+    manifest = load_record(path, Manifest, command="sliplens train")
+    if manifest.schema_version != SCHEMA_VERSION:
+        raise CheckpointError(f"{path} is not a sliplens manifest of schema {SCHEMA_VERSION}; train the network again")
+    return manifest
 
 
 def shipped_names() -> list[str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from sliplens._version import __version__
@@ -16,7 +17,8 @@ from sliplens.codec import write_tables
 from sliplens.errors import InputError
 from sliplens.files import hash_json, require_new_file
 from sliplens.friction import Friction, FrictionLike, as_friction
-from sliplens.models.checkpoint import Estimate, Run, load
+from sliplens.markers.gel import marker_spacing
+from sliplens.models.checkpoint import Estimate, Run, load, sensor_kind
 from sliplens.models.engines import Engine, make_engine
 from sliplens.progress import OnProgress, note, stage
 from sliplens.recordings import Dataset
@@ -24,6 +26,7 @@ from sliplens.recordings.capture import Capture
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import Frame, Frames, open_source
+from sliplens.simulation.sensor import SENSORS
 
 LEVEL = 0.9
 """Confidence of the intervals."""
@@ -180,15 +183,33 @@ def _require_comparable(trained: Run, trial: Capture) -> Iterator[str]:
     """Refuse a trial that the network cannot read; gives what is assumed of one that it can."""
     trained.require_frame_size(trial.frame_size)
     encoding = trained.encoding
+    doubt = trained.doubt(trial.sensor)
+    if doubt is not None:
+        yield doubt + _compare_markers(trained, trial)
+    recorded = trial.files is None and trial.time_s is not None  # nobody compares frames before they are recorded
+    if trial.read_reference is None and not recorded:
+        trained.require_kind(next(trial.read_frames()), what=trial.files[0] if trial.files else "the first frame")
     if trial.read_reference is not None or encoding.name == "raw":
         return
-    recorded = trial.files is None and trial.time_s is not None  # nobody compares frames before they are recorded
     if recorded or not encoding.empty_is_black:
         raise InputError(
             f"a network on {encoding.name} images compares the frames of {trial.name} with the untouched sensor; "
             "name its image with --reference IMAGE, or a frame of it with --reference-frame N"
         )
     yield f"{trial.name}: no reference was given, so its images were taken for difference images."
+
+
+def _compare_markers(trained: Run, trial: Capture) -> str:
+    """How far apart the markers are, beside those that a network of a simulated sensor learned from."""
+    known = SENSORS[kind] if (kind := sensor_kind(trained.manifest.sensor)) in SENSORS else None
+    if known is None or trial.read_reference is None:
+        return ""
+    learned = known.geometry.project(known.geometry.marker_positions())
+    wanted_px = float(np.median(KDTree(learned).query(learned, k=2)[0][:, 1]))
+    found_px = marker_spacing(trial.read_reference())
+    if np.isnan(found_px):
+        return "; no markers were found, and it learned from how markers move: do not trust it here"
+    return f"; markers are {found_px:.1f} pixels apart, those it learned from {wanted_px:.1f}"
 
 
 def _schema(trials: Sequence[Capture], metadata: dict[str, str], *, ratio: bool) -> pa.Schema:

@@ -11,6 +11,7 @@ from sliplens.files import hash_file, hash_json, read_json, require_folder
 from sliplens.progress import OnProgress, note
 from sliplens.recordings.journal import JOURNAL_FOLDER, JournalLock, finish_journal, journals_of
 from sliplens.recordings.labelling import Labelling
+from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, load_profile, profile_text
 from sliplens.recordings.store import SCHEMA_VERSION, forces_path, load_recording, read_header
 from sliplens.recordings.trial import Labels, Recording, TrialFacts
 
@@ -32,6 +33,18 @@ class TrialInfo(TrialFacts):
 
 
 @dataclass(frozen=True, kw_only=True)
+class LeftOut:
+    """Recording of many that could not be imported."""
+
+    trial: str
+    """Name that its trial would have."""
+    source: str
+    """File or folder, for people."""
+    why: str
+    """What was wrong with it, and the cure."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class _Table:
     """What `dataset.json` holds."""
 
@@ -41,6 +54,7 @@ class _Table:
         default_factory=lambda: {"time_s": "s", "normal_force_n": "N", "tangential_force_n": "N"}
     )
     trials: tuple[TrialInfo, ...]
+    left_out: tuple[LeftOut, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +64,8 @@ class Dataset:
     folder: Path
     trials: tuple[TrialInfo, ...]
     simulated: bool = False
+    left_out: tuple[LeftOut, ...] = ()
+    """Recordings that were given and could not be imported."""
 
     @property
     def source(self) -> str:
@@ -94,6 +110,11 @@ class Dataset:
         """Read one trial, frames included; without the ground truth of a simulated one where that is not needed."""
         return load_recording(trial_path(self.folder, info.trial), truth=truth)
 
+    def profile(self, sensor: str) -> SensorProfile | None:
+        """Profile that the frames of a sensor went through on import; None where there was none."""
+        kept = (self.folder / SENSORS_FOLDER).glob("*.toml")
+        return next((load_profile(path) for path in kept if path.stem == sensor), None)
+
     def read_labels(self, info: TrialInfo) -> Labels:
         """Labels of one trial, without its frames."""
         return load_recording(trial_path(self.folder, info.trial), pixels=False)
@@ -118,7 +139,7 @@ def load_dataset(folder: Path | str) -> Dataset:
     table = _read_table(folder)
     if not table.trials:
         raise RecordingError(f"{folder} lists no trials; make or import a data set first")
-    return Dataset(folder=folder, trials=table.trials, simulated=table.simulated)
+    return Dataset(folder=folder, trials=table.trials, simulated=table.simulated, left_out=table.left_out)
 
 
 def _read_table(folder: Path) -> _Table:
@@ -151,7 +172,7 @@ def begin_recording(folder: Path, *, simulated: bool) -> tuple[JournalLock, tupl
         raise RecordingError(f"{folder} holds {kinds[0]} trials, these are {kinds[1]}; choose another folder")
     lock = JournalLock(folder)
     # also where it lists no trial yet: whoever opens the folder sees a data set, and finishes it if it was cut off
-    write_dataset_table(folder, table.trials, simulated=simulated)
+    write_dataset_table(folder, table.trials, simulated=simulated, left_out=table.left_out)
     return lock, tuple(info.trial for info in table.trials)
 
 
@@ -169,7 +190,7 @@ def finish_recording(folder: Path, lock: JournalLock | None = None) -> None:
             path = trial_path(folder, journal.stem)
             if finish_journal(journal, path) is not None:
                 found[journal.stem] = trial_info(path, split=_RECORDED_SPLIT)
-        write_dataset_table(folder, tuple(found.values()), simulated=table.simulated)
+        write_dataset_table(folder, tuple(found.values()), simulated=table.simulated, left_out=table.left_out)
         held.discard()
     finally:
         held.release()
@@ -184,6 +205,13 @@ def tell_flags(trial: str, labelling: Labelling | None, on_progress: OnProgress 
     basis = None if labelling is None else labelling.basis
     for flag in () if basis is None else basis.flags:
         note(on_progress, f"{trial}: {flag}")
+
+
+def keep_profile(folder: Path, profile: SensorProfile) -> None:
+    """Keep, in the folder of a data set, the profile that frames went through."""
+    path = folder / SENSORS_FOLDER / f"{profile.name}.toml"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(profile_text(profile), encoding="utf-8")
 
 
 def trial_path(folder: Path, trial: str) -> Path:
@@ -201,6 +229,9 @@ def trial_info(path: Path, *, split: str) -> TrialInfo:
     )
 
 
-def write_dataset_table(folder: Path, trials: Sequence[TrialInfo], *, simulated: bool = False) -> None:
+def write_dataset_table(
+    folder: Path, trials: Sequence[TrialInfo], *, simulated: bool = False, left_out: Sequence[LeftOut] = ()
+) -> None:
     """Write `dataset.json`, the last file of a data set."""
-    save_record(_Table(trials=tuple(trials), simulated=simulated), folder / DATASET_FILE)
+    table = _Table(trials=tuple(trials), simulated=simulated, left_out=tuple(left_out))
+    save_record(table, folder / DATASET_FILE)

@@ -1,25 +1,47 @@
 """From recordings to a labelled data set on disk, one frame at a time; and its labels made anew."""
 
+import os
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+from threading import Event, Lock
 
 import numpy as np
 
-from sliplens.errors import InputError, RecordingError
+from sliplens.errors import InputError, RecordingError, SliplensError
 from sliplens.files import output_folder
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings.capture import Capture, Frame
-from sliplens.recordings.dataset import Dataset, load_dataset, tell_flags, trial_info, trial_path, write_dataset_table
+from sliplens.recordings.dataset import (
+    Dataset,
+    LeftOut,
+    TrialInfo,
+    keep_profile,
+    load_dataset,
+    tell_flags,
+    trial_info,
+    trial_path,
+    write_dataset_table,
+)
 from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.labelling import Labelling, ReferenceChoice
 from sliplens.recordings.labels import Reason, choose_reference, label_trial, measure_motion
+from sliplens.recordings.manifest import ManifestRow, find_rows, read_manifest
 from sliplens.recordings.options import LabelSettings, ReadOptions
+from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, is_profile, load_profile
 from sliplens.recordings.source import open_source
-from sliplens.recordings.splits import SPLITS_FILE, SplitPlan, assign_splits, read_splits, write_split_record
+from sliplens.recordings.splits import (
+    SPLITS_FILE,
+    SplitPlan,
+    SplitResult,
+    assign_splits,
+    read_splits,
+    write_split_record,
+)
 from sliplens.recordings.store import encode_frames, forces_path, read_header, save_forces, write_trial
 from sliplens.recordings.trial import Labels
 
@@ -29,7 +51,7 @@ def import_recordings(
     *,
     out: Path | str,
     forces: Path | str | None = None,
-    sensor: str | None = None,
+    sensor: SensorProfile | Path | str | None = None,
     day: int | None = None,
     condition: str | None = None,
     object: str | None = None,
@@ -39,6 +61,7 @@ def import_recordings(
     test_trials: int | None = None,
     reading: ReadOptions | None = None,
     labelling: LabelSettings | None = None,
+    add: bool = False,
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
 ) -> Dataset:
@@ -50,12 +73,17 @@ def import_recordings(
     Parameters
     ----------
     sources
-        Bags, videos, folders of images, LeRobot data sets, lists of the thesis or data sets of sliplens.
+        Bags, videos, folders of images, LeRobot data sets, lists of the thesis or data sets of sliplens. Of a folder of
+        recordings or a manifest (`sliplens.recordings.manifest`) a trial that cannot be imported does not stop the
+        others: `Dataset.left_out` lists it.
     out
         Folder to make.
     forces
         Table of forces beside a video or folder of images (CSV); short for `reading.forces`.
-    sensor, day, condition, object
+    sensor
+        Name of the sensor, or its profile (`SensorProfile`, its TOML file, the name of one that comes with sliplens),
+        which frames go through and which is kept with them.
+    day, condition, object
         What the trials are; as the source tells where None.
     format
         Row of `FORMATS`; recognised by names if None.
@@ -67,6 +95,9 @@ def import_recordings(
         What is known of the sources.
     labelling
         What is known of forces and friction.
+    add
+        Add to the data set that `out` is; trials that are there already stay as they are, and so do their splits
+        unless `splits` deals all of them anew.
 
     Raises
     ------
@@ -80,23 +111,31 @@ def import_recordings(
     if forces is not None:
         reading = replace(reading, forces=Path(forces))
     if reading.forces is not None and len(paths) > 1:
-        raise InputError("one table of forces goes with one recording; import the trials one by one")
-    facts = {"sensor": sensor, "day": day, "condition": condition, "object": object}
-    with stage(on_progress, "Opening the recordings"):
-        found = [one for path in paths for one in open_source(path, format=format, options=reading, whole=True)]
-    captures = [replace(one, **{name: fact for name, fact in facts.items() if fact is not None}) for one in found]
-    _require_names(captures)
+        raise InputError("one table of forces goes with one recording; name what belongs together in a manifest (CSV)")
+    profile = load_profile(sensor) if sensor is not None and is_profile(sensor) else None
+    facts = {"sensor": sensor if profile is None else None, "day": day, "condition": condition, "object": object}
+    before = load_dataset(out) if add else None
+    with stage(on_progress, "Opening the recordings") as count:
+        jobs, left_out = _open_all(
+            paths, format=format, reading=reading, labelling=labelling, profile=profile, facts=facts, on_progress=count
+        )
+    known = {info.trial for info in before.trials} if before else set()
+    if kept := [job.capture.trial for job in jobs if job.capture.trial in known]:
+        note(on_progress, f"{len(kept)} trials are in {out} already and stay as they are, such as {kept[0]}")
+    jobs = [job for job in jobs if job.capture.trial not in known]
+    if before is not None and not jobs:
+        return _tell(replace(before, left_out=tuple(left_out)), on_progress, kept=True)
+    _require_names([job.capture for job in jobs], left_out)
     if splits is not None and (validation_trials is not None or test_trials is not None):
         raise InputError("splits come from a file or from numbers of trials, not from both; leave one out")
     plan = splits if splits is None or isinstance(splits, SplitPlan) else read_splits(Path(splits))
-    dealt = None if plan is None else assign_splits(plan, captures)
-    names = _deal(captures, validation_trials, test_trials) if dealt is None else dealt.splits
     config = {
         **facts,
+        "profile": profile,
         "format": format,
         "validation_trials": validation_trials,
         "test_trials": test_trials,
-        "sources": [_fingerprint(path) for path in paths],
+        "sources": [_fingerprint(path) for path in [*paths, *_named_by(paths)]],
         "reading": {
             name: _fingerprint(value) if isinstance(value, Path) else value
             for name in reading.given()
@@ -104,15 +143,143 @@ def import_recordings(
         },
         "labelling": labelling,
         "splits": None if plan is None else plan.rules,
+        **({} if before is None else {"added_to": before.hash}),
     }
-    with output_folder(Path(out), stage="import", config=config, overwrite=overwrite) as output:
+
+    def deal(captures: Sequence[Capture]) -> tuple[list[str], SplitResult | None]:
+        """Splits of all trials, those that were there before first."""
+        old = () if before is None else before.trials
+        if plan is None:
+            return [info.split for info in old] + _deal(captures, validation_trials, test_trials), None
+        dealt = assign_splits(plan, [*old, *captures])
+        return list(dealt.splits), dealt
+
+    _, dealt = deal([job.capture for job in jobs])  # a mistake in the rules is told before anything slow
+    with output_folder(Path(out), stage="import", config=config, overwrite=overwrite or add) as output:
         if not output.complete:
-            _write_trials(output.folder, captures, names, labelling, on_progress, title="Importing frames")
+            if before is not None:
+                _link_trials(before.folder, output.folder)
+            for one in {job.profile.name: job.profile for job in jobs if job.profile}.values():
+                keep_profile(output.folder, one)
+            table, failed = _write_trials(output.folder, jobs, on_progress, title="Importing frames", first=len(known))
+            written = [job.capture for job in jobs if job.capture.trial in {info.trial for info in table}]
+            left_out = [*left_out, *failed]
+            if not written:
+                raise RecordingError(f"no trial could be imported; the first: {left_out[0].why}")
+            names, dealt = deal(written)
+            old = () if before is None else before.trials
+            table = [replace(info, split=split) for info, split in zip([*old, *table], names, strict=True)]
             if plan is not None and dealt is not None:
-                write_split_record(output.folder, plan, captures, dealt)
+                write_split_record(output.folder, plan, [*old, *written], dealt)
+            told = {row.trial for row in table} | {one.trial for one in left_out}
+            left_out = [*(one for one in (before.left_out if before else ()) if one.trial not in told), *left_out]
+            simulated = all(one.simulated for one in written) and (before is None or before.simulated)
+            write_dataset_table(output.folder, table, simulated=simulated, left_out=left_out)
     for message in dealt.notes if dealt else ():
         note(on_progress, message)
     return _tell(load_dataset(out), on_progress, kept=output.complete)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Job:
+    """A trial to be imported."""
+
+    capture: Capture
+    settings: LabelSettings
+    profile: SensorProfile | None = None
+    """What its frames went through."""
+    one_of_many: bool = False
+    """Whether it is left out where it cannot be imported, rather than stopping the others."""
+
+
+def _open_all(
+    paths: Sequence[Path],
+    *,
+    format: str | None,
+    reading: ReadOptions,
+    labelling: LabelSettings,
+    profile: SensorProfile | None,
+    facts: Mapping[str, object],
+    on_progress: OnProgress,
+) -> tuple[list[_Job], list[LeftOut]]:
+    """Open what was named; of a manifest or a folder of recordings what cannot be opened is left out."""
+    given = {name: fact for name, fact in facts.items() if fact is not None}
+    jobs, left_out = [], []
+    for path in paths:
+        rows = None if format is not None or reading.forces is not None else find_rows(path)
+        if rows is None:
+            settings = labelling if profile is None else profile.settings(labelling)
+            opened = open_source(path, format=format, options=reading, sensor=profile, whole=True)
+            jobs += [_Job(capture=replace(one, **given), settings=settings, profile=profile) for one in opened]
+            continue
+        for number, row in enumerate(rows, start=1):
+            try:
+                jobs += _open_row(row, reading, labelling, profile, given)
+            except SliplensError as error:
+                left_out.append(LeftOut(trial=row.trial, source=str(row.video), why=str(error)))
+            on_progress(number, len(rows))
+    return jobs, left_out
+
+
+def _open_row(
+    row: ManifestRow,
+    reading: ReadOptions,
+    labelling: LabelSettings,
+    profile: SensorProfile | None,
+    given: Mapping[str, object],
+) -> list[_Job]:
+    """Open the recordings of a row, which says more than the command; its profile takes the place of the command's."""
+    named = row.sensor is not None and is_profile(row.sensor)
+    profile = load_profile(str(row.sensor)) if named else None if row.sensor else profile
+    facts = {**given, **{name: getattr(row, name) for name in ("day", "object", "condition") if getattr(row, name)}}
+    if row.sensor is not None:
+        facts["sensor"] = row.sensor
+    if profile is not None:
+        facts["sensor"] = profile.name
+        labelling = profile.settings(labelling)
+    index = row.reference if isinstance(row.reference, int) else None
+    if row.mu is not None or index is not None:
+        changes = {name: value for name, value in (("mu", row.mu), ("reference_frame", index)) if value is not None}
+        labelling = replace(labelling, **changes)
+    opened = open_source(
+        row.video,
+        options=replace(reading, forces=row.forces),
+        reference=row.reference if isinstance(row.reference, Path) else None,
+        reference_frame=index,
+        sensor=profile,
+        whole=True,
+    )
+    if len(opened) == 1:
+        facts["trial"] = row.trial
+    captures = [replace(one, **facts) for one in opened]
+    _require_names(captures)
+    for capture in captures:
+        _require_forces(capture)
+    return [_Job(capture=one, settings=labelling, profile=profile, one_of_many=True) for one in captures]
+
+
+def _named_by(paths: Sequence[Path]) -> list[Path]:
+    """Files that manifests name: what changes in them changes the data set."""
+    manifests = [path for path in paths if path.is_file() and find_rows(path)]
+    rows = [row for path in manifests for row in read_manifest(path)]
+    references = [row.reference for row in rows if isinstance(row.reference, Path)]
+    named = [*(row.video for row in rows), *(row.forces for row in rows if row.forces), *references]
+    return [path for path in named if path.exists()]
+
+
+def _link_trials(source: Path, folder: Path) -> None:
+    """Put the trials of a data set into another folder without copying what is in them, where that can be."""
+
+    def link(one: str, other: str) -> None:
+        if not Path(other).exists():
+            try:
+                os.link(one, other)
+            except OSError:  # another disk, or one that has no links
+                shutil.copyfile(one, other)
+
+    for name in ("trials", "forces", SENSORS_FOLDER, "audit"):
+        if (source / name).is_dir():
+            shutil.copytree(source / name, folder / name, copy_function=link, dirs_exist_ok=True)
 
 
 def label_dataset(
@@ -160,8 +327,17 @@ def label_dataset(
     config = {"labelling": labelling, "data_hash": data.hash}
     with output_folder(out, stage="label", config=config, overwrite=overwrite or in_place) as output:
         if not output.complete:
-            bare, names = [_without_labels(one) for one in captures], [info.split for info in data.trials]
-            _write_trials(output.folder, bare, names, labelling, on_progress, title="Labelling frames")
+            jobs = []
+            for one in captures:
+                profile = data.profile(one.sensor)
+                settings = labelling if profile is None else profile.settings(labelling)
+                jobs.append(_Job(capture=_without_labels(one), settings=settings))
+            table, _ = _write_trials(output.folder, jobs, on_progress, title="Labelling frames")
+            named = [replace(row, split=info.split) for row, info in zip(table, data.trials, strict=True)]
+            simulated = all(capture.simulated for capture in captures)
+            write_dataset_table(output.folder, named, simulated=simulated, left_out=data.left_out)
+            if (data.folder / SENSORS_FOLDER).is_dir():
+                shutil.copytree(data.folder / SENSORS_FOLDER, output.folder / SENSORS_FOLDER, dirs_exist_ok=True)
             if (data.folder / SPLITS_FILE).is_file():
                 shutil.copyfile(data.folder / SPLITS_FILE, output.folder / SPLITS_FILE)
     return _tell(load_dataset(out), on_progress, kept=output.complete)
@@ -174,7 +350,9 @@ def _tell(data: Dataset, on_progress: OnProgress | None, *, kept: bool) -> Datas
     return data
 
 
-def _require_names(captures: Sequence[Capture]) -> None:
+def _require_names(captures: Sequence[Capture], left_out: Sequence[LeftOut] = ()) -> None:
+    if not captures and left_out:
+        raise RecordingError(f"no trial could be imported; the first: {left_out[0].why}")
     if not captures:
         raise RecordingError("there is no trial to import; name a recording")
     twice = [name for name, count in Counter(one.trial for one in captures).items() if count > 1]
@@ -222,33 +400,48 @@ def _without_labels(capture: Capture) -> Capture:
 
 
 def _write_trials(
-    folder: Path,
-    captures: Sequence[Capture],
-    splits: Iterable[str],
-    settings: LabelSettings,
-    on_progress: OnProgress | None,
-    *,
-    title: str,
-) -> None:
-    """Write the trials of a data set that are not there yet, and its table."""
-    table, done, total = [], 0, sum(map(len, captures))
-    with stage(on_progress, title) as count:
-        for number, (capture, split) in enumerate(zip(captures, splits, strict=True)):
-            path = trial_path(folder, capture.trial)
-            # a trial is there whole or not at all, and the folder is of this very command
-            if not path.is_file():
-                import_trial(
-                    capture,
-                    path,
-                    settings=settings,
-                    rng=np.random.default_rng((settings.seed, number)),
-                    forces_file=forces_path(folder, capture.trial),
-                    on_progress=lambda written, _, before=done: count(before + written, total),
-                )
-            done += len(capture)
-            count(done, total)
-            table.append(trial_info(path, split=split))
-    write_dataset_table(folder, table, simulated=all(capture.simulated for capture in captures))
+    folder: Path, jobs: Sequence[_Job], on_progress: OnProgress | None, *, title: str, first: int = 0
+) -> tuple[list[TrialInfo], list[LeftOut]]:
+    """Write the trials of a data set that are not there yet; gives their rows, and what was left out of many."""
+    total, done, lock = sum(len(job.capture) for job in jobs), [0] * len(jobs), Lock()
+
+    def write(number: int, count: OnProgress) -> TrialInfo | LeftOut:
+        job = jobs[number]
+        capture, path = job.capture, trial_path(folder, job.capture.trial)
+        samples = forces_path(folder, capture.trial)
+
+        def tell(written: int, _: int) -> None:
+            if stopped.is_set():
+                raise KeyboardInterrupt
+            with lock:
+                done[number] = written
+                count(sum(done), total)
+
+        # a trial is there whole or not at all, and the folder is of this very command
+        if not path.is_file():
+            rng = np.random.default_rng((job.settings.seed, first + number))
+            try:
+                import_trial(capture, path, settings=job.settings, rng=rng, forces_file=samples, on_progress=tell)
+            except SliplensError as error:
+                samples.unlink(missing_ok=True)
+                if not job.one_of_many:
+                    raise
+                return LeftOut(trial=capture.trial, source=capture.source, why=str(error))
+        tell(len(capture), total)
+        return trial_info(path, split="")
+
+    stopped = Event()
+    # decoding, arrays and compression run beside one another in threads; each holds one frame of its trial
+    workers = min(os.cpu_count() or 1, len(jobs))
+    with stage(on_progress, title) as count, ThreadPoolExecutor(max_workers=workers) as pool:
+        try:
+            rows = [future.result() for future in [pool.submit(write, number, count) for number in range(len(jobs))]]
+        except BaseException:
+            stopped.set()
+            pool.shutdown(cancel_futures=True)
+            raise
+    failed = [row for row in rows if isinstance(row, LeftOut)]
+    return [row for row in rows if isinstance(row, TrialInfo)], failed
 
 
 def import_trial(
@@ -266,10 +459,7 @@ def import_trial(
     write them. The samples of the force sensor, from which labels can be made anew, are kept in `forces_file`.
     """
     settings = settings or LabelSettings()
-    if capture.labels is None and capture.forces is None:
-        raise RecordingError(
-            f"{capture.source} has no forces, and without them there is no label; give the table of the force sensor"
-        )
+    _require_forces(capture)
     try:
         reference, labels = _label(capture, settings, rng)
     except RecordingError as error:
@@ -279,6 +469,13 @@ def import_trial(
         save_forces(capture.forces, forces_file)
     images = encode_frames(_frames(capture, on_progress))
     write_trial(path, images, facts=capture, time_s=capture.frame_time_s, labels=labels, reference=reference)
+
+
+def _require_forces(capture: Capture) -> None:
+    if capture.labels is None and capture.forces is None:
+        raise RecordingError(
+            f"{capture.source} has no forces, and without them there is no label; give the table of the force sensor"
+        )
 
 
 def _label(capture: Capture, settings: LabelSettings, rng: np.random.Generator) -> tuple[Frame, Labels]:

@@ -1,6 +1,7 @@
 """Sensor profiles: what a camera's frames go through before anybody reads them, as one small TOML file."""
 
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -88,8 +89,9 @@ class SensorProfile:
     """Network that reads these frames: a folder, or the name of one that comes with sliplens."""
 
     def __post_init__(self) -> None:
-        if not self.name:
-            raise ValueError("a sensor has a name")
+        # a data set keeps the profile in a file of this name
+        if not re.fullmatch(r"[A-Za-z0-9._-]+", self.name):
+            raise ValueError(f"a sensor's name has letters, digits, dots, dashes and underscores, not {self.name!r}")
         for what, size in (("camera_size_px", self.camera_size_px), ("resize_px", self.resize_px)):
             if size is not None and min(size) <= 0:
                 raise ValueError(f"{what} is {size}; widths and heights are positive")
@@ -124,7 +126,7 @@ class SensorProfile:
             )
         return wanted_height, wanted_width
 
-    def apply(self, frame: Frame) -> Frame:
+    def apply(self, frame: Frame) -> UInt8[np.ndarray, "rows columns 3"]:
         """Frame as networks and markers' trackers read it.
 
         Examples
@@ -213,9 +215,7 @@ class SensorProfile:
 
 
 @lru_cache(maxsize=4)
-def _undistorting(
-    lens: Lens, scale: tuple[float, float], size: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
+def _undistorting(lens: Lens, scale: tuple[float, float], size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Where each pixel of the straight image lies in the camera's, as OpenCV remaps."""
     cv2 = import_cv2()
     (across, down), (focal_x, focal_y), (centre_x, centre_y) = scale, lens.focal_px, lens.centre_px
@@ -269,9 +269,9 @@ def load_profile(profile: Path | str | SensorProfile) -> SensorProfile:
         raise InputError(f"{path} is no sensor profile: {text}{where}; mend it there") from None
 
 
-def is_profile(name: str) -> bool:
-    """Whether a word that names a sensor names a profile: a TOML file, or one that comes with sliplens."""
-    return name.endswith(".toml") or name in shipped_profiles()
+def is_profile(sensor: Path | str | SensorProfile) -> bool:
+    """Whether what names a sensor names a profile: a TOML file, or one that comes with sliplens."""
+    return isinstance(sensor, SensorProfile) or str(sensor).endswith(".toml") or str(sensor) in shipped_profiles()
 
 
 def profile_text(profile: SensorProfile, *, notes: tuple[str, ...] = ()) -> str:

@@ -317,7 +317,7 @@ def split_dataset(data: Dataset | Path | str, rules: SplitPlan | Path | str, *, 
         write_split_record(data.folder, plan, data.trials, result)
         trials = [replace(info, split=split) for info, split in zip(data.trials, result.splits, strict=True)]
         # last: whoever sees the new splits finds the rules too
-        write_dataset_table(data.folder, trials, simulated=data.simulated)
+        write_dataset_table(data.folder, trials, simulated=data.simulated, left_out=data.left_out)
     return result
 
 

@@ -157,6 +157,8 @@ def _take(
     untouched = None if opened.read_reference is None else opened.read_reference()
     first = islice(opened.read_frames(), max(numbers) + 1)
     frames = {number: frame for number, frame in enumerate(first) if number in numbers}
+    if untouched is None and source == "real":
+        trained.require_kind(frames[numbers[0]], what=names[numbers[0]])
     images, empty = network_images(trained, np.stack([frames[number] for number in numbers]), untouched)
     margin = np.full(opened.frames, np.nan) if opened.safety_margin is None else opened.safety_margin
     return ChosenFrames(

@@ -2,7 +2,7 @@
 
 import hashlib
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -25,6 +25,7 @@ from sliplens.plots.saliency import draw_panel, overlay_jet, overlay_saliency, s
 from sliplens.plots.style import drawing_style, method_name, percent
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, Recording
+from sliplens.recordings.capture import Capture
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import open_source
 from sliplens.results.explanation import Explained, Strip, StripReadings, load_explained

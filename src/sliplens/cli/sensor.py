@@ -1,0 +1,64 @@
+"""`sliplens sensor`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from sliplens.cli.command import Command
+from sliplens.cli.console import print_table, say, wrote
+from sliplens.errors import InputError
+
+_TASK = "new makes a profile, list tells those that come with sliplens."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor(Command):
+    """Make the profile of your sensor from a recording: `sliplens sensor new --from tip.mp4 -o tip.toml`.
+
+    Finds the gel's rectangle and the markers, proposes what to do with the frames, and draws a picture of it beside the
+    file. Look at it, change the file where it is wrong, and name it in --sensor of the other commands.
+    """
+
+    task: Annotated[Literal["new", "list"], tyro.conf.Positional, tyro.conf.arg(help=_TASK)]
+    source: Annotated[Path | None, tyro.conf.arg(name="from", metavar="VIDEO")] = None
+    """Video, bag or folder of images that begins with the sensor untouched."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="FILE.toml")] = None
+    """Profile to write; the picture stands beside it as PNG."""
+    name: str | None = None
+    """Name of the sensor; that of the file if not given."""
+    network: str = "chromatouch-difference"
+    """Network that is to read the frames: they are brought to the size it was trained on."""
+    keep_size: bool = False
+    """Leave the gel in the camera's resolution, to train a network of its own; no network is named then."""
+
+    def run(self) -> None:
+        """Propose, draw and write, or list."""
+        from sliplens.recordings.sensor import load_profile, shipped_profiles
+
+        if self.task == "list":
+            shipped = [load_profile(name) for name in shipped_profiles()]
+            rows = [(one.name, one.markers or "none", str(one.camera_size_px or "any")) for one in shipped]
+            print_table("Sensor profiles", ("name", "markers", "camera, width x height"), rows)
+            return
+        if self.source is None or self.output is None:
+            raise InputError("name a recording and the file to write: sliplens sensor new --from VIDEO -o FILE.toml")
+        from sliplens.files import require_new_file
+        from sliplens.markers.gel import propose_profile
+        from sliplens.models.checkpoint import read_manifest
+        from sliplens.plots.sensor import write_proposal
+        from sliplens.recordings.sensor import profile_text
+
+        require_new_file(self.output, suffix=".toml", overwrite=self.overwrite)
+        network = None if self.keep_size else self.network
+        height, width = (0, 0) if network is None else read_manifest(network).frame_size
+        size_px = None if network is None else (width, height)
+        name = self.name or self.output.stem
+        proposal = propose_profile(self.source, name=name, network=network, size_px=size_px)
+        self.output.write_text(profile_text(proposal.profile, notes=proposal.notes), encoding="utf-8")
+        for sentence in proposal.notes:
+            say(f"  {sentence}")
+        wrote(self.output, "change in it what the picture shows to be wrong")
+        write_proposal(proposal, self.output.with_suffix(".png"))
+        wrote(self.output.with_suffix(".png"), "what the profile does to a frame")

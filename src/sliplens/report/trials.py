@@ -1,0 +1,144 @@
+"""The page of a data set: every trial with its pictures, margins, friction and flags."""
+
+from base64 import b64encode
+from dataclasses import dataclass
+from hashlib import sha256
+from importlib.resources import files
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from PIL import Image
+
+from sliplens.plots.layout import written_whole
+from sliplens.plots.style import UNKNOWN, decimals, percent
+from sliplens.recordings.capture import Frame
+from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_path
+from sliplens.recordings.store import load_recording, read_frames
+from sliplens.recordings.trial import Recording
+
+PAGE = "trials.html"
+_THUMBNAIL_PX = 72
+_CURVE = 160, 44  # of the picture's own units
+_POINTS = 80
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Row:
+    """A trial on the page: texts, and the numbers that it is sorted by."""
+
+    info: TrialInfo
+    pictures: tuple[str, ...]
+    """The sensor untouched, and where the margin is least, as data addresses."""
+    curves: tuple[str, ...]
+    """Points of the margins' runs, as SVG takes them."""
+    curve_words: str
+    valid: str
+    valid_share: float
+    margin: str
+    least: float
+    friction: str
+    mu: float
+    flags: tuple[str, ...]
+    lost: str
+
+
+def write_trials_page(data: Dataset | Path | str, out: Path | str | None = None) -> Path:
+    """Write the summary of a data set's trials as one self-contained HTML page; gives its path.
+
+    Each trial has a row: the untouched sensor and the frame of the least margin, the margin against time, its range,
+    friction with its interval, the share of frames with a valid label, and what puts the labels in doubt. Columns are
+    sorted by a click on their heads; recordings that were left out are listed with the reason.
+
+    Parameters
+    ----------
+    data
+        Data set, or its folder.
+    out
+        HTML file to write; `trials.html` in the data set if None.
+
+    Raises
+    ------
+    InputError
+        If the data set is missing or damaged.
+    """
+    data = data if isinstance(data, Dataset) else load_dataset(data)
+    page = data.folder / PAGE if out is None else Path(out)
+    loader = PackageLoader("sliplens.report")
+    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    script = (files("sliplens.report") / "templates" / "trials.js").read_text(encoding="utf-8")
+    text = pages.get_template("trials.html.j2").render(
+        name=data.folder.resolve().name,
+        rows=[_row(data, info) for info in data.trials],
+        left_out=data.left_out,
+        frames=f"{data.frames:,}",
+        curve=_CURVE,
+        script=script,
+        # the page may run this script and no other
+        script_hash=b64encode(sha256(script.encode()).digest()).decode(),
+    )
+    with written_whole(page) as part:
+        part.write_text(text, encoding="utf-8")
+    return page
+
+
+def _row(data: Dataset, info: TrialInfo) -> _Row:
+    path = trial_path(data.folder, info.trial)
+    trial = load_recording(path, pixels=False)
+    margin = np.where(trial.labelled, trial.safety_margin, np.nan)
+    known, counts = margin[np.isfinite(margin)], trial.count()
+    shown = int(np.nanargmin(margin)) if len(known) else len(margin) // 2
+    basis = trial.labelling.basis if trial.labelling else None
+    friction, mu = UNKNOWN, np.nan
+    if basis is not None:
+        mu, low, high = basis.friction.mu, basis.friction.low, basis.friction.high
+        friction = (
+            f"{decimals(mu, 2)} given"
+            if low == high
+            else f"{decimals(mu, 2)} [{decimals(low, 2)}, {decimals(high, 2)}]"
+        )
+    else:
+        estimates = trial.friction_coefficient[np.isfinite(trial.friction_coefficient)]
+        if len(estimates):
+            mu = float(np.median(estimates))
+            friction = decimals(mu, 2)
+    least, most = (float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)
+    return _Row(
+        info=info,
+        pictures=(_thumbnail(trial.reference), _thumbnail(read_frames(path, [shown])[0])),
+        curves=_curves(trial, margin),
+        curve_words=f"margin from {percent(least)} to {percent(most)}" if len(known) else "no valid margin",
+        valid=f"{counts.get('valid', 0)} of {info.frames}",
+        valid_share=counts.get("valid", 0) / info.frames,
+        margin=f"{percent(least)} to {percent(most)}" if len(known) else UNKNOWN,
+        least=least,
+        friction=friction,
+        mu=mu,
+        flags=basis.flags if basis else (),
+        lost=", ".join(f"{count} {reason}" for reason, count in counts.items() if reason != "valid"),
+    )
+
+
+def _curves(trial: Recording, margin: Float[np.ndarray, " frames"]) -> tuple[str, ...]:
+    """The margin against time in pieces, as points of an SVG line: broken where no label is valid."""
+    width, height = _CURVE
+    span = max(float(trial.time_s[-1] - trial.time_s[0]), 1e-9)
+    step = max(1, len(margin) // _POINTS)
+    pieces: list[list[str]] = [[]]
+    for time_s, value in zip(trial.time_s[::step].tolist(), margin[::step].tolist(), strict=True):
+        if np.isnan(value):
+            pieces.append([])
+        else:
+            pieces[-1].append(f"{width * (time_s - trial.time_s[0]) / span:.1f},{height * (1 - value):.1f}")
+    # a point alone is drawn as a short stroke
+    return tuple(" ".join(points if len(points) > 1 else points * 2) for points in pieces if points)
+
+
+def _thumbnail(frame: Frame) -> str:
+    image = Image.fromarray(frame)
+    image.thumbnail((2 * _THUMBNAIL_PX, 2 * _THUMBNAIL_PX))  # twice as fine, for dense screens
+    stream = BytesIO()
+    image.save(stream, format="JPEG", quality=80)
+    return f"data:image/jpeg;base64,{b64encode(stream.getvalue()).decode()}"

@@ -1,0 +1,103 @@
+"""`sliplens import` of a folder or a manifest: many trials, some of them bad, and more of them later."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import run
+from own_recording import write_forces, write_video
+
+from sliplens.recordings import Recording, load_dataset
+from sliplens.simulation import PRESETS, plan_trials, simulate_trial
+
+PROFILE = 'name = "mine"\ncamera_size_px = [112, 112]\nrotate_deg = 90\nnormal_axis = "z"\nnormal_sign = -1\n'
+
+
+@pytest.fixture(scope="module")
+def trial() -> Recording:
+    """A simulated trial at 30 frames a second, of every other pixel: its motion is seen all the same."""
+    whole = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=240))
+    return replace(whole, frames=whole.frames[:, ::2, ::2].copy(), reference=whole.reference[::2, ::2].copy())
+
+
+@pytest.fixture(scope="module")
+def source(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two good trials, one without forces, one whose video is no video, and a profile."""
+    folder = tmp_path_factory.mktemp("many")
+    write_video(trial, folder / "cup.mkv")
+    write_forces(trial, folder / "cup.csv")
+    for name in ("jar", "mug"):
+        shutil.copy(folder / "cup.mkv", folder / f"{name}.mkv")
+    shutil.copy(folder / "cup.csv", folder / "jar_forces.csv")
+    (folder / "bad.mkv").write_bytes(b"nothing")
+    shutil.copy(folder / "cup.csv", folder / "bad.csv")
+    (folder / "tip.toml").write_text(PROFILE)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def imported(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    data = tmp_path_factory.mktemp("imported") / "data"
+    with pytest.raises(SystemExit, match="1"):
+        run("import", source, "-o", data, "--sensor", source / "tip.toml", "--no-audit")
+    return data
+
+
+def test_bad_trials_are_listed_and_do_not_stop_the_others(imported: Path, trial: Recording):
+    data = load_dataset(imported)
+    assert {info.trial for info in data.trials} == {"cup", "jar"}
+    assert {one.trial: "forces" in one.why for one in data.left_out} == {"bad": False, "mug": True}
+    assert run("check", imported) == 0
+    # frames went through the profile, which is kept
+    cup = data.load(data.find("cup"))
+    np.testing.assert_array_equal(cup.frames[100], np.rot90(trial.frames[100], k=-1))
+    assert cup.sensor == "mine"
+    profile = data.profile("mine")
+    assert profile is not None
+    assert profile.normal_sign == -1
+
+
+def test_the_page_has_a_row_a_trial_and_says_what_was_left_out(imported: Path):
+    page = (imported / "trials.html").read_text(encoding="utf-8")
+    assert page.count("<tr>") == 1 + 2
+    for words in ("cup", "jar", "mug", "polyline", "data:image/jpeg"):
+        assert words in page
+    assert "http" not in page.replace("http-equiv", "")
+
+
+def test_more_trials_are_added_and_the_old_ones_stay(
+    imported: Path, source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    data = shutil.copytree(imported, tmp_path / "data")
+    before = {info.trial: info for info in load_dataset(data).trials}
+    manifest = tmp_path / "more.csv"
+    manifest.write_text(
+        "trial,video,forces,sensor,day,object,condition,mu\n"
+        f"mug,{source / 'mug.mkv'},{source / 'cup.csv'},{source / 'tip.toml'},3,mug,wet,0.5\n"
+        f"cup,{source / 'cup.mkv'},{source / 'cup.csv'},mine,,,,\n"
+    )
+    command = ("import", manifest, "-o", data, "--add", "--no-audit")
+    with pytest.raises(SystemExit, match="1"):  # bad is still left out
+        run(*command)
+    assert "already" in capsys.readouterr().err
+    after = load_dataset(data)
+    assert {name: after.find(name) for name in before} == before
+    mug = after.find("mug")
+    assert (mug.day, mug.object, mug.condition, mug.sensor) == (3, "mug", "wet", "mine")
+    labelling = after.read_labels(mug).labelling
+    assert labelling is not None
+    assert labelling.basis is not None
+    assert labelling.basis.friction.mu == 0.5
+    assert [one.trial for one in after.left_out] == ["bad"]
+    assert run("check", data) == 0
+
+
+def test_many_at_once_give_the_bytes_that_one_by_one_give(imported: Path, source: Path, tmp_path: Path):
+    words = ("--sensor", source / "tip.toml", "--forces", source / "cup.csv", "--no-audit")
+    assert run("import", source / "cup.mkv", "-o", tmp_path / "one", *words) == 0
+    one, many = load_dataset(tmp_path / "one"), load_dataset(imported)
+    np.testing.assert_allclose(
+        one.read_labels(one.find("cup")).safety_margin, many.read_labels(many.find("cup")).safety_margin
+    )

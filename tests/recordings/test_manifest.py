@@ -1,0 +1,83 @@
+"""Many recordings at once: which files belong to which trial."""
+
+from pathlib import Path
+
+import pytest
+
+from sliplens.errors import RecordingError
+from sliplens.recordings.manifest import find_rows, pair_recordings, read_manifest
+
+
+def touch(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name).touch()
+    return folder
+
+
+def test_recordings_and_tables_are_paired_by_name(tmp_path: Path):
+    touch(tmp_path, "cup.mp4", "cup.csv", "jar.MKV", "jar_forces.csv", "mug.avi", "notes.txt", "tip.toml", ".x.mp4")
+    rows = {row.trial: (row.video.name, row.forces and row.forces.name) for row in pair_recordings(tmp_path)}
+    assert rows == {"cup": ("cup.mp4", "cup.csv"), "jar": ("jar.MKV", "jar_forces.csv"), "mug": ("mug.avi", None)}
+    assert find_rows(tmp_path) == pair_recordings(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (("cup.mp4", "cup.avi"), "recordings named cup"),
+        (("cup.mp4", "cup.csv", "cup_ft.csv"), "tables of forces named cup"),
+        (("a b.mp4", "a-b.avi"), "trials named a-b"),
+        (("notes.txt",), "no recording"),
+    ],
+)
+def test_a_folder_that_leaves_a_choice_is_refused(tmp_path: Path, names, words):
+    with pytest.raises(RecordingError, match=words):
+        pair_recordings(touch(tmp_path, *names))
+
+
+def test_a_manifest_says_all_of_a_trial(tmp_path: Path):
+    path = tmp_path / "trials.csv"
+    path.write_text(
+        "\ufefftrial,video,forces,sensor,day,object,condition,mu,reference\n"
+        "one,a.mp4,a.csv,tip.toml,2,cup,wet,0.7,12\n"
+        ",b.mp4,,digit,,,,,still.png\n\n",
+        encoding="utf-8",
+    )
+    one, two = read_manifest(path)
+    assert (one.trial, one.video, one.forces) == ("one", tmp_path / "a.mp4", tmp_path / "a.csv")
+    assert (one.sensor, one.day, one.object, one.condition, one.mu) == (
+        str(tmp_path / "tip.toml"),
+        2,
+        "cup",
+        "wet",
+        0.7,
+    )
+    assert one.reference == 12
+    assert (two.trial, two.forces, two.sensor, two.day, two.reference) == (
+        "b", None, "digit", None, tmp_path / "still.png"
+    )  # fmt: skip
+    assert find_rows(path) == (one, two)
+
+
+def test_a_table_of_forces_is_no_manifest(tmp_path: Path):
+    path = tmp_path / "forces.csv"
+    path.write_text("time_s,fx,fy,fz\n0,0,0,1\n")
+    assert find_rows(path) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("trial,video,colour\na,a.mp4,red\n", "colour"),
+        ("trial,video\na,\n", "line 2: no video"),
+        ("trial,video,day\na,a.mp4,first\n", "line 2: day is 'first'"),
+        ("trial,video\na,a.mp4\na,b.mp4\n", "trials named a"),
+        ("trial,video\na,b,c\n", "line 2: 3 cells"),
+        ("trial,video\n", "no trial"),
+    ],
+)
+def test_a_manifest_that_cannot_be_is_refused_with_its_line(tmp_path: Path, text, words):
+    path = tmp_path / "trials.csv"
+    path.write_text(text)
+    with pytest.raises(RecordingError, match=words):
+        read_manifest(path)

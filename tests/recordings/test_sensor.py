@@ -1,0 +1,156 @@
+"""Sensor profiles: what frames go through, and the files that say so."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sliplens.errors import ImageError, InputError
+from sliplens.recordings.options import LabelSettings
+from sliplens.recordings.sensor import Lens, SensorProfile, load_profile, profile_text, shipped_profiles
+from sliplens.recordings.source import open_source
+
+FRAME = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+LENS = Lens(focal_px=(60.0, 60.0), centre_px=(31.5, 23.5), distortion=(0.0, 0.0, 0.0, 0.0))
+TIP = SensorProfile(name="tip", camera_size_px=(64, 48), crop_px=(8, 0, 48, 48), resize_px=(24, 24))
+
+
+def test_a_profile_that_says_nothing_changes_nothing():
+    np.testing.assert_array_equal(SensorProfile(name="tip").apply(FRAME), FRAME)
+
+
+@given(turns=st.lists(st.sampled_from([0, 90, 180, 270]), max_size=5))
+def test_quarter_turns_add_up(turns):
+    turned = FRAME
+    for turn in turns:
+        turned = SensorProfile(name="tip", rotate_deg=turn).apply(turned)
+    whole = SensorProfile(name="tip", rotate_deg=sum(turns) % 360)  # pyright: ignore[reportArgumentType]
+    np.testing.assert_array_equal(turned, whole.apply(FRAME))
+
+
+def test_clockwise_brings_the_upper_left_corner_to_the_upper_right():
+    turned = SensorProfile(name="tip", rotate_deg=90).apply(FRAME)
+    assert turned.shape == (64, 48, 3)
+    np.testing.assert_array_equal(turned[0, -1], FRAME[0, 0])
+
+
+@pytest.mark.parametrize("flip", ["horizontal", "vertical", "both"])
+def test_a_flip_done_twice_is_undone(flip):
+    profile = SensorProfile(name="tip", flip=flip)
+    assert not np.array_equal(profile.apply(FRAME), FRAME)
+    np.testing.assert_array_equal(profile.apply(profile.apply(FRAME)), FRAME)
+
+
+@pytest.mark.parametrize("colours", ["bgr", "gbr", "brg"])
+def test_channels_are_found_where_they_arrive(colours):
+    sent = FRAME[..., ["rgb".index(channel) for channel in colours]]
+    np.testing.assert_array_equal(SensorProfile(name="tip", colours=colours).apply(sent), FRAME)
+
+
+def test_a_lens_without_distortion_changes_nothing_and_one_with_it_is_inverted():
+    cv2 = pytest.importorskip("cv2")
+    profile = SensorProfile(name="tip", camera_size_px=(64, 48), undistort=LENS)
+    np.testing.assert_array_equal(profile.apply(FRAME), FRAME)
+    # a dot of the scene is seen where OpenCV's own camera model puts it, and comes back to where a pinhole sees it
+    bent = replace(LENS, distortion=(-0.3, 0.05, 0.0, 0.0))
+    camera = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
+    point = np.array([[0.35, -0.25, 1.0]])
+    seen = cv2.projectPoints(point, np.zeros(3), np.zeros(3), camera, np.array(bent.distortion))[0].ravel()
+    rows, columns = np.mgrid[:48, :64]
+    blob = 255 * np.exp(-((columns - seen[0]) ** 2 + (rows - seen[1]) ** 2) / 4)
+    frame = np.repeat(blob[..., None], 3, axis=2).astype(np.uint8)
+    straight = replace(profile, undistort=bent).apply(frame)[..., 0].astype(float)
+    found = np.array([(straight * columns).sum(), (straight * rows).sum()]) / straight.sum()
+    # half a pixel: the blob is not small against how fast the distortion changes
+    np.testing.assert_allclose(found, point[0, :2] * 60 + [31.5, 23.5], atol=0.5)
+    assert np.linalg.norm(found - seen) > 1
+
+
+def test_what_is_cropped_and_resized_keeps_its_place_and_its_mean():
+    small = TIP.apply(FRAME)
+    assert small.shape[:2] == TIP.output_size((48, 64)) == (24, 24)
+    constant = np.full((48, 64, 3), 77, dtype=np.uint8)
+    assert np.all(TIP.apply(constant) == 77)
+    np.testing.assert_array_equal(replace(TIP, resize_px=None).apply(FRAME), FRAME[:, 8:56])
+
+
+def test_a_larger_frame_of_the_same_shape_is_cropped_alike():
+    doubled = FRAME.repeat(2, axis=0).repeat(2, axis=1)
+    cropped = replace(TIP, resize_px=None).apply(doubled)
+    np.testing.assert_array_equal(cropped[::2, ::2], FRAME[:, 8:56])
+
+
+def test_another_camera_and_a_stretch_are_refused():
+    with pytest.raises(ImageError, match="sliplens sensor new"):
+        TIP.apply(FRAME[:, :48])
+    with pytest.raises(ImageError, match="stretches"):
+        SensorProfile(name="tip", resize_px=(24, 24)).output_size((48, 64))
+
+
+def test_a_profile_comes_back_from_its_text(tmp_path: Path):
+    profile = replace(
+        TIP, undistort=LENS, rotate_deg=90, flip="both", colours="bgr", markers="tactip", reference="first still",
+        reference_frame=3, frame_rate_hz=30.0, normal_axis="z", normal_sign=-1, network='a "b" ü',
+    )  # fmt: skip
+    path = tmp_path / "tip.toml"
+    path.write_text(profile_text(profile, notes=("a note",)), encoding="utf-8")
+    assert load_profile(path) == profile
+    assert load_profile(str(path)) == profile
+
+
+def test_every_shipped_profile_can_be_read():
+    assert set(shipped_profiles()) == {"chromatouch", "digit", "gelsight-mini", "tactip"}
+    for name in shipped_profiles():
+        profile = load_profile(name)
+        assert profile.name == name
+        width, height = profile.camera_size_px or (224, 224)
+        assert min(profile.output_size((height, width))) > 0
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("name = 'tip'\ncorp_px = [0, 0, 1, 1]", "corp_px"),
+        ("name = 'tip'\ncrop_px = [0, 0, 90, 90]\ncamera_size_px = [64, 48]", "not inside"),
+        ("name = 'tip'\ncrop_px = [0, 0, 9, 9]", "camera_size_px"),
+        ("name = 'tip'\nrotate_deg = 45", "rotate_deg"),
+        ("name = 'a/b'", "letters"),
+        ("name = ", "TOML"),
+        ("colours = 'rgb'", "name"),
+    ],
+)
+def test_a_profile_that_cannot_be_is_refused_with_its_place(tmp_path: Path, text, words):
+    path = tmp_path / "tip.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words) as caught:
+        load_profile(path)
+    assert "tip.toml" in str(caught.value)
+
+
+def test_a_name_that_is_no_profile_lists_those_there_are():
+    with pytest.raises(InputError, match="digit"):
+        load_profile("digti")
+
+
+def test_a_source_is_read_through_its_profile_and_what_is_said_of_the_reference_counts_more():
+    frames = np.stack([FRAME, FRAME[::-1], FRAME[:, ::-1]])
+    profile = replace(TIP, reference_frame=2)
+    (capture,) = open_source(frames, sensor=profile)
+    assert (capture.sensor, capture.frame_size) == ("tip", (24, 24))
+    np.testing.assert_array_equal(next(capture.read_frames()), TIP.apply(FRAME))
+    assert capture.read_reference is not None
+    np.testing.assert_array_equal(capture.read_reference(), TIP.apply(frames[2]))
+    (capture,) = open_source(frames, sensor=profile, reference=FRAME)
+    assert capture.read_reference is not None
+    np.testing.assert_array_equal(capture.read_reference(), TIP.apply(FRAME))
+    with pytest.raises(InputError, match="--reference-frame"):
+        open_source(frames[:2], sensor=profile)
+
+
+def test_what_a_user_says_of_forces_counts_more_than_the_profile():
+    profile = replace(TIP, normal_axis="y", normal_sign=-1, reference="first still")
+    settings = profile.settings(LabelSettings(normal_axis="x"))
+    assert (settings.normal_axis, settings.normal_sign, settings.reference) == ("x", -1, "first still")
