@@ -9,8 +9,10 @@ import pytest
 
 from sliplens.errors import InputError
 from sliplens.live import ReplaySource, SimulatedSource, SourceOptions, open_live
+from sliplens.live.sources import ProfiledSource
 from sliplens.mechanics import safety_margin
 from sliplens.recordings import Dataset, Recording
+from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import open_source
 from sliplens.simulation.filming import prepare_film
 from sliplens.simulation.loading import load_at_margins
@@ -135,3 +137,15 @@ def test_wishes_that_cannot_be_are_told():
 
 def test_a_path_is_replayed_by_its_text_too(small_dataset: Dataset):
     assert open_live(str(small_dataset.folder)).name == open_live(Path(small_dataset.folder)).name
+
+
+def test_frames_and_reference_go_through_the_profile():
+    frames = np.random.default_rng(0).integers(0, 256, (4, 48, 64, 3), dtype=np.uint8)
+    tip = SensorProfile(name="tip", camera_size_px=(64, 48), crop_px=(8, 0, 48, 48), resize_px=(24, 24))
+    (capture,) = open_source(frames, reference_frame=1)
+    with ProfiledSource(ReplaySource(capture, speed=100.0), tip) as source:
+        assert source.size == (24, 24)
+        assert source.reference is not None
+        np.testing.assert_array_equal(source.reference, tip.apply(frames[1]))
+        images = [frame.image for frame in source.frames()]
+    np.testing.assert_array_equal(images, [tip.apply(frame) for frame in frames])

@@ -38,9 +38,6 @@ class Live:
     simulated fingertip; none if not given."""
     reference: Path | None = None
     """Image of the untouched sensor; taken when the picture is still at first if not given."""
-    sensor: Path | None = None
-    """Profile of the sensor: a file that `sliplens sensor new` made, or chromatouch, digit, gelsight-mini or tactip. It
-    may name the network."""
     list: bool = False
     """List the cameras with their formats, sizes and rates, and what else can be read, and end."""
     rate: float | None = None
@@ -71,7 +68,7 @@ class Live:
     forces: Path | None = None
     """File or named pipe into which another program writes force samples (time_s,fx,fy,fz), to be recorded too."""
     sensor: str = ""
-    """Name of the sensor, for the recording; the network's if not given."""
+    """Profile of the sensor, a file or a name such as digit; or its name alone, for the recording."""
     object: str = ""
     """Name of what is held, for the recording."""
     condition: str = "dry"
@@ -86,12 +83,11 @@ class Live:
         """Read until the source ends."""
         from sliplens.live import LiveReader
         from sliplens.live.sinks import open_sink
-        from sliplens.recordings.sensor import load_profile
+        from sliplens.recordings.sensor import is_profile
 
         if self.list:
             self._list()
             return
-        profile = None if self.sensor is None else load_profile(self.sensor)
         shipped = "chromatouch-difference" if self.source in {"simulated", "simulated:chromatouch"} else None
         with ExitStack() as stack:
             sinks = [open_sink(name) for name in self.sink]
@@ -99,9 +95,9 @@ class Live:
                 stack.callback(sink.close)
             reader = LiveReader(
                 self.source,
-                self.network or (profile and profile.network) or shipped,
+                self.network or shipped,
                 reference=self.reference,
-                sensor=profile,
+                sensor=self.sensor if is_profile(self.sensor) else None,
                 options=self._options(),
                 engine=self.engine,
                 device=self.device,

@@ -23,7 +23,7 @@ from sliplens.models.checkpoint import Run, load
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.predictions import LEVEL
 from sliplens.recordings.capture import Capture, Frame
-from sliplens.recordings.dataset import Dataset
+from sliplens.recordings.dataset import Dataset, keep_profile
 from sliplens.recordings.labels.lag import soften
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.trial import ContactState, TrialFacts, contact_states
@@ -152,7 +152,8 @@ class LiveReader:
     options
         Wishes for the source.
     sensor
-        Profile of the sensor that frames and reference go through, its file, or the name of one that comes along.
+        Profile of the sensor that frames and reference go through, its file, or the name of one that comes along;
+        where it names a network and `network` is None, that one is read by.
     engine
         Row of `ENGINES`; `auto` for the fastest at hand that pays for `seconds`, or for hours where that is None, and
         that may take seconds to be made.
@@ -211,9 +212,11 @@ class LiveReader:
             raise InputError(f"--smoothing must be 0 or more seconds, got {smoothing_s:g}")
         if seconds is not None and not seconds > 0:
             raise InputError(f"--seconds must be positive, got {seconds:g}")
+        profile = None if sensor is None else load_profile(sensor)
+        if network is None and profile is not None:
+            network = profile.network
         self.network = load(network, device=device) if isinstance(network, Path | str) else network
         options = options or SourceOptions()
-        profile = None if sensor is None else load_profile(sensor)
         if self.network is not None and profile is None:
             options = replace(options, fit_size=self.network.manifest.frame_size)
         self.source = open_live(source, options=options)
@@ -225,7 +228,7 @@ class LiveReader:
         """The sensor untouched, as the next frame is compared with it."""
         self.engine: Engine | None = None
         """What runs the network, while it is entered."""
-        self._named = named
+        self._named, self._profile = named, profile
         self._engine_name, self._seconds, self._stall_s = engine, seconds, stall_s
         self._smooth = LowPass(time_constant_s=smoothing_s)
         self.recorder: Recorder | None = None
@@ -334,6 +337,8 @@ class LiveReader:
         if self.recorder is not None:
             raise RecordingError(f"{self.recorder.folder} is being recorded; stop that first")
         facts = facts or TrialFacts(trial="live")
+        if self._profile is not None:
+            facts = replace(facts, sensor=self._profile.name)
         if self.network is not None and not facts.sensor:
             facts = replace(facts, sensor=self.network.manifest.sensor)
         self.recorder = Recorder(
@@ -343,6 +348,8 @@ class LiveReader:
             simulated=self.source.simulated,
             reference=self.reference,
         )
+        if self._profile is not None:
+            keep_profile(Path(folder), self._profile)
         return self.recorder
 
     def stop_recording(self) -> Dataset | None:

@@ -196,7 +196,7 @@ class ProfiledSource(LiveSource):
 
     def __init__(self, source: LiveSource, profile: SensorProfile) -> None:
         self._source, self._profile, self.name = source, profile, source.name
-        self.cure, self.reconnects = source.cure, source.reconnects
+        self.cure, self.reconnects, self.simulated = source.cure, source.reconnects, source.simulated
 
     def __enter__(self) -> "ProfiledSource":
         source = self._source.__enter__()
