@@ -55,7 +55,8 @@ class Live:
     smoothing: float = 0.0
     """Time constant in seconds of a low-pass on margin and interval, which delays them by so much; 0 for none."""
     sink: tuple[str, ...] = ()
-    """Where readings go: json prints a line of JSON for each. Without one, a line a second is printed."""
+    """Where readings go: json (lines on standard output), udp:HOST:PORT, mcap:FILE, foxglove:HOST:PORT, rerun:FILE.
+    Without one, a line a second is printed."""
     page: bool = True
     """Show it in browsers, with buttons to freeze, explain and record."""
     host: str = "127.0.0.1"
