@@ -1,6 +1,7 @@
 """`sliplens live`: lines of JSON, lines for people, and what is there."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,9 @@ def test_a_line_of_json_a_reading(small_dataset: Dataset, difference_run: Path, 
     lines = [json.loads(line) for line in capfdbinary.readouterr().out.splitlines()]
     assert lines
     for line in lines:
-        assert 0 <= line["margin"] <= 1
+        # frames of noise are not healthy, and the margin of those is withheld
+        assert line["withheld"] or 0 <= line["margin"] <= 1
+        assert {"exposure", "touch"} <= {check["name"] for check in line["health"]}
         assert set(line["latency"]) == {"decode_ms", "encode_ms", "network_ms", "total_ms"}
     assert lines[-1]["number"] == 11
     assert len(lines) + lines[-1]["dropped"] + lines[0]["number"] == 12
@@ -23,7 +26,8 @@ def test_a_line_of_json_a_reading(small_dataset: Dataset, difference_run: Path, 
 
 def test_a_line_for_people(small_dataset: Dataset, capsys: pytest.CaptureFixture[str]):
     assert main(["live", str(small_dataset.folder), "--speed", "4", "--no-page"]) == 0
-    assert "no network" in capsys.readouterr().out
+    # a frame is not healthy, or there is no network
+    assert re.search("no network|no margin: .*; ", capsys.readouterr().out)
 
 
 def test_what_can_be_read_is_listed(capsys: pytest.CaptureFixture[str]):

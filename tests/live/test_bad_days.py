@@ -6,6 +6,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from threading import Event, Thread
 from types import SimpleNamespace
@@ -23,6 +24,8 @@ from sliplens.live.camera import FrameDecoder
 from sliplens.live.contract import LiveSource
 from sliplens.live.reading import LiveFrame, Reading
 
+plain_reader = partial(sl.LiveReader, health=None, slip=None)
+"""What is captured and read, without judging it."""
 IMAGE = np.tile(np.arange(48, dtype=np.uint8)[:, None, None], (1, 48, 3))
 Act = Callable[["Wicked"], LiveFrame | None]
 
@@ -87,7 +90,7 @@ def readings_of(source: Wicked, *, stall_s: float = 5.0) -> list[Reading]:
         heard.append(reading)
         source.read.set()
 
-    reader = sl.LiveReader(source, reference=IMAGE, stall_s=stall_s)
+    reader = plain_reader(source, reference=IMAGE, stall_s=stall_s)
     reader.subscribe(next_one)
     with reader:
         list(reader.readings())
@@ -120,7 +123,7 @@ def test_a_source_that_breaks_off_for_good_is_told_to_whoever_reads():
 
 def test_a_source_that_hangs_is_told_and_left():
     source = Wicked(frame(0), hang, frame(1))
-    reader = sl.LiveReader(source, reference=IMAGE, stall_s=0.05)
+    reader = plain_reader(source, reference=IMAGE, stall_s=0.05)
     with reader:
         stale = next(reading for reading in reader.readings() if reading.withheld)
         begun = time.monotonic()
@@ -451,7 +454,7 @@ def test_a_camera_that_is_unplugged_is_read_again_when_it_is_back(driver: FakeDr
     driver.send(data, number=8, stamp_s=begun_s)
     driver.sent.append(OSError(errno.ENODEV, "No such device"))
     numbers = []
-    with sl.LiveReader("0", reference=IMAGE, seconds=10.0) as reader:
+    with plain_reader("0", reference=IMAGE, seconds=10.0) as reader:
         for reading in reader.readings():
             numbers.append(reading.number)
             if len(numbers) == 2:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Semaphore
 
@@ -17,6 +18,9 @@ from sliplens.live.reading import Check, LiveFrame, MarkerReading, Reading, Slip
 from sliplens.markers import TrackedFrame
 from sliplens.models import Run
 from sliplens.recordings import ContactState, Dataset, Recording
+
+plain_reader = partial(sl.LiveReader, health=None, slip=None)
+"""What is captured and read, without judging it."""
 
 
 class Burst(LiveSource):
@@ -68,7 +72,7 @@ def test_a_reading_is_what_predict_says_of_the_frame(recording: Recording, diffe
     told = table.column("prediction").to_numpy()
     source = Patient(recording.frames, list(range(12)))
     readings = source.all_readings(
-        sl.LiveReader(source, difference_run, reference=recording.reference, engine="eager", stall_s=10.0)
+        plain_reader(source, difference_run, reference=recording.reference, engine="eager", stall_s=10.0)
     )
     assert len(readings) == 12
     for reading in readings:
@@ -86,7 +90,7 @@ def test_every_frame_is_read_or_counted_as_dropped(recording: Recording, wait_s:
         heard.append(reading)
 
     source = Burst(recording.frames, list(range(len(recording.frames))), wait_s=wait_s)
-    reader = sl.LiveReader(source, reference=recording.reference)
+    reader = plain_reader(source, reference=recording.reference)
     reader.subscribe(slowly)
     with reader:
         list(reader.readings())
@@ -99,13 +103,13 @@ def test_every_frame_is_read_or_counted_as_dropped(recording: Recording, wait_s:
 
 def test_frames_that_the_camera_lost_count_as_dropped(recording: Recording):
     source = Patient(recording.frames[:3], [0, 4, 5])
-    readings = source.all_readings(sl.LiveReader(source, reference=recording.reference))
+    readings = source.all_readings(plain_reader(source, reference=recording.reference))
     assert [reading.dropped for reading in readings] == [0, 3, 3]
 
 
 def test_a_slow_reader_gets_the_newest(recording: Recording):
     source = Burst(recording.frames, list(range(12)), wait_s=0.01)
-    with sl.LiveReader(source, reference=recording.reference) as reader:
+    with plain_reader(source, reference=recording.reference) as reader:
         readings = reader.readings()
         next(readings)
         assert reader._over.wait(timeout=10)
@@ -113,7 +117,7 @@ def test_a_slow_reader_gets_the_newest(recording: Recording):
 
 
 def test_a_late_listener_is_not_left_waiting(recording: Recording):
-    with sl.LiveReader(Burst(recording.frames[:2], [0, 1]), reference=recording.reference) as reader:
+    with plain_reader(Burst(recording.frames[:2], [0, 1]), reference=recording.reference) as reader:
         list(reader.readings())
         assert list(reader.readings()) == []
 
@@ -122,7 +126,7 @@ def test_without_a_reference_the_first_still_picture_is_taken(recording: Recordi
     moving = rng.integers(0, 255, (6, 48, 48, 3), dtype=np.uint8)
     still = np.repeat(recording.reference[None] + np.uint8(40), 10, axis=0)
     source = Burst(np.concatenate([moving, still]), list(range(16)), wait_s=0.005)
-    with sl.LiveReader(source) as reader:
+    with plain_reader(source) as reader:
         readings = list(reader.readings())
     assert "no reference frame yet" in str(readings[0].withheld)
     assert readings[-1].withheld is None
@@ -130,7 +134,7 @@ def test_without_a_reference_the_first_still_picture_is_taken(recording: Recordi
 
 
 def test_a_black_picture_is_no_reference(recording: Recording):
-    with sl.LiveReader(Burst(np.zeros_like(recording.frames), list(range(12)), wait_s=0.005)) as reader:
+    with plain_reader(Burst(np.zeros_like(recording.frames), list(range(12)), wait_s=0.005)) as reader:
         list(reader.readings())
     assert reader.reference is None
 
@@ -138,7 +142,7 @@ def test_a_black_picture_is_no_reference(recording: Recording):
 def test_a_new_reference_is_taken_on_request(recording: Recording):
     light = recording.reference + np.uint8(60)
     source = Burst(np.repeat(light[None], 30, axis=0), list(range(30)), wait_s=0.005)
-    with sl.LiveReader(source, reference=recording.reference) as reader:
+    with plain_reader(source, reference=recording.reference) as reader:
         readings = reader.readings()
         next(readings)
         np.testing.assert_array_equal(reader.reference, recording.reference)
@@ -162,9 +166,7 @@ class Strict:
 def test_a_margin_is_withheld_where_a_check_fails(recording: Recording, difference_run: Path):
     source = Patient(recording.frames, list(range(12)))
     readings = source.all_readings(
-        sl.LiveReader(
-            source, difference_run, reference=recording.reference, engine="eager", health=Strict, stall_s=10.0
-        )
+        plain_reader(source, difference_run, reference=recording.reference, engine="eager", health=Strict, stall_s=10.0)
     )
     assert {(reading.number % 2 == 1, reading.margin is None, bool(reading.withheld)) for reading in readings} == {
         (False, False, False),
@@ -186,7 +188,7 @@ def test_markers_are_followed_for_whoever_tells_slip(trials: dict[str, Recording
             return MarkerReading(state=SlipState.STICKING)
 
     source = Patient(trial.frames[:3], [0, 1, 2])
-    readings = source.all_readings(sl.LiveReader(source, reference=trial.reference, slip=Watch, stall_s=10.0))
+    readings = source.all_readings(plain_reader(source, reference=trial.reference, slip=Watch, stall_s=10.0))
     assert [reading.slip for reading in readings] == [SlipState.STICKING] * 3
     assert trial.truth is not None
     # markers of the untouched sensor, seen within a pixel
@@ -209,7 +211,7 @@ def test_without_a_contact_there_is_no_margin(trials: dict[str, Recording], name
     source = Patient(trial.frames[:2], [0, 1])
     network = "chromatouch-difference" if named else None
     first, second = source.all_readings(
-        sl.LiveReader(source, network, reference=trial.reference, engine="eager", slip=Watch, stall_s=10.0)
+        plain_reader(source, network, reference=trial.reference, engine="eager", slip=Watch, stall_s=10.0)
     )
     assert first.contact_state is ContactState.NO_CONTACT
     assert first.margin is None
@@ -220,14 +222,14 @@ def test_without_a_contact_there_is_no_margin(trials: dict[str, Recording], name
 
 def test_a_network_of_another_sensor_is_refused_before_anything_runs(difference_run: Path):
     with pytest.raises(ImageError, match=r"224 x 224 pixels but the network was trained on 48 x 48"):
-        sl.LiveReader("simulated", difference_run).__enter__()
+        plain_reader("simulated", difference_run).__enter__()
 
 
 def test_options_that_cannot_be_are_told():
     with pytest.raises(InputError, match="--smoothing must be 0 or more seconds, got -1"):
-        sl.LiveReader("simulated", smoothing_s=-1.0)
+        plain_reader("simulated", smoothing_s=-1.0)
     with pytest.raises(InputError, match="--seconds must be positive, got 0"):
-        sl.LiveReader("simulated", seconds=0.0)
+        plain_reader("simulated", seconds=0.0)
 
 
 def test_a_low_pass_delays_a_ramp_by_its_time_constant(rng: np.random.Generator):
@@ -240,3 +242,15 @@ def test_a_low_pass_delays_a_ramp_by_its_time_constant(rng: np.random.Generator)
 def test_a_low_pass_of_no_time_constant_changes_nothing():
     smooth = LowPass(time_constant_s=0.0)
     assert [smooth.update(np.array([value]), 0.1)[0] for value in (0.3, 0.9)] == [0.3, 0.9]
+
+
+def test_by_default_health_and_slip_are_watched_and_no_touch_has_no_margin(trials: dict[str, Recording]):
+    trial = trials["chromatouch"]
+    untouched = np.flatnonzero(np.isnan(trial.safety_margin))[:2]
+    touched = np.flatnonzero(np.isfinite(trial.safety_margin))[20:22]
+    source = Patient(trial.frames[np.concatenate([untouched, touched])], [0, 1, 2, 3])
+    readings = source.all_readings(sl.LiveReader(source, reference=trial.reference, stall_s=10.0))
+    assert [reading.contact_state is ContactState.NO_CONTACT for reading in readings] == [True, True, False, False]
+    assert "nothing touches the sensor; press it on something" in str(readings[0].withheld)
+    assert {reading.slip for reading in readings} == {SlipState.CANNOT_TELL}  # not yet still for long enough
+    assert {"exposure", "focus", "camera", "markers"} <= {check.name for check in readings[0].health}

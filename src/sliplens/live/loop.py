@@ -14,6 +14,7 @@ from jaxtyping import Float
 from sliplens.errors import ImageError, InputError, RecordingError, SourceError
 from sliplens.images import read_image
 from sliplens.live.contract import LiveSource, SourceOptions
+from sliplens.live.health import HealthMonitor
 from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading
 from sliplens.live.recorder import ForceStream, Recorder
 from sliplens.live.slip import SlipDetector
@@ -205,7 +206,7 @@ class LiveReader:
         seconds: float | None = None,
         stall_s: float = 1.0,
         forces: Path | str | None = None,
-        health: Callable[[Frame, Run | None], HealthWatch] | None = None,
+        health: Callable[[Frame, Run | None], HealthWatch] | None = HealthMonitor,
         slip: Callable[[Float[np.ndarray, "markers 2"]], SlipWatch] | None = SlipDetector,
     ) -> None:
         if not smoothing_s >= 0:
@@ -484,7 +485,8 @@ class LiveReader:
         health = () if self._health is None else self._health.check(frame, followed)
         withheld = next((check.sentence for check in health if not check.ok), None)
         reading = replace(begin, slip=markers and markers.state, markers=markers, health=health)
-        if markers is not None and markers.contact is False:
+        untouched = any(check.name == "touch" and not check.ok for check in health)
+        if untouched or (markers is not None and markers.contact is False):
             reading = replace(reading, contact_state=ContactState.NO_CONTACT)
             withheld = withheld or (None if self.network is None else _NO_CONTACT)
         if self.network is None or withheld is not None:

@@ -21,6 +21,7 @@ from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.models.backbones import Answers, bin_edges, build_model, ratio_edges
 from sliplens.models.calibration import Calibration, Traction, raw_interval, spread
 from sliplens.models.encodings import Encoding, get_encoding
+from sliplens.models.novelty import Novelty
 from sliplens.models.told import told_probabilities
 from sliplens.results.training import Training
 
@@ -48,6 +49,8 @@ class Manifest:
     calibration: Calibration | None = None
     traction: Traction | None = None
     """Of the second answer, F_t / F_n; None for a network that answers with the margin alone."""
+    novelty: Novelty | None = None
+    """Where its training frames lie in its features; None where that was never fitted."""
     versions: dict[str, str] = field(default_factory=dict)
     trained_on: tuple[str, ...] = ()
     """First 12 hex digits of the hash of every trial that trained or validated it, or what it started from."""

@@ -2,7 +2,7 @@
 
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -32,6 +32,7 @@ from sliplens.models.calibration import (
 )
 from sliplens.models.checkpoint import Estimate, Ratio, load, tell_each
 from sliplens.models.encodings import get_encoding
+from sliplens.models.novelty import Novelty, fit_novelty
 from sliplens.progress import OnProgress, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset
@@ -41,6 +42,9 @@ from sliplens.training.data import EpochShuffle, FrameSet, extract_features, get
 from sliplens.training.loggers import open_logger
 from sliplens.training.module import Clock, DivergedError, Regressor
 from sliplens.training.trainer import make_trainer, run_trainer, share_of_batch
+
+_NOVELTY_FRAMES = 2000
+"""Frames from which the place of healthy inputs in the features is told, at most."""
 
 
 def train(
@@ -275,6 +279,12 @@ def _offsets(
     )
 
 
+def _spread_batches(frames: FrameSet, *, batch_size: int) -> Iterator[Tensor]:
+    """Encoded frames of all trials, some thousands at most."""
+    rows = torch.linspace(0, len(frames) - 1, min(len(frames), _NOVELTY_FRAMES)).round().long()
+    return (frames.__getitems__(some)[0] for some in rows.split(batch_size))
+
+
 def fit(
     config: TrainConfig,
     train: FrameSet,
@@ -376,6 +386,7 @@ def fit(
             trained_friction=train.friction,
             kept=start.manifest.calibration if start and config.frozen else None,
         )
+        _put_back(network, model)
         manifest = Manifest(
             backbone=config.backbone,
             head=config.head,
@@ -390,9 +401,9 @@ def fit(
             metrics={"validation_mse": calibration.mse},
             calibration=calibration,
             traction=traction,
+            novelty=_find_novelty(model.eval(), config, train, validation, start=start),
             versions=versions(),
         )
-        _put_back(network, model)
         save_checkpoint(folder, model, manifest)
         return best_mse
 
@@ -448,6 +459,14 @@ def _put_back(network: nn.Module, model: nn.Module) -> None:
     if network is not model:
         model.load_state_dict(network.state_dict(), strict=False)
         last_layer(model).load_state_dict(last_layer(network).state_dict())
+
+
+def _find_novelty(
+    model: nn.Module, config: TrainConfig, train: FrameSet, validation: FrameSet, *, start: Run | None
+) -> Novelty | None:
+    if start is not None and config.frozen:
+        return start.manifest.novelty  # its early layers stay as they were
+    return fit_novelty(model, *(_spread_batches(some, batch_size=config.batch_size) for some in (train, validation)))
 
 
 def _check_frames(config: TrainConfig, train: FrameSet, validation: FrameSet, processes: int) -> None:

@@ -1,0 +1,337 @@
+"""Health of a running sensor: what of a frame speaks against believing its margin, each with its cure."""
+
+import time
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from sliplens.errors import InputError
+from sliplens.live.reading import Check, LiveFrame
+from sliplens.markers import MarkerStatus, TrackedFrame
+from sliplens.models.checkpoint import Run
+from sliplens.models.novelty import read_features
+from sliplens.recordings.capture import Frame
+from sliplens.recordings.labels.lag import soften
+
+Plane = Float32[np.ndarray, "height width"]
+
+_BRIGHT, _DARK = 250, 5
+_SIDE_PX = 224  # pictures are looked at about as large, so that limits in pixels mean the same
+_BORDER = 0.14  # share of the side: what touches seldom reaches there
+_COARSE = 4
+_REACH_PX = 8.0
+_PARTS, _STRAYS = 8, 2
+"""Parts of the border, and how many of them may move otherwise while the camera moves."""
+_STRAY_SHARE, _STRAY_PX = 0.2, 0.1
+_TILES = 4
+_SEEN = 10.0
+"""Grey levels below which a ratio of brightness means nothing."""
+_NOVELTY_EVERY_S = 0.25
+_DROPS_OVER_S = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class HealthLimits:
+    """Bounds of healthy values; a frame beyond one of them has no margin.
+
+    The defaults hold for 99.7 % and more of the healthy frames in contact of simulated validation trials, for each
+    check (`benchmarks/health.py --choose`); those in seconds are chosen by hand.
+    """
+
+    repeated_s: float = 0.25
+    """Time for which no pixel has changed: a camera's noise never repeats."""
+    late_s: float = 0.5
+    """Age of the frame when it is read."""
+    drops: float = 0.8
+    """Share of the last second's frames that were lost."""
+    saturation: float = 0.06
+    """Share of the pixels that turned black or white since the reference."""
+    exposure: float = 0.2
+    """Brightness against the reference, as a power of 2 up or down."""
+    focus: float = 0.25
+    """Share of the reference's sharpness that is lost."""
+    light: float = 0.2
+    """Brightness of one side of the border against the rest, as a power of 2 up or down."""
+    camera_px: float = 0.8
+    """Motion of the border as a whole against the reference, in pixels of a picture 224 high."""
+    markers: float = 0.15
+    """Share of the reference's markers that are not seen where they should be."""
+    touch: float = 7.0
+    """Least change of the picture, in grey levels, that shows a contact."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not value > 0:
+                raise InputError(f"the health limit {name} must be positive, got {value:g}")
+
+
+class HealthMonitor:
+    """Checks frames against the untouched sensor, and against what a network was trained on.
+
+    Looked at are whether frames repeat, come late or are lost; saturation and exposure; focus; light that falls
+    unevenly, as when a lamp is out; the border of the picture, which moves as a whole when the camera does (in a wide
+    contact only what was seen before it is known); markers that are
+    missing or have jumped; whether anything touches at all; and, every quarter of a second, how far the network's own
+    features are from those of its training frames, for networks whose manifest holds that.
+
+    Parameters
+    ----------
+    reference
+        The sensor untouched.
+    run
+        Network whose input is judged; None for the picture alone.
+    limits
+        Bounds of healthy values.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.live import HealthMonitor, LiveFrame
+    >>> untouched = np.random.default_rng(0).integers(60, 200, (56, 56, 3), dtype=np.uint8)
+    >>> bright = np.clip(1.3 * untouched, 0, 255).astype(np.uint8)
+    >>> frame = LiveFrame(image=bright, number=0, time_s=0.0, captured_s=0.0)
+    >>> checks = {check.name: check for check in HealthMonitor(untouched).check(frame)}
+    >>> checks["exposure"].sentence
+    'the picture is 1.3 times as bright as the reference; fix exposure and gain of the camera, or take a new reference'
+    """
+
+    def __init__(self, reference: Frame, run: Run | None = None, limits: HealthLimits | None = None) -> None:
+        self.limits = limits or HealthLimits()
+        self._reference, self._run = reference, run
+        self._soft, self._grey = soften(reference), _grey(reference)
+        self._sharp = _sharpness(self._grey)
+        self._fine, self._coarse = (_Border(plane) for plane in (self._grey, _shrink(self._grey, _COARSE)))
+        self._lost = _saturated(reference)
+        self._before: np.ndarray | None = None
+        self._changed_s = self._moved_px = 0.0
+        self._numbers: deque[tuple[float, int]] = deque()
+        self._novelty: tuple[float, Check] | None = None
+
+    def check(self, frame: LiveFrame, markers: TrackedFrame | None = None, /) -> tuple[Check, ...]:
+        """Check a frame of the reference's size, and its markers where they are followed.
+
+        The first check that is not fine names the cause: what is wrong with the camera comes before what that changes
+        in the picture.
+        """
+        soft, grey = soften(frame.image), _grey(frame.image)
+        both = (self._soft > _SEEN) & (soft > _SEEN) & (self._soft < _BRIGHT) & (soft < _BRIGHT)
+        ratio = np.log2(np.where(both, soft, 1) / np.where(both, self._soft, 1))
+        gain = float(np.median(ratio[both])) if both.any() else 0.0
+        checks = [
+            self._check_repeated(frame),
+            self._check_late(frame),
+            self._check_drops(frame),
+            self._check_saturation(frame.image),
+            self._check_exposure(gain),
+            self._check_focus(grey, gain),
+            self._check_light(ratio - gain, both),
+            self._check_camera(grey, gain),
+        ]
+        if markers is not None:
+            checks.append(self._check_markers(markers))
+        checks.append(self._check_touch(soft, gain))
+        if self._run is not None and self._run.manifest.novelty is not None:
+            checks.append(self._check_novelty(frame, self._run))
+        return tuple(checks)
+
+    def _check_repeated(self, frame: LiveFrame) -> Check:
+        pixels = frame.image[::4, ::4]
+        if self._before is None or not np.array_equal(pixels, self._before):
+            self._before, self._changed_s = pixels.copy(), frame.time_s
+        value = max(0.0, frame.time_s - self._changed_s)
+        return _judge(
+            "repeated", value, self.limits.repeated_s,
+            f"the picture has not changed by a single pixel for {value:.2g} s; start the camera again",
+            f"the picture changed {value:.2g} s ago",
+        )  # fmt: skip
+
+    def _check_late(self, frame: LiveFrame) -> Check:
+        value = max(0.0, time.monotonic() - frame.captured_s) if frame.captured_s > 0 else 0.0
+        return _judge(
+            "late", value, self.limits.late_s,
+            f"the frame is {value:.2g} s old; close what else uses the processor, or lower --rate",
+            f"the frame is {value:.2g} s old",
+        )  # fmt: skip
+
+    def _check_drops(self, frame: LiveFrame) -> Check:
+        self._numbers.append((frame.time_s, frame.number))
+        while frame.time_s - self._numbers[0][0] > _DROPS_OVER_S or frame.number < self._numbers[0][1]:
+            self._numbers.popleft()
+        span = self._numbers[-1][1] - self._numbers[0][1]
+        value = 1 - (len(self._numbers) - 1) / span if span > 0 else 0.0
+        return _judge(
+            "drops", value, self.limits.drops,
+            f"{value:.0%} of the frames of the last second were lost; lower --rate or --size, or use another port",
+            f"{value:.0%} of the frames of the last second were lost",
+        )  # fmt: skip
+
+    def _check_saturation(self, image: Frame) -> Check:
+        value = max(0.0, _saturated(image) - self._lost)
+        return _judge(
+            "saturation", value, self.limits.saturation,
+            f"{value:.0%} of the picture have turned black or white; mend the exposure or the lamps",
+            f"{value:.0%} of the picture have turned black or white",
+        )  # fmt: skip
+
+    def _check_exposure(self, gain: float) -> Check:
+        told = f"the picture is {2**gain:.2g} times as bright as the reference"
+        cure = "fix exposure and gain of the camera, or take a new reference"
+        return _judge("exposure", abs(gain), self.limits.exposure, f"{told}; {cure}", told)
+
+    def _check_focus(self, grey: Plane, gain: float) -> Check:
+        left = _sharpness(grey) / 2**gain / max(self._sharp, 1e-3)
+        told = f"edges are {left:.0%} as sharp as in the reference"
+        return _judge(
+            "focus", max(0.0, 1 - left), self.limits.focus,
+            f"{told}; clean or focus the lens, and take a new reference", told,
+        )  # fmt: skip
+
+    def _check_light(self, ratio: np.ndarray, known: np.ndarray) -> Check:
+        rows, columns = (np.array_split(np.arange(side), _TILES) for side in ratio.shape[:2])
+        worst = 0.0
+        for down, some in enumerate(rows):
+            for along, others in enumerate(columns):
+                if not {down, along} & {0, _TILES - 1}:
+                    continue  # inside the border, contact may brighten or shade
+                tile, seen = ratio[np.ix_(some, others)], known[np.ix_(some, others)]
+                for channel in range(3):
+                    values = tile[..., channel][seen[..., channel]]
+                    # the median: markers that moved are few
+                    worst = max(worst, abs(float(np.median(values)))) if len(values) > 3 else worst
+        return _judge(
+            "light", worst, self.limits.light,
+            f"one side of the picture is {2**worst:.2g} times brighter or darker than in the reference; look after the "
+            "lamps, or take a new reference",
+            f"the light falls as in the reference, to a factor of {2**worst:.2g}",
+        )  # fmt: skip
+
+    def _check_camera(self, grey: Plane, gain: float) -> Check:
+        level = np.float32(2**-gain)
+        start = _COARSE * self._coarse.shifts(_shrink(grey, _COARSE) * level, np.zeros((_PARTS, 2)))
+        shifts = self._fine.shifts(grey * level, start)
+        middle = np.median(shifts, axis=0)
+        length, strays = float(np.linalg.norm(middle)), np.linalg.norm(shifts - middle, axis=1)
+        # a camera moves all parts alike, a contact does not: what was seen before it holds until it is let go
+        if np.sort(strays)[_PARTS - _STRAYS - 1] < _STRAY_SHARE * length + _STRAY_PX:
+            self._moved_px = min(length, _REACH_PX)
+        value = self._moved_px
+        told = f"the border of the picture moved by {value:.1f} px since the reference"
+        return _judge(
+            "camera", value, self.limits.camera_px,
+            f"{told}: the camera or the skin has shifted; fasten it, and take a new reference", told,
+        )  # fmt: skip
+
+    def _check_markers(self, markers: TrackedFrame) -> Check:
+        status = markers.status
+        if (status == MarkerStatus.LOST).any():
+            value, told = 1.0, "the pattern of the markers has jumped, and none can be told from the next"
+        else:
+            absent = np.isin(status, (MarkerStatus.MISSING, MarkerStatus.BROKEN))
+            value = float(absent.sum() / max(1, (absent | (status == MarkerStatus.FOLLOWED)).sum()))
+            told = f"{value:.0%} of the markers are not seen where they should be"
+        return _judge(
+            "markers", value, self.limits.markers,
+            f"{told}; clean the skin and the lens, let go, and take a new reference", told,
+        )  # fmt: skip
+
+    def _check_touch(self, soft: np.ndarray, gain: float) -> Check:
+        value = float(np.quantile(np.abs(soft * 2**-gain - self._soft).max(axis=-1), 0.98))
+        told = f"the picture differs by {value:.2g} grey levels from the untouched sensor"
+        touches = value >= self.limits.touch
+        sentence = told if touches else "nothing touches the sensor; press it on something"
+        return Check(name="touch", value=value, limit=self.limits.touch, ok=touches, sentence=sentence)
+
+    def _check_novelty(self, frame: LiveFrame, run: Run) -> Check:
+        known = self._novelty
+        if known is not None and 0 <= frame.time_s - known[0] < _NOVELTY_EVERY_S:
+            return known[1]
+        novelty = run.manifest.novelty
+        assert novelty is not None
+        inputs = run.encode(frame.image[None], self._reference)
+        value = float(novelty.distance(read_features(run.model, novelty.layer, inputs))[0])
+        told = f"to the network the picture is {value / novelty.limit:.2g} times as strange as any it was tested on"
+        check = _judge(
+            "novelty", value, novelty.limit,
+            f"{told}; use the sensor that it was trained on, or train it on this one",
+            f"the picture is like those that the network was trained on (distance {value:.2g})",
+        )  # fmt: skip
+        self._novelty = frame.time_s, check
+        return check
+
+
+def severity(checks: Iterable[Check]) -> float:
+    """How far the worst check is from its limit, as a ratio: above 1 something is wrong."""
+    ratios = (check.limit / max(check.value, 1e-6) if check.name == "touch" else check.value / check.limit
+              for check in checks)  # fmt: skip
+    return max(ratios, default=0.0)
+
+
+def _judge(name: str, value: float, limit: float, wrong: str, fine: str) -> Check:
+    ok = value <= limit
+    return Check(name=name, value=value, limit=limit, ok=ok, sentence=fine if ok else wrong)
+
+
+def _shrink(plane: Plane, factor: int) -> Float32[np.ndarray, "rows columns"]:
+    """Means of square blocks; what fills no block at the right and below is left out."""
+    height, width = (side // factor * factor for side in plane.shape)
+    return plane[:height, :width].reshape(height // factor, factor, width // factor, factor).mean(axis=(1, 3))
+
+
+def _grey(image: Frame) -> Float32[np.ndarray, "rows columns"]:
+    """Green, which cameras see best, about 224 pixels high."""
+    return _shrink(image[..., 1].astype(np.float32), max(1, min(image.shape[:2]) // _SIDE_PX))
+
+
+def _sharpness(grey: Plane) -> float:
+    """Slope of the sharpest fortieth of the pixels, in grey levels a pixel; of means of 3 x 3, above the noise."""
+    rows = grey[:-2] + grey[1:-1] + grey[2:]
+    means = (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 9
+    slope = np.hypot(means[1:-1, 2:] - means[1:-1, :-2], means[2:, 1:-1] - means[:-2, 1:-1])
+    return float(np.quantile(slope[::2, ::2], 0.975)) / 2
+
+
+def _saturated(image: Frame) -> float:
+    """Share of the pixels that are black or white."""
+    pixels = image[::4, ::4]
+    return float(np.mean((pixels.min(axis=-1) >= _BRIGHT) | (pixels.max(axis=-1) <= _DARK)))
+
+
+class _Border:
+    """Border of a picture in eight parts, whose shifts are found by least squares on the slopes of each.
+
+    Lucas and Kanade, *An Iterative Image Registration Technique with an Application to Stereo Vision*, IJCAI 1981.
+    """
+
+    def __init__(self, plane: Plane) -> None:
+        self._plane, (height, width) = plane, plane.shape
+        wide = max(4, round(_BORDER * min(height, width)))
+        rows, columns = np.mgrid[:height, :width]
+        # bearing from the middle, the sides of the picture made alike: eight sectors of the border
+        bearing = np.arctan2(rows / (height - 1) - 0.5, columns / (width - 1) - 0.5)
+        sector = np.floor((bearing / (2 * np.pi) + 1) * _PARTS).astype(int) % _PARTS
+        sector[wide:-wide, wide:-wide] = -1
+        sector[[0, -1]] = sector[:, [0, -1]] = -1
+        down, along = np.gradient(plane)
+        self._parts = []
+        for part in range(_PARTS):
+            inside = np.nonzero(sector == part)
+            terms = np.stack([along[inside], down[inside], np.ones(len(inside[0]))], axis=1)
+            self._parts.append((*inside, np.linalg.pinv(terms, rcond=1e-3)))
+
+    def shifts(self, plane: Plane, start: Float[np.ndarray, "parts 2"]) -> Float[np.ndarray, "parts 2"]:
+        """Motion (x, y) of each part since the picture that it was made from, in pixels, near a first guess."""
+        height, width = plane.shape
+        found = start.copy()
+        for part, (rows, columns, inverse) in enumerate(self._parts):
+            for _ in range(3):
+                whole = np.clip(np.round(found[part]), -_REACH_PX, _REACH_PX).astype(int)
+                there = np.clip(rows + whole[1], 0, height - 1), np.clip(columns + whole[0], 0, width - 1)
+                step = (inverse @ (self._plane[rows, columns] - plane[there]))[:2]
+                found[part] = whole + np.clip(step, -1.5, 1.5)
+        return found
+
+
+__all__ = ["HealthLimits", "HealthMonitor", "severity"]

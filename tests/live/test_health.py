@@ -1,0 +1,154 @@
+"""Health: each fault is told by its own check, and healthy frames by none."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sliplens as sl
+from sliplens.errors import InputError
+from sliplens.live import Check, HealthLimits, HealthMonitor, LiveFrame
+from sliplens.live.health import severity
+from sliplens.markers import Tracker
+from sliplens.models.novelty import Novelty
+from sliplens.recordings import Dataset, Recording
+
+SIDE = 112
+
+
+@pytest.fixture
+def untouched(rng: np.random.Generator) -> np.ndarray:
+    """Dark spots on a bright ground, without noise."""
+    rows, columns = np.mgrid[:SIDE, :SIDE]
+    spots = (np.cos(rows / 2.5) * np.cos(columns / 2.5)).clip(0.2, 0.6)
+    return (190 - 150 * spots[..., None] * np.array([0.8, 1.0, 0.6])).astype(np.float64)
+
+
+def shot(picture: np.ndarray, rng: np.random.Generator, *, number: int = 0, time_s: float = 0.0) -> LiveFrame:
+    """A noisy frame that is touched in its middle."""
+    touched = picture.copy()
+    touched[40:72, 40:72] += 12
+    pixels = np.clip(touched + rng.normal(0, 2, touched.shape), 0, 255).astype(np.uint8)
+    return LiveFrame(image=pixels, number=number, time_s=time_s, captured_s=time.monotonic())
+
+
+def failed(checks: tuple[Check, ...]) -> set[str]:
+    return {check.name for check in checks if not check.ok}
+
+
+@pytest.fixture
+def monitor(untouched: np.ndarray, rng: np.random.Generator) -> HealthMonitor:
+    return HealthMonitor(np.clip(untouched + rng.normal(0, 2, untouched.shape), 0, 255).astype(np.uint8))
+
+
+def blurred(picture: np.ndarray) -> np.ndarray:
+    """Each pixel the mean of 5 x 5."""
+    padded = np.pad(picture, ((2, 2), (2, 2), (0, 0)), mode="edge")
+    return np.lib.stride_tricks.sliding_window_view(padded, (5, 5), axis=(0, 1)).mean(axis=(-1, -2))
+
+
+def test_a_healthy_frame_passes_every_check(monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator):
+    checks = monitor.check(shot(untouched, rng))
+    assert failed(checks) == set()
+    assert severity(checks) < 1
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.8, 1.3])
+def test_exposure_tells_the_factor(
+    monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator, factor: float
+):
+    checks = {check.name: check for check in monitor.check(shot(factor * untouched, rng))}
+    assert not checks["exposure"].ok
+    assert checks["exposure"].value == pytest.approx(abs(np.log2(factor)), abs=0.03)
+    assert f"{factor:.2g} times as bright as the reference; fix exposure" in checks["exposure"].sentence
+    assert checks["light"].ok  # evenly brighter is no lamp
+    assert checks["focus"].ok
+
+
+@pytest.mark.parametrize(("down", "along"), [(2, 0), (0, -3), (3, 3)])
+def test_a_camera_that_moved_is_told_in_pixels(
+    monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator, down: int, along: int
+):
+    moved = np.roll(untouched, (down, along), axis=(0, 1))
+    checks = {check.name: check for check in monitor.check(shot(moved, rng))}
+    # a frame of 112 pixels is looked at as it is
+    assert checks["camera"].value == pytest.approx(np.hypot(down, along), rel=0.1)
+    assert "the camera or the skin has shifted" in checks["camera"].sentence
+
+
+def test_defocus_takes_sharpness(monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator):
+    assert "focus" in failed(monitor.check(shot(blurred(untouched), rng)))
+
+
+def test_a_lamp_that_is_out_darkens_one_side(monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator):
+    ramp = np.linspace(0.5, 1.0, SIDE)[None, :, None]
+    assert "light" in failed(monitor.check(shot(ramp * untouched, rng)))
+
+
+def test_a_picture_that_turns_white_or_black_is_told(
+    monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator
+):
+    for level in (0.0, 255.0):
+        covered = untouched.copy()
+        covered[:30] = level + np.sign(127 - level) * -10
+        assert "saturation" in failed(monitor.check(shot(covered, rng)))
+
+
+def test_frames_that_repeat_come_late_or_are_lost_are_told(
+    monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator
+):
+    frame = shot(untouched, rng)
+    assert failed(monitor.check(frame)) == set()
+    assert failed(monitor.check(replace(frame, number=1, time_s=0.1))) == set()
+    assert failed(monitor.check(replace(frame, number=2, time_s=0.3))) == {"repeated"}
+    assert failed(monitor.check(shot(untouched, rng, number=3, time_s=0.4))) == set()
+    late = shot(untouched, rng, number=4, time_s=0.5)
+    assert failed(monitor.check(replace(late, captured_s=late.captured_s - 2))) == {"late"}
+    assert failed(monitor.check(shot(untouched, rng, number=90, time_s=0.6))) == {"drops"}
+
+
+def test_without_a_touch_there_is_nothing_to_tell(
+    monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator
+):
+    bare = np.clip(untouched + rng.normal(0, 2, untouched.shape), 0, 255).astype(np.uint8)
+    checks = monitor.check(LiveFrame(image=bare, number=0, time_s=0.0, captured_s=0.0))
+    assert failed(checks) == {"touch"}
+    assert severity(checks) > 1
+
+
+def test_markers_that_are_hidden_are_counted(trials: dict[str, Recording]):
+    trial = trials["chromatouch"]
+    tracker = Tracker(trial.reference)
+    count = len(tracker.rest)
+    picture = trial.reference.copy()
+    hidden = tracker.rest.centre_px[: count // 3]
+    for along, down in hidden.round().astype(int):
+        picture[down - 9 : down + 10, along - 9 : along + 10] = np.median(picture, axis=(0, 1))
+    monitor = HealthMonitor(trial.reference)
+    frame = LiveFrame(image=picture, number=0, time_s=0.0, captured_s=0.0)
+    [check] = [check for check in monitor.check(frame, tracker.update(picture)) if check.name == "markers"]
+    # patches may cut neighbours: no fewer than were hidden
+    assert len(hidden) / count - 0.05 <= check.value < 0.6
+    assert not check.ok
+
+
+def test_a_network_says_what_is_unlike_its_training(difference_run: Path, small_dataset: Dataset):
+    recording = small_dataset.load(small_dataset.trials[0])
+    run = sl.load(difference_run)
+    here = LiveFrame(image=recording.frames[0], number=0, time_s=0.0, captured_s=0.0)
+    novelty = Novelty(
+        layer="conv1", mean=(0.5,) * 24, scale=(1.0,) * 24, directions=((1.0,) + (0.0,) * 23,), variances=(1.0,),
+        rest=1.0, limit=1e-9, frames=40,
+    )  # fmt: skip
+    strange = replace(run, manifest=replace(run.manifest, novelty=novelty))
+    checks = {check.name: check for check in HealthMonitor(recording.reference, strange).check(here)}
+    assert not checks["novelty"].ok
+    assert "use the sensor that it was trained on" in checks["novelty"].sentence
+    assert "novelty" not in {check.name for check in HealthMonitor(recording.reference, run).check(here)}
+
+
+def test_limits_that_cannot_be_are_told():
+    with pytest.raises(InputError, match="the health limit focus must be positive, got -1"):
+        HealthLimits(focus=-1.0)
