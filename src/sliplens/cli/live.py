@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from sliplens.live import LiveReader, SourceOptions
     from sliplens.recordings import TrialFacts
 
+_COLUMNS = ("device", "name", "format", "size", "frames/s")
 _SOURCE = "simulated, the number of a camera, the address of a stream, or a video, bag, data set or growing folder."
 
 
@@ -60,8 +61,7 @@ class Live:
     page: bool = True
     """Show it in browsers, with buttons to freeze, explain and record."""
     host: str = "127.0.0.1"
-    """Address on which the page listens: this machine alone, or others too, 0.0.0.0 for all; they need the token of
-    the address that is printed."""
+    """Where the page listens; 0.0.0.0 for all machines, which need the token of the address that is printed."""
     port: int | None = None
     """Port of the page; 8090 if not given."""
     record: Path | None = None
@@ -91,27 +91,16 @@ class Live:
             return
         shipped = "chromatouch-difference" if self.source in {"simulated", "simulated:chromatouch"} else None
         with ExitStack() as stack:
-            sinks = [open_sink(name) for name in self.sink]
-            for sink in sinks:
-                stack.callback(sink.close)
-            reader = LiveReader(
-                self.source,
-                self.network or shipped,
-                reference=self.reference,
-                sensor=self.sensor if is_profile(self.sensor) else None,
-                options=self._options(),
-                engine=self.engine,
-                device=self.device,
-                smoothing_s=self.smoothing,
-                seconds=self.seconds,
-                forces=self.forces,
-            )
+            sinks = [stack.enter_context(closing(open_sink(name))) for name in self.sink]
+            named = {name: getattr(self, name) for name in ("reference", "engine", "device", "seconds", "forces")}
+            named |= {"sensor": self.sensor if is_profile(self.sensor) else None, "smoothing_s": self.smoothing}
+            reader = LiveReader(self.source, self.network or shipped, options=self._options(), **named)
             for sink in sinks:
                 reader.subscribe(lambda reading, frame, sink=sink: sink.send(reading, frame and frame.image))
             if self.record is not None:
                 recorder = reader.record(self.record, facts=self._facts)
                 stack.callback(lambda: _tell(f"{recorder.folder}: {recorder.state}"))
-            with suppress(KeyboardInterrupt), reader:  # the way to end it
+            with suppress(KeyboardInterrupt), reader, self._shown(reader):  # the way to end it
                 self._watch(reader)
 
     @contextmanager
@@ -139,12 +128,9 @@ class Live:
     def _options(self) -> "SourceOptions":
         from sliplens.live.contract import SourceOptions, parse_size
 
+        size = parse_size(self.size)
         return SourceOptions(
-            rate_hz=self.rate,
-            speed=self.speed,
-            trial=self.trial,
-            size=parse_size(self.size),
-            pixel_format=self.pixel_format,
+            rate_hz=self.rate, speed=self.speed, trial=self.trial, size=size, pixel_format=self.pixel_format
         )
 
     def _watch(self, reader: "LiveReader") -> None:
@@ -157,11 +143,8 @@ class Live:
     def _list(self) -> None:
         from sliplens.live import SOURCES, list_cameras
 
-        cameras = [(camera, mode) for camera in list_cameras() for mode in camera.modes]
-        rows = [(str(camera.path), camera.name, *mode.in_words()) for camera, mode in cameras]
-        if rows:
-            print_table("Cameras", ("device", "name", "format", "size", "frames/s"), rows)
-        else:
-            say("no camera is there that can be read")
+        cameras = list_cameras()
+        rows = [(str(one.path), one.name, *mode.in_words()) for one in cameras for mode in one.modes]
+        print_table("Cameras", _COLUMNS, rows) if rows else say("no camera is there that can be read")
         for kind in SOURCES.values():
             say(f"  {kind.words}")
