@@ -49,3 +49,10 @@ def test_what_can_be_read_is_listed(capsys: pytest.CaptureFixture[str]):
 def test_mistakes_are_told_in_a_sentence(words: list[str], told: str, capsys: pytest.CaptureFixture[str]):
     assert main(["live", *words]) == 2
     assert told in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_command_shows_its_page_where_it_is_wanted(capsys):
+    pytest.importorskip("nicegui", reason="the page needs NiceGUI (extra live)")
+    for words, shown in (((), True), (("--no-page",), False)):
+        assert main(["live", "--seconds", "0.3", "--port", "8391", *words]) == 0
+        assert ("open http://127.0.0.1:8391/" in capsys.readouterr().err) is shown
