@@ -3,10 +3,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from jaxtyping import Float32, Float64, Int64
 
-from sliplens.codec import Columns, keep_part, load_record, load_result, save_record, save_result
+from sliplens.codec import (
+    TABLE_SUFFIXES,
+    Columns,
+    keep_part,
+    load_record,
+    load_result,
+    read_written,
+    save_record,
+    save_result,
+    write_tables,
+)
 from sliplens.errors import InputError
 
 
@@ -175,3 +186,14 @@ def test_what_is_declared_as_any_object_comes_back_as_json_holds_it(tmp_path: Pa
 
     save_record(Loose(config={"a": (1, 2)}), tmp_path / "loose.json")
     assert load_record(tmp_path / "loose.json", Loose, command="sliplens x").config == {"a": [1, 2]}
+
+
+@pytest.mark.parametrize("suffix", TABLE_SUFFIXES)
+@pytest.mark.parametrize("rows", [0, 3])
+def test_a_table_comes_back_from_every_ending(tmp_path: Path, suffix: str, rows: int):
+    schema = pa.schema([("trial", pa.string()), ("frame", pa.int64()), ("margin", pa.float64())])
+    table = pa.table({"trial": ["a, b", 'c "d"', "e"], "frame": [0, 1, 2], "margin": [0.25, None, 1 / 3]}, schema)
+    path = tmp_path / f"table{suffix}"
+    assert write_tables([table.slice(0, min(rows, 1)), table.slice(1, max(rows - 1, 0))], path, schema) is None
+    assert read_written(path, schema).equals(table.slice(0, rows))
+    assert [one.name for one in tmp_path.iterdir()] == [path.name]

@@ -17,6 +17,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 import msgspec
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 from jaxtyping import AbstractArray, jaxtyped
 
@@ -226,10 +227,50 @@ def _load_columns(path: Path, kind: type[_Columns], cure: str) -> _Columns:
     return kind(**values)
 
 
-def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schema) -> pa.Table | None:
-    """Write tables as row groups of one Parquet file, each as it comes; whole or not at all.
+TABLE_SUFFIXES = (".parquet", ".csv", ".json")
+"""Endings of the tables that can be written: Parquet, CSV, and JSON with one object a row."""
 
-    A file that is there is replaced; without a path the tables are joined in memory and given back.
+
+class _JsonWriter:
+    """Rows as a JSON array, one object a line; what is not known is null."""
+
+    def __init__(self, path: Path) -> None:
+        self._stream = path.open("wb")
+        self._first = True
+
+    def __enter__(self) -> "_JsonWriter":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stream.write(b"[]\n" if self._first else b"\n]\n")
+        self._stream.close()
+
+    def write_table(self, table: pa.Table) -> None:
+        for row in table.to_pylist():
+            self._stream.write((b"[\n" if self._first else b",\n") + msgspec.json.encode(row))
+            self._first = False
+
+
+def _table_writer(part: Path, schema: pa.Schema, suffix: str) -> Any:
+    if suffix == ".csv":
+        return pa_csv.CSVWriter(part, schema)
+    return _JsonWriter(part) if suffix == ".json" else pq.ParquetWriter(part, schema, compression="zstd")
+
+
+def read_written(path: Path, schema: pa.Schema) -> pa.Table:
+    """Read a table that `write_tables` wrote."""
+    if path.suffix == ".csv":
+        return pa_csv.read_csv(path, convert_options=pa_csv.ConvertOptions(column_types=schema))
+    if path.suffix == ".json":
+        return pa.Table.from_pylist(msgspec.json.decode(path.read_bytes()), schema)
+    return pq.ParquetFile(path).read()  # not read_table, which imports pandas
+
+
+def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schema) -> pa.Table | None:
+    """Write tables into one file, each as it comes; whole or not at all.
+
+    The file is Parquet, a row group a table, or by its ending CSV or JSON (`TABLE_SUFFIXES`). A file that is there is
+    replaced; without a path the tables are joined in memory and given back.
 
     Raises
     ------
@@ -241,7 +282,7 @@ def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schem
     part = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        writer = pq.ParquetWriter(part, schema, compression="zstd")
+        writer = _table_writer(part, schema, path.suffix)
     except OSError as error:
         raise InputError(f"cannot write {path} ({error.strerror or error}); choose another file") from None
     try:

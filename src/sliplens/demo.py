@@ -17,6 +17,7 @@ from sliplens.results.explanation import Strip
 from sliplens.simulation.trials import simulate
 from sliplens.study import explain_source, explain_trial, run_study, score_explained
 from sliplens.study.curves import Setting
+from sliplens.study.explaining import DEFAULT_METHODS
 from sliplens.study.scoring import STEPS
 from sliplens.training import evaluate, train
 
@@ -116,7 +117,8 @@ def run_demo(
     run_study(data, out=folder, difference=difference, raw=raw, **_STUDY, jobs=jobs, seed=seed, on_progress=on_progress)
     if real is not None:
         maps = folder / "explain-real"
-        explain_source(difference, real, labels_in_names=True, budget=_BUDGET, out=maps, on_progress=on_progress)
+        settings: dict[str, Any] = {"methods": DEFAULT_METHODS, "budget": _BUDGET, "labels_in_names": True}
+        explain_source(difference, real, **settings, out=maps, on_progress=on_progress)
         score_explained(difference, maps, out=folder / "score-real", steps=STEPS, seed=seed, on_progress=on_progress)
     return show()
 

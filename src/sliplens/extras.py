@@ -1,6 +1,7 @@
 """What may be installed beside sliplens: packages of its extras, and packages that add rows to its tables."""
 
 import os
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from functools import cached_property
@@ -127,8 +128,36 @@ def import_openvino() -> ModuleType:
     return openvino
 
 
+def import_torchvision() -> ModuleType:
+    """TorchVision, without torch's compiler: it imports all of that for one question that it asks when it compiles.
+
+    `torchvision.ops.roi_align` of 0.20 to 0.29 takes `is_compile_supported` from there, which no network here calls;
+    imported as it is, the compiler costs as much again as torch.
+    """
+    compiler = "torch._dynamo.utils"
+    hide = "torchvision" not in sys.modules and compiler not in sys.modules
+    if hide:
+        stand_in = ModuleType(compiler)
+        stand_in.is_compile_supported = _is_compile_supported  # pyright: ignore[reportAttributeAccessIssue]
+        sys.modules[compiler] = stand_in
+    try:
+        import torchvision  # noqa: PLC0415 (takes seconds)
+    finally:
+        if hide:
+            del sys.modules[compiler]
+    return torchvision
+
+
+def _is_compile_supported(device_type: str) -> bool:
+    return import_module("torch._dynamo.utils").is_compile_supported(device_type)
+
+
 def require_device(name: str) -> None:
     """Refuse a device that is not known or not there."""
+    if not re.fullmatch(r"[a-z]+(:\d+)?", name):
+        raise InputError(f"device {name!r} is not known; use cpu, cuda or cuda:1")
+    if name == "cpu":
+        return  # the usual one, known without torch
     torch = import_module("torch")  # takes seconds, and the floors below the networks do without
     try:
         device = torch.device(name)

@@ -8,11 +8,12 @@ import shutil
 import sys
 import tempfile
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ from sliplens.errors import InputError
 
 RUN_FILE = "run.json"
 """Provenance of a folder."""
+MANIFEST_FILE = "manifest.json"
+"""What a network is; its folder is one that holds this."""
 _PACKAGES = ("numpy", "torch", "torchvision", "lightning", "captum", "matplotlib", "pyarrow", "pillow")
 
 
@@ -136,6 +139,26 @@ def require_folder(path: Path, *, what: str) -> Path:
     return path
 
 
+# the package is installed as files, never as an archive: its weights are mapped into memory from there
+_WEIGHTS = Path(str(files("sliplens"))) / "weights"
+
+
+def shipped_names() -> list[str]:
+    """Names of the networks that come with the package."""
+    return sorted(path.parent.name for path in _WEIGHTS.glob(f"*/{MANIFEST_FILE}"))
+
+
+def find_run(run: Path) -> Path:
+    """Folder of a network: the one that is named, else the one of that name that comes with the package."""
+    if run.exists():
+        return run
+    names = shipped_names()
+    if str(run) in names:
+        return _WEIGHTS / run
+    shipped = f", or name {' or '.join(names)}, which comes with sliplens" if names else ""
+    raise InputError(f"the run {run} does not exist; check the path{shipped}")
+
+
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
     """Folder for what must lie on disk for a while; it is gone afterwards."""
@@ -143,10 +166,11 @@ def scratch_folder() -> Iterator[Path]:
         yield Path(folder)
 
 
-def require_new_file(path: Path, *, suffix: str | None = None, overwrite: bool = False) -> None:
-    """Check that a file can be written under its name."""
-    if suffix is not None and path.suffix != suffix:
-        raise InputError(f"{path} does not end in {suffix}; name the file to write so")
+def require_new_file(path: Path, *, suffix: str | Sequence[str] = (), overwrite: bool = False) -> None:
+    """Check that a file can be written under its name, which ends in the suffix or one of them."""
+    endings = (suffix,) if isinstance(suffix, str) else tuple(suffix)
+    if endings and path.suffix not in endings:
+        raise InputError(f"{path} does not end in {' or '.join(endings)}; name the file to write so")
     if path.exists() and not overwrite:
         raise InputError(f"{path} exists; choose another file or pass --overwrite")
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
-from scipy.special import stdtrit
 
 __all__ = ["FEWEST_UNITS", "Difference", "mean_interval", "paired_difference"]
 
@@ -183,4 +182,6 @@ def _student_ends(
     if variance == 0:
         return np.zeros(2)
     degrees = variance**2 / sum(part**2 / one for part, one in zip(parts, freedom, strict=True))  # Satterthwaite's
+    from scipy.special import stdtrit  # noqa: PLC0415 (takes a second, and predictions have none)
+
     return np.sqrt(variance) * stdtrit(degrees, at)

@@ -1,5 +1,6 @@
 """`sliplens explain`: the folder it makes, and what is said to mistakes."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +17,16 @@ from sliplens.files import read_json
 from sliplens.images import list_images, read_image
 from sliplens.recordings import Dataset
 from sliplens.results import load_explained
+from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
+from sliplens.study.workspace import draw_explained
 
 QUICK = ("--method", "grad-cam", "occlusion")
 
 
 def run(*words: object) -> None:
-    tyro.cli(Explain, args=[str(word) for word in words]).run()
+    command = tyro.cli(Explain, args=[str(word) for word in words])
+    command.check()
+    command.run()
 
 
 def refused(message: str, *words: object) -> None:
@@ -38,20 +43,55 @@ def test_maps_overlays_and_a_panel(difference_run: Path, small_dataset: Dataset,
         assert explained.relevance[method].dtype == np.float32
         overlays = output / "overlays" / method
         assert {path.stem for path in overlays.iterdir()} == {frame.id for frame in explained.frames}
-        for frame, saliency in zip(explained.frames, explained.saliency[method], strict=True):
+        for frame, relevance in zip(explained.frames, explained.relevance[method], strict=True):
             picture = read_image(overlays / f"{frame.id}.png")
             assert picture.shape == (32, 32, 3)
-            # colour is saliency: where there is none the picture is grey
-            spread = picture.max(axis=2).astype(int) - picture.min(axis=2)
-            assert (spread[saliency == 0] == 0).all()
+            # colour is relevance: where there is none the picture is grey, what raises is blue and what lowers orange
+            red, _, blue = picture.astype(int).transpose(2, 0, 1)
+            assert (red == blue)[relevance == 0].all()
+            assert (blue >= red)[relevance > 0].all()
+            assert (red >= blue)[relevance < 0].all()
     # a row for the input and for each method, a column for each frame
     with Image.open(output / "panel.png") as panel:
         assert panel.height > panel.width
-    told = capsys.readouterr().err
+    out, told = capsys.readouterr()
+    assert "a first picture" in out
     notes = {note for one in read_json(output / "result.json")["methods"].values() for note in one["warnings"]}
-    assert told.count("note: ") == len(notes)  # what several methods warn of is told once
+    assert 1 <= told.count("note: ") <= len(notes)  # what several methods warn of, or other numbers, is told once
     run(difference_run, small_dataset.folder, "-o", output, *QUICK, "--levels", 1, 0)
     assert "kept" in capsys.readouterr().out
+
+
+def test_a_frame_with_nothing_to_explain_looks_empty(tmp_path: Path):
+    relevance = np.zeros((2, 8, 8), dtype=np.float32)
+    relevance[0, 2:4, 2:4] = -0.2  # 80 points of margin; the second frame changes by a hundredth of a point
+    relevance[1, 2:4, 2:4] = 0.000025
+    frame = {"trial": "t", "condition": "dry", "safety_margin": 0.2, "prediction": 0.2, "reference_prediction": 1.0}
+    explained = Explained(
+        input="difference",
+        source="real",
+        weights_sha256="",
+        frames=(ExplainedFrame(id="touched", **frame), ExplainedFrame(id="untouched", **frame)),
+        methods={"occlusion": MethodNotes(seconds_per_frame=0.0, warnings=())},
+        images=np.full((2, 3, 8, 8), 100, dtype=np.uint8),
+        pictures=np.full((2, 8, 8, 3), 100, dtype=np.uint8),
+        relevance={"occlusion": relevance},
+        saliency={"occlusion": np.abs(relevance)},
+    )
+    draw_explained(explained, tmp_path, colours="signed")
+    strong, empty = (read_image(tmp_path / "overlays" / "occlusion" / f"{one.id}.png") for one in explained.frames)
+    assert np.ptp(strong[2, 2].astype(int)) > 100
+    assert np.ptp(empty.astype(int)) <= 1
+    with Image.open(tmp_path / "panel.png") as panel:  # two rows, and the colours that they are drawn in below
+        assert panel.height > panel.width
+
+
+def test_without_a_method_the_recommended_ones_explain(difference_run: Path, difference_folder: Path, tmp_path: Path):
+    run(difference_run, "--frames", difference_folder, "-o", tmp_path / "maps")
+    explained = load_explained(tmp_path / "maps")
+    assert list(explained.relevance) == ["shapley", "poly-cam"]  # difference images show no markers
+    for notes in explained.methods.values():
+        assert all(re.match(r"[123] of 3 frames \(frame", warning) for warning in notes.warnings)
 
 
 def test_colours_of_the_thesis(difference_run: Path, difference_folder: Path, tmp_path: Path):
@@ -70,13 +110,23 @@ def test_colours_of_the_thesis(difference_run: Path, difference_folder: Path, tm
 def test_a_budget_reaches_poly_cam(difference_run: Path, difference_folder: Path, tmp_path: Path, monkeypatch):
     seen = []
 
-    def explain(trained, chosen, *, methods, explainers, parts, on_progress):
+    def explain(trained, chosen, *, methods, explainers, parts, on_map, on_progress):
         seen.append(explainers["poly-cam"].budget)
         raise KeyboardInterrupt
 
     monkeypatch.setattr("sliplens.study.workspace.explain_frames", explain)
     with pytest.raises(KeyboardInterrupt):
-        run(difference_run, "--frames", difference_folder, "-o", tmp_path / "maps", "--budget", 0.25)
+        run(
+            difference_run,
+            "--frames",
+            difference_folder,
+            "-o",
+            tmp_path / "maps",
+            "--budget",
+            0.25,
+            "--method",
+            "poly-cam",
+        )
     assert seen == [0.25]
 
 
@@ -148,5 +198,5 @@ def test_mistakes_are_told_before_anything_is_written(
     refused("no explainer named 'lime'; choose", difference_run, small_dataset.folder, *here, "--method", "lime")
     refused("budget is 2.0; give a share", difference_run, small_dataset.folder, *here, "--budget", 2)
     assert not (tmp_path / "maps").exists()
-    with pytest.raises(InputError, match="does not exist"):
+    with pytest.raises(InputError, match="nothing does not exist"):
         run(tmp_path / "nothing", small_dataset.folder, *here)

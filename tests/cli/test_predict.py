@@ -1,20 +1,28 @@
 """`sliplens predict`: the file it writes, and what is said to mistakes."""
 
+import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 import tyro
+from pyarrow.csv import read_csv
 
 from sliplens import __version__
+from sliplens.cli.command import in_options
 from sliplens.cli.predict import Predict
+from sliplens.cli.train import Train
 from sliplens.errors import InputError, SliplensError
 from sliplens.files import hash_file, hash_json, read_json
 from sliplens.recordings import Dataset
 
 
 def run(*words: object) -> None:
-    tyro.cli(Predict, args=[str(word) for word in words]).run()
+    command = tyro.cli(Predict, args=[str(word) for word in words])
+    command.check()
+    command.run()
 
 
 def refused(message: str, *words: object) -> None:
@@ -66,7 +74,7 @@ def test_mistakes_are_told_before_anything_is_written(
 ):
     output = tmp_path / "a.parquet"
     here = ("-o", output)
-    refused("does not end in .parquet", difference_run, difference_folder, "-o", tmp_path / "a.csv")
+    refused("does not end in .parquet or .csv or .json", difference_run, difference_folder, "-o", tmp_path / "a.txt")
     refused("--batch-size must be at least 1, got 0", difference_run, difference_folder, *here, "--batch-size", 0)
     refused("device 'qpu' is not known", difference_run, difference_folder, *here, "--device", "qpu")
     refused("the run .*nothing does not exist", tmp_path / "nothing", difference_folder, *here)
@@ -75,6 +83,45 @@ def test_mistakes_are_told_before_anything_is_written(
     onnx = ("--onnx", tmp_path / "a.onnx")
     refused("not for eager; leave it out", difference_run, difference_folder, *here, *onnx, "--engine", "eager")
     assert not output.exists()
+
+
+def test_few_frames_are_told_one_by_one(difference_run: Path, difference_folder: Path, tmp_path: Path, capsys):
+    run(difference_run, difference_folder, "-o", tmp_path / "a.json")
+    rows = json.loads((tmp_path / "a.json").read_text())
+    lines = capsys.readouterr().out.splitlines()
+    for row in rows:
+        (line,) = (line for line in lines if row["file"] in line)
+        assert f"{100 * row['prediction']:.0f} %" in line
+        assert row["low_90"] is None or f"{100 * row['low_90']:.0f} to {100 * row['high_90']:.0f} %" in line
+
+
+def test_many_frames_are_told_by_their_lowest(difference_run: Path, small_dataset: Dataset, tmp_path: Path, capsys):
+    run(difference_run, small_dataset.folder, "-o", tmp_path / "a.csv", "--plot", tmp_path / "a.png")
+    rows = read_csv(tmp_path / "a.csv").to_pylist()
+    lines = capsys.readouterr().out.splitlines()
+    for trial in {row["trial"] for row in rows}:
+        margins = [row["prediction"] for row in rows if row["trial"] == trial]
+        (line,) = (line for line in lines if line.startswith(f"{trial} "))
+        assert f"lowest {100 * min(margins):.0f} %" in line
+        assert len([sign for sign in line if "\u2581" <= sign <= "\u2588"]) == min(40, len(margins))
+    assert {"normal_force_n", "tangential_force_n", "safety_margin"} <= rows[0].keys()
+    assert (tmp_path / "a.png").stat().st_size > 10_000
+
+
+def test_mistakes_are_told_before_torch_is_imported(difference_folder: Path, tmp_path: Path):
+    script = "import sys; from sliplens.cli import main; code = main(sys.argv[1:]); print(code, 'torch' in sys.modules)"
+    words = ["predict", "chromatouch-difference", str(difference_folder), "-o", str(tmp_path / "a.txt")]
+    told = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True, check=True)
+    assert told.stdout.split() == ["2", "False"]
+    assert "does not end in" in told.stderr
+
+
+def test_errors_name_the_option_that_was_typed():
+    command = tyro.cli(Train, args=["data", "-o", "run", "--batch-size", "1"])
+    said = "batch_size must be at least 2, since batch normalisation needs more than one image"
+    assert in_options(said, command) == said.replace("batch_size", "--batch-size")
+    assert in_options("epochs must be positive, got -1", command) == "--epochs must be positive, got -1"
+    assert in_options("the output of all epochs", command) == "the output of all epochs"
 
 
 def test_a_graphics_card_that_is_not_there_is_told(difference_run: Path, difference_folder: Path, tmp_path: Path):

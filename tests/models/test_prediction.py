@@ -69,6 +69,8 @@ def test_a_data_set_is_predicted_frame_by_frame(trained: Run, small_dataset: Dat
         "frame",
         "time_s",
         "safety_margin",
+        "normal_force_n",
+        "tangential_force_n",
         "prediction",
         "sigma",
         "low_90",

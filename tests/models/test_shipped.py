@@ -1,15 +1,18 @@
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from scipy.stats import spearmanr
 
 import sliplens
 from sliplens.errors import InputError
 from sliplens.faithfulness.controls import cascade
+from sliplens.files import find_run, shipped_names
 from sliplens.models import Run
-from sliplens.models.checkpoint import find_run, shipped_names
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 from sliplens.study import frames_from_folder
 
@@ -84,3 +87,24 @@ def test_a_folder_counts_before_a_network_of_the_package(difference_run: Path):
 def test_nothing_else_is_found_by_asking_the_package():
     with pytest.raises(AttributeError, match="has no attribute 'weights_of_the_world'"):
         _ = sliplens.weights_of_the_world  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_networks_are_loaded_without_the_compiler_and_pandas():
+    script = "import sys, sliplens.models.predictions; print([name for name in sys.argv[1:] if name in sys.modules])"
+    words = ["torch._dynamo", "torch._inductor", "pandas", "scipy.special", "matplotlib"]
+    told = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == "[]"
+
+
+def test_a_network_is_told_in_ten_lines():
+    told = repr(sliplens.load("chromatouch-difference"))
+    assert len(told.splitlines()) <= 10
+    assert "difference images" in told
+    assert "224 x 224 px" in told
+
+
+def test_the_network_may_be_left_out():
+    frames = np.zeros((3, 224, 224, 3), dtype=np.uint8)
+    alone, named = sliplens.predict(frames), sliplens.predict("chromatouch-difference", frames)
+    assert pa.table(alone).equals(named.frame())
+    assert len(alone) == 3

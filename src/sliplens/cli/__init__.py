@@ -3,11 +3,14 @@
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import redirect_stdout
+from typing import Any, get_args
 
 import tyro
 
 from sliplens._version import __version__
 from sliplens.cli.check import Check
+from sliplens.cli.command import in_options
 from sliplens.cli.console import fail
 from sliplens.cli.demo import Demo
 from sliplens.cli.diagnose import Diagnose
@@ -15,6 +18,7 @@ from sliplens.cli.evaluate import Evaluate
 from sliplens.cli.explain import Explain
 from sliplens.cli.export import Export
 from sliplens.cli.grip import Grip
+from sliplens.cli.help import OPTIONAL, Help, HelpText, describe_options, print_help
 from sliplens.cli.import_ import Import
 from sliplens.cli.label import Label
 from sliplens.cli.live import Live
@@ -29,14 +33,34 @@ from sliplens.cli.track import Track
 from sliplens.cli.train import Train
 from sliplens.cli.view import View
 from sliplens.errors import SliplensError
+from sliplens.recordings.options import LabelSettings, ReadOptions
 
 _Recordings = Sensor | Simulate | Import | Label | Split | Check | View | Track
 _Networks = Train | Evaluate | Predict | Export
-Command = Demo | Live | _Recordings | _Networks | Explain | Score | Diagnose | Study | Grip | Report
+Command = Demo | Live | _Recordings | _Networks | Explain | Score | Diagnose | Study | Grip | Report | Help
 
 _DESCRIPTION = """sliplens tells how close a soft robotic fingertip is to losing its grip, from the images of the camera
-inside it, and shows why the network says so. Start with `sliplens demo runs/demo`; every stage it runs is a command
-of its own: simulate, train, evaluate, explain, score, report."""
+inside it, and shows why the network says so. Start with `sliplens demo runs/demo`; `sliplens help` tells which commands
+do what you came for."""
+
+
+def _parse(words: Sequence[str]) -> Any:
+    """Make the command that the words name; help is printed here, and ends the program."""
+    help_text = HelpText()
+    describe_options(*get_args(Command), LabelSettings, ReadOptions)
+    try:
+        with redirect_stdout(help_text):
+            return tyro.cli(
+                Command,  # pyright: ignore[reportArgumentType]
+                prog="sliplens",
+                description=_DESCRIPTION,
+                args=words,
+                registry=OPTIONAL,
+            )
+    except SystemExit:
+        if help_text.getvalue():
+            print_help(help_text.getvalue(), words)
+        raise
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -58,20 +82,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     # threads that spin while they wait take the cores from those that work; must be set before torch is imported
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    command = None
     try:
-        command = tyro.cli(
-            Command,  # pyright: ignore[reportArgumentType]
-            prog="sliplens",
-            description=_DESCRIPTION,
-            args=words or ["--help"],
-        )
+        command = _parse(words or ["--help"])
+        getattr(command, "check", lambda: None)()
         command.run()
     except BrokenPipeError:
         # whoever read it has seen enough, as `| head` does; what is still to be written on the way out goes nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except SliplensError as error:
-        fail(str(error))
+        fail(str(error) if command is None else in_options(str(error), command))
         return 2
     except OSError as error:
         fail(

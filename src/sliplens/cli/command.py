@@ -1,7 +1,8 @@
 """What commands share: options that mean the same in several, and the call that hands options to the library."""
 
+import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -9,6 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import tyro
 
 from sliplens.cli.console import Terminal
+from sliplens.errors import InputError
+from sliplens.extras import require_device
+from sliplens.files import find_run
 
 if TYPE_CHECKING:
     from sliplens.recordings.options import ReadOptions
@@ -26,12 +30,43 @@ Friction = Annotated[str | None, tyro.conf.arg(metavar="MU|LOW..HIGH", help=_FRI
 Device = Annotated[str, tyro.conf.arg(help="Where the network runs: cpu, cuda or cuda:1.")]
 
 
+def require_network(name: Path | str) -> None:
+    """Refuse a network that is not there, before torch is imported to load it."""
+    find_run(Path(name))
+
+
+def require_path(path: Path, *, what: str) -> None:
+    """Refuse what does not exist, before what reads it is imported."""
+    if not path.exists():
+        raise InputError(f"{what} {path} does not exist; check the path")
+
+
+def in_options(message: str, command: object) -> str:
+    """Write the parameters that a message names as the options of a command that the user typed."""
+    for name in sorted((field.name for field in fields(command)), key=len, reverse=True):  # pyright: ignore
+        # in the middle of a sentence a single word may be just a word
+        place = rf"(?<![\w-]){name}(?![\w-])" if "_" in name else rf"^{name}(?= (?:must|is \d|is -))"
+        message = re.sub(place, f"--{name.replace('_', '-')}", message)
+    return message
+
+
 @dataclass(frozen=True, kw_only=True)
 class Command:
     """A command that writes; its options are named as the parameters of the library's calls are."""
 
     overwrite: bool = False
     """Replace what is there."""
+
+    def check(self) -> None:
+        """Refuse what is wrong at first sight, before anything is imported that takes seconds."""
+        given = vars(self)
+        if isinstance(network := given.get("model"), Path):
+            require_network(network)
+        for name, what in (("data", "the data set"), ("source", "the source"), ("reference", "the reference image")):
+            if isinstance(path := given.get(name), Path):
+                require_path(path, what=what)
+        if isinstance(device := given.get("device"), str):
+            require_device(device)
 
     def call(self, function: Callable[..., Result], **others: Any) -> Result:
         """Call the library with every option that it has a parameter for, and with what is named here."""

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sliplens.cli.command import Command, Device
+from sliplens.cli.command import Command, Device, require_path
 from sliplens.cli.console import print_table
 from sliplens.errors import InputError
 
@@ -33,15 +33,17 @@ class Explain(Command):
     """Profile of the sensor for --frames: a file that `sliplens sensor new` made, or a name such as digit."""
     labels_in_names: bool = False
     """Read the safety margin in percent from names such as image_433_20.png."""
-    method: tuple[str, ...] = ("grad-cam", "integrated-gradients", "poly-cam")
-    """Explainers to run; --list-methods tells which there are."""
+    method: tuple[str, ...] | None = None
+    """Explainers to run; --list-methods tells which there are. If not given, Shapley values of the markers, or of tiles
+    where none are found, and Poly-CAM."""
     list_methods: bool = False
     """Print the table of explainers and do nothing else."""
-    budget: float = 1.0
+    budget: float | None = None
     """Share of the channels that poly-cam measures at first; below 1 it is faster. It goes on where the map is not
-    expected to be like the exact one, and tells how far it is."""
-    colours: Literal["inferno", "jet"] = "inferno"
-    """Colours of the pictures: inferno is perceptually uniform, jet is that of the thesis's figures."""
+    expected to be like the exact one, and tells how far it is. If not given, 1 for one image and 0.15 for several."""
+    colours: Literal["signed", "jet"] = "signed"
+    """Colours of the pictures. signed: blue raises the answer and orange lowers it, on one scale for all frames. jet:
+    what supports the answer, each picture on its own scale, as in the thesis's figures."""
     split: str = "test"
     """Trials of the data set to take frames from."""
     condition: str = "dry"
@@ -51,6 +53,18 @@ class Explain(Command):
     levels: tuple[float, ...] = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
     """Safety margins at which frames are taken."""
     device: Device = "cpu"
+
+    def check(self) -> None:
+        """Refuse what is wrong at first sight."""
+        if self.list_methods:
+            return
+        if self.model is None or self.output is None:
+            raise InputError("name the network and the folder to make: sliplens explain RUN DATA -o FOLDER")
+        if (self.data is None) == (self.frames is None):
+            raise InputError("name either a data set or --frames FOLDER, to say which frames to explain")
+        if self.frames is not None:
+            require_path(self.frames, what="the folder of frames")
+        super().check()
 
     def run(self) -> None:
         """Explain and write the maps."""

@@ -2,25 +2,39 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from sliplens.cli.command import Device, Friction, Network, Source, SourceCommand, TableFile
-from sliplens.cli.console import wrote
+from sliplens.cli.command import Device, Friction, Network, Source, SourceCommand, require_path
+from sliplens.cli.console import print_table, say, sparkline, wrote
+from sliplens.errors import InputError
+from sliplens.files import require_new_file
+
+if TYPE_CHECKING:
+    from sliplens.models.predictions import Predictions, TrialMargins
+
+_FEW = 24
+"""Frames of which each has a line on the terminal."""
+_TRIALS = 40
+"""Trials of which each has a line."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Predict(SourceCommand):
     """Read the safety margin of every frame: of a data set, a folder of images, a video, or any recording.
 
-    Writes a row a frame: trial, frame, time, prediction, and how sure the network is, where it tells. Memory does not
-    grow with the recording. Images of a folder are taken for difference images if no reference is named.
+    Shows the margin with its 90 % interval: frame by frame where there are few, else the course of each trial and its
+    lowest point. Images of a folder are taken for difference images if no reference is named.
     """
 
     model: Network
     source: Source
-    output: TableFile
+    output: Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="FILE.csv")] = None
+    """Table to write, by its ending .parquet, .csv or .json: trial, frame, time, margin, interval, and label and forces
+    where they are known. Memory does not grow with the recording."""
+    plot: Annotated[Path | None, tyro.conf.arg(metavar="FILE.png")] = None
+    """Picture to draw: margin with its interval over time, and label and forces where they are known."""
     engine: str = "auto"
     """What runs the network: eager, folded, compiled, onnxruntime or openvino; auto takes the fastest at hand."""
     onnx: Annotated[Path | None, tyro.conf.arg(metavar="FILE.onnx")] = None
@@ -30,10 +44,76 @@ class Predict(SourceCommand):
     """Frames predicted together; on a CPU more are slower, as they no longer fit its cache."""
     device: Device = "cpu"
 
+    def check(self) -> None:
+        """Refuse what is wrong at first sight."""
+        from sliplens.codec import TABLE_SUFFIXES
+
+        if self.output is not None:
+            require_new_file(self.output, suffix=TABLE_SUFFIXES, overwrite=self.overwrite)
+        if self.plot is not None:
+            from sliplens.plots.layout import require_picture_path
+
+            require_picture_path(self.plot, example="margins.png")
+            require_new_file(self.plot, overwrite=self.overwrite)
+        if self.batch_size < 1:
+            raise InputError(f"--batch-size must be at least 1, got {self.batch_size}")
+        if self.onnx is not None:
+            require_path(self.onnx, what="the ONNX file")
+        super().check()
+
     def run(self) -> None:
-        """Predict and write."""
+        """Predict, show and write."""
         from sliplens.models.predictions import predict
 
         named = {"run": self.model, "options": self.options, "onnx_file": self.onnx, "out": self.output}
         predictions = self.call(predict, **named)
-        wrote(self.output, f"{predictions.frames:,} frames, by {predictions.engine}")
+        _show(predictions)
+        if self.plot is not None:
+            from sliplens.plots.margins import draw_margins
+
+            shown = draw_margins(predictions.frame(), self.plot, title=f"{self.source.name}, read by {self.model.name}")
+            wrote(self.plot, f"margin over time of {shown} trial{'s' if shown > 1 else ''}")
+        if self.output is not None:
+            wrote(self.output, f"{predictions.frames:,} frames, by {predictions.engine}")
+
+
+def _show(predictions: "Predictions") -> None:
+    if predictions.frames <= _FEW:
+        rows = predictions.frame().to_pylist()
+        labelled = any(row.get("safety_margin") is not None for row in rows)
+        head = ("frame", "safety margin", "90 % interval", *(["true"] if labelled else []))
+        told = [
+            (
+                row.get("file") or f"{row['trial']} {row['frame']}",
+                _percent(row["prediction"]),
+                _interval(row["low_90"], row["high_90"]),
+                *([_percent(row["safety_margin"])] if labelled else []),
+            )
+            for row in rows
+        ]
+        print_table("Safety margins", head, told)
+        return
+    trials = predictions.trials()
+    for trial in trials[:_TRIALS]:
+        say(_course(trial))
+    if len(trials) > _TRIALS:
+        say(f"and {len(trials) - _TRIALS} more trials; -o margins.csv writes every frame")
+    say("bars: safety margin, 0 % to 100 %, the lowest of the frames that share one")
+
+
+def _course(trial: "TrialMargins") -> str:
+    where = f"frame {trial.lowest}" if trial.time_s is None else f"{trial.time_s:.2f} s"
+    low, high = trial.interval or (None, None)
+    interval = "" if low is None else f" ({_interval(low, high)})"
+    return (
+        f"{trial.trial}  {sparkline(trial.margin.tolist())}  lowest {_percent(float(trial.margin[trial.lowest]))}"
+        f"{interval} at {where}, {len(trial.margin):,} frames"
+    )
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.0f} %"
+
+
+def _interval(low: float | None, high: float | None) -> str:
+    return "-" if low is None or high is None else f"{100 * low:.0f} to {100 * high:.0f} %"

@@ -9,9 +9,9 @@ from jaxtyping import Float, Float32, Int
 
 from sliplens.codec import load_result
 from sliplens.errors import InputError
+from sliplens.files import find_run, shipped_names
 from sliplens.grip.fingertip import Fingertip, draw_film, mean_shear
 from sliplens.models import Run, make_engine
-from sliplens.models.checkpoint import find_run, shipped_names
 from sliplens.models.predictions import LEVEL
 from sliplens.progress import OnProgress
 

@@ -142,12 +142,13 @@ def track(
             options=options,
             sensor=sensor,
         )
-    for sentence in dict.fromkeys(words for one in source for words in (*one.notes, *_require_movement(one))):
-        note(on_progress, sentence)
+    notes = dict.fromkeys(words for one in source for words in (*one.notes, *_require_movement(one)))
     metadata = {"sliplens.version": __version__, "sliplens.source": source[0].opened, "sliplens.markers": markers}
     schema = pa.schema(list(_COLUMNS.items()), metadata=metadata)
     outcomes: list[TrialTracking] = []
     with stage(on_progress, "Following markers") as count:
+        for sentence in notes:
+            note(on_progress, sentence)
         tables = _tables(source, markers, schema=schema, outcomes=outcomes, on_tracked=on_tracked, on_progress=count)
         rows = write_tables(tables, path, schema)
     return Tracking(trials=tuple(outcomes), path=path, rows=rows)

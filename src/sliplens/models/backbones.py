@@ -5,14 +5,14 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
-import torchvision
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
 from sliplens.errors import ModelError
-from sliplens.extras import Table
+from sliplens.extras import Table, import_torchvision
 
+_classifiers = import_torchvision().models
 BINS = 60
 LOWEST, HIGHEST = -0.1, 1.1
 """Ends of the histogram, in margin units: a label's width beyond [0, 1], so that its mean is not pulled inwards."""
@@ -194,7 +194,7 @@ DEFAULT_BACKBONE = "shufflenet_v2_x1_0"
 BACKBONES: Table[Callable[..., nn.Module]] = Table(
     "backbone",
     "sliplens.backbones",
-    {name: torchvision.models.get_model_builder(name) for name in torchvision.models.list_models(torchvision.models)},
+    {name: _classifiers.get_model_builder(name) for name in _classifiers.list_models(_classifiers)},
 )
 """What builds a classifier, called with `num_classes`: TorchVision's, and those that installed packages add by the
 entry point `sliplens.backbones`."""

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +13,9 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from sliplens.codec import load_record, load_result, save_record
-from sliplens.errors import CheckpointError, ImageError, InputError
+from sliplens.errors import CheckpointError, ImageError
 from sliplens.extras import require_device
-from sliplens.files import hash_file, require_folder
+from sliplens.files import MANIFEST_FILE, find_run, hash_file, require_folder
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.models.backbones import Answers, bin_edges, build_model, ratio_edges
 from sliplens.models.calibration import Calibration, Traction, raw_interval, spread
@@ -26,7 +25,6 @@ from sliplens.models.told import told_probabilities
 from sliplens.results.training import Training
 
 WEIGHTS_FILE = "model.safetensors"
-MANIFEST_FILE = "manifest.json"
 SCHEMA_VERSION = 1
 
 
@@ -67,7 +65,7 @@ def sensor_kind(sensor: str) -> str:
     return re.sub(r"-\d+$", "", sensor)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Run:
     """A trained network, in evaluation mode, with what it is and how it was trained."""
 
@@ -75,6 +73,21 @@ class Run:
     manifest: Manifest
     training: Training | None = None
     """How it was trained, with its learning curve; None where its folder does not tell."""
+
+    def __repr__(self) -> str:
+        """What it is, in a few lines: the layers are in `model`."""
+        kept = self.manifest
+        weights = sum(values.numel() for values in self.model.parameters())
+        intervals = "calibrated intervals" if kept.calibration else "no intervals"
+        lines = (
+            f"Run: {kept.backbone} with a {kept.head} head, {weights:,} weights, on {self.device}",
+            f"  reads {kept.input} images of {kept.sensor}, frames of {' x '.join(map(str, kept.frame_size))} px "
+            f"at {kept.image_size} px",
+            f"  tells {kept.target.replace('_', ' ')}, {intervals}",
+            f"  trained on {len(kept.trained_on)} trials, recipe {kept.recipe or 'not told'}",
+            *([f"  {', '.join(f'{name} {value:.3g}' for name, value in kept.metrics.items())}"] * bool(kept.metrics)),
+        )
+        return "\n".join(lines)
 
     @property
     def device(self) -> torch.device:
@@ -355,10 +368,6 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> Run:
     return Run(model=model, manifest=manifest, training=training)
 
 
-# the package is installed as files, never as an archive: its weights are mapped into memory from there
-_WEIGHTS = Path(str(files("sliplens"))) / "weights"
-
-
 def read_manifest(run: str | Path) -> Manifest:
     """Read what a network is without its weights, by the name or folder that `load` takes."""
     path = find_run(Path(run)) / MANIFEST_FILE
@@ -366,11 +375,6 @@ def read_manifest(run: str | Path) -> Manifest:
     if manifest.schema_version != SCHEMA_VERSION:
         raise CheckpointError(f"{path} is not a sliplens manifest of schema {SCHEMA_VERSION}; train the network again")
     return manifest
-
-
-def shipped_names() -> list[str]:
-    """Names of the networks that come with the package."""
-    return sorted(path.parent.name for path in _WEIGHTS.glob(f"*/{MANIFEST_FILE}"))
 
 
 def load(run: str | Path, *, device: str = "cpu") -> Run:
@@ -399,14 +403,3 @@ def load(run: str | Path, *, device: str = "cpu") -> Run:
     """
     require_device(device)
     return load_checkpoint(find_run(Path(run)), device=device)
-
-
-def find_run(run: Path) -> Path:
-    """Folder of a network: the one that is named, else the one of that name that comes with the package."""
-    if run.exists():
-        return run
-    names = shipped_names()
-    if str(run) in names:
-        return _WEIGHTS / run
-    shipped = f", or name {' or '.join(names)}, which comes with sliplens" if names else ""
-    raise InputError(f"the run {run} does not exist; check the path{shipped}")

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
-from scipy.spatial import KDTree
+from jaxtyping import Float
 from torch import Tensor
 
 from sliplens._version import __version__
-from sliplens.codec import write_tables
+from sliplens.codec import TABLE_SUFFIXES, read_written, write_tables
 from sliplens.errors import InputError
 from sliplens.files import hash_json, require_new_file
 from sliplens.friction import Friction, FrictionLike, as_friction
@@ -37,6 +36,8 @@ _COLUMNS = {
     "file": pa.string(),
     "time_s": pa.float64(),
     "safety_margin": pa.float64(),
+    "normal_force_n": pa.float64(),
+    "tangential_force_n": pa.float64(),
     "prediction": pa.float64(),
     "sigma": pa.float64(),
     "low_90": pa.float64(),
@@ -46,17 +47,40 @@ _COLUMNS = {
 }
 
 
+_FORCES = ("normal_force_n", "tangential_force_n")
+
+
 @dataclass(frozen=True, kw_only=True)
+class TrialMargins:
+    """Margins that a network reads in one trial, as a person asks for them first."""
+
+    trial: str
+    margin: Float[np.ndarray, " frames"]
+    """In margin units, frame by frame; not clipped to [0, 1]."""
+    lowest: int
+    """Frame of the lowest margin."""
+    time_s: float | None
+    """Time of that frame; None where it is not known."""
+    interval: tuple[float, float] | None
+    """Ends of its 90 % interval; None for a network that was never calibrated."""
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Predictions:
-    """Safety margins that a network reads, a row a frame."""
+    """Safety margins that a network reads, a row a frame.
+
+    It is a table to whatever takes one of Arrow: `pandas.DataFrame.from_arrow`, `polars.DataFrame`, `pyarrow.table`.
+    """
 
     frames: int
     engine: str
     """Row of `ENGINES` that ran the network."""
     path: Path | None
-    """Parquet file of the rows; None where they are kept in memory."""
+    """File of the rows; None where they are kept in memory."""
     rows: pa.Table | None
     """The rows; None where they are in the file."""
+    schema: pa.Schema | None = None
+    """Columns of the rows in the file; None where they are kept in memory."""
     notes: tuple[str, ...] = ()
     """What was assumed, a sentence each."""
 
@@ -64,16 +88,59 @@ class Predictions:
         """Arrow table; `.to_pandas()` where pandas is installed.
 
         Columns are `trial`, `frame`, `file` (of a folder of images), `time_s`, `safety_margin` (where the source has
-        labels), `prediction`, `sigma`, `low_90` and `high_90`, and `traction_ratio` and `traction_ratio_sigma` of a
-        network that tells F_t / F_n. What is not known is null: the time of images without a rate, sigma of a network
-        that answers with one number, intervals of one that was never calibrated. Predictions are not clipped to [0, 1].
+        labels), `normal_force_n` and `tangential_force_n` (where it has forces), `prediction`, `sigma`, `low_90` and
+        `high_90`, and `traction_ratio` and `traction_ratio_sigma` of a network that tells F_t / F_n. What is not known
+        is null: the time of images without a rate, sigma of a network that answers with one number, intervals of one
+        that was never calibrated. Predictions are not clipped to [0, 1].
         """
-        return pq.read_table(self.path) if self.rows is None else self.rows
+        if self.rows is not None:
+            return self.rows
+        assert self.path is not None  # one of the two is given
+        assert self.schema is not None
+        return read_written(self.path, self.schema)
+
+    def __len__(self) -> int:
+        return self.frames
+
+    def __repr__(self) -> str:
+        table = self.frame()
+        return f"Predictions of {self.frames} frames by {self.engine}\n{table.to_string(preview_cols=3)}"
+
+    def __arrow_c_stream__(self, requested_schema: object = None) -> object:
+        """Rows for whatever reads Arrow's stream (the Arrow PyCapsule interface)."""
+        return self.frame().__arrow_c_stream__(requested_schema)
+
+    def trials(self) -> list[TrialMargins]:
+        """Course and lowest margin of every trial."""
+        table = self.frame().combine_chunks()
+        names = table["trial"].to_numpy(zero_copy_only=False)
+        numbers = {
+            name: table[name].to_numpy(zero_copy_only=False).astype(np.float64)
+            for name in ("prediction", "time_s", "low_90", "high_90")
+        }
+        found = []
+        for trial in dict.fromkeys(names.tolist()):
+            own = {name: values[names == trial] for name, values in numbers.items()}
+            lowest = int(own["prediction"].argmin())
+            at = {name: float(values[lowest]) for name, values in own.items()}
+            found.append(
+                TrialMargins(
+                    trial=trial,
+                    margin=own["prediction"],
+                    lowest=lowest,
+                    time_s=at["time_s"] if np.isfinite(at["time_s"]) else None,
+                    interval=(at["low_90"], at["high_90"]) if np.isfinite(at["low_90"]) else None,
+                )
+            )
+        return found
+
+
+_SHIPPED = "chromatouch-difference"
 
 
 def predict(
-    run: Run | Path | str,
-    source: Path | str | Frames | Dataset | Sequence[Capture],
+    run: Run | Path | str | Frames | Dataset | Sequence[Capture],
+    source: Path | str | Frames | Dataset | Sequence[Capture] | None = None,
     *,
     reference: Path | str | Frame | None = None,
     reference_frame: int | None = None,
@@ -95,7 +162,8 @@ def predict(
     Parameters
     ----------
     run
-        Network, its folder, or the name of one that comes with sliplens.
+        Network, its folder, or the name of one that comes with sliplens. It may be left out: `predict("cup.mp4")` reads
+        the source with `chromatouch-difference`.
     source
         Data set, folder of images, video, bag, uint8 RGB frames (frames, height, width, 3), or what `open_source` gave.
         Images without a reference are taken for difference images, compared before.
@@ -115,7 +183,7 @@ def predict(
     device
         Device of a network that is loaded here: cpu or cuda.
     out
-        Parquet file to write, whole or not at all; rows are kept in memory if None.
+        File to write, Parquet, CSV or JSON by its ending, whole or not at all; rows are kept in memory if None.
 
     Raises
     ------
@@ -137,11 +205,17 @@ def predict(
     """
     path = None if out is None else Path(out)
     if path is not None:
-        require_new_file(path, suffix=".parquet", overwrite=overwrite)
+        require_new_file(path, suffix=TABLE_SUFFIXES, overwrite=overwrite)
     if batch_size < 1:
         raise InputError(f"--batch-size must be at least 1, got {batch_size}")
     if onnx_file is not None and engine not in {"auto", "onnxruntime", "openvino"}:
         raise InputError(f"--onnx is for onnxruntime and openvino, not for {engine}; leave it out")
+    if source is None:
+        if isinstance(run, Run):
+            raise InputError("name what to read: a data set, a folder of images, a video, or frames")
+        run, source = _SHIPPED, run
+    if not isinstance(run, Run | Path | str):
+        raise InputError(f"{type(run).__name__} is no network; give a network, its folder or its name first")
     trained = run if isinstance(run, Run) else load(run, device=device)
     known = None if friction is None else as_friction(friction)
     if known is not None:
@@ -160,10 +234,10 @@ def predict(
     notes = tuple(dict.fromkeys(words for one in source for words in (*one.notes, *_require_comparable(trained, one))))
     if known is not None:
         notes = (*notes, f"The coefficient of friction is taken for {known}.")
-    for sentence in notes:
-        note(on_progress, sentence)
     total = sum(trial.frames for trial in source)
     with stage(on_progress, "Making the network ready"):
+        for sentence in notes:
+            note(on_progress, sentence)
         ready = make_engine(engine, trained, frames=total, batch_size=batch_size, onnx_file=onnx_file)
     metadata = {
         "sliplens.engine": ready.name,
@@ -176,7 +250,7 @@ def predict(
     schema = _schema(source, metadata, ratio=trained.manifest.traction is not None)
     with stage(on_progress, f"Predicting frames ({trained.manifest.input}, {ready.name})") as count:
         rows = write_tables(_tables(ready, trained, source, schema, friction=known, on_progress=count), path, schema)
-    return Predictions(frames=total, engine=ready.name, path=path, rows=rows, notes=notes)
+    return Predictions(frames=total, engine=ready.name, path=path, rows=rows, schema=path and schema, notes=notes)
 
 
 def _require_comparable(trained: Run, trial: Capture) -> Iterator[str]:
@@ -205,6 +279,8 @@ def _compare_markers(trained: Run, trial: Capture) -> str:
     if known is None or trial.read_reference is None:
         return ""
     learned = known.geometry.project(known.geometry.marker_positions())
+    from scipy.spatial import KDTree  # noqa: PLC0415 (takes a second, and most frames need none)
+
     wanted_px = float(np.median(KDTree(learned).query(learned, k=2)[0][:, 1]))
     found_px = marker_spacing(trial.read_reference())
     if np.isnan(found_px):
@@ -218,6 +294,7 @@ def _schema(trials: Sequence[Capture], metadata: dict[str, str], *, ratio: bool)
         "safety_margin": any(trial.safety_margin is not None for trial in trials),
         "traction_ratio": ratio,
         "traction_ratio_sigma": ratio,
+        **dict.fromkeys(_FORCES, any(trial.labels is not None for trial in trials)),
     }
     columns = [pa.field(name, kind) for name, kind in _COLUMNS.items() if known.get(name, True)]
     return pa.schema(columns, metadata={"sliplens.version": __version__, **metadata})
@@ -275,6 +352,7 @@ def _columns(estimate: Estimate, trial: Capture, first: int) -> dict[str, list]:
     if ratio is not None:
         numbers = {"traction_ratio": ratio.mean, "traction_ratio_sigma": ratio.sigma}
     numbers |= {"time_s": times, "safety_margin": margins, "sigma": estimate.sigma, "low_90": low, "high_90": high}
+    numbers |= {name: None if trial.labels is None else getattr(trial.labels, name)[here] for name in _FORCES}
     return {
         "trial": [trial.name] * count,
         "frame": list(range(first, first + count)),

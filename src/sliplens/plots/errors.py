@@ -269,7 +269,10 @@ def _summary(evaluation: Evaluation, conditions: list[str]) -> str:
         r2 = "none" if scores.r2 is None else f"{scores.r2:.3f}"
         words = f"{name}: {scores.frames:,} frames, MSE {scores.mse:.4f}, R² {r2}, MAE {100 * scores.mae:.1f} points"
         if lead.median_ms is not None:
-            words += f", warns {lead.median_ms:.0f} ms before the slip (the true Γ: {lead.ideal_ms:.0f} ms)"
+            words += f", warns in {lead.warned} of {lead.trials} trials that slip, {lead.median_ms:.0f} ms before"
+            words += f" (the true Γ: {lead.ideal_ms:.0f} ms)"
+        elif lead.trials:
+            words += f", warns in none of {lead.trials} trials that slip"
         parts.append(f"{words}, {lead.false_per_minute:.1f} false alarms a minute")
     return "\n".join(parts)
 

@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 from sliplens.codec import Columns
 from sliplens.errors import InputError
 from sliplens.intervals import Difference
-from sliplens.plots.errors import MARGIN_LABEL, plot_answers, plot_faithfulness, plot_learning_curves
+from sliplens.plots.errors import plot_answers, plot_faithfulness, plot_learning_curves
 from sliplens.plots.grip import plot_grip_force
+from sliplens.plots.margins import column, plot_margins
 from sliplens.plots.saliency import full_colour, overlay_relevance, overlay_saliency, stretch_saliency
 from sliplens.plots.strip import plot_readings
 from sliplens.plots.style import (
@@ -177,23 +178,12 @@ def _predictions(predictions: Any, ax: Axes, index: int) -> None:
     # an evaluation's are columns
     table = predictions.table() if isinstance(predictions, Columns) else predictions.frame()
     shown = _rows_of_trial(table, index)
-    timed = "time_s" in shown.column_names and shown["time_s"].null_count == 0
-    across = _column(shown, "time_s" if timed else "frame")
-    if "low_90" in shown.column_names:
-        low, high = 100 * _column(shown, "low_90"), 100 * _column(shown, "high_90")
-        if np.isfinite(low).any():  # a network that was never calibrated tells none
-            ax.fill_between(across, low, high, color=BLUE, alpha=0.18, linewidth=0, label="90 % interval")
-    ax.plot(across, 100 * _column(shown, "prediction"), color=BLUE, label="read")
-    if "safety_margin" in shown.column_names:
-        ax.plot(across, 100 * _column(shown, "safety_margin"), color=BLACK, linestyle="--", label="true")
-    ax.set(xlabel="Time (s)" if timed else "Frame", ylabel=MARGIN_LABEL)
-    ax.set_title(shown["trial"][0].as_py(), parse_math=False)
-    ax.legend()
+    plot_margins(shown, ax=ax)
 
 
 def _tracking(tracking: Any, ax: Axes, index: int) -> None:
     shown = _rows_of_trial(tracking.frame(), index)
-    frame, right, down = (_column(shown, name) for name in ("frame", "dx_px", "dy_px"))
+    frame, right, down = (column(shown, name) for name in ("frame", "dx_px", "dy_px"))
     frames, length = np.unique(frame), np.hypot(right, down)
     known = [length[(frame == one) & np.isfinite(length)] for one in frames]
     for values, name, colour in (
@@ -209,10 +199,6 @@ def _tracking(tracking: Any, ax: Axes, index: int) -> None:
 def _rows_of_trial(table: pa.Table, index: int) -> pa.Table:
     names = table["trial"].unique().to_pylist()
     return table.filter(pc.field("trial") == names[_of(len(names), index)])
-
-
-def _column(table: pa.Table, name: str) -> np.ndarray:
-    return table[name].to_numpy().astype(np.float64)
 
 
 def _array(values: Any) -> np.ndarray:

@@ -6,8 +6,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
 
 from sliplens.arrays import require_saliency
 from sliplens.plots.style import ORANGE, SKY, in_order
@@ -87,6 +89,7 @@ def _blend(
 
 
 _CELL_IN = 1.6
+_BAR_IN = 3.6  # as wide as what is said below the colour bar
 
 
 def overlay_jet(
@@ -105,10 +108,15 @@ def overlay_jet(
 
 
 def draw_panel(
-    rows: Mapping[str, Sequence[UInt8[np.ndarray, "height width 3"] | None]], *, titles: Sequence[str]
+    rows: Mapping[str, Sequence[UInt8[np.ndarray, "height width 3"] | None]],
+    *,
+    titles: Sequence[str],
+    bar: ScalarMappable,
+    bar_label: str,
 ) -> Figure:
-    """Draw a table of pictures, each row under its name; None leaves a cell empty."""
-    figure = Figure(figsize=(_CELL_IN * len(titles) + 0.4, _CELL_IN * len(rows) + 0.5), dpi=120, layout="constrained")
+    """Draw a table of pictures, each row under its name, and one colour bar; None leaves a cell empty."""
+    size = (max(_CELL_IN * len(titles) + 0.6, _BAR_IN), _CELL_IN * len(rows) + 1.2)
+    figure = Figure(figsize=size, dpi=120, layout="constrained")
     axes = figure.subplots(len(rows), len(titles), squeeze=False)
     for line, (name, pictures) in zip(axes, rows.items(), strict=True):
         line[0].set_ylabel(name, fontsize=8)
@@ -118,7 +126,11 @@ def draw_panel(
             if picture is not None:
                 ax.imshow(picture, interpolation="nearest")
     for ax, title in zip(axes[0], titles, strict=True):
-        ax.set_title(title, fontsize=8)
+        ax.set_title(title, fontsize=7, loc="center", fontweight="normal", parse_math=False)
+    drawn = figure.colorbar(bar, ax=list(axes.flat), location="bottom", fraction=0.05, aspect=50, pad=0.02)
+    drawn.set_label(bar_label, fontsize=8)
+    drawn.ax.tick_params(labelsize=7)
+    drawn.ax.xaxis.set_major_formatter(PercentFormatter(1))
     return figure
 
 

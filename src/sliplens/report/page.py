@@ -42,8 +42,8 @@ def write_report(
     Parameters
     ----------
     workspace
-        Folder with one subfolder a stage, as the sliplens commands write them, or a study. A stage that was not run is
-        named as missing on the page.
+        Folder with one subfolder a stage, as the sliplens commands write them, or a study. A stage of a study
+        that was not run is named as missing on the page.
     out
         HTML file to write; it appears when complete. `report.html` in the workspace if not given.
     waiting_for

@@ -41,8 +41,6 @@ class Section:
     title: str
     short_title: str
     intro: str | Callable[[Results], str]
-    command: str = ""
-    """Command that makes its results, in a workspace that is no study; empty where none misses them."""
     apart: bool = False
     """Whether they are no part of a study, which does not miss them."""
     build: Callable[[Results, np.random.Generator], Iterable[Block | None]] = lambda *_: ()
@@ -58,18 +56,18 @@ class Section:
 
 def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Section, ...]:
     """Build the sections whose results are there, in the order they are read; the last says what was not run."""
-    sections, absent = [], {}
+    sections, absent = [], []
     for section in SECTIONS:
         blocks = tuple(block for block in section.build(results, rng) if block is not None)
-        command = f"sliplens {'study' if results.study else section.command}"
-        alone = results.grip is not None and not results.inputs
-        if not blocks and (not section.command or alone or (results.study and section.apart)):
+        # a study that stopped was asked for all of its stages; single commands are asked for one by one
+        if not blocks and (section.apart or not results.study):
             continue
         if not blocks:
-            absent.setdefault(command, []).append(section.short_title)
+            absent.append(section.short_title)
             continue
-        without = [name for name in _names(results.inputs) if name not in section.needs(results)]
-        missing = tuple(f"{input_name(name)}: not run yet; `{command}` makes it." for name in without)
+        asked = _names(results.inputs) if results.study else []
+        without = [name for name in asked if name not in section.needs(results)]
+        missing = tuple(f"{input_name(name)}: not run yet; `sliplens study` makes it." for name in without)
         intro = section.intro if isinstance(section.intro, str) else section.intro(results)
         if results.study.choice is not None and section.of_sample:
             sample = tell_sample(results.study.choice)
@@ -185,7 +183,7 @@ def _diagnosis(results: Results, _: np.random.Generator) -> Iterable[Block | Non
         yield from show_diagnosis(found)
 
 
-def _recipe(results: Results, absent: dict[str, list[str]]) -> Section:
+def _recipe(results: Results, absent: list[str]) -> Section:
     simulation = results.simulation
     again = " `sliplens study` with the same options goes on where it stopped, and" if results.study else ""
     intro = (
@@ -202,7 +200,7 @@ def _recipe(results: Results, absent: dict[str, list[str]]) -> Section:
         title="How these results were made",
         short_title="Recipe",
         intro=intro,
-        missing=tuple(f"{', '.join(titles)}: not run yet; `{command}` makes it." for command, titles in absent.items()),
+        missing=(f"{', '.join(absent)}: not run yet; `sliplens study` makes it.",) if absent else (),
         blocks=(tables.table_training(results), charts.plate_learning(results)) if results.trainings else (),
     )
 
@@ -232,7 +230,6 @@ SECTIONS: tuple[Section, ...] = (
         intro="Each claim holds, does not hold, or stays undecided. A fill is what removed parts become; intervals (95 "
         "%) are over days and trials; fewer than five trials decide nothing. A claim holds for a network where it "
         "holds under more than half of the fills and the opposite is sure under none.",
-        command="study",
         build=lambda results, rng: judge_claims(results, rng=rng) if results.study else (),
     ),
     Section(
@@ -241,7 +238,6 @@ SECTIONS: tuple[Section, ...] = (
         short_title="Accuracy",
         intro="The networks answer on trials they were not trained on (Table 1 and Fig. 7 of the thesis, for this "
         "data). A raw image is the camera's frame; a difference image is that frame against the untouched sensor.",
-        command="evaluate",
         build=_accuracy,
         needs=lambda results: results.evaluations,
     ),
@@ -252,7 +248,6 @@ SECTIONS: tuple[Section, ...] = (
         intro="Slices of the trials in which the error is large, tested on trials they were not found on; what the "
         "network looked at there, and what the best reading of the markers needed; what it says of the same press and "
         "pull where friction alone differs; and the kinds of explanations there are.",
-        command="diagnose",
         apart=True,
         build=_diagnosis,
         needs=lambda results: results.diagnoses,
@@ -277,7 +272,6 @@ SECTIONS: tuple[Section, ...] = (
         "those that a map says speak for the answer, first those that speak least for it, and at random. With a "
         "faithful map the answer goes back to that on the untouched sensor at once in the first case, and not in the "
         "second. Controls are maps that know nothing of the trained network.",
-        command="study",
         build=_faithfulness,
         needs=lambda results: results.study.faithfulness,
     ),
@@ -289,7 +283,6 @@ SECTIONS: tuple[Section, ...] = (
         intro="D = (1 \N{MINUS SIGN} |change of Γ|)² while pixels go, the most salient first: 1 where nothing changed, "
         "towards 0 if the network did rely on them. Removing pixels in random order is the control that each method "
         "has to beat. With every pixel gone no map has a part in it.",
-        command="score",
         build=_deletion,
         needs=lambda results: {
             name for name, _ in results.scores if not results.study.remedies or name in results.study.remedies
@@ -301,7 +294,6 @@ SECTIONS: tuple[Section, ...] = (
         title="Does the explanation notice that the network forgot everything?",
         short_title="New weights",
         intro="The weights are drawn anew, layer by layer from the output. A map of what was learned has to change.",
-        command="study",
         build=_randomisation,
         needs=lambda results: results.study.randomisation,
     ),
@@ -313,7 +305,6 @@ SECTIONS: tuple[Section, ...] = (
         intro="From full stick (Γ 100 %) to the onset of full slip (Γ 0 %): what each method holds to speak for the "
         "answer, rather than for that on the untouched sensor. The thesis judged the maps by eye; a study measures "
         "the same.",
-        command="explain",
         build=_maps,
         needs=lambda results: {name for name, source in results.explanations if source == results.study.source},
     ),
@@ -322,7 +313,6 @@ SECTIONS: tuple[Section, ...] = (
         title="Real touch",
         short_title="Real touch",
         intro="Frames of a real sensor, shown to the same networks.",
-        command="explain",
         build=_real,
         # real frames may exist as difference images only, so one input is enough
     ),
@@ -331,7 +321,6 @@ SECTIONS: tuple[Section, ...] = (
         title="What an explanation costs",
         short_title="Cost",
         intro="Seconds a frame; a study measures them with warm-up, and waiting for the device to finish.",
-        command="explain",
         build=_cost,
         needs=lambda results: results.study.timing or {name for name, _ in results.explanations},
     ),
@@ -340,7 +329,6 @@ SECTIONS: tuple[Section, ...] = (
         title="Which trials were taken",
         short_title="Trials",
         intro=lambda results: "" if results.study.choice is None else results.study.choice.summary,
-        command="study",
         build=lambda results, _: () if results.study.choice is None else (tables.table_trials(results.study.choice),),
     ),
     Section(
@@ -356,7 +344,6 @@ SECTIONS: tuple[Section, ...] = (
         "reading of the margin (linear in the markers' displacements, exact for small ones) is where the network "
         "should look; stretched over a marker's whole motion that reading may exceed the margin itself, and the "
         "markers cancel.",
-        command="study",
         build=_truth,
         needs=lambda results: results.study.truth,
     ),

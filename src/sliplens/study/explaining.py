@@ -1,12 +1,12 @@
 """Frames to explain, and their explanations, made one map at a time."""
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby, islice, product
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -200,6 +200,10 @@ def require_methods(methods: Sequence[str], explainers: Collection[str] = EXPLAI
             raise InputError(f"there is no explainer named {name!r}; choose from {', '.join(explainers)}")
 
 
+OnMap: TypeAlias = Callable[[str, int, UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]], None]
+"""Takes the method, the number of the frame, its picture, and its map."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Map:
     """Explanation of one frame by one method."""
@@ -217,11 +221,13 @@ def explain_frames(
     methods: Sequence[str] = DEFAULT_METHODS,
     explainers: Mapping[str, Explainer] = EXPLAINERS,
     parts: Path | None = None,
+    on_map: OnMap | None = None,
     on_progress: OnProgress | None = None,
 ) -> Explained:
     """Explain frames with several methods.
 
     `parts` is a folder that keeps each map as soon as it is there, so that an interrupted run loses at most one.
+    `on_map` is called with each: method, number of the frame, its picture, and the map.
 
     Raises
     ------
@@ -242,10 +248,13 @@ def explain_frames(
             warnings=explanation.warnings,
         )
 
+    pictures = (255 * inputs).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous().cpu().numpy()
     maps: dict[str, list[_Map]] = {method: [] for method in methods}
     for method, index in counted(list(product(methods, range(len(inputs)))), on_progress):
         part = parts and parts / f"{method}-{index:05d}"
         maps[method].append(keep_part(part, _Map, partial(explain, method, index)))
+        if on_map is not None:
+            on_map(method, index, pictures[index], maps[method][-1].relevance)
     # the same answers for every method: asked once, on all frames
     predictions, untouched = trained.predict(inputs).tolist(), trained.predict(chosen.references).tolist()
     return Explained(
@@ -266,7 +275,7 @@ def explain_frames(
         ),
         methods={method: _note(own, chosen.ids) for method, own in maps.items()},
         images=chosen.images.numpy(),
-        pictures=(255 * inputs).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous().cpu().numpy(),
+        pictures=pictures,
         relevance={method: np.stack([one.relevance for one in own]) for method, own in maps.items()},
         saliency={method: np.stack([one.saliency for one in own]) for method, own in maps.items()},
     )
@@ -280,8 +289,18 @@ def _note(maps: Sequence[_Map], ids: Sequence[str]) -> MethodNotes:
             warnings.setdefault(warning.removeprefix("image 0: "), []).append(name)
     return MethodNotes(
         seconds_per_frame=float(np.mean([own.seconds for own in maps])),
-        warnings=tuple(f"{', '.join(names)}: {warning}" for warning, names in warnings.items()),
+        warnings=tuple(f"{_of_all(names, len(ids))}: {warning}" for warning, names in warnings.items()),
     )
+
+
+_NAMED = 3
+"""Frames that a warning names."""
+
+
+def _of_all(names: Sequence[str], count: int) -> str:
+    """Frames that a warning is of, against how many were explained."""
+    more = ", \N{HORIZONTAL ELLIPSIS}" if len(names) > _NAMED else ""
+    return f"{len(names)} of {count} frame{'s' if count > 1 else ''} ({', '.join(names[:_NAMED])}{more})"
 
 
 def network_inputs(trained: Run, explained: Explained) -> Float[Tensor, "frames 3 size size"]:

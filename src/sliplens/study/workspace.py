@@ -9,11 +9,13 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32, UInt8
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from torch import Tensor
 
 from sliplens.codec import load_result, save_result
-from sliplens.errors import InputError
+from sliplens.errors import InputError, SliplensError
 from sliplens.explainers import EXPLAINERS, ExpectedGradients, Explainer, get_explainer
 from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
 from sliplens.explainers.table import open_run
@@ -21,7 +23,7 @@ from sliplens.faithfulness import get_fill
 from sliplens.files import output_folder
 from sliplens.images import write_png
 from sliplens.models import Run
-from sliplens.plots.saliency import draw_panel, overlay_jet, overlay_saliency, stretch_saliency
+from sliplens.plots.saliency import SIGN_COLOURS, draw_panel, full_colour, overlay_jet, overlay_relevance
 from sliplens.plots.style import drawing_style, method_name, percent
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, Recording
@@ -32,8 +34,8 @@ from sliplens.results.explanation import Explained, Strip, StripReadings, load_e
 from sliplens.results.faithfulness import DeletionScores
 from sliplens.study.explaining import (
     DEFAULT_LEVELS,
-    DEFAULT_METHODS,
     ChosenFrames,
+    OnMap,
     explain_frames,
     frames_from_dataset,
     frames_from_folder,
@@ -41,9 +43,11 @@ from sliplens.study.explaining import (
     nearest_frame,
     require_methods,
 )
-from sliplens.study.material import study_explainers, with_markers
+from sliplens.study.material import STUDY_BUDGET, study_explainers, with_markers
 from sliplens.study.scoring import require_same_network, score_explanations
 
+RECOMMENDED_METHODS = ("shapley-marker", "poly-cam")
+"""Methods that explain where none is named, the quickest first."""
 _FULL_STICK = 0.9
 """Safety margin from which a labelled frame counts as one without slip."""
 
@@ -55,15 +59,15 @@ def explain_source(
     reference: Path | None = None,
     labels_in_names: bool = False,
     sensor: SensorProfile | Path | str | None = None,
-    methods: Sequence[str] = DEFAULT_METHODS,
-    budget: float = 1.0,
+    methods: Sequence[str] | None = None,
+    budget: float | None = None,
     split: str = "test",
     condition: str = "dry",
     trials: int = 1,
     levels: Sequence[float] = DEFAULT_LEVELS,
     device: str = "cpu",
     out: Path | None = None,
-    colours: Literal["inferno", "jet"] = "inferno",
+    colours: Literal["signed", "jet"] = "signed",
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
 ) -> Explained:
@@ -79,21 +83,24 @@ def explain_source(
     sensor
         Profile of the sensor, its file, or the name of one that comes with sliplens; None for a data set.
     methods, budget
-        Rows of `EXPLAINERS`, and the share of the channels that `poly-cam` measures at first.
+        Rows of `EXPLAINERS`, and the share of the channels that `poly-cam` measures at first. If None, Shapley values
+        of the markers, whose map ranks them most like the truth in simulation, or of tiles where no markers are found;
+        and Poly-CAM, with all its channels for a single image and on a budget for several.
     split, condition, trials, levels
         Which trials of a data set and how many, and the safety margins at which frames are taken.
     out
         Folder to write: maps, overlays of every map, all of them side by side; nowhere if None. A folder that was
         interrupted goes on after its last map.
     colours
-        Colours of the overlays: perceptually uniform, or as the thesis's figures have them.
+        Colours of the overlays: what raises the answer and what lowers it, on one scale for all frames; or what
+        supports it, each frame on a scale of its own, as the thesis's figures have it.
 
     Raises
     ------
     InputError
         If there is no such method, the source has no such frames, or the folder holds something else.
     """
-    require_methods(methods)
+    require_methods(methods or ())
     if trials < 1:
         raise InputError(f"--trials must be at least 1, got {trials}")
     trained = open_run(run, device=device)
@@ -109,7 +116,16 @@ def explain_source(
             trained, source, reference=reference, labels_in_names=labels_in_names, sensor=sensor
         )
     opened = source if isinstance(source, Dataset) else partial(open_source, source, reference=reference, sensor=sensor)
-    explainers = _choose_explainers(trained, chosen, opened, methods=methods, budget=budget)
+    budget = budget if budget is not None else 1.0 if len(chosen.ids) == 1 else STUDY_BUDGET
+    choose = partial(_choose_explainers, trained, chosen, opened, budget=budget)
+    if methods is None:
+        try:
+            explainers = choose(methods=RECOMMENDED_METHODS)
+        except SliplensError:  # difference images, another sensor, or no OpenCV: tiles tell nearly as much
+            explainers = choose(methods=[name.removesuffix("-marker") for name in RECOMMENDED_METHODS])
+        methods = tuple(explainers)
+    else:
+        explainers = choose(methods=methods)
     explain = partial(explain_frames, trained, chosen, methods=methods, explainers=explainers)
     title = f"Explaining {len(chosen.ids)} frames ({trained.manifest.input}, {chosen.source})"
     if out is None:
@@ -123,13 +139,15 @@ def explain_source(
     with output_folder(out, stage="explain", config=recipe, overwrite=overwrite) as output:
         if not output.complete:
             with stage(on_progress, title) as count:
-                explained = explain(parts=output.folder / "parts", on_progress=count)
+                show = _show_first(output.folder, chosen.ids, on_progress) if colours == "signed" else None
+                explained = explain(parts=output.folder / "parts", on_map=show, on_progress=count)
+                # while the stage is open: what differs in numbers alone is then shown once
+                for warning in dict.fromkeys(one for notes in explained.methods.values() for one in notes.warnings):
+                    warned = [method for method, notes in explained.methods.items() if warning in notes.warnings]
+                    note(on_progress, f"{', '.join(warned)}: {warning}")
             shutil.rmtree(output.folder / "parts", ignore_errors=True)
             draw_explained(explained, output.folder, colours=colours)
             save_result(explained, output.folder)
-            for warning in dict.fromkeys(one for notes in explained.methods.values() for one in notes.warnings):
-                warned = [method for method, notes in explained.methods.items() if warning in notes.warnings]
-                note(on_progress, f"{', '.join(warned)}: {warning}")
     wrote(on_progress, out, what, kept=output.complete)
     return load_explained(out)
 
@@ -178,26 +196,80 @@ def score_explained(
     return load_result(out, DeletionScores, command="sliplens score")
 
 
-def draw_explained(explained: Explained, folder: Path, *, colours: Literal["inferno", "jet"]) -> None:
+def draw_explained(explained: Explained, folder: Path, *, colours: Literal["signed", "jet"]) -> None:
     """Write an overlay of every map (`overlays/METHOD/FRAME.png`), and all of them side by side (`panel.png`)."""
-    lay = overlay_jet if colours == "jet" else lambda picture, map_: overlay_saliency(picture, stretch_saliency(map_))
-    rows = {"Input": list(explained.pictures)}
+    rows = {"What the network saw": list(explained.pictures)}
     for method, maps in explained.saliency.items():
         (overlays := folder / "overlays" / method).mkdir(parents=True, exist_ok=True)
-        row = rows[method_name(method)] = []
-        for frame, picture, saliency in zip(explained.frames, explained.pictures, maps, strict=True):
+        points = _points(explained.relevance[method])
+        limit = _common_scale(points)
+        scale = f"\nfull colour: {limit:.2g} points" if colours == "signed" else ""
+        row = rows[f"{method_name(method)}{scale}"] = []
+        for frame, picture, saliency, signed in zip(explained.frames, explained.pictures, maps, points, strict=True):
             # a map that holds NaN is named in the notes, and is not shown
-            row.append(lay(picture, saliency) if np.isfinite(saliency).all() else None)
+            finite = bool(np.isfinite(signed).all())
+            lay = overlay_jet(picture, saliency) if colours == "jet" and finite else None
+            row.append(overlay_relevance(picture, signed / limit) if colours == "signed" and finite else lay)
             if row[-1] is not None:
                 write_png(overlays / f"{frame.id}.png", row[-1])
     titles = [
         # of recorded images the margin need not be known
-        ("" if frame.safety_margin is None else f"true {percent(frame.safety_margin)}, ")
-        + f"read {percent(frame.prediction)}"
+        f"{_short(frame.id)}\nread {percent(frame.prediction)}"
+        + ("" if frame.safety_margin is None else f", true {percent(frame.safety_margin)}")
         for frame in explained.frames
     ]
+    if colours == "jet":
+        bar, words = (
+            ScalarMappable(Normalize(0, 1), "jet"),
+            "supports the answer (share of its own picture's strongest)",
+        )
+    else:
+        bar = ScalarMappable(Normalize(-1, 1), SIGN_COLOURS)
+        words = "lowers the margin  |  raises it, in shares of the full colour\n"
+        words += "(which is in points of margin per 1 % of the image)"
     with drawing_style():
-        draw_panel(rows, titles=titles).savefig(folder / "panel.png")
+        draw_panel(rows, titles=titles, bar=bar, bar_label=words).savefig(folder / "panel.png", bbox_inches="tight")
+
+
+_LEAST = 0.2
+"""Full colour at least, in points of margin per 1 % of the image: 2 points, which is nothing to explain, on a tenth."""
+
+
+def _points(relevance: Float32[np.ndarray, "*frames height width"]) -> Float32[np.ndarray, "*frames height width"]:
+    """Relevance in points of the margin for every 1 % of the image: its own unit is too small to read."""
+    return relevance * (relevance.shape[-1] * relevance.shape[-2])
+
+
+def _common_scale(points: Float32[np.ndarray, "frames height width"]) -> float:
+    """Full colour of all frames of a method, so that one with nothing to explain looks empty."""
+    finite = points[np.isfinite(points).all(axis=(1, 2))]
+    return max(full_colour(finite), _LEAST) if len(finite) else _LEAST
+
+
+def _short(name: str, longest: int = 22) -> str:
+    return name if len(name) <= longest else f"\N{HORIZONTAL ELLIPSIS}{name[1 - longest :]}"
+
+
+def _show_first(folder: Path, ids: Sequence[str], on_progress: OnProgress | None) -> OnMap:
+    """Draw the first map as soon as it is there, on a scale of its own: something to look at while others are made."""
+    shown = []
+
+    def show(
+        method: str,
+        index: int,
+        picture: UInt8[np.ndarray, "height width 3"],
+        relevance: Float32[np.ndarray, "height width"],
+    ) -> None:
+        if shown or not np.isfinite(relevance).all():
+            return
+        path = folder / "overlays" / method / f"{ids[index]}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        points = _points(relevance)
+        write_png(path, overlay_relevance(picture, points / _common_scale(points[None])))
+        shown.append(path)
+        wrote(on_progress, path, "a first picture; the folder takes its name when all are there")
+
+    return show
 
 
 def _choose_explainers(

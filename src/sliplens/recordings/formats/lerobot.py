@@ -14,7 +14,6 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 from av.container import InputContainer
 from av.video.stream import VideoStream
@@ -268,6 +267,8 @@ def _stored_images(path: Path, key: str, episode: int, *, frame_size: tuple[int,
     try:
         file = pq.ParquetFile(path)
         # without this, each episode would cost all that share its file
+        import pyarrow.dataset as ds  # noqa: PLC0415 (takes a second, and other formats are read without)
+
         (fragment,) = ds.dataset(path).get_fragments()
         groups = [group.id for group in fragment.subset(pc.field("episode_index") == episode).row_groups]
         for batch in file.iter_batches(batch_size=16, row_groups=groups, columns=["episode_index", key]):

@@ -1,0 +1,92 @@
+"""How long a first answer takes: a few images predicted, a first explanation to look at, a mistake refused.
+
+    python benchmarks/start.py --json
+
+Each command runs in a process of its own, as a user types it, on five images that are drawn here. `predict_s` and
+`refused_s` end with the process, `explain_first_s` when the first picture of a map is on disk. `cpu_predict_s` is the
+processor time of the prediction: on a machine that others use too it says more than the clock.
+"""
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+_IMAGES, _SIZE = 5, 224
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="print one object of numbers")
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        numbers = measure(Path(folder))
+    print(json.dumps(numbers) if asked.json else "\n".join(f"{name}: {value:.2f}" for name, value in numbers.items()))
+
+
+def measure(folder: Path) -> dict[str, float]:
+    """Seconds of each command."""
+    images = folder / "images"
+    images.mkdir()
+    draw_images(images)
+    network = "chromatouch-difference"
+    run("--version")  # what lies on disk is then in memory, as after any first command
+    predict = ("predict", network, str(images))
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    numbers = {"predict_s": run(*predict, "-o", str(folder / "margins.csv"))}
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    numbers["cpu_predict_s"] = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    numbers["refused_s"] = run(*predict, "-o", str(folder / "margins.txt"), code=2)
+    maps = folder / "maps"
+    numbers["explain_first_s"] = first_picture(maps, "explain", network, "--frames", str(images), "-o", str(maps))
+    return numbers
+
+
+def draw_images(folder: Path) -> None:
+    """Difference images of markers that moved a little more from frame to frame."""
+    down, right = np.mgrid[:_SIZE, :_SIZE]
+    centres = np.stack(np.meshgrid(np.arange(28, 200, 24), np.arange(28, 200, 24)), axis=-1).reshape(-1, 2)
+    for number in range(_IMAGES):
+        rest, moved = (
+            np.max([np.exp(-((right - x - shift) ** 2 + (down - y) ** 2) / 30) for x, y in centres], axis=0)
+            for shift in (0, number)
+        )
+        pixels = np.round(255 * np.abs(moved - rest)).astype(np.uint8)
+        Image.fromarray(np.repeat(pixels[..., None], 3, axis=2)).save(folder / f"frame{number}.png")
+
+
+def run(*words: str, code: int = 0) -> float:
+    """Seconds of a command, which must end with this exit code."""
+    began = time.perf_counter()
+    ended = subprocess.run([sys.executable, "-m", "sliplens", *words], capture_output=True, text=True, check=False)
+    if ended.returncode != code:
+        raise SystemExit(f"sliplens {' '.join(words)} ended with {ended.returncode}: {ended.stderr}")
+    return time.perf_counter() - began
+
+
+def first_picture(folder: Path, *words: str) -> float:
+    """Seconds until a command has drawn a first map; it is ended then."""
+    began = time.perf_counter()
+    command = [sys.executable, "-m", "sliplens", *words]
+    overlays = folder.with_name(f".{folder.name}.partial") / "overlays", folder / "overlays"
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=dict(os.environ)) as asked:
+        while asked.poll() is None and not any(one.is_dir() and any(one.rglob("*.png")) for one in overlays):
+            time.sleep(0.02)
+        took = time.perf_counter() - began
+        if asked.poll() not in {None, 0}:
+            raise SystemExit(f"sliplens {' '.join(words)} ended with {asked.returncode}")
+        asked.terminate()
+    return took
+
+
+if __name__ == "__main__":
+    main()

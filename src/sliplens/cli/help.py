@@ -1,0 +1,131 @@
+"""`sliplens help`, and what every command tells of itself: examples, options as they are typed, lines that fit."""
+
+import io
+import shutil
+import sys
+from collections.abc import Iterable
+from dataclasses import MISSING, dataclass, fields, replace
+from functools import cache
+from textwrap import fill
+from types import UnionType
+from typing import Annotated, Any, Union, get_args
+
+import docstring_parser
+import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+from sliplens.cli.console import say
+from sliplens.errors import InputError
+
+EXAMPLES = {
+    "demo": "sliplens demo runs/demo",
+    "live": "sliplens live 0 --network chromatouch-difference --reference untouched.png",
+    "sensor": "sliplens sensor new --from tip.mp4 -o tip.toml",
+    "simulate": "sliplens simulate runs/mine/data --preset small",
+    "import": "sliplens import cup.mp4 --forces cup.csv --sensor tip -o runs/mine/data",
+    "label": "sliplens label runs/mine/data --mu 0.7 -o runs/mine/data-again",
+    "split": "sliplens split runs/mine/data --preset trials --dry-run",
+    "check": "sliplens check runs/mine/data",
+    "view": "sliplens view runs/mine/data --trial cup",
+    "track": "sliplens track cup.mp4 --reference untouched.png -o markers.parquet",
+    "train": "sliplens train runs/mine/data -o runs/mine/train --start-from chromatouch-difference --epochs 5",
+    "evaluate": "sliplens evaluate runs/mine/train runs/mine/data -o runs/mine/evaluate",
+    "predict": "sliplens predict runs/mine/train cup.mp4 --reference untouched.png --plot margin.png -o margins.csv",
+    "export": "sliplens export runs/mine/train --onnx -o tip.onnx",
+    "explain": "sliplens explain runs/mine/train --frames frames --reference untouched.png -o runs/mine/explain",
+    "score": "sliplens score runs/mine/train runs/mine/explain -o runs/mine/score",
+    "diagnose": "sliplens diagnose runs/mine/train runs/mine/data -o runs/mine/why",
+    "study": "sliplens study runs/mine/data --difference runs/mine/train --raw none -o runs/mine/study",
+    "grip": "sliplens grip -o runs/grip --object egg",
+    "report": "sliplens report runs/mine",
+    "help": "sliplens help teach",
+}
+"""One line for each command that can be typed as it stands, once the files are there."""
+TASKS = {
+    "look": ("See what sliplens does, without any data", ("demo",)),
+    "read": ("Read the safety margin from images, a video or a bag", ("predict", "view")),
+    "explain": ("See which parts of an image a margin comes from", ("explain", "score")),
+    "teach": ("Teach a network your own sensor", ("sensor", "import", "check", "train", "evaluate")),
+    "judge": ("Find out where a network fails, and which explanation can be believed", ("diagnose", "study")),
+    "live": ("Read a running camera", ("live",)),
+}
+"""What users come for, and the commands that do it, in their order."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Help:
+    """Show which commands do what you came for: look, read, explain, teach, judge or live."""
+
+    task: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")] = None
+    """One of the six; all if not given."""
+
+    def run(self) -> None:
+        """Show the commands of one task, or of all."""
+        if self.task is not None and self.task not in TASKS:
+            raise InputError(f"there is no help on {self.task!r}; choose one of {', '.join(TASKS)}")
+        for name in TASKS if self.task is None else (self.task,):
+            title, commands = TASKS[name]
+            say(f"{title} ({name})")
+            for command in commands:
+                say(f"  {EXAMPLES[command]}")
+        say("`sliplens COMMAND --help` tells every option of a command.")
+
+
+OPTIONAL = ConstructorRegistry()
+"""Rules of the command line: what may be left out is shown by its own type, not as `{None}|STR`."""
+
+
+@OPTIONAL.primitive_rule
+def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    kinds = [kind for kind in get_args(info.type) if kind is not type(None)]
+    if info.type_origin not in {Union, UnionType} or len(kinds) != 1 or len(get_args(info.type)) != 2:
+        return None
+    inner = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kinds[0], info.markers))
+    if not isinstance(inner, PrimitiveConstructorSpec):
+        return None
+    return replace(
+        inner,
+        is_instance=lambda value: value is None or inner.is_instance(value),
+        str_from_instance=lambda value: [] if value is None else inner.str_from_instance(value),
+    )
+
+
+@cache  # once is enough: what they are annotated with stays
+def describe_options(*commands: type) -> None:
+    """Give every option of commands its help as one paragraph, and no default where that is to be left out.
+
+    tyro keeps the line breaks of a docstring whose lines are indented, and shows `(default: None)`.
+    """
+    for kind in {base for command in commands for base in command.__mro__ if "__dataclass_fields__" in vars(base)}:
+        said = {one.arg_name: one.description for one in docstring_parser.parse_from_object(kind).params}
+        hints: dict[str, str] = {}
+        for one in fields(kind):  # pyright: ignore[reportArgumentType]
+            if one.default is None or one.default == ():
+                hints[one.name] = ""
+            elif one.default is MISSING and one.default_factory is MISSING:
+                hints[one.name] = "(required)"
+        for name, annotation in list(vars(kind).get("__annotations__", {}).items()):
+            settings: dict[str, Any] = {"help": " ".join(said[name].split())} if said.get(name) else {}
+            settings |= {"help_behavior_hint": hints[name]} if name in hints else {}
+            if settings:
+                kind.__annotations__[name] = Annotated[annotation, tyro.conf.arg(**settings)]
+
+
+class HelpText(io.StringIO):
+    """What tyro prints, which asks where it goes whether that can show boxes."""
+
+    @property
+    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """That of the terminal."""
+        return (sys.__stdout__ or sys.stdout).encoding
+
+
+def print_help(text: str, words: Iterable[str]) -> None:
+    """Print what tyro says of a command: its lines as wide as the terminal, an example below."""
+    width = shutil.get_terminal_size().columns
+    # what stands in boxes is as wide already
+    lines = [line if len(line) <= width else fill(line, width, break_on_hyphens=False) for line in text.splitlines()]
+    command = next((word for word in words if word in EXAMPLES), None)
+    tail = [] if command is None else ["", "Example:", f"  {EXAMPLES[command]}"]
+    sys.stdout.write("\n".join([*lines, *tail, ""]))
+    sys.stdout.flush()
