@@ -128,30 +128,6 @@ def import_openvino() -> ModuleType:
     return openvino
 
 
-def import_torchvision() -> ModuleType:
-    """TorchVision, without torch's compiler: it imports all of that for one question that it asks when it compiles.
-
-    `torchvision.ops.roi_align` of 0.20 to 0.29 takes `is_compile_supported` from there, which no network here calls;
-    imported as it is, the compiler costs as much again as torch.
-    """
-    compiler = "torch._dynamo.utils"
-    hide = "torchvision" not in sys.modules and compiler not in sys.modules
-    if hide:
-        stand_in = ModuleType(compiler)
-        stand_in.is_compile_supported = _is_compile_supported  # pyright: ignore[reportAttributeAccessIssue]
-        sys.modules[compiler] = stand_in
-    try:
-        import torchvision  # noqa: PLC0415 (takes seconds)
-    finally:
-        if hide:
-            del sys.modules[compiler]
-    return torchvision
-
-
-def _is_compile_supported(device_type: str) -> bool:
-    return import_module("torch._dynamo.utils").is_compile_supported(device_type)
-
-
 def require_device(name: str) -> None:
     """Refuse a device that is not known or not there."""
     if not re.fullmatch(r"[a-z]+(:\d+)?", name):

@@ -1,7 +1,10 @@
 """Backbones: any TorchVision classifier, with the outputs that its head needs."""
 
 import math
+import sys
 from collections.abc import Callable, Mapping
+from importlib import import_module
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -10,9 +13,35 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sliplens.errors import ModelError
-from sliplens.extras import Table, import_torchvision
+from sliplens.extras import Table
 
-_classifiers = import_torchvision().models
+
+def _import_torchvision() -> ModuleType:
+    """TorchVision, without torch's compiler: it imports all of that for one question that it asks when it compiles.
+
+    `torchvision.ops.roi_align` takes `is_compile_supported` from there, which no network here calls;
+    imported as it is, the compiler costs as much again as torch.
+    """
+    compiler = "torch._dynamo.utils"
+    hide = "torchvision" not in sys.modules and compiler not in sys.modules
+    if hide:
+        stand_in = ModuleType(compiler)
+        stand_in.is_compile_supported = _is_compile_supported  # pyright: ignore[reportAttributeAccessIssue]
+        sys.modules[compiler] = stand_in
+    try:
+        import torchvision  # noqa: PLC0415 (as late as the stand-in)
+    finally:
+        if hide:
+            del sys.modules[compiler]
+    return torchvision
+
+
+def _is_compile_supported(device_type: str) -> bool:
+    return import_module("torch._dynamo.utils").is_compile_supported(device_type)
+
+
+_classifiers = _import_torchvision().models
+
 BINS = 60
 LOWEST, HIGHEST = -0.1, 1.1
 """Ends of the histogram, in margin units: a label's width beyond [0, 1], so that its mean is not pulled inwards."""
