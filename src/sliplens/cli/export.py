@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from sliplens.cli.command import Command, Output
+from sliplens.cli.command import Command, Output, require_network, require_path
 from sliplens.cli.console import OUT, wrote
 from sliplens.errors import InputError
 
@@ -31,6 +31,13 @@ class Export(Command):
     """The data set as MCAP files of ROS 2 messages, one a trial."""
     trials: tuple[str, ...] = ()
     """Names of trials of the data set; all if not given."""
+
+    def check(self) -> None:
+        """Refuse what is wrong at first sight."""
+        if self.onnx:
+            require_network(self.source)
+        elif self.lerobot or self.mcap:
+            require_path(self.source, what="the data set")
 
     def run(self) -> None:
         """Export."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from sliplens.cli.command import Device, Friction, Network, Source, SourceCommand, require_path
+from sliplens.cli.command import Device, Friction, Network, Source, SourceCommand
 from sliplens.cli.console import print_table, say, sparkline, wrote
 from sliplens.errors import InputError
 from sliplens.files import require_new_file
@@ -57,8 +57,6 @@ class Predict(SourceCommand):
             require_new_file(self.plot, overwrite=self.overwrite)
         if self.batch_size < 1:
             raise InputError(f"--batch-size must be at least 1, got {self.batch_size}")
-        if self.onnx is not None:
-            require_path(self.onnx, what="the ONNX file")
         super().check()
 
     def run(self) -> None:
