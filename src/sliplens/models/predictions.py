@@ -16,7 +16,6 @@ from sliplens.codec import TABLE_SUFFIXES, read_written, write_tables
 from sliplens.errors import InputError
 from sliplens.files import hash_json, require_new_file
 from sliplens.friction import Friction, FrictionLike, as_friction
-from sliplens.markers.gel import marker_spacing
 from sliplens.models.checkpoint import Estimate, Run, load, sensor_kind
 from sliplens.models.engines import Engine, make_engine
 from sliplens.progress import OnProgress, note, stage
@@ -25,7 +24,6 @@ from sliplens.recordings.capture import Capture
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import Frame, Frames, open_source
-from sliplens.simulation.sensor import SENSORS
 
 LEVEL = 0.9
 """Confidence of the intervals."""
@@ -275,12 +273,16 @@ def _require_comparable(trained: Run, trial: Capture) -> Iterator[str]:
 
 def _compare_markers(trained: Run, trial: Capture) -> str:
     """How far apart the markers are, beside those that a network of a simulated sensor learned from."""
+    # together they take seconds to import, and most frames need none of them
+    from scipy.spatial import KDTree  # noqa: PLC0415
+
+    from sliplens.markers.gel import marker_spacing  # noqa: PLC0415
+    from sliplens.simulation.sensor import SENSORS  # noqa: PLC0415
+
     known = SENSORS[kind] if (kind := sensor_kind(trained.manifest.sensor)) in SENSORS else None
     if known is None or trial.read_reference is None:
         return ""
     learned = known.geometry.project(known.geometry.marker_positions())
-    from scipy.spatial import KDTree  # noqa: PLC0415 (takes a second, and most frames need none)
-
     wanted_px = float(np.median(KDTree(learned).query(learned, k=2)[0][:, 1]))
     found_px = marker_spacing(trial.read_reference())
     if np.isnan(found_px):
