@@ -30,6 +30,12 @@ def test_a_line_for_people(small_dataset: Dataset, capsys: pytest.CaptureFixture
     assert re.search("no network|no margin: .*; ", capsys.readouterr().out)
 
 
+def test_the_address_of_the_page_is_told_with_its_token(small_dataset: Dataset, capsys: pytest.CaptureFixture[str]):
+    pytest.importorskip("nicegui")
+    assert main(["live", str(small_dataset.folder), "--seconds", "9", "--port", "0", "--host", "0.0.0.0"]) == 0
+    assert re.search(r"open http://\S+:\d+/\?token=\S{32}", capsys.readouterr().err)
+
+
 def test_what_can_be_read_is_listed(capsys: pytest.CaptureFixture[str]):
     pytest.importorskip("linuxpy")
     assert main(["live", "--list"]) == 0
