@@ -54,7 +54,7 @@ def defocus(image: np.ndarray, sigma_px: float, rng: np.random.Generator) -> np.
     kernel /= kernel.sum()
     soft = np.pad(image.astype(float), ((reach, reach), (reach, reach), (0, 0)), mode="edge")
     for axis in (0, 1):
-        soft = np.apply_along_axis(np.convolve, axis, soft, kernel, mode="valid")
+        soft = np.apply_along_axis(lambda line: np.convolve(line, kernel, mode="valid"), axis, soft)
     return soft + rng.normal(0, 2.2, soft.shape)
 
 

@@ -39,7 +39,7 @@ def write_trial(trial: Recording, folder: Path, *, name: str) -> None:
         for frame in trial.frames:
             canvas = np.full((height, width, 3), 12, dtype=np.uint8)
             left = (width - height) // 2
-            canvas[:, left : left + height] = Image.fromarray(frame).resize((height, height))
+            canvas[:, left : left + height] = np.asarray(Image.fromarray(frame).resize((height, height)))
             container.mux(stream.encode(av.VideoFrame.from_ndarray(canvas, format="rgb24")))
         container.mux(stream.encode())
     times = np.arange(0, len(trial) / _RATE_HZ, 1 / _FORCE_HZ)

@@ -1,6 +1,7 @@
 """Laws of the controllers: the force each formula asks for, and what every one of them owes a grip."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,7 +65,8 @@ def test_force_grows_faster_than_it_falls(name):
 
 @pytest.mark.parametrize("name", ["margin", "proportional"])
 def test_nothing_is_loosened_on_a_withheld_reading_and_blindness_ends_at_the_safe_force(name):
-    controller, force, blind = make_controller(name), 1.0, np.full((1, 2), np.nan)
+    controller: Any = make_controller(name)
+    force, blind = 1.0, np.full((1, 2), np.nan)
     controller.command(seen(0.5, time_s=LATE_S))
     told = []
     for tick in range(1, 60):
@@ -83,7 +85,7 @@ def test_one_finger_that_reads_is_enough():
 
 @pytest.mark.parametrize("name", ["margin", "proportional", "reflex"])
 def test_a_slip_is_answered_at_once_and_not_loosened_after(name):
-    controller = make_controller(name)
+    controller: Any = make_controller(name)
     force = float(controller.command(seen(0.9, force_n=1.5, slip=True))[0])
     assert force >= controller.boost * 1.5
     after = controller.command(seen(1.0, force_n=force, time_s=LATE_S + 0.1))[0]
@@ -91,7 +93,8 @@ def test_a_slip_is_answered_at_once_and_not_loosened_after(name):
 
 
 def test_after_a_slip_what_was_read_there_counts_as_nothing_left():
-    controller, told = make_controller("margin", {"zero": 0.0, "calm_s": 0.0, "boost": 1.0, "dead_band": 0.0}), 0.6
+    controller: Any = make_controller("margin", {"zero": 0.0, "calm_s": 0.0, "boost": 1.0, "dead_band": 0.0})
+    told = 0.6
     controller.command(seen(told))
     controller.command(seen(told, slip=True, time_s=LATE_S + 0.1))
     again = controller.command(seen(told, time_s=LATE_S + 0.5))[0]

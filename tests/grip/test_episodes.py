@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,8 +45,9 @@ def table(network) -> ReadingTable:
     return found
 
 
-def few(controller: str, condition: str = "dry", **options) -> Grip:
-    return run_episodes("cup", controller, condition=condition, **({"episodes": 40, "seed": 7} | options))
+def few(controller: str, condition: str = "dry", **options: Any) -> Grip:
+    asked: dict[str, Any] = {"episodes": 40, "seed": 7, **options}
+    return run_episodes("cup", controller, condition=condition, **asked)
 
 
 def test_every_controller_meets_the_same_episodes():

@@ -129,6 +129,7 @@ def test_a_command_that_is_no_number_holds():
 
 def test_an_object_on_the_table_stays_there():
     plant = Plant(CUP)
+    state = plant.state
     for _ in range(30):
         state = plant.step(np.array([1.0]), world(pull_n=5.0))
     assert state.height_m[0] == state.speed_m_s[0] == 0

@@ -105,7 +105,8 @@ def describe_options(*commands: type) -> None:
             elif one.default is MISSING and one.default_factory is MISSING:
                 hints[one.name] = "(required)"
         for name, annotation in list(vars(kind).get("__annotations__", {}).items()):
-            settings: dict[str, Any] = {"help": " ".join(said[name].split())} if said.get(name) else {}
+            words = said.get(name) or ""
+            settings: dict[str, Any] = {"help": " ".join(words.split())} if words else {}
             settings |= {"help_behavior_hint": hints[name]} if name in hints else {}
             if settings:
                 kind.__annotations__[name] = Annotated[annotation, tyro.conf.arg(**settings)]
@@ -115,7 +116,7 @@ class HelpText(io.StringIO):
     """What tyro prints, which asks where it goes whether that can show boxes."""
 
     @property
-    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleMethodOverride, reportIncompatibleVariableOverride]
         """That of the terminal."""
         return (sys.__stdout__ or sys.stdout).encoding
 

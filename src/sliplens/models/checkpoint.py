@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from sliplens.codec import load_record, load_result, save_record
-from sliplens.errors import CheckpointError, ImageError
+from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.extras import require_device
 from sliplens.files import MANIFEST_FILE, find_run, hash_file, require_folder
 from sliplens.friction import Friction, FrictionLike, as_friction
