@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -185,11 +186,14 @@ def test_an_interrupted_import_goes_on_where_it_stopped(
     assert run(*whole) == 0
     written = []
 
+    turn = Lock()
+
     def write(path: Path, *arguments: Any, **more: Any) -> None:
-        if len(written) == 1:
-            raise KeyboardInterrupt
-        written.append(path)
-        write_trial(path, *arguments, **more)
+        with turn:  # trials are written by several threads
+            if written:
+                raise KeyboardInterrupt
+            write_trial(path, *arguments, **more)
+            written.append(path)
 
     with monkeypatch.context() as patch:
         patch.setattr("sliplens.recordings.importing.write_trial", write)

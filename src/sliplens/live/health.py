@@ -51,11 +51,11 @@ class HealthLimits:
     saturation: float = 0.06
     """Share of the pixels that turned black or white since the reference."""
     exposure: float = 0.2
-    """Brightness against the reference, as a power of 2 up or down."""
+    """Brightness against the reference, as the ratio's power of 2, up or down."""
     focus: float = 0.25
     """Share of the reference's sharpness that is lost."""
     light: float = 0.2
-    """Brightness of one side of the border against the rest, as a power of 2 up or down."""
+    """Brightness of one side of the border against the rest, as the ratio's power of 2, up or down."""
     camera_px: float = 0.8
     """Motion of the border as a whole against the reference, in pixels of a picture 224 high."""
     markers: float = 0.15
