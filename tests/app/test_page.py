@@ -32,8 +32,8 @@ def page(source: SimulatedSource, tmp_path_factory: pytest.TempPathFactory) -> I
     source.load(normal_force_n=0.0, tangential_force_n=0.0)
     into = tmp_path_factory.mktemp("page") / "recorded"
     with (
-        # a busy machine drops frames, and health would withhold margins for that
-        sl.LiveReader(source, "chromatouch-difference", engine="eager", health=None) as reader,
+        # a busy machine drops frames, and health and markers would withhold margins for that
+        sl.LiveReader(source, "chromatouch-difference", engine="eager", health=None, slip=None) as reader,
         LivePage(reader, port=0, record_into=into) as page,
     ):
         yield page
@@ -74,12 +74,12 @@ def test_more_pull_means_less_margin_and_more_press_means_more(seen):
     seen.keyboard.press("PageDown")  # takes the fingertip in hand; whatever the step, it is pressed still
     seen.wait_for_function(f"{MARGIN} > 80")
     pull.focus()
-    for _ in range(5):
-        seen.keyboard.press("PageUp")
-    seen.wait_for_function(f"{MARGIN} < 20")
-    for _ in range(5):
-        seen.keyboard.press("PageDown")
-    seen.wait_for_function(f"{MARGIN} > 80")
+    # to the end and back, with steps to spare: a busy machine answers a key with the value of the one before
+    for key, reached in (("PageUp", "< 20"), ("PageDown", "> 80")):
+        for _ in range(15):
+            seen.keyboard.press(key)
+            seen.wait_for_timeout(60)
+        seen.wait_for_function(f"{MARGIN} {reached}")
 
 
 def test_the_picture_is_frozen_and_explained_while_the_margin_runs_on(seen, page: LivePage, source: SimulatedSource):
