@@ -1,6 +1,7 @@
 """The page in a real browser, and who may see it."""
 
 import json
+import os
 import shutil
 import urllib.error
 import urllib.request
@@ -17,6 +18,9 @@ from sliplens.live import SimulatedSource
 from sliplens.recordings.check import check_dataset
 
 pytest.importorskip("nicegui", reason="the page needs NiceGUI (extra live)")
+pytestmark = pytest.mark.skipif(
+    "PYTEST_XDIST_WORKER" in os.environ, reason="the page's server wants a process of its own: pytest tests/app"
+)
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome") or shutil.which("chromium-browser")
 MARGIN = "parseInt(document.querySelector('.sl-number').textContent)"
 

@@ -1,6 +1,7 @@
 """`sliplens live`: lines of JSON, lines for people, and what is there."""
 
 import json
+import os
 import re
 from pathlib import Path
 
@@ -30,6 +31,7 @@ def test_a_line_for_people(small_dataset: Dataset, capsys: pytest.CaptureFixture
     assert re.search("no network|no margin: .*; ", capsys.readouterr().out)
 
 
+@pytest.mark.skipif("PYTEST_XDIST_WORKER" in os.environ, reason="the page's server wants a process of its own")
 def test_the_address_of_the_page_is_told_with_its_token(small_dataset: Dataset, capsys: pytest.CaptureFixture[str]):
     pytest.importorskip("nicegui")
     assert main(["live", str(small_dataset.folder), "--seconds", "9", "--port", "0", "--host", "0.0.0.0"]) == 0
@@ -57,6 +59,7 @@ def test_mistakes_are_told_in_a_sentence(words: list[str], told: str, capsys: py
     assert told in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.skipif("PYTEST_XDIST_WORKER" in os.environ, reason="the page's server wants a process of its own")
 def test_the_command_shows_its_page_where_it_is_wanted(capsys):
     pytest.importorskip("nicegui", reason="the page needs NiceGUI (extra live)")
     for words, shown in (((), True), (("--no-page",), False)):
