@@ -27,8 +27,6 @@ demo: $(INSTALLED) ## have a first look, in minutes: runs/demo/report.html
 
 test: $(INSTALLED) ## run the tests on all cores; the last line says how long they took
 	$(BIN)/pytest --durations 10
-# the live page has a server and a browser, which want a process of their own
-	$(BIN)/pytest --quiet tests/app tests/cli/test_live.py
 
 check: $(INSTALLED) ## lint, format, types, floors
 	$(BIN)/ruff check
