@@ -201,7 +201,7 @@ def test_an_interrupted_import_goes_on_where_it_stopped(
     assert not (tmp_path / "b").exists()
     kept = written[0].stat().st_mtime_ns
     assert run(*broken) == 0
-    assert (tmp_path / "b" / "trials" / "a.parquet").stat().st_mtime_ns == kept
+    assert (tmp_path / "b" / "trials" / written[0].name).stat().st_mtime_ns == kept
     assert load_dataset(tmp_path / "b").hash == load_dataset(tmp_path / "w").hash
 
 

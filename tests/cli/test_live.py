@@ -1,8 +1,9 @@
 """`sliplens live`: lines of JSON, lines for people, and what is there."""
 
 import json
-import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -31,11 +32,18 @@ def test_a_line_for_people(small_dataset: Dataset, capsys: pytest.CaptureFixture
     assert re.search("no network|no margin: .*; ", capsys.readouterr().out)
 
 
-@pytest.mark.skipif("PYTEST_XDIST_WORKER" in os.environ, reason="the page's server wants a process of its own")
-def test_the_address_of_the_page_is_told_with_its_token(small_dataset: Dataset, capsys: pytest.CaptureFixture[str]):
+def told_by_a_process(*words: str) -> str:
+    """What `sliplens live` says: a process serves one page, and this one has other things to do."""
+    ended = subprocess.run(
+        [sys.executable, "-m", "sliplens", "live", *words], capture_output=True, text=True, timeout=120, check=True
+    )
+    return ended.stderr
+
+
+def test_the_address_of_the_page_is_told_with_its_token(small_dataset: Dataset):
     pytest.importorskip("nicegui")
-    assert main(["live", str(small_dataset.folder), "--seconds", "9", "--port", "0", "--host", "0.0.0.0"]) == 0
-    assert re.search(r"open http://\S+:\d+/\?token=\S{32}", capsys.readouterr().err)
+    told = told_by_a_process(str(small_dataset.folder), "--seconds", "1", "--port", "0", "--host", "0.0.0.0")
+    assert re.search(r"open http://\S+:\d+/\?token=\S{32}", told)
 
 
 def test_what_can_be_read_is_listed(capsys: pytest.CaptureFixture[str]):
@@ -59,9 +67,8 @@ def test_mistakes_are_told_in_a_sentence(words: list[str], told: str, capsys: py
     assert told in " ".join(capsys.readouterr().err.split())
 
 
-@pytest.mark.skipif("PYTEST_XDIST_WORKER" in os.environ, reason="the page's server wants a process of its own")
-def test_the_command_shows_its_page_where_it_is_wanted(capsys):
+@pytest.mark.parametrize(("words", "shown"), [((), True), (("--no-page",), False)])
+def test_the_command_shows_its_page_where_it_is_wanted(words: tuple[str, ...], shown: bool):
     pytest.importorskip("nicegui", reason="the page needs NiceGUI (extra live)")
-    for words, shown in (((), True), (("--no-page",), False)):
-        assert main(["live", "--seconds", "0.3", "--port", "8391", *words]) == 0
-        assert ("open http://127.0.0.1:8391/" in capsys.readouterr().err) is shown
+    told = told_by_a_process("--seconds", "0.3", "--port", "0", *words)
+    assert ("open http://127.0.0.1:" in told) is shown

@@ -38,6 +38,7 @@ _PICTURES_HZ, _ARROWS_HZ, _MAPS_HZ = 30.0, 10.0, 2.0
 _LONGEST_PX = 800
 _QUALITY = 85
 _UNANSWERED = 2  # messages under way to one viewer: one is drawn while the next one travels
+_STILL_THERE_S = 1.0  # without news: the page takes a longer silence for a lost connection
 _RATE_S = 2.0
 
 
@@ -282,7 +283,7 @@ class Feed:
                     continue
                 drawn_s = time.monotonic()
                 newest = self._newest
-                if newest is not None and any(viewer.ready for viewer in tuple(self.viewers)):
+                if newest is not None and any(viewer.wants_picture for viewer in tuple(self.viewers)):
                     self.picture = self._draw(*newest)
                 self._wake()
             self.ended = f"{self.reader.source.name} has ended"
@@ -409,6 +410,7 @@ class Viewer:
         """What this viewer waits for, in words."""
         self.shows_map = self.shows_arrows = True
         self._changed = asyncio.Event()
+        self._has_news = True
         self._serial = 0
         self._unanswered: dict[int, float] = {}
         self._forget()
@@ -421,12 +423,18 @@ class Viewer:
 
     def wake(self) -> None:
         """Send what is new as soon as this viewer has answered; called in the thread of the server."""
+        self._has_news = True
         self._changed.set()
 
     @property
     def ready(self) -> bool:
         """Whether it has answered what it was sent."""
         return len(self._unanswered) < _UNANSWERED
+
+    @property
+    def wants_picture(self) -> bool:
+        """Whether a newer picture would be sent; one that waits for a slow viewer need not be drawn again."""
+        return self.ready or self._picture is self.feed.picture
 
     def freeze(self) -> Picture | None:
         """Keep the picture that is seen; None before the first."""
@@ -451,7 +459,7 @@ class Viewer:
                 captured_s = self._unanswered.pop(answer.serial, None)
                 if captured_s is not None and answer.drawn and np.isfinite(captured_s):
                     self._drawn_ms = 1e3 * (time.monotonic() - captured_s)
-                self.wake()
+                self._changed.set()
         except (WebSocketDisconnect, msgspec.MsgspecError, KeyError):
             pass  # it has gone, or speaks another language
         finally:
@@ -464,9 +472,12 @@ class Viewer:
     async def _send(self, socket: WebSocket) -> None:
         self.wake()
         while True:
-            await self._changed.wait()
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._changed.wait(), _STILL_THERE_S)
+            still_there = not self._changed.is_set()
             self._changed.clear()
-            if self.ready:
+            if self.ready and (self._has_news or still_there):
+                self._has_news = False
                 await socket.send_bytes(self._message())
 
     def _message(self) -> bytes:
