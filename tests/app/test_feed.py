@@ -1,0 +1,129 @@
+"""What one viewer is sent, and when."""
+
+import asyncio
+import json
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+from starlette.websockets import WebSocketDisconnect
+
+from sliplens.app.feed import Feed, Picture, Viewer
+from sliplens.live.reading import LiveFrame, Reading
+
+
+class StillFeed(Feed):
+    """A feed in which nothing happens by itself."""
+
+    rate_hz, waiting = 0.0, ""
+
+    def __init__(self) -> None:  # no reader, no threads
+        self.viewers: set[Viewer] = set()
+        self.reading = self.picture = self.map = self.ended = None
+        self.reader = cast("Any", SimpleNamespace(recorder=None))
+
+    def points_since(self, at_s: float) -> tuple:
+        return ()
+
+
+class Wire:
+    """Socket of a browser whose answers the test gives."""
+
+    def __init__(self) -> None:
+        self.sent: asyncio.Queue[dict] = asyncio.Queue()
+        self.answers: asyncio.Queue[dict | None] = asyncio.Queue()
+
+    async def accept(self) -> None: ...
+
+    async def close(self) -> None: ...
+
+    async def send_bytes(self, message: bytes) -> None:
+        length = int.from_bytes(message[:4], "little")
+        await self.sent.put(json.loads(message[4 : 4 + length]))
+
+    async def receive_text(self) -> str:
+        answer = await self.answers.get()
+        if answer is None:
+            raise WebSocketDisconnect
+        return json.dumps(answer)
+
+    async def next(self, *, within_s: float = 30.0) -> dict:
+        return await asyncio.wait_for(self.sent.get(), within_s)
+
+
+def picture(number: int) -> Picture:
+    frame = LiveFrame(image=np.zeros((4, 4, 3), np.uint8), number=number, time_s=0.0, captured_s=0.0)
+    return Picture(
+        reading=Reading(number=number, time_s=0.0, captured_s=0.0),
+        frame=frame,
+        reference=None,
+        jpeg=bytes([number]),
+        arrows=(),
+    )
+
+
+def with_viewer(act) -> None:
+    """Let a viewer be served while something is done."""
+
+    async def run() -> None:
+        feed, wire = StillFeed(), Wire()
+        viewer = Viewer(feed)
+        served = asyncio.create_task(viewer.serve(cast("Any", wire)))
+        await act(feed, wire, viewer)
+        await wire.answers.put(None)
+        await served
+
+    asyncio.run(run())
+
+
+def test_an_answer_alone_is_not_answered():
+    async def act(_: StillFeed, wire: Wire, viewer: Viewer) -> None:
+        first = await wire.next()
+        await wire.answers.put({"serial": first["serial"]})
+        while not viewer.ready or viewer._unanswered:
+            await asyncio.sleep(0.001)
+        await asyncio.sleep(0.05)
+        assert wire.sent.empty()
+        viewer.wake()
+        assert (await wire.next())["serial"] == first["serial"] + 1
+
+    with_viewer(act)
+
+
+def test_something_is_said_before_the_page_takes_silence_for_a_lost_connection():
+    async def act(_: StillFeed, wire: Wire, viewer: Viewer) -> None:
+        await wire.answers.put({"serial": (await wire.next())["serial"]})
+        assert await wire.next()  # with no news
+
+    with_viewer(act)
+
+
+def test_a_slow_viewer_sees_the_picture_move():
+    async def act(feed: StillFeed, wire: Wire, viewer: Viewer) -> None:
+        owed = []
+        for number in range(1, 6):
+            # as the drawing thread does with each reading
+            if viewer.wants_picture:
+                feed.picture = picture(number)
+            viewer.wake()
+            if number > 2:  # it answers after the next reading has come, never before
+                await wire.answers.put({"serial": owed.pop(0)["serial"]})
+            owed.append(await wire.next())
+        drawn = [message["picture_bytes"] for message in owed]
+        assert all(drawn)  # pictures that are new
+        assert feed.picture.frame.number >= 4
+
+    with_viewer(act)
+
+
+def test_a_picture_that_nobody_fetches_is_not_drawn_again():
+    async def act(feed: StillFeed, wire: Wire, viewer: Viewer) -> None:
+        await wire.next()
+        viewer.wake()
+        await wire.next()  # two that stay without an answer
+        assert viewer.wants_picture is (feed.picture is None)
+        feed.picture = picture(1)
+        assert not viewer.ready
+        assert not viewer.wants_picture
+
+    with_viewer(act)
