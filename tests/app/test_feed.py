@@ -2,28 +2,14 @@
 
 import asyncio
 import json
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 from starlette.websockets import WebSocketDisconnect
 
+import sliplens as sl
 from sliplens.app.feed import Feed, Picture, Viewer
 from sliplens.live.reading import LiveFrame, Reading
-
-
-class StillFeed(Feed):
-    """A feed in which nothing happens by itself."""
-
-    rate_hz, waiting = 0.0, ""
-
-    def __init__(self) -> None:  # no reader, no threads
-        self.viewers: set[Viewer] = set()
-        self.reading = self.picture = self.map = self.ended = None
-        self.reader = cast("Any", SimpleNamespace(recorder=None))
-
-    def points_since(self, at_s: float) -> tuple:
-        return ()
 
 
 class Wire:
@@ -66,7 +52,8 @@ def with_viewer(act) -> None:
     """Let a viewer be served while something is done."""
 
     async def run() -> None:
-        feed, wire = StillFeed(), Wire()
+        # nothing happens in it by itself: it was not started
+        feed, wire = Feed(sl.LiveReader("simulated")), Wire()
         viewer = Viewer(feed)
         served = asyncio.create_task(viewer.serve(cast("Any", wire)))
         await act(feed, wire, viewer)
@@ -77,10 +64,10 @@ def with_viewer(act) -> None:
 
 
 def test_an_answer_alone_is_not_answered():
-    async def act(_: StillFeed, wire: Wire, viewer: Viewer) -> None:
+    async def act(_: Feed, wire: Wire, viewer: Viewer) -> None:
         first = await wire.next()
         await wire.answers.put({"serial": first["serial"]})
-        while not viewer.ready or viewer._unanswered:
+        while first["serial"] in viewer._unanswered:
             await asyncio.sleep(0.001)
         await asyncio.sleep(0.05)
         assert wire.sent.empty()
@@ -91,7 +78,7 @@ def test_an_answer_alone_is_not_answered():
 
 
 def test_something_is_said_before_the_page_takes_silence_for_a_lost_connection():
-    async def act(_: StillFeed, wire: Wire, viewer: Viewer) -> None:
+    async def act(_: Feed, wire: Wire, viewer: Viewer) -> None:
         await wire.answers.put({"serial": (await wire.next())["serial"]})
         assert await wire.next()  # with no news
 
@@ -99,7 +86,7 @@ def test_something_is_said_before_the_page_takes_silence_for_a_lost_connection()
 
 
 def test_a_slow_viewer_sees_the_picture_move():
-    async def act(feed: StillFeed, wire: Wire, viewer: Viewer) -> None:
+    async def act(feed: Feed, wire: Wire, viewer: Viewer) -> None:
         owed = []
         for number in range(1, 6):
             # as the drawing thread does with each reading
@@ -111,13 +98,14 @@ def test_a_slow_viewer_sees_the_picture_move():
             owed.append(await wire.next())
         drawn = [message["picture_bytes"] for message in owed]
         assert all(drawn)  # pictures that are new
+        assert feed.picture is not None
         assert feed.picture.frame.number >= 4
 
     with_viewer(act)
 
 
 def test_a_picture_that_nobody_fetches_is_not_drawn_again():
-    async def act(feed: StillFeed, wire: Wire, viewer: Viewer) -> None:
+    async def act(feed: Feed, wire: Wire, viewer: Viewer) -> None:
         await wire.next()
         viewer.wake()
         await wire.next()  # two that stay without an answer
