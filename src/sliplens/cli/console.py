@@ -108,16 +108,6 @@ def fold_equal(messages: Iterable[str]) -> list[str]:
     return folded
 
 
-_BARS = "\u2581\u2582\u2583\u2584\u2585\u2586\u2587\u2588"
-
-
-def sparkline(shares: Sequence[float], *, width: int = 40) -> str:
-    """Shares in [0, 1] as bars of a line, the lowest of those that fall into one; full height is 1."""
-    count = min(width, len(shares))
-    parts = (shares[at * len(shares) // count : (at + 1) * len(shares) // count] for at in range(count))
-    return "".join(_BARS[round(min(max(min(part), 0.0), 1.0) * (len(_BARS) - 1))] for part in parts)
-
-
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print a table, numbers to the right; columns that do not fit beside each other are printed below, names again."""
     columns = [_column(name, [row[place] for row in rows], names=place == 0) for place, name in enumerate(header)]

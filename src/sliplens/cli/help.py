@@ -47,7 +47,7 @@ TASKS = {
     "explain": ("See which parts of an image a margin comes from", ("explain", "score")),
     "teach": ("Teach a network your own sensor", ("sensor", "import", "check", "train", "evaluate")),
     "judge": ("Find out where a network fails, and which explanation can be believed", ("diagnose", "study")),
-    "live": ("Read a running camera", ("live",)),
+    "live": ("Read a running camera, and hold what it feels", ("live", "grip")),
 }
 """What users come for, and the commands that do it, in their order."""
 

@@ -1,5 +1,6 @@
 """`sliplens predict`."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -7,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sliplens.cli.command import Device, Friction, Network, Source, SourceCommand
-from sliplens.cli.console import print_table, say, sparkline, wrote
+from sliplens.cli.console import print_table, say, wrote
 from sliplens.errors import InputError
 from sliplens.files import require_new_file
 
@@ -18,6 +19,7 @@ _FEW = 24
 """Frames of which each has a line on the terminal."""
 _TRIALS = 40
 """Trials of which each has a line."""
+_BARS = "\u2581\u2582\u2583\u2584\u2585\u2586\u2587\u2588"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +106,7 @@ def _course(trial: "TrialMargins") -> str:
     low, high = trial.interval or (None, None)
     interval = "" if low is None else f" ({_interval(low, high)})"
     return (
-        f"{trial.trial}  {sparkline(trial.margin.tolist())}  lowest {_percent(float(trial.margin[trial.lowest]))}"
+        f"{trial.trial}  {_sparkline(trial.margin.tolist())}  lowest {_percent(float(trial.margin[trial.lowest]))}"
         f"{interval} at {where}, {len(trial.margin):,} frames"
     )
 
@@ -115,3 +117,10 @@ def _percent(value: float | None) -> str:
 
 def _interval(low: float | None, high: float | None) -> str:
     return "-" if low is None or high is None else f"{100 * low:.0f} to {100 * high:.0f} %"
+
+
+def _sparkline(shares: Sequence[float], *, width: int = 40) -> str:
+    """Shares in [0, 1] as bars of a line, the lowest of those that fall into one; full height is 1."""
+    count = min(width, len(shares))
+    parts = (shares[at * len(shares) // count : (at + 1) * len(shares) // count] for at in range(count))
+    return "".join(_BARS[round(min(max(min(part), 0.0), 1.0) * (len(_BARS) - 1))] for part in parts)
