@@ -36,6 +36,7 @@ _STUDY: dict[str, Any] = {
     "tests": ("score", "faithfulness"),
     "settings": (Setting(fill="reference", unit="pixel"), Setting(fill="noisy-linear", unit="pixel")),
     "random_orders": 4,
+    "steps": STEPS,
 }
 """The study of a first look: too few trials to decide anything, as the page says, but there within minutes."""
 DEMO_SEED = 20261122

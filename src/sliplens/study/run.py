@@ -73,6 +73,7 @@ def run_study(
     tests: Collection[str] = TESTS,
     settings: Sequence[Setting] = SETTINGS,
     random_orders: int = 10,
+    steps: int | None = None,
     device: str = "cpu",
     jobs: int = 1,
     seed: int = 0,
@@ -101,6 +102,8 @@ def run_study(
     tests, settings, random_orders
         What to judge explanations by, some of `TESTS`; what is removed and put there by the removal curves, and how
         many random orders every method has to beat.
+    steps
+        Steps of the thesis's deletion score; as many as there are rows of pixels, as in the thesis, if None.
     jobs
         Networks to judge at the same time, each by a process with its share of the cores. More than one needs a script
         that starts its work under `if __name__ == "__main__":`, as all that starts processes does.
@@ -140,6 +143,7 @@ def run_study(
         tests=frozenset(tests),
         settings=tuple(settings),
         random_orders=random_orders,
+        steps=steps,
         seed=seed,
         overwrite=overwrite,
         on_progress=on_progress,
@@ -204,6 +208,7 @@ class _Stages:
     tests: frozenset[str]
     settings: tuple[Setting, ...]
     random_orders: int
+    steps: int | None
     seed: int
     overwrite: bool
     on_progress: OnProgress | None
@@ -259,7 +264,9 @@ class _Stages:
             return judge_by_truth(run, material().explained, self.data, parts=parts, on_progress=count, **own)
 
         works: dict[str, _Work] = {
-            "score": lambda _, count: score_explanations(run, material().explained, seed=seed, on_progress=count),
+            "score": lambda _, count: score_explanations(
+                run, material().explained, steps=self.steps, seed=seed, on_progress=count
+            ),
             "remedies": lambda _, count: score_remedies(material(), grey=found["score"], seed=seed, on_progress=count),
             "control": lambda parts, count: explain_untrained(material(), seed=seed, parts=parts, on_progress=count),
             "faithfulness": remove,
@@ -270,7 +277,8 @@ class _Stages:
         removal = {"random_orders": self.random_orders, "areas": STUDY_AREAS, "settings": self.settings}
         depends: dict[str, dict[str, Any]] = {
             # the report reads these of every score
-            "score": {"input": name, "source": self.data.source, "fill": "grey"},
+            "score": {"input": name, "source": self.data.source, "fill": "grey"}
+            | ({} if self.steps is None else {"steps": self.steps}),
             "remedies": {"steps": STEPS},
             "control": _CONTROLS,
             "faithfulness": removal | _CONTROLS,
