@@ -15,6 +15,7 @@ from hypothesis import settings
 
 from sliplens.images import absolute_difference, write_png
 from sliplens.models import Manifest, build_model, save_checkpoint
+from sliplens.models.calibration import Calibration, Traction
 from sliplens.recordings import ContactState, Dataset, Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
@@ -124,22 +125,43 @@ def fine_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return load_dataset(folder)
 
 
-def save_untrained(folder: Path, *, kind: str = "difference", seed: int = 0, frame_size: int = FRAME_SIZE) -> Path:
+def save_untrained(
+    folder: Path,
+    *,
+    kind: str = "difference",
+    seed: int = 0,
+    frame_size: int = FRAME_SIZE,
+    image_size: int = IMAGE_SIZE,
+    traction: Traction | None = None,
+) -> Path:
     """A checkpoint with random weights: enough to test everything around a network."""
+    head = "point" if traction is None else "margin-and-ratio"
     folder.mkdir(parents=True, exist_ok=True)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = build_model()
+        model = build_model(head=head)
     manifest = Manifest(
         backbone="shufflenet_v2_x1_0",
         input=kind,
-        image_size=IMAGE_SIZE,
+        image_size=image_size,
         frame_size=(frame_size, frame_size),
         sensor="test-sensor",
         data_hash="none",
+        head=head,
+        calibration=None if traction is None else traction.calibration,
+        traction=traction,
     )
     save_checkpoint(folder, model.eval(), manifest)
     return folder
+
+
+@pytest.fixture(scope="session")
+def ratio_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A network of the ChromaTouch that answers with the margin and with F_t / F_n."""
+    calibration = Calibration(temperature=1.0, offsets={"0.9": 0.05}, frames=100, mse=0.01)
+    friction = tuple(0.15 + 0.105 * part for part in range(11))
+    traction = Traction(calibration=calibration, told=calibration, friction=friction)
+    return save_untrained(tmp_path_factory.mktemp("ratio-run"), frame_size=224, traction=traction)
 
 
 @pytest.fixture(scope="session")

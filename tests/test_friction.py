@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from sliplens.errors import InputError
-from sliplens.friction import Friction, as_friction
+from sliplens.friction import Friction, SlipLearner, as_friction
 
 
 def test_a_range_is_even():
@@ -84,3 +84,41 @@ def test_weights_must_fit():
         Friction(np.array([0.5, 0.6]), np.array([1.0, -1.0]))
     with pytest.raises(InputError, match="share of the friction"):
         Friction(0.5).next_grasp(1.5)
+
+
+def rising(learner: SlipLearner, *, until: float, sigma: float = 0.03) -> float:
+    """Read a ratio that rises by 0.6 a second from 0; gives the time at its end."""
+    times = np.arange(0, until / 0.6 + 1e-9, 1 / 60)
+    for time_s in times.tolist():
+        learner.note(0.6 * time_s, sigma=sigma, time_s=time_s)
+    return float(times[-1])
+
+
+def test_a_slip_teaches_what_was_read_as_it_began():
+    prior, learner = Friction.between(0.2, 1.0), SlipLearner(Friction.between(0.2, 1.0))
+    end_s = rising(learner, until=0.5)
+    for late in range(3):  # the same slip, told again and again
+        learner.update(end_s + 0.05 * late, slipping_s=0.1 + 0.05 * late)
+    began = 0.6 * (end_s - 0.1)
+    assert learner.friction.mean == pytest.approx(prior.update(began, 0.03).mean, abs=0.011)  # a frame before
+
+
+def test_the_next_grasp_of_a_slip_that_was_learnt_is_less_sure():
+    learner = SlipLearner(Friction.between(0.2, 1.0))
+    learner.update(rising(learner, until=0.5), slipping_s=0.05)
+    held = learner.friction.sigma
+    learner.update(5.0, slipping_s=None, touches=False)
+    let_go = learner.friction.sigma
+    assert let_go == pytest.approx(np.hypot(held, 0.06 * learner.friction.mean), rel=0.05)
+    learner.update(6.0, slipping_s=None, touches=False)  # still nothing touches
+    assert learner.friction.sigma == let_go
+
+
+@pytest.mark.parametrize("friction", [Friction(0.6), Friction.between(0.3, 0.9)])
+def test_without_a_reading_or_a_doubt_a_slip_teaches_nothing(friction: Friction):
+    learner = SlipLearner(friction)
+    if friction.sigma == 0:
+        rising(learner, until=0.5)
+    learner.update(1.0, slipping_s=0.1)
+    learner.update(2.0, slipping_s=None, touches=False)
+    assert learner.friction is friction

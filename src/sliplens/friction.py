@@ -1,6 +1,7 @@
 """What is known of the coefficient of friction: told exactly, within a range, or learnt from slips."""
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
@@ -10,7 +11,7 @@ from jaxtyping import Float
 
 from sliplens.errors import InputError
 
-__all__ = ["Friction", "FrictionLike", "as_friction"]
+__all__ = ["Friction", "FrictionLike", "SlipLearner", "as_friction"]
 
 LOWEST, HIGHEST = 0.05, 2.0
 """Coefficients between which friction is looked for where only slips tell it: ice on steel to clean rubber on glass."""
@@ -165,6 +166,54 @@ class Friction:
         if self.note.endswith("range"):
             return self.note
         return f"{self.mean:.3g}{f' +- {self.sigma:.2g}' if len(self.nodes[0]) > 1 else ''}, {self.note}"
+
+
+class SlipLearner:
+    """Friction of an object while it is held: each gross slip narrows it down, and a new grasp widens it again.
+
+    As a contact begins to slip, F_t / F_n is the static friction; what is read while it slides is less. So a slip is
+    told together with the time since it began, and the ratio that was read just before counts.
+
+    Parameters
+    ----------
+    friction
+        What is known beforehand; what is known exactly stays so.
+
+    Examples
+    --------
+    >>> from sliplens.friction import Friction, SlipLearner
+    >>> learner = SlipLearner(Friction.between(0.2, 1.0))
+    >>> for tick in range(10):
+    ...     learner.note(0.06 * tick, sigma=0.03, time_s=0.1 * tick)
+    >>> learner.update(0.95, slipping_s=0.2)
+    >>> str(learner.friction)
+    '0.42 +- 0.03, learnt from slips'
+    """
+
+    def __init__(self, friction: Friction) -> None:
+        self.friction = friction
+        self._read: deque[tuple[float, float, float]] = deque(maxlen=_KEPT)
+        self._slips = self._learnt = False
+
+    def note(self, ratio: float, *, sigma: float, time_s: float) -> None:
+        """Keep a ratio F_t / F_n that was read, and its standard deviation."""
+        self._read.append((time_s, ratio, sigma))
+
+    def update(self, time_s: float, *, slipping_s: float | None, touches: bool = True) -> None:
+        """Learn from whether the contact slips now, and since how many seconds; None where it holds."""
+        if slipping_s is not None and not self._slips:
+            before = [(ratio, sigma) for then_s, ratio, sigma in self._read if then_s <= time_s - slipping_s]
+            if before and before[-1][0] > 0 and len(self.friction.nodes[0]) > 1:
+                self.friction, self._learnt = self.friction.update(*before[-1]), True
+        self._slips = slipping_s is not None
+        if not touches:
+            self._read.clear()
+            if self._learnt:
+                self.friction, self._learnt = self.friction.next_grasp(), False
+
+
+_KEPT = 120
+"""Readings that are kept: longer than any slip takes to be told."""
 
 
 FrictionLike: TypeAlias = Friction | float | tuple[float, float] | str

@@ -220,6 +220,44 @@ def test_without_a_contact_there_is_no_margin(trials: dict[str, Recording], name
     assert second.contact_state is not ContactState.NO_CONTACT
 
 
+def test_what_is_told_of_friction_shapes_the_margin_and_a_slip_narrows_it(
+    trials: dict[str, Recording], ratio_run: Path
+):
+    trial, network = trials["chromatouch"], sl.load(ratio_run)
+
+    class Watch:
+        def __init__(self, rest_px: np.ndarray) -> None:
+            self.markers = len(rest_px)
+
+        def update(self, positions_px: np.ndarray, time_s: float) -> MarkerReading:
+            assert len(positions_px) == self.markers
+            slipping_s = 0.06 if time_s > 0.12 else None
+            return MarkerReading(state=SlipState.STICKING, contact=True, slipping_s=slipping_s)
+
+    told, source = sl.Friction.between(0.3, 0.9), Patient(trial.frames[10:14], [0, 1, 2, 3])
+    reader = sl.LiveReader(
+        source, network, reference=trial.reference, friction=told, engine="eager", slip=Watch, health=None, stall_s=10.0
+    )
+    readings = source.all_readings(reader)
+    estimates = [network.estimate(network.encode(frame[None], trial.reference)) for frame in trial.frames[10:14]]
+    ratios = [one.ratio for one in estimates]
+    assert all(one is not None for one in ratios)
+    assert [reading.ratio for reading in readings] == pytest.approx([float(one.mean[0]) for one in ratios], abs=1e-4)
+    # the slip that the fourth frame tells began 0.06 s before it, after the second
+    learnt = told.update(float(ratios[1].mean[0]), float(ratios[1].sigma[0]))
+    assert [reading.friction for reading in readings] == [str(told)] * 3 + [str(learnt)]
+    for reading, frame, friction in zip(readings, trial.frames[10:14], [told] * 3 + [learnt], strict=True):
+        again = network.estimate(network.encode(frame[None], trial.reference), friction=friction)
+        assert reading.margin == pytest.approx(float(again.margin[0]), abs=1e-4)
+
+
+def test_friction_needs_a_network_that_tells_f_t_over_f_n():
+    with pytest.raises(InputError, match="makes a margin of what a network reads; name one with --network"):
+        plain_reader("simulated", friction=0.6)
+    with pytest.raises(InputError, match="answers with the margin alone and cannot use it"):
+        plain_reader("simulated", "chromatouch-difference", friction=0.6)
+
+
 def test_a_network_of_another_sensor_is_refused_before_anything_runs(difference_run: Path):
     with pytest.raises(ImageError, match=r"224 x 224 pixels but the network was trained on 48 x 48"):
         plain_reader("simulated", difference_run).__enter__()

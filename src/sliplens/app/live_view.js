@@ -387,12 +387,15 @@ export default {
         latency: `${ms(latency.total_ms)} to the reading`,
         "of that": `decoding ${ms(latency.decode_ms)}, encoding ${ms(latency.encode_ms)}, network ${ms(latency.network_ms)}`,
         drawn: `${ms(drawn_ms)} after the capture`,
+        ...(reading?.friction ? { friction: `taken for ${reading.friction}` } : {}),
         dropped: `${reading?.dropped ?? 0} frames`,
         state: `${reading?.contact_state ?? "unknown"}`,
         viewers: `${viewers}`,
       };
       const list = this.$refs.facts;
-      if (list.children.length !== 2 * Object.keys(rows).length) {
+      // a row more where friction is told, which a withheld reading does not say
+      if (list.dataset.names !== `${Object.keys(rows)}`) {
+        list.dataset.names = `${Object.keys(rows)}`;
         list.replaceChildren(
           ...Object.keys(rows).flatMap((name) => {
             const term = document.createElement("dt");

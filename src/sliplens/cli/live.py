@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sliplens.cli.command import Device
+from sliplens.cli.command import Device, Friction
 from sliplens.cli.console import ERR, print_table, say
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ class Live:
     simulated fingertip; none if not given."""
     reference: Path | None = None
     """Image of the untouched sensor; taken when the picture is still at first if not given."""
+    friction: Friction = None
     list: bool = False
     """List the cameras with their formats, sizes and rates, and what else can be read, and end."""
     rate: float | None = None
@@ -92,9 +93,10 @@ class Live:
         shipped = "chromatouch-difference" if self.source in {"simulated", "simulated:chromatouch"} else None
         with ExitStack() as stack:
             sinks = [stack.enter_context(closing(open_sink(name))) for name in self.sink]
-            named = {name: getattr(self, name) for name in ("reference", "engine", "device", "seconds", "forces")}
-            named |= {"sensor": self.sensor if is_profile(self.sensor) else None, "smoothing_s": self.smoothing}
-            reader = LiveReader(self.source, self.network or shipped, options=self._options(), **named)
+            names = ("reference", "engine", "device", "seconds", "forces", "friction")
+            named = {name: getattr(self, name) for name in names} | {"smoothing_s": self.smoothing}
+            named |= {"sensor": self.sensor if is_profile(self.sensor) else None, "options": self._options()}
+            reader = LiveReader(self.source, self.network or shipped, **named)
             for sink in sinks:
                 reader.subscribe(lambda reading, frame, sink=sink: sink.send(reading, frame and frame.image))
             if self.record is not None:
@@ -128,10 +130,8 @@ class Live:
     def _options(self) -> "SourceOptions":
         from sliplens.live.contract import SourceOptions, parse_size
 
-        size = parse_size(self.size)
-        return SourceOptions(
-            rate_hz=self.rate, speed=self.speed, trial=self.trial, size=size, pixel_format=self.pixel_format
-        )
+        named = {name: getattr(self, name) for name in ("speed", "trial", "pixel_format")}
+        return SourceOptions(rate_hz=self.rate, size=parse_size(self.size), **named)
 
     def _watch(self, reader: "LiveReader") -> None:
         told_s = -1.0

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sliplens.errors import ImageError, InputError, RecordingError, SourceError
+from sliplens.friction import FrictionLike, SlipLearner, as_friction
 from sliplens.images import read_image
 from sliplens.live.contract import LiveSource, SourceOptions
 from sliplens.live.health import HealthMonitor
@@ -155,6 +156,9 @@ class LiveReader:
     sensor
         Profile of the sensor that frames and reference go through, its file, or the name of one that comes along;
         where it names a network and `network` is None, that one is read by.
+    friction
+        What is known of the coefficient of friction, as `predict` takes it, for a network that tells F_t / F_n. Slips
+        that the markers tell narrow a range down; `Reading.friction` says what was assumed.
     engine
         Row of `ENGINES`; `auto` for the fastest at hand that pays for `seconds`, or for hours where that is None, and
         that may take seconds to be made.
@@ -200,6 +204,7 @@ class LiveReader:
         reference: Path | str | Frame | None = None,
         options: SourceOptions | None = None,
         sensor: SensorProfile | Path | str | None = None,
+        friction: FrictionLike | None = None,
         engine: str = "auto",
         device: str = "cpu",
         smoothing_s: float = 0.0,
@@ -217,6 +222,11 @@ class LiveReader:
         if network is None and profile is not None:
             network = profile.network
         self.network = load(network, device=device) if isinstance(network, Path | str) else network
+        self._friction = None if friction is None else SlipLearner(as_friction(friction))
+        if self._friction is not None:
+            if self.network is None:
+                raise InputError("--friction makes a margin of what a network reads; name one with --network")
+            self.network.require_ratio()
         options = options or SourceOptions()
         if self.network is not None and profile is None:
             options = replace(options, fit_size=self.network.manifest.frame_size)
@@ -489,6 +499,10 @@ class LiveReader:
         if untouched or (markers is not None and markers.contact is False):
             reading = replace(reading, contact_state=ContactState.NO_CONTACT)
             withheld = withheld or (None if self.network is None else _NO_CONTACT)
+        if self._friction is not None:
+            slipping_s = None if markers is None else markers.slipping_s
+            touches = reading.contact_state != ContactState.NO_CONTACT
+            self._friction.update(frame.time_s, slipping_s=slipping_s, touches=touches)
         if self.network is None or withheld is not None:
             return self._withhold(reading, frame, withheld)
         return self._estimate(reading, frame)
@@ -530,8 +544,12 @@ class LiveReader:
         begun = time.perf_counter()
         inputs = self.network.encode(frame.image[None], self.reference)
         encoded = time.perf_counter()
-        estimate = self.engine.estimate(self.network, inputs)
+        friction = None if self._friction is None else self._friction.friction
+        estimate = self.engine.estimate(self.network, inputs, friction=friction)
         done = time.perf_counter()
+        ratio = None if estimate.ratio is None else float(estimate.ratio.mean[0])
+        if self._friction is not None and ratio is not None and estimate.ratio is not None:
+            self._friction.note(ratio, sigma=float(estimate.ratio.sigma[0]), time_s=frame.time_s)
         interval = estimate.interval(LEVEL)
         values = [estimate.margin] if interval is None else [estimate.margin, *interval]
         margin, *ends = np.clip(np.concatenate(values), 0, 1)
@@ -549,6 +567,8 @@ class LiveReader:
             margin=margin,
             low=low,
             high=high,
+            ratio=ratio,
+            friction=None if friction is None else str(friction),
             contact_state=state,
             lag_s=self._smooth.time_constant_s,
             latency=latency,
@@ -566,6 +586,7 @@ def read_live(
     reference: Path | str | Frame | None = None,
     options: SourceOptions | None = None,
     sensor: SensorProfile | Path | str | None = None,
+    friction: FrictionLike | None = None,
     engine: str = "auto",
     device: str = "cpu",
     smoothing_s: float = 0.0,
@@ -594,6 +615,7 @@ def read_live(
         reference=reference,
         options=options,
         sensor=sensor,
+        friction=friction,
         engine=engine,
         device=device,
         smoothing_s=smoothing_s,

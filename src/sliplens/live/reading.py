@@ -100,6 +100,10 @@ class Reading:
     that was never calibrated."""
     high: float | None = None
     """Upper end of it, in margin units."""
+    ratio: float | None = None
+    """Traction ratio F_t / F_n, of a network that tells it."""
+    friction: str | None = None
+    """Coefficient of friction that the margin was read with, in words; None where none was told."""
     lag_s: float = 0.0
     """Delay of margin and interval by smoothing; 0 without."""
     contact_state: ContactState = ContactState.UNKNOWN
