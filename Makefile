@@ -56,13 +56,17 @@ weights: $(INSTALLED) ## train the networks that come with the package: some fiv
 	$(BIN)/sliplens simulate runs/weights/more --preset varied --dry-trials 3060 --days 1020 --seed 1
 	$(BIN)/sliplens train runs/weights/more -o runs/weights/more-difference --input difference \
 		--start-from runs/weights/large-difference --epochs 5 --learning-rate 1e-3
+# a second answer, F_t / F_n, for where friction is told: its margins stay as they are
+	$(BIN)/sliplens simulate runs/weights/other --preset varied --dry-trials 1230 --days 410 --seed 2
+	$(BIN)/sliplens train runs/weights/other -o runs/weights/told-difference --recipe ratio \
+		--start-from runs/weights/more-difference
 # the networks of the thesis: its days and trials on one sensor, its recipe, as far as two cores reach
 	$(BIN)/sliplens simulate runs/weights/thesis --preset thesis --frames-per-trial 200
 	@set -e; for input in difference raw; do \
 		$(BIN)/sliplens train runs/weights/thesis -o runs/weights/thesis-$$input --input $$input \
 			--recipe thesis --image-size 112 --epochs 4; \
 	done
-	@set -e; for kept in more-difference:chromatouch large-raw:chromatouch thesis-difference:thesis thesis-raw:thesis; do \
+	@set -e; for kept in told-difference:chromatouch large-raw:chromatouch thesis-difference:thesis thesis-raw:thesis; do \
 		run=$${kept%:*}; folder=src/sliplens/weights/$${kept#*:}-$${run##*-}; mkdir -p $$folder; \
 		for file in model.safetensors manifest.json run.json result.json; do \
 			cp runs/weights/$$run/$$file $$folder; \
