@@ -30,12 +30,6 @@ def test_a_reader_that_stops_reading_is_no_error():
     assert asked.returncode == 1
 
 
-def test_an_unknown_command_exits_with_2(capsys: pytest.CaptureFixture[str]):
-    with pytest.raises(SystemExit) as exit_info:
-        run("predikt")
-    assert exit_info.value.code == 2
-
-
 @pytest.mark.parametrize(
     "command",
     [
@@ -159,3 +153,19 @@ def test_a_full_disk_is_one_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: 
 
     monkeypatch.setattr("sliplens.cli.report.Report.run", full)
     assert "maps.npz could not be read or written (No space left on device)" in refused(capsys, "report", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("prdict cup.mp4", "there is no command prdict; did you mean predict? `sliplens --help` tells all"),
+        ("predict a b --frction 0.7", "no option --frction of `sliplens predict`; did you mean --friction?"),
+        ("label a -o b --reference-fram 3", "did you mean --reference-frame?"),  # of a group of options
+        ("predict a b c", "'c' is one word too many for `sliplens predict`"),
+    ],
+)
+def test_a_slip_of_the_pen_is_told_in_one_line(words: str, told: str, capsys: pytest.CaptureFixture[str]):
+    assert run(*words.split()) == 2
+    said = capsys.readouterr().err
+    assert told in said
+    assert said.count("\n") == 1

@@ -10,7 +10,7 @@ import tyro
 
 from sliplens._version import __version__
 from sliplens.cli.check import Check
-from sliplens.cli.command import in_options
+from sliplens.cli.command import in_options, option_names
 from sliplens.cli.console import fail
 from sliplens.cli.demo import Demo
 from sliplens.cli.diagnose import Diagnose
@@ -18,7 +18,7 @@ from sliplens.cli.evaluate import Evaluate
 from sliplens.cli.explain import Explain
 from sliplens.cli.export import Export
 from sliplens.cli.grip import Grip
-from sliplens.cli.help import OPTIONAL, Help, HelpText, describe_options, print_help
+from sliplens.cli.help import EXAMPLES, OPTIONAL, Help, HelpText, describe_options, print_help, tell_unknown
 from sliplens.cli.import_ import Import
 from sliplens.cli.label import Label
 from sliplens.cli.live import Live
@@ -32,7 +32,7 @@ from sliplens.cli.study import Study
 from sliplens.cli.track import Track
 from sliplens.cli.train import Train
 from sliplens.cli.view import View
-from sliplens.errors import SliplensError
+from sliplens.errors import InputError, SliplensError
 from sliplens.recordings.options import LabelSettings, ReadOptions
 
 _Recordings = Sensor | Simulate | Import | Label | Split | Check | View | Track
@@ -46,21 +46,27 @@ do what you came for."""
 
 def _parse(words: Sequence[str]) -> Any:
     """Make the command that the words name; help is printed here, and ends the program."""
+    if words[0] not in EXAMPLES and not words[0].startswith("-"):
+        raise InputError(tell_unknown(words[0], EXAMPLES, what="command", help_of="sliplens"))
     help_text = HelpText()
     describe_options(*get_args(Command), LabelSettings, ReadOptions)
     try:
         with redirect_stdout(help_text):
-            return tyro.cli(
+            command, unknown = tyro.cli(
                 Command,  # pyright: ignore[reportArgumentType]
                 prog="sliplens",
                 description=_DESCRIPTION,
                 args=words,
                 registry=OPTIONAL,
+                return_unknown_args=True,
             )
     except SystemExit:
         if help_text.getvalue():
             print_help(help_text.getvalue(), words)
         raise
+    if unknown:
+        raise InputError(tell_unknown(unknown[0], option_names(command), what="option", help_of=f"sliplens {words[0]}"))
+    return command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

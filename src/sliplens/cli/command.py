@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -48,6 +48,13 @@ def in_options(message: str, command: object) -> str:
         place = rf"(?<![\w-]){name}(?![\w-])" if "_" in name else rf"^{name}(?= (?:must|is \d|is -))"
         message = re.sub(place, f"--{name.replace('_', '-')}", message)
     return message
+
+
+def option_names(command: object) -> list[str]:
+    """Options of a command as they are typed, those of its groups among them."""
+    groups = [value for value in vars(command).values() if is_dataclass(value)]
+    own = [f"--{name.replace('_', '-')}" for name in vars(command)]
+    return own + [name for group in groups for name in option_names(group)]
 
 
 @dataclass(frozen=True, kw_only=True)

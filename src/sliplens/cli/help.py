@@ -5,6 +5,7 @@ import shutil
 import sys
 from collections.abc import Iterable
 from dataclasses import MISSING, dataclass, fields, replace
+from difflib import get_close_matches
 from functools import cache
 from textwrap import fill
 from types import UnionType
@@ -69,6 +70,15 @@ class Help:
             for command in commands:
                 say(f"  {EXAMPLES[command]}")
         say("`sliplens COMMAND --help` tells every option of a command.")
+
+
+def tell_unknown(word: str, known: Iterable[str], *, what: str, help_of: str) -> str:
+    """Say that a command or an option is not there, and which one may have been meant."""
+    if what == "option" and not word.startswith("-"):
+        return f"{word!r} is one word too many for `{help_of}`; `{help_of} --help` tells what it takes"
+    [near] = get_close_matches(word, list(known), n=1) or [None]
+    meant = f"did you mean {near}? `{help_of} --help` tells all" if near else f"`{help_of} --help` tells what there is"
+    return f"there is no {what} {word}{f' of `{help_of}`' if what == 'option' else ''}; {meant}"
 
 
 OPTIONAL = ConstructorRegistry()

@@ -68,6 +68,8 @@ class Predict(SourceCommand):
         named = {"run": self.model, "options": self.options, "onnx_file": self.onnx, "out": self.output}
         predictions = self.call(predict, **named)
         _show(predictions)
+        if self.friction is not None:
+            say(f"margins for a friction of {self.friction}, as you told it")
         if self.plot is not None:
             from sliplens.plots.margins import draw_margins
 
