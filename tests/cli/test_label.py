@@ -9,8 +9,10 @@ import pytest
 from command_line import refused, run
 
 from sliplens.images import write_png
-from sliplens.recordings import ContactState, Recording, load_dataset
+from sliplens.recordings import ContactState, LabelSettings, Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.edits import EDITS_FILE, keep_edit, make_edit, read_edits
+from sliplens.recordings.importing import relabel_trial
 from sliplens.recordings.store import forces_path, load_forces, load_recording, read_header, save_recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
@@ -231,3 +233,66 @@ def test_real_clips_come_with_what_is_known_of_them_and_no_label(tmp_path: Path,
         assert set(back.contact_state) == {ContactState.UNKNOWN}
         np.testing.assert_array_equal(back.reference, back.frames[back.labelling.reference.index])
     assert len(list((tmp_path / "data" / "audit").glob("*.png"))) == 2
+
+
+def margins(folder: Path, trial: Recording) -> np.ndarray:
+    return load_recording(trial_path(folder, trial.trial), pixels=False).safety_margin
+
+
+def test_edits_give_the_labels_of_their_settings_and_undone_those_of_before(
+    tmp_path: Path, trial: Recording, relabelled: Path, capsys: pytest.CaptureFixture[str]
+):
+    folder = tmp_path / "data"
+    shutil.copytree(relabelled, folder)
+    data, name = load_dataset(folder), trial.trial
+    before = load_recording(trial_path(folder, name))
+    assert before.labelling is not None
+    assert before.labelling.basis is not None
+    slip_s = before.labelling.basis.friction.onset_s
+    assert slip_s is not None
+    said = {"slip_s": slip_s - 0.5, "contact_s": 0.7, "reference_frame": 5, "tare": (0.01, 0.0, -0.02)}
+    bad = (60, 79)
+    settings = LabelSettings(**said, bad_frames=(bad,))
+    edits = [make_edit(name, kind, value) for kind, value in (*said.items(), ("bad", bad))]
+    expected = relabel_trial(data, name, labelling=settings)
+    for edit in edits:
+        keep_edit(data, edit)
+    assert run("label", folder, "--no-audit") == 0
+    assert "5 edits by hand were applied, to 1 trials" in capsys.readouterr().err
+    edited = load_recording(trial_path(folder, name))
+    np.testing.assert_array_equal(edited.safety_margin, expected.safety_margin)
+    np.testing.assert_array_equal(edited.reference, trial.frames[5])
+    assert edited.reason is not None
+    assert {edited.reason[place] for place in range(bad[0], bad[1] + 1)} == {"marked by hand"}
+    assert edited.labelling is not None
+    assert edited.labelling.basis is not None
+    assert edited.labelling.basis.friction.onset_s == pytest.approx(said["slip_s"])
+    assert edited.labelling.edits == tuple(edits)
+    assert {edited.reason[place] for place in np.flatnonzero(trial.time_s < 0.7)} == {"no contact"}
+    assert run("check", folder) == 0
+    # after a restart, and though the reference had been written anew
+    for _ in edits:
+        keep_edit(load_dataset(folder), make_edit(name, "undo"))
+    assert run("label", folder, "--no-audit") == 0
+    after = load_recording(trial_path(folder, name))
+    for field, values in signals(before).items():
+        np.testing.assert_array_equal(getattr(after, field), values, err_msg=field)
+    np.testing.assert_array_equal(after.reference, before.reference)
+    assert after.labelling == before.labelling
+    assert len(read_edits(folder)) == 2 * len(edits)
+
+
+def test_edits_that_do_not_fit_their_data_set_are_told(
+    tmp_path: Path, relabelled: Path, trial: Recording, capsys: pytest.CaptureFixture[str]
+):
+    shutil.copytree(relabelled, tmp_path / "data")
+    line = '{"trial": "%s", "kind": "bad", "value": [100, 900], "by": "ana", "at": "2026-11-23T00:00:00+00:00"}\n'
+    path = tmp_path / "data" / EDITS_FILE
+    path.write_text(line % trial.trial)
+    assert "frames 100 to 900 cannot be marked as bad: the trial has frames 0 to 239" in refused(
+        capsys, "label", tmp_path / "data", "--no-audit"
+    )
+    path.write_text(line % "gone")
+    assert run("label", tmp_path / "data", "--no-audit") == 0
+    assert "edits gone, which is no trial of the data set" in capsys.readouterr().err
+    assert path.read_text() == line % "gone"

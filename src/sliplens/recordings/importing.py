@@ -11,6 +11,7 @@ from pathlib import Path
 from threading import Event, Lock
 
 import numpy as np
+from jaxtyping import Float
 
 from sliplens.errors import InputError, RecordingError, SliplensError
 from sliplens.files import output_folder
@@ -27,9 +28,10 @@ from sliplens.recordings.dataset import (
     trial_path,
     write_dataset_table,
 )
-from sliplens.recordings.formats.stored import read_stored
-from sliplens.recordings.labelling import Labelling, ReferenceChoice
-from sliplens.recordings.labels import Reason, choose_reference, label_trial, measure_motion
+from sliplens.recordings.edits import EDITS_FILE, apply_edits, edits_in_force, read_edits
+from sliplens.recordings.formats.stored import read_stored, read_stored_trial
+from sliplens.recordings.labelling import Edit, EditKind, Labelling, ReferenceChoice
+from sliplens.recordings.labels import Reason, choose_reference, label_trial, measure_motion, require_inside
 from sliplens.recordings.manifest import ManifestRow, find_rows, read_manifest
 from sliplens.recordings.options import LabelSettings, ReadOptions
 from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, is_profile, load_profile
@@ -42,7 +44,14 @@ from sliplens.recordings.splits import (
     read_splits,
     write_split_record,
 )
-from sliplens.recordings.store import encode_frames, forces_path, read_header, save_forces, write_trial
+from sliplens.recordings.store import (
+    encode_frames,
+    forces_path,
+    read_first_reference,
+    read_header,
+    save_forces,
+    write_trial,
+)
 from sliplens.recordings.trial import Labels
 
 
@@ -186,6 +195,8 @@ class _Job:
 
     capture: Capture
     settings: LabelSettings
+    edits: tuple[Edit, ...] = ()
+    """Repairs by hand that its labels follow."""
     profile: SensorProfile | None = None
     """What its frames went through."""
     one_of_many: bool = False
@@ -280,6 +291,8 @@ def _link_trials(source: Path, folder: Path) -> None:
     for name in ("trials", "forces", SENSORS_FOLDER, "audit"):
         if (source / name).is_dir():
             shutil.copytree(source / name, folder / name, copy_function=link, dirs_exist_ok=True)
+    if (source / EDITS_FILE).is_file():
+        shutil.copyfile(source / EDITS_FILE, folder / EDITS_FILE)
 
 
 def label_dataset(
@@ -291,6 +304,9 @@ def label_dataset(
     on_progress: OnProgress | None = None,
 ) -> Dataset:
     """Label the trials of a data set anew, from the frames and the force samples that it keeps; splits stay.
+
+    Edits that are kept beside the data set (`sliplens.recordings.edits`) are followed, and count for their trials
+    before what `labelling` says of all.
 
     Parameters
     ----------
@@ -310,37 +326,85 @@ def label_dataset(
     """
     data = data if isinstance(data, Dataset) else load_dataset(data)
     labelling, out = labelling or LabelSettings(), Path(out)
-    captures = read_stored(data.folder)
+    captures, edits = read_stored(data.folder), read_edits(data.folder)
+    jobs = [_relabelling(data, capture, labelling, edits) for capture in captures]
     in_place = out.resolve() == data.folder.resolve()
     for capture in captures:
         kept = capture.labels.labelling if capture.labels else None
-        if capture.forces is None:
-            raise InputError(
-                f"{capture.trial} of {data.folder} has no forces, and without them there is no label; "
-                "import it again with its table of forces"
-            )
         if in_place and (kept is None or kept.basis is None):
             raise InputError(
                 f"the labels of {capture.trial} did not come from its forces and would be lost; "
                 "name a new folder with --output"
             )
-    config = {"labelling": labelling, "data_hash": data.hash}
+    config = {"labelling": labelling, "data_hash": data.hash, "edits": [job.edits for job in jobs]}
     with output_folder(out, stage="label", config=config, overwrite=overwrite or in_place) as output:
         if not output.complete:
-            jobs = []
-            for one in captures:
-                profile = data.profile(one.sensor)
-                settings = labelling if profile is None else profile.settings(labelling)
-                jobs.append(_Job(capture=_without_labels(one), settings=settings))
             table, _ = _write_trials(output.folder, jobs, on_progress, title="Labelling frames")
             named = [replace(row, split=info.split) for row, info in zip(table, data.trials, strict=True)]
             simulated = all(capture.simulated for capture in captures)
             write_dataset_table(output.folder, named, simulated=simulated, left_out=data.left_out)
             if (data.folder / SENSORS_FOLDER).is_dir():
                 shutil.copytree(data.folder / SENSORS_FOLDER, output.folder / SENSORS_FOLDER, dirs_exist_ok=True)
-            if (data.folder / SPLITS_FILE).is_file():
-                shutil.copyfile(data.folder / SPLITS_FILE, output.folder / SPLITS_FILE)
+            for name in (SPLITS_FILE, EDITS_FILE):
+                if (data.folder / name).is_file():
+                    shutil.copyfile(data.folder / name, output.folder / name)
+    if count := sum(len(job.edits) for job in jobs):
+        note(on_progress, f"{count} edits by hand were applied, to {sum(bool(job.edits) for job in jobs)} trials")
+    if gone := sorted({edit.trial for edit in edits} - {info.trial for info in data.trials}):
+        note(on_progress, f"{data.folder / EDITS_FILE} edits {gone[0]}, which is no trial of the data set; it is kept")
     return _tell(load_dataset(out), on_progress, kept=output.complete)
+
+
+def relabel_trial(
+    data: Dataset,
+    trial: str,
+    *,
+    labelling: LabelSettings | None = None,
+    edits: Sequence[Edit] | None = None,
+    image_motion: Float[np.ndarray, " frames"] | None = None,
+) -> Labels:
+    """Labels of one trial as `label_dataset` makes them, in memory.
+
+    Parameters
+    ----------
+    labelling
+        What is known of forces and friction.
+    edits
+        Edits to follow in place of those that are kept beside the data set.
+    image_motion
+        `measure_motion` of its frames, where it is known already; it is most of the work.
+
+    Raises
+    ------
+    InputError
+        If there is no such trial, it has no forces, or edits do not fit it.
+    RecordingError
+        If nothing touches, or the trial never slips and no friction is given.
+    """
+    info = data.find(trial)
+    edits = read_edits(data.folder) if edits is None else edits
+    job = _relabelling(data, read_stored_trial(data, info), labelling or LabelSettings(), edits)
+    rng = np.random.default_rng((job.settings.seed, data.trials.index(info)))
+    return _label(job, rng, image_motion)[1]
+
+
+def _relabelling(data: Dataset, capture: Capture, labelling: LabelSettings, edits: Sequence[Edit]) -> _Job:
+    """Stored trial, as it was recorded and with the image of the untouched sensor from before any edit."""
+    if capture.forces is None:
+        raise InputError(
+            f"{capture.trial} of {data.folder} has no forces, and without them there is no label; "
+            "import it again with its table of forces"
+        )
+    profile, mine = data.profile(capture.sensor), edits_in_force(edits, capture.trial)
+    settings = apply_edits(labelling if profile is None else profile.settings(labelling), mine)
+    try:
+        require_inside(settings, frames=len(capture), time_s=capture.forces.time_s)
+    except RecordingError as error:
+        where = f" ({data.folder / EDITS_FILE})" if mine else ""
+        raise RecordingError(f"{capture.trial}: {error}{where}") from None
+    capture = _without_labels(capture)
+    first = read_first_reference(trial_path(data.folder, capture.trial))
+    return _Job(capture=capture if first is None else replace(capture, reference=first), settings=settings, edits=mine)
 
 
 def _tell(data: Dataset, on_progress: OnProgress | None, *, kept: bool) -> Dataset:
@@ -396,7 +460,8 @@ def _without_labels(capture: Capture) -> Capture:
     kept = capture.labels.labelling if capture.labels else None
     if kept is None:
         return replace(capture, labels=None)
-    return replace(capture, labels=None, source=kept.source, notes=kept.notes, reference_choice=kept.reference)
+    choice = kept.first_reference or kept.reference
+    return replace(capture, labels=None, source=kept.source, notes=kept.notes, reference_choice=choice)
 
 
 def _write_trials(
@@ -421,7 +486,7 @@ def _write_trials(
         if not path.is_file():
             rng = np.random.default_rng((job.settings.seed, first + number))
             try:
-                import_trial(capture, path, settings=job.settings, rng=rng, forces_file=samples, on_progress=tell)
+                _import_job(job, path, rng=rng, forces_file=samples, on_progress=tell)
             except SliplensError as error:
                 samples.unlink(missing_ok=True)
                 if not job.one_of_many:
@@ -458,17 +523,33 @@ def import_trial(
     The frames are read several times, never all at once: to see the image move, to find the untouched sensor, and to
     write them. The samples of the force sensor, from which labels can be made anew, are kept in `forces_file`.
     """
-    settings = settings or LabelSettings()
+    job = _Job(capture=capture, settings=settings or LabelSettings())
+    _import_job(job, path, rng=rng, forces_file=forces_file, on_progress=on_progress)
+
+
+def _import_job(
+    job: _Job, path: Path, *, rng: np.random.Generator, forces_file: Path | None, on_progress: OnProgress | None
+) -> None:
+    capture = job.capture
     _require_forces(capture)
     try:
-        reference, labels = _label(capture, settings, rng)
+        reference, labels = _label(job, rng)
     except RecordingError as error:
         raise RecordingError(f"{capture.source}: {error}") from None
     # before the trial, whose file tells that all of it is there
     if forces_file is not None and capture.forces is not None:
         save_forces(capture.forces, forces_file)
     images = encode_frames(_frames(capture, on_progress))
-    write_trial(path, images, facts=capture, time_s=capture.frame_time_s, labels=labels, reference=reference)
+    first = capture.reference if labels.labelling and labels.labelling.first_reference else None
+    write_trial(
+        path,
+        images,
+        facts=capture,
+        time_s=capture.frame_time_s,
+        labels=labels,
+        reference=reference,
+        first_reference=first,
+    )
 
 
 def _require_forces(capture: Capture) -> None:
@@ -478,13 +559,16 @@ def _require_forces(capture: Capture) -> None:
         )
 
 
-def _label(capture: Capture, settings: LabelSettings, rng: np.random.Generator) -> tuple[Frame, Labels]:
+def _label(
+    job: _Job, rng: np.random.Generator, image_motion: Float[np.ndarray, " frames"] | None = None
+) -> tuple[Frame, Labels]:
     """Image of the untouched sensor, and the labels that came with the recording, or are found."""
+    capture, settings = job.capture, job.settings
     index = capture.reference_index if settings.reference_frame is None else settings.reference_frame
     labels, found, image = capture.labels, None, capture.reference
     if labels is None:
         assert capture.forces is not None
-        motion = measure_motion(_frames(capture))
+        motion = measure_motion(_frames(capture)) if image_motion is None else image_motion
         labels = found = label_trial(capture.frame_time_s, motion, capture.forces, settings=settings, rng=rng)
     if image is not None and index is None:
         method = "recorded apart from the frames" if found else "came with the recording"
@@ -507,6 +591,8 @@ def _label(capture: Capture, settings: LabelSettings, rng: np.random.Generator) 
         reference=choice,
         clip=capture.clip,
         basis=found.basis if found else None,
+        edits=job.edits,
+        first_reference=capture.reference_choice if any(one.kind is EditKind.REFERENCE for one in job.edits) else None,
     )
     return image, replace(labels, labelling=labelling)
 

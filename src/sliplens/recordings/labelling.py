@@ -155,6 +155,7 @@ class Reason(StrEnum):
     CLIPPED = "clipped force"
     SPIKE = "spike of the force"
     STEP = "step of the force"
+    MARKED = "marked by hand"
     MISSING_SAMPLES = "missing samples"
     OUT_OF_RANGE = "outside the force sensor's range"
     NO_CONTACT = "no contact"
@@ -222,6 +223,57 @@ def tell_faults(faults: Sequence[ForceFault]) -> tuple[str, ...]:
     return tuple(told)
 
 
+class EditKind(StrEnum):
+    """What an edit says: a field of `LabelSettings`, a mark of frames, or that the edit before does not hold."""
+
+    REFERENCE = "reference_frame"
+    CONTACT = "contact_s"
+    SLIP = "slip_s"
+    TARE = "tare"
+    SIGN = "normal_sign"
+    FRICTION = "mu"
+    BAD = "bad"
+    GOOD = "good"
+    UNDO = "undo"
+
+
+_VALUES = {EditKind.TARE: 3, EditKind.BAD: 2, EditKind.GOOD: 2, EditKind.UNDO: 0}
+_WHOLE = {EditKind.REFERENCE, EditKind.SIGN, EditKind.BAD, EditKind.GOOD}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Edit:
+    """One repair of a trial's labels by hand.
+
+    A value that does not fit its kind is a `RecordingError`.
+    """
+
+    trial: str
+    kind: EditKind
+    value: float | tuple[float, ...] | None = None
+    """Number of the frame; seconds on the clock of the forces; x, y, z of the untouched sensor, in newtons; 1 or -1;
+    the coefficient; first and last frame of a span. None: to be found, as if nothing had been said."""
+    by: str
+    """Who made it."""
+    at: str
+    """Date and time in UTC, as ISO 8601."""
+
+    def __post_init__(self) -> None:
+        values = self.numbers
+        wanted = _VALUES.get(self.kind, 1)
+        missing = self.value is None and self.kind not in {EditKind.BAD, EditKind.GOOD}
+        if not missing and (len(values) != wanted or isinstance(self.value, tuple) != (wanted > 1)):
+            raise RecordingError(f"an edit of {self.kind} takes {wanted or 'no'} numbers, not {self.value}; mend it")
+        whole = self.kind not in _WHOLE or all(float(one).is_integer() for one in values)
+        if not (np.isfinite(values).all() and whole) or (self.kind is EditKind.SIGN and not {*values} <= {1, -1}):
+            raise RecordingError(f"an edit of {self.kind} cannot be {self.value}; mend it, or undo it")
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """Its value as numbers, however many it has."""
+        return () if self.value is None else self.value if isinstance(self.value, tuple) else (self.value,)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Labelling:
     """Where a trial and its labels come from."""
@@ -236,3 +288,7 @@ class Labelling:
     clip: Clip | None = None
     basis: LabelBasis | None = None
     """None where the labels came with the frames."""
+    edits: tuple[Edit, ...] = ()
+    """Repairs by hand that the labels follow."""
+    first_reference: ReferenceChoice | None = None
+    """How the reference was chosen before one was named by an edit; None where none was."""

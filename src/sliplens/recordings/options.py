@@ -86,5 +86,11 @@ class LabelSettings:
     """How to choose the untouched frame among those before the contact, where the source does not tell it."""
     reference_frame: int | None = None
     """Number of the untouched frame, by hand."""
+    contact_s: float | None = None
+    """Time at which the contact begins, on the clock of the forces; found if not given."""
+    slip_s: float | None = None
+    """Time at which the contact slips as a whole, on the clock of the forces; found if not given."""
+    bad_frames: tuple[tuple[int, int], ...] = ()
+    """First and last frame of each span that is wrong: its frames are not valid, its forces tell nothing."""
     seed: int = 0
     """Seed of the random draws behind the uncertainties."""

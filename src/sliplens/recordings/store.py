@@ -112,7 +112,7 @@ class TrialHeader(TrialFacts):
     truth: TruthHeader | None = None
 
 
-_HEADER = b"sliplens"
+_HEADER, _FIRST_REFERENCE = b"sliplens", b"first_reference"
 
 
 def read_header(path: Path) -> TrialHeader:
@@ -120,6 +120,14 @@ def read_header(path: Path) -> TrialHeader:
     file, header = _open(path)
     file.close()
     return header
+
+
+def read_first_reference(path: Path) -> Frame | None:
+    """Image of the untouched sensor from before an edit named another; None where none did."""
+    file, _ = _open(path)
+    with file:
+        image = file.schema_arrow.metadata.get(_FIRST_REFERENCE)
+    return None if image is None else decode_png(image, where=f"the first reference frame of {path}")
 
 
 def _open(path: Path) -> tuple[pq.ParquetFile, TrialHeader]:
@@ -168,9 +176,13 @@ def write_trial(
     time_s: Float[np.ndarray, " frames"],
     labels: Labels,
     reference: Frame,
+    first_reference: Frame | None = None,
     truth: GroundTruth | None = None,
 ) -> None:
-    """Write the Parquet file of a trial, its encoded images a row group at a time; it appears when complete."""
+    """Write the Parquet file of a trial, its encoded images a row group at a time; it appears when complete.
+
+    `first_reference` is the image that stood in the place of the reference before an edit named another.
+    """
     columns: dict[str, Any] = {"time_s": time_s, "contact_state": labels.contact_state}
     columns |= {name: getattr(labels, name) for name in (*SIGNALS[1:], *OPTIONAL_LABELS)}
     columns = {name: values for name, values in columns.items() if values is not None}
@@ -191,6 +203,8 @@ def write_trial(
         b"codec": CODEC.encode(),
         b"reference": encode_png(reference),
     }
+    if first_reference is not None:
+        metadata[_FIRST_REFERENCE] = encode_png(first_reference)
     table = pa.table(columns)
     schema = pa.schema([pa.field("frame", pa.int64()), *table.schema, pa.field("image", pa.binary())], metadata)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -91,7 +91,12 @@ def _integral(
 
 
 def infer_axes(
-    forces: Forces, *, normal: str | None = None, sign: int | None = None, tare_n: Vector | None = None
+    forces: Forces,
+    *,
+    normal: str | None = None,
+    sign: int | None = None,
+    tare_n: Vector | None = None,
+    touch_s: float | None = None,
 ) -> ForceAxes:
     """Infer what is not declared of how to read a force sensor.
 
@@ -101,7 +106,8 @@ def infer_axes(
     its tare. Where nothing is ever pressed, axis and sign cannot be inferred: that is a `RecordingError`.
     """
     noise = np.asarray(noise_sigma(forces.force_n))
-    touch, until = _find_touch(forces, tare_n=tare_n)
+    touch = _find_touch(forces, tare_n=tare_n) if touch_s is None else touch_s
+    until = touch - min(_GUARD_S, max(0.0, touch - float(forces.time_s[0])) / 2) if np.isfinite(touch) else touch
     if np.isinf(touch) and (normal is None or sign is None):
         raise RecordingError(
             f"{forces.source} never departs from its noise: no touch to infer the axes from; "
@@ -199,8 +205,8 @@ def _vector(values: Axes) -> Vector:
     return x, y, z
 
 
-def _find_touch(forces: Forces, *, tare_n: Vector | None) -> tuple[float, float]:
-    """When the sensor is first touched, and until when its samples are surely still; infinite if it never is."""
+def _find_touch(forces: Forces, *, tare_n: Vector | None) -> float:
+    """When the sensor is first touched; infinite if it never is."""
     time, start = forces.time_s, float(forces.time_s[0])
     first = forces.force_n[time <= start + _FIRST_S]
     rest = np.median(first, axis=0) if tare_n is None else np.array(tare_n)
@@ -213,10 +219,7 @@ def _find_touch(forces: Forces, *, tare_n: Vector | None) -> tuple[float, float]
     touched = away > max(_TOUCH_SIGMAS * sigma, _TOUCH_SHARE * away.max(), 1e-9)
     # the window shrinks at the ends, where a single sample's noise is no touch
     touched &= (time >= start + _WINDOW_S / 2) & (time <= time[-1] - _WINDOW_S / 2)
-    if not touched.any():
-        return float("inf"), float("inf")
-    touch = float(time[np.argmax(touched)])
-    return touch, touch - min(_GUARD_S, (touch - start) / 2)
+    return float(time[np.argmax(touched)]) if touched.any() else float("inf")
 
 
 _FEW_MEANS = 20  # fewer means tell no spread

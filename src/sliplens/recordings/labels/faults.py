@@ -1,6 +1,6 @@
 """Faults of a force sensor: samples that no touch explains, found before anything is inferred from them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, permutations
 from typing import TypeAlias
@@ -21,8 +21,8 @@ Sees: TypeAlias = Callable[[float, float], bool]
 """Whether the image moves as it would at a jump of the force: its time (s) and its size (N)."""
 
 GAP_STEPS = 4.0  # samples further apart than so many typical steps miss others between them
-FAULTS = (Reason.NONE, Reason.DROP_OUT, Reason.STUCK, Reason.CLIPPED, Reason.SPIKE, Reason.STEP)
-_DROP_OUT, _STUCK, _CLIPPED, _SPIKE, _STEP = range(1, len(FAULTS))
+FAULTS = (Reason.NONE, Reason.DROP_OUT, Reason.STUCK, Reason.CLIPPED, Reason.SPIKE, Reason.STEP, Reason.MARKED)
+_DROP_OUT, _STUCK, _CLIPPED, _SPIKE, _STEP, MARKED = range(1, len(FAULTS))
 
 _LEAST_RUN = 4  # equal samples: fewer hold a frame's force up by less than its noise
 _RUN_CHANCE = 1e-4  # chance that a sensor that works repeats a value as often, anywhere in a trial
@@ -73,8 +73,12 @@ class Screened:
         return tuple(sorted(faults, key=lambda fault: fault.start_s))
 
 
-def screen_forces(forces: Forces, *, sees: Sees = lambda _time_s, _size_n: False) -> Screened:
+def screen_forces(
+    forces: Forces, *, sees: Sees = lambda _time_s, _size_n: False, bad_s: Sequence[tuple[float, float]] = ()
+) -> Screened:
     """Leave out the samples of a force sensor that are faulty, and tell what they suffer from.
+
+    `bad_s` are the ends of spans, in seconds, that somebody knows to be wrong.
 
     Numbers that are none; values that a noisy sensor repeats; clipped tops; spikes, which neither side of them
     explains; and what lies between jumps from one sample to the next that the image does not see, until the force is
@@ -88,6 +92,8 @@ def screen_forces(forces: Forces, *, sees: Sees = lambda _time_s, _size_n: False
     """
     marks = np.zeros(len(forces.time_s), dtype=np.int64)
     marks[~np.isfinite(forces.force_n).all(axis=1)] = _DROP_OUT
+    for start_s, end_s in bad_s:
+        marks[(forces.time_s >= start_s) & (forces.time_s <= end_s)] = MARKED
     good = marks == 0
     if good.sum() < 2 * _BESIDE:
         return _leave_out(forces, marks)
@@ -107,10 +113,13 @@ def screen_trial(
     forces: Forces,
     *,
     lag: Lag | None,
+    bad_frames: Sequence[tuple[int, int]] = (),
     rng: np.random.Generator,
 ) -> tuple[Screened, Lag]:
     """Screen the forces of a trial, the image as a witness of their jumps, and estimate the lag if it is None."""
-    screened = screen_forces(forces, sees=lambda _time_s, _size_n: True)
+    at_s = frame_time_s - (0.0 if lag is None else lag.lag_s)
+    bad_s = [(float(at_s[first]), float(at_s[last])) for first, last in bad_frames]
+    screened = screen_forces(forces, sees=lambda _time_s, _size_n: True, bad_s=bad_s)
     bridged, jumps = _bridge(screened.forces)
     if lag is None:
         try:
@@ -123,7 +132,7 @@ def screen_trial(
         time = frame_time_s - (0.0 if lag.doubt else lag.lag_s)
         changes = np.append(0.0, np.nan_to_num(force_changes(time, bridged)))
         sees = image_witness(frame_time_s, image_motion, changes, lag=lag, longest_lag_s=_LONGEST_LAG_S)
-        screened = screen_forces(forces, sees=sees)
+        screened = screen_forces(forces, sees=sees, bad_s=bad_s)
     return screened, lag
 
 

@@ -32,7 +32,15 @@ class Break:
     times_s: Float[np.ndarray, " draws"]
 
 
-def fit_break(time_s: Samples, values: Samples, *, about_s: float, rng: np.random.Generator, draws: int) -> Break:
+def fit_break(
+    time_s: Samples,
+    values: Samples,
+    *,
+    about_s: float,
+    rng: np.random.Generator,
+    draws: int,
+    reach_s: float = _REACH_S,
+) -> Break:
     """Fit a parabola that at a break goes over into a fall and then a line, by least squares.
 
     Every break within reach and a few lengths of the fall are tried; the bootstrap draws blocks of the residuals anew
@@ -41,7 +49,7 @@ def fit_break(time_s: Samples, values: Samples, *, about_s: float, rng: np.rando
     """
     tried = [
         (moment, fall)
-        for moment in about_s + np.linspace(-_REACH_S, _REACH_S, _TRIES)
+        for moment in about_s + np.unique(np.linspace(-reach_s, reach_s, _TRIES))
         for fall in _FALLS_S
         if np.sum(time_s < moment) >= _LEAST_BEFORE and np.sum(time_s > moment + fall) >= _LEAST_AFTER
     ]
@@ -145,6 +153,7 @@ def estimate_friction(
     contact_threshold_n: float,
     rng: np.random.Generator,
     image: ImageMotion | None = None,
+    slip_s: float | None = None,
     draws: int = 300,
 ) -> FrictionEstimate:
     """Estimate static friction at the onset of gross slip, with a bootstrap interval.
@@ -153,13 +162,13 @@ def estimate_friction(
     breaks off: rising until the onset, falling after it; mu_s is its value at the break. Where several falls compete,
     the one that the image moves at wins. Below `contact_threshold_n`, a normal force in newtons, the ratio means
     nothing. A trial that never slips is a `RecordingError`: its friction is larger than all that was seen, no more.
+    Where somebody knows the onset, `slip_s`, the ratio breaks off there.
     """
-    highest = 0.0
+    candidates, highest = [slip_s] if slip_s is not None else [], 0.0
     for window_s in _WINDOWS_S:
-        candidates, highest = _find_falls(forces, window_s=window_s, contact_threshold_n=contact_threshold_n)
-        if candidates:
-            break
-    else:
+        if not candidates:
+            candidates, highest = _find_falls(forces, window_s=window_s, contact_threshold_n=contact_threshold_n)
+    if not candidates:
         raise RecordingError(
             f"the trial never slips (F_t / F_n reaches {highest:.2f} without breaking off), so its friction is "
             "unknown; give the coefficient of friction by hand"
@@ -171,10 +180,13 @@ def estimate_friction(
     near = forces.time_s >= rough - max(_BEFORE_S, _BEFORE_STEPS * step)
     near &= forces.time_s <= rough + max(_AFTER_S, _AFTER_STEPS * step)
     near &= forces.normal_n > contact_threshold_n
+    if not np.any(near & (forces.time_s <= rough)):
+        raise RecordingError(f"nothing presses before the slip at {rough:.2f} s; set it later, or the contact earlier")
     pull = forces.tangential_n[near & (forces.time_s <= rough)].mean(axis=0)
     # along the direction of the pull: a projection is not biased by noise
     ratio = forces.tangential_n[near] @ (pull / np.linalg.norm(pull)) / forces.normal_n[near]
-    fit = fit_break(forces.time_s[near], ratio, about_s=rough, rng=rng, draws=draws)
+    reach_s = _REACH_S if slip_s is None else 0.0
+    fit = fit_break(forces.time_s[near], ratio, about_s=rough, rng=rng, draws=draws, reach_s=reach_s)
     # no resampling of the slip can show the uncertainty of the tare
     (normal,), (tangential,) = forces.tare_sigma_n(np.array([fit.time_s]))
     tare = np.hypot(tangential, fit.level * normal)
@@ -186,7 +198,9 @@ def estimate_friction(
         high=float(max(high, fit.level)),
         onset_s=fit.time_s,
         found=Found.INFERRED,
-        method="break of F_t / F_n" + (", seen in the image" if seen else ""),
+        method="F_t / F_n at the slip set by hand"
+        if slip_s is not None
+        else "break of F_t / F_n" + (", seen in the image" if seen else ""),
         onset_sigma_s=float(late - early) / 2,
         image_sigmas=_image_sigmas(image, fit.time_s),
     )
@@ -202,6 +216,8 @@ def _find_falls(forces: ContactForces, *, window_s: float, contact_threshold_n: 
     pressed = normal > max(contact_threshold_n, _PRESSED_SHARE * normal.max())
     # the window shrinks at the ends, where a single sample's noise is no fall
     pressed &= (time - time[0] >= window_s / 2) & (time[-1] - time >= window_s / 2)
+    # what is not touched cannot slip: a knock, where the contact was set by hand
+    pressed &= time >= (-np.inf if forces.axes.still_until_s is None else forces.axes.still_until_s)
     if not pressed.any():
         return [], 0.0
     safe = np.where(pressed, normal, 1)

@@ -21,7 +21,7 @@ from sliplens.recordings.labels.axes import (
     mean_force,
     typical_step,
 )
-from sliplens.recordings.labels.faults import FAULTS, GAP_STEPS, Screened, faults_at, screen_trial
+from sliplens.recordings.labels.faults import FAULTS, GAP_STEPS, MARKED, Screened, faults_at, screen_trial
 from sliplens.recordings.labels.friction import ImageMotion, estimate_friction
 from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.trial import ContactState, Labels
@@ -144,7 +144,7 @@ def label_frames(
     unsure = 0.0 if lag is None else lag.sigma_s if apply_lag else float(np.hypot(lag.lag_s, lag.sigma_s))
     time = frame_time_s - shift
     at = forces_at(time)
-    contact = at.normal_n >= threshold
+    contact = (at.normal_n >= threshold) & (time >= (-np.inf if settings.contact_s is None else settings.contact_s))
     used = _used(at, friction, threshold)
     # a chord as short as the lag's uncertainty would count the noise of its ends, which `_variance` counts already
     reach = max(unsure, _RATE_STEPS * typical_step(frame_time_s), 1e-9)
@@ -156,6 +156,8 @@ def label_frames(
     sigma = np.sqrt(_variance(at, friction, threshold) + swing**2 + (used * drift) ** 2)
 
     fault = np.zeros(len(time), dtype=np.int64) if screened is None else faults_at(screened, time, window_s=window)
+    for first, last in settings.bad_frames:
+        fault[first : last + 1] = MARKED
     reliable = contact & ~at.missing & ~at.out_of_range & (fault == 0)
     slip_s = friction.onset_s
     if slip_s is None and np.any(outside := reliable & (used > 1 + sigma)):
@@ -256,18 +258,45 @@ def label_trial(
     Raises
     ------
     RecordingError
-        If nothing touches, no tangential force was recorded, the trial never slips and no friction is given, or a
-        doubtful lag is to be applied.
+        If nothing touches, no tangential force was recorded, the trial never slips and no friction is given, a
+        doubtful lag is to be applied, or what is set by hand lies outside the trial.
     """
     if lag is None and settings.lag_ms is not None:
         lag = Lag(lag_s=settings.lag_ms / 1e3, sigma_s=0.0)
-    screened, lag = screen_trial(frame_time_s, image_motion, forces, lag=lag, rng=rng)
+    require_inside(settings, frames=len(frame_time_s), time_s=forces.time_s)
+    bad = settings.bad_frames
+    screened, lag = screen_trial(frame_time_s, image_motion, forces, lag=lag, bad_frames=bad, rng=rng)
     try:
         return _label_screened(frame_time_s, image_motion, screened, lag=lag, settings=settings, rng=rng)
     except RecordingError as error:
         if not screened.faults:
             raise
         raise RecordingError(f"{error} (left out were: {'; '.join(tell_faults(screened.faults))})") from None
+
+
+def require_inside(settings: LabelSettings, *, frames: int, time_s: Frames) -> None:
+    """Check that what is set by hand lies within a trial of so many frames, with force samples at these times."""
+    for first, last in settings.bad_frames:
+        if not 0 <= first <= last < frames:
+            raise RecordingError(
+                f"frames {first} to {last} cannot be marked as bad: the trial has frames 0 to {frames - 1}; name the "
+                "first and the last of a span in it"
+            )
+    if settings.reference_frame is not None and not 0 <= settings.reference_frame < frames:
+        raise RecordingError(
+            f"the reference is frame {settings.reference_frame} of {frames}; name one from 0 on that is there"
+        )
+    begin, end = float(time_s[0]), float(time_s[-1])
+    for what, at_s in (("contact", settings.contact_s), ("slip", settings.slip_s)):
+        if at_s is not None and not begin <= at_s <= end:
+            raise RecordingError(
+                f"the {what} is set to {at_s:.2f} s, and the forces are from {begin:.2f} to {end:.2f} s; set it within"
+            )
+    if settings.contact_s is not None and settings.slip_s is not None and settings.slip_s <= settings.contact_s:
+        raise RecordingError(
+            f"the slip is set to {settings.slip_s:.2f} s and the contact to {settings.contact_s:.2f} s, after it; set "
+            "the contact first"
+        )
 
 
 def _label_screened(
@@ -280,7 +309,8 @@ def _label_screened(
     rng: np.random.Generator,
 ) -> FoundLabels:
     forces = screened.forces
-    axes = infer_axes(forces, normal=settings.normal_axis, sign=settings.normal_sign, tare_n=settings.tare)
+    given = {"normal": settings.normal_axis, "sign": settings.normal_sign, "tare_n": settings.tare}
+    axes = infer_axes(forces, **given, touch_s=settings.contact_s)
     contact = apply_axes(forces, axes)
     if not np.ptp(contact.tangential_n, axis=0).any():
         # a sensor that measures it has noise, a simulated pull changes
@@ -293,10 +323,11 @@ def _label_screened(
     if threshold is None:
         threshold = contact_threshold(contact, window_s=typical_step(frame_time_s))
     if settings.mu is not None:
-        friction = FrictionEstimate(mu=settings.mu, low=settings.mu, high=settings.mu)
+        friction = FrictionEstimate(mu=settings.mu, low=settings.mu, high=settings.mu, onset_s=settings.slip_s)
     else:
         image = ImageMotion(time_s=frame_time_s - (0.0 if lag.doubt else lag.lag_s), motion=image_motion)
-        friction = estimate_friction(contact, contact_threshold_n=threshold, rng=rng, image=image)
+        limits = {"contact_threshold_n": threshold, "slip_s": settings.slip_s}
+        friction = estimate_friction(contact, **limits, rng=rng, image=image)
     if friction.onset_s is not None:
         begin = forces.time_s[0] if axes.still_until_s is None else axes.still_until_s
         pull = (screened.recorded.time_s > begin) & (screened.recorded.time_s < friction.onset_s)
