@@ -81,6 +81,13 @@ def encode_png(pixels: UInt8[np.ndarray, "height width *channels"], *, compress_
     return buffer.getvalue()
 
 
+def encode_jpeg(pixels: UInt8[np.ndarray, "height width 3"], quality: int) -> bytes:
+    """Bytes of an image as JPEG, for people and other programs to look at: it changes pixels."""
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="JPEG", quality=quality)
+    return buffer.getvalue()
+
+
 def decode_png(data: bytes, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
     """Pixels of an RGB PNG held in memory."""
     try:
@@ -101,10 +108,15 @@ def list_images(folder: Path) -> list[Path]:
         If the folder is missing, or holds no image.
     """
     require_folder(folder, what="the image folder")
-    found = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+    found = [path for path in folder.iterdir() if is_image(path)]
     if not found:
         raise InputError(f"{folder} holds no image (looked for {', '.join(sorted(IMAGE_SUFFIXES))}); check the path")
     return sorted(found, key=lambda path: natural_key(path.name))
+
+
+def is_image(path: Path) -> bool:
+    """Whether it is a file that is named as an image."""
+    return path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
 
 
 def natural_key(text: str) -> list[tuple[int, int | str]]:

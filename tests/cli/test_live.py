@@ -21,7 +21,7 @@ def test_a_line_of_json_a_reading(small_dataset: Dataset, difference_run: Path, 
         # frames of noise are not healthy, and the margin of those is withheld
         assert line["withheld"] or 0 <= line["margin"] <= 1
         assert {"exposure", "touch"} <= {check["name"] for check in line["health"]}
-        assert set(line["latency"]) == {"decode_ms", "encode_ms", "network_ms", "total_ms"}
+        assert set(line["latency"]) == {"decode_ms", "checks_ms", "encode_ms", "network_ms", "total_ms"}
     assert lines[-1]["number"] == 11
     assert len(lines) + lines[-1]["dropped"] + lines[0]["number"] == 12
 

@@ -17,9 +17,9 @@ import pytest
 from PIL import Image
 
 import sliplens as sl
-from sliplens.errors import RecordingError, SourceError
+from sliplens.errors import ImageError, InputError, RecordingError, SourceError
 from sliplens.images import write_png
-from sliplens.live import FolderSource, SourceOptions, StreamSource, list_cameras, loop, open_live
+from sliplens.live import FolderSource, SourceOptions, StreamSource, list_cameras, loop, open_live, sources
 from sliplens.live.camera import FrameDecoder
 from sliplens.live.contract import LiveSource
 from sliplens.live.reading import LiveFrame, Reading
@@ -57,7 +57,9 @@ def hang(source: "Wicked") -> None:
 class Wicked(LiveSource):
     """Does what a script says, line after line, also after it was opened again."""
 
-    name, size, cure = "the fake", (48, 48), "give it a push"
+    name, cure = "the fake", "give it a push"
+    sizes: tuple[tuple[int, int], ...] = ((48, 48),)
+    """Sizes of its frames, by how often it was opened."""
 
     def __init__(self, *script: Act, reconnects: bool = True, refuses: int = 0) -> None:
         self.script, self.reconnects, self.refuses = list(script), reconnects, refuses
@@ -66,6 +68,7 @@ class Wicked(LiveSource):
 
     def __enter__(self) -> "Wicked":
         self.opened += 1
+        self.size = self.sizes[min(self.opened, len(self.sizes)) - 1]
         if 1 < self.opened <= 1 + self.refuses:
             raise SourceError(f"{self.name} is not there; plug it in")
         return self
@@ -140,11 +143,35 @@ def test_frames_of_another_size_have_no_margin_until_they_are_as_before():
     assert "now 24 x 48 pixels, they were 48 x 48; set the camera as it was" in str(readings[1].withheld)
 
 
-@pytest.mark.parametrize("jump_s", [-3.0, 0.0, 60.0])
+def test_a_source_that_comes_back_with_another_size_is_told_too():
+    other = np.zeros((24, 48, 3), dtype=np.uint8)
+    source = Wicked(frame(0), lost, frame(0, image=other, time_s=7.0), frame(1, image=other, time_s=7.01))
+    source.sizes = ((48, 48), (24, 48))
+    readings = readings_of(source)
+    assert "now 24 x 48 pixels, they were 48 x 48" in str(readings[-1].withheld)
+
+
+def test_a_reference_of_another_size_is_refused_before_anything_runs():
+    with pytest.raises(ImageError, match="reference has 24 x 24 pixels, the frames of the fake have 48 x 48"):
+        sl.LiveReader(Wicked(), reference=np.zeros((24, 24, 3), dtype=np.uint8)).__enter__()
+
+
+def test_a_reader_reads_once_and_only_while_it_is_entered():
+    reader = plain_reader(Wicked(frame(0)), reference=IMAGE)
+    with pytest.raises(InputError, match="enter the reader first"):
+        next(reader.readings())
+    with reader:
+        list(reader.readings())
+    with pytest.raises(InputError, match="a reader reads once"):
+        reader.__enter__()
+
+
+@pytest.mark.parametrize("jump_s", [-3.0, 0.0, 60.0, np.nan])
 def test_a_clock_that_jumps_withholds_one_frame(jump_s: float):
     times = [5.0, 5.01, 5.01 + jump_s, 5.02 + jump_s]
     readings = readings_of(Wicked(*(frame(number, time_s=time_s) for number, time_s in enumerate(times))))
-    assert [bool(reading.withheld) for reading in readings] == [False, False, True, False]
+    # a clock that tells nothing withholds all
+    assert [bool(reading.withheld) for reading in readings] == [False, False, True, bool(np.isnan(jump_s))]
     assert "the clock of the fake jumped by" in str(readings[2].withheld)
 
 
@@ -186,15 +213,52 @@ def test_an_image_that_is_half_written_is_waited_for(tmp_path: Path):
         end.join()
 
 
-def test_an_image_that_stays_damaged_is_missing_in_the_numbers(tmp_path: Path):
+def test_an_image_that_stays_damaged_is_missing_in_the_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sources, "_WRITTEN_S", 0.05)
     write_png(tmp_path / "1.png", IMAGE)
     with FolderSource(tmp_path) as source:
         frames = source.frames()
         next(frames)
         (tmp_path / "2.png").write_bytes(b"no image")
-        os.utime(tmp_path / "2.png", (1, 1))
         write_png(tmp_path / "3.png", IMAGE)
         assert next(frames).number == 2
+
+
+def test_images_that_come_and_go_while_they_are_looked_at_disturb_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    write_png(tmp_path / "1.png", IMAGE)
+    with FolderSource(tmp_path) as source:
+        frames = source.frames()
+        next(frames)
+        (tmp_path / "1.png").unlink()  # the folder is empty now
+        read = sources.read_frame
+
+        def vanish(path: Path, **options) -> np.ndarray:
+            image = read(path, **options)
+            if path.name == "2.png":
+                path.unlink()
+                raise ImageError(f"{path} does not exist; check the path")
+            return image
+
+        monkeypatch.setattr(sources, "read_frame", vanish)
+        write_png(tmp_path / "2.png", IMAGE)
+        write_png(tmp_path / "3.png", IMAGE)
+        os.utime(tmp_path / "3.png", (2**31, 2**31))  # by the clock of another machine
+        np.testing.assert_array_equal(next(frames).image, IMAGE)
+
+
+def test_a_folder_that_is_removed_is_told(tmp_path: Path):
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    write_png(folder / "1.png", IMAGE)
+    with FolderSource(folder) as source:
+        frames = source.frames()
+        next(frames)
+        (folder / "1.png").unlink()
+        folder.rmdir()
+        with pytest.raises(SourceError, match=r"cannot be read .*; make it again, and begin anew"):
+            next(frames)
 
 
 # a network stream

@@ -13,7 +13,7 @@ import pytest
 import sliplens as sl
 from sliplens.errors import ImageError, InputError
 from sliplens.live.contract import LiveSource
-from sliplens.live.loop import LowPass
+from sliplens.live.frame_reader import LowPass
 from sliplens.live.reading import Check, LiveFrame, MarkerReading, Reading, SlipState
 from sliplens.markers import TrackedFrame
 from sliplens.models import Run

@@ -331,6 +331,23 @@ def test_samples_without_times_count_from_when_they_arrive(tmp_path: Path):
     assert begun_s <= forces.time_s[0] <= time.monotonic()
 
 
+def test_samples_that_drop_out_or_come_late_are_left_out(tmp_path: Path):
+    path = tmp_path / "forces.csv"
+    path.write_text("time_s,fx,fy,fz\n")
+    with ForceStream(path) as stream, path.open("a") as file:
+        time.sleep(0.1)
+        file.write("1.0,0,0,1\n1.2,nan,0,1\n1.4,0,0,3\n1.1,0,0,9\n1.3,0,0,9\n1.5,0,0,4\n")
+        file.flush()
+        forces = samples_of(stream, 6, time_s=0.0, captured_s=0.0)
+        np.testing.assert_array_equal(forces.force_n[:, 2], [1, 3, 4])
+        file.write("2.0,nan,nan,nan\n")
+        file.flush()
+        end_s = time.monotonic() + 5
+        while not stream._samples and time.monotonic() < end_s:
+            time.sleep(0.01)
+        assert stream.attach(frame_at(0.0, 0.0)).forces is None
+
+
 def test_a_named_pipe_is_read_too(tmp_path: Path):
     path = tmp_path / "pipe"
     os.mkfifo(path)

@@ -5,15 +5,28 @@ import json
 import socket
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 import msgspec
 import numpy as np
 import pytest
 from PIL import Image
 
+import sliplens as sl
 from sliplens.errors import InputError
+from sliplens.live import ReplaySource
 from sliplens.live.reading import Reading
-from sliplens.live.sinks import IMAGE_TOPIC, READING_TOPIC, FoxgloveTopics, open_sink, reading_schema
+from sliplens.live.sinks import (
+    IMAGE_TOPIC,
+    READING_TOPIC,
+    ROS_TOPICS,
+    SINKS,
+    FoxgloveTopics,
+    Sender,
+    open_sink,
+    reading_schema,
+)
+from sliplens.recordings.source import open_source
 
 READING = Reading(number=7, time_s=0.5, captured_s=100.25, margin=0.4, low=0.3, high=0.55)
 IMAGE = np.full((8, 12, 3), (200, 100, 50), dtype=np.uint8)
@@ -113,6 +126,121 @@ def test_a_rerun_file_is_read_by_rerun(tmp_path: Path):
     assert same(np.asarray(Image.open(io.BytesIO(bytes(blob)))))
 
 
+def test_what_zenoh_carries_is_read_as_messages_of_ros(monkeypatch: pytest.MonkeyPatch):
+    zenoh = pytest.importorskip("zenoh", reason="Zenoh is not installed")
+    typesys = pytest.importorskip("rosbags.typesys", reason="rosbags is not installed")
+    monkeypatch.setenv("ROS_DOMAIN_ID", "7")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    config = zenoh.Config()
+    for name, value in (("listen/endpoints", [address]), ("scouting/multicast/enabled", False)):
+        config.insert_json5(name, json.dumps(value))
+    samples: dict[str, list] = {}
+    all_sent = Event()
+
+    def hear(sample) -> None:
+        samples.setdefault(str(sample.key_expr), []).append(sample)
+        if sum(map(len, samples.values())) == 8:
+            all_sent.set()
+
+    with zenoh.open(config) as session, session.declare_subscriber("**", hear):
+        sink = open_sink(f"zenoh:tip/left@{address}")
+        sink.send(READING, IMAGE)
+        sink.send(replace(READING, number=8, margin=None, withheld="the camera moved"), None)
+        assert all_sent.wait(10)
+        sink.close()
+    types = typesys.get_typestore(typesys.Stores.LATEST)
+    own = {key: heard for key, heard in samples.items() if key.startswith("tip/left/")}
+    assert {key: len(heard) for key, heard in own.items()} == {
+        "tip/left/margin": 1, "tip/left/reading": 2, "tip/left/image/compressed": 1,
+    }  # fmt: skip
+    for topic in ROS_TOPICS:
+        by_name = own[f"tip/left/{topic.name}"]
+        # the name that rmw_zenoh listens to, with the attachment without which it drops a message
+        by_type = samples[f"7/tip/left/{topic.name}/{topic.kind.replace('/', '::').replace('msg::', 'msg::dds_::')}_/"
+                          f"{types.hash_rihs01(topic.kind)}"]  # fmt: skip
+        assert [bytes(sample.payload) for sample in by_type] == [bytes(sample.payload) for sample in by_name]
+        attached = [bytes(sample.attachment) for sample in by_type]
+        assert {len(words) for words in attached} == {8 + 8 + 1 + 16}
+        assert [int.from_bytes(words[:8], "little") for words in attached] == list(range(1, 1 + len(attached)))
+    parse = types.deserialize_cdr
+    margin = parse(bytes(own["tip/left/margin"][0].payload), "std_msgs/msg/Float32")
+    assert margin.data == pytest.approx(READING.margin)
+    texts = [parse(bytes(sample.payload), "std_msgs/msg/String").data for sample in own["tip/left/reading"]]
+    assert msgspec.json.decode(texts[0], type=Reading) == READING
+    assert msgspec.json.decode(texts[1])["withheld"] == "the camera moved"
+    picture = parse(bytes(own["tip/left/image/compressed"][0].payload), "sensor_msgs/msg/CompressedImage")
+    assert (picture.format, picture.header.frame_id) == ("jpeg", "fingertip")
+    assert same(np.asarray(Image.open(io.BytesIO(picture.data.tobytes()))))
+
+
+class Slow:
+    """A sink that takes its time."""
+
+    def __init__(self) -> None:
+        self.go, self.began, self.taken, self.closed = Event(), Event(), [], False
+
+    def send(self, reading: Reading, _: np.ndarray | None, /) -> None:
+        self.began.set()
+        assert self.go.wait(10)
+        if reading.number == 99:
+            raise OSError(28, "No space left on device")
+        self.taken.append(reading.number)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.fixture
+def slow(monkeypatch: pytest.MonkeyPatch) -> Slow:
+    sink = Slow()
+    monkeypatch.setitem(SINKS._rows, "slow", lambda _: sink)
+    monkeypatch.setattr("sliplens.live.sinks._MOST_WAITING_BYTES", 3 * 4096)
+    return sink
+
+
+def test_a_slow_sink_loses_the_oldest_and_nobody_waits_for_it(slow: Slow):
+    sender = Sender("slow")
+    sender.put(replace(READING, number=0), None)
+    assert slow.began.wait(10)
+    for number in range(1, 8):
+        sender.put(replace(READING, number=number), None)
+    slow.go.set()
+    sender.close()
+    assert slow.taken == [0, 5, 6, 7]
+    assert slow.closed
+    assert (sender.state.sent, sender.state.lost, sender.state.trouble) == (4, 4, None)
+
+
+def test_a_sink_that_hangs_is_left_after_a_while(slow: Slow, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("sliplens.live.sinks._FLUSH_S", 0.05)
+    sender = Sender("slow")
+    for number in range(2):
+        sender.put(replace(READING, number=number), None)
+    assert slow.began.wait(10)
+    sender.close()  # the first is still being sent
+    assert (sender.state.sent, sender.state.lost) == (0, 1)
+    slow.go.set()
+
+
+def test_a_sink_that_breaks_off_says_so_and_the_reading_goes_on(slow: Slow):
+    frames = np.full((6, 8, 8, 3), 128, dtype=np.uint8)
+    slow.go.set()
+    source = ReplaySource(open_source(frames)[0], rate_hz=500.0)
+    with sl.LiveReader(source, reference=frames[0], health=None, slip=None) as reader:
+        reader.send_to("slow")
+        reader.senders[0].put(replace(READING, number=99), None)
+        numbers = [reading.number for reading in reader.readings()]
+    assert numbers[-1] == 5
+    assert slow.closed
+    [state] = reader.outputs
+    assert reader.troubles == (state.trouble,)
+    assert "--sink slow broke off after" in str(state)
+    assert "No space left on device" in str(state)
+    assert state.lost >= 1
+
+
 @pytest.mark.parametrize(
     ("name", "told"),
     [
@@ -122,10 +250,14 @@ def test_a_rerun_file_is_read_by_rerun(tmp_path: Path):
         ("mcap", "writes a file that ends in .mcap; give mcap:grip.mcap"),
         ("mcap:nowhere/grip.mcap", "the folder nowhere does not exist"),
         ("rerun:grip.txt", "ends in .rrd"),
+        ("zenoh", "names no key that ROS can have; give letters and digits, as zenoh:tip"),
+        ("zenoh:a b@tcp/127.0.0.1:1", "names no key"),
+        ("zenoh:tip@tcp/127.0.0.1:1", "reaches nobody at tcp/127.0.0.1:1"),
         ("paper", "there is no sink named 'paper'"),
     ],
 )
-def test_mistakes_are_told_in_a_sentence(name: str, told: str):
+def test_mistakes_are_told_in_a_sentence(name: str, told: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("sliplens.live.sinks._ZENOH_PATIENCE_MS", 100)
     with pytest.raises(InputError) as error:
         open_sink(name)
     assert told in str(error.value)

@@ -14,10 +14,9 @@ from sliplens.cli.command import Device, Friction
 from sliplens.cli.console import ERR, print_table, say
 
 if TYPE_CHECKING:
-    from sliplens.live import LiveReader, SourceOptions
+    from sliplens.live import LiveReader
     from sliplens.recordings import TrialFacts
 
-_COLUMNS = ("device", "name", "format", "size", "frames/s")
 _SOURCE = "simulated, the number of a camera, the address of a stream, or a video, bag, data set or growing folder."
 
 
@@ -35,8 +34,7 @@ class Live:
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE", help=_SOURCE)] = "simulated"
     network: str | None = None
-    """Folder of a trained network, or the name of one that comes with sliplens: chromatouch-difference for the
-    simulated fingertip; none if not given."""
+    """Folder or name of a trained network: chromatouch-difference for the simulated fingertip, none if not given."""
     reference: Path | None = None
     """Image of the untouched sensor; taken when the picture is still at first if not given."""
     friction: Friction = None
@@ -57,8 +55,8 @@ class Live:
     smoothing: float = 0.0
     """Time constant in seconds of a low-pass on margin and interval, which delays them by so much; 0 for none."""
     sink: tuple[str, ...] = ()
-    """Where readings go: json (lines on standard output), udp:HOST:PORT, mcap:FILE, foxglove:HOST:PORT, rerun:FILE.
-    Without one, a line a second is printed."""
+    """Where readings go: json (lines on standard output), udp:HOST:PORT, mcap:FILE, foxglove:HOST:PORT, rerun:FILE,
+    zenoh:KEY (to ROS 2). Without one, a line a second is printed."""
     page: bool = True
     """Show it in browsers, with buttons to freeze, explain and record."""
     host: str = "127.0.0.1"
@@ -84,24 +82,24 @@ class Live:
     def run(self) -> None:
         """Read until the source ends."""
         from sliplens.live import LiveReader
-        from sliplens.live.sinks import open_sink
+        from sliplens.live.contract import SourceOptions, parse_size
         from sliplens.recordings.sensor import is_profile
 
         if self.list:
             self._list()
             return
         shipped = "chromatouch-difference" if self.source in {"simulated", "simulated:chromatouch"} else None
+        wishes = {name: getattr(self, name) for name in ("speed", "trial", "pixel_format")}
+        options = SourceOptions(rate_hz=self.rate, size=parse_size(self.size), **wishes)
+        names = ("reference", "engine", "device", "seconds", "forces", "friction")
+        named = {name: getattr(self, name) for name in names} | {"smoothing_s": self.smoothing, "options": options}
+        named["sensor"] = self.sensor if is_profile(self.sensor) else None
         with ExitStack() as stack:
-            sinks = [stack.enter_context(closing(open_sink(name))) for name in self.sink]
-            names = ("reference", "engine", "device", "seconds", "forces", "friction")
-            named = {name: getattr(self, name) for name in names} | {"smoothing_s": self.smoothing}
-            named |= {"sensor": self.sensor if is_profile(self.sensor) else None, "options": self._options()}
-            reader = LiveReader(self.source, self.network or shipped, **named)
-            for sink in sinks:
-                reader.subscribe(lambda reading, frame, sink=sink: sink.send(reading, frame and frame.image))
+            reader = stack.enter_context(closing(LiveReader(self.source, self.network or shipped, **named)))
+            reader.send_to(*self.sink)
             if self.record is not None:
-                recorder = reader.record(self.record, facts=self._facts)
-                stack.callback(lambda: _tell(f"{recorder.folder}: {recorder.state}"))
+                reader.record(self.record, facts=self._facts())
+            stack.callback(lambda: [_tell(str(state)) for state in reader.outputs])
             with suppress(KeyboardInterrupt), reader, self._shown(reader):  # the way to end it
                 self._watch(reader)
 
@@ -113,38 +111,38 @@ class Live:
         if not self.page:
             yield
             return
-        into = self.record or Path("recorded")
-        with LivePage(reader, host=self.host, port=self.port, record_into=into, facts=self._facts) as page:
+        shown = {"host": self.host, "port": self.port, "record_into": self.record or Path("recorded")}
+        with LivePage(reader, facts=self._facts(), **shown) as page:
             _tell(f"open {page.address}")
             yield
             if self.seconds is None and not self.sink:
                 _tell(f"{reader.source.name} has ended; the page stays until Ctrl-C")
                 Event().wait()
 
-    @property
     def _facts(self) -> "TrialFacts":
         from sliplens.recordings import TrialFacts
 
         return TrialFacts(trial="live", sensor=self.sensor, object=self.object, condition=self.condition, day=self.day)
 
-    def _options(self) -> "SourceOptions":
-        from sliplens.live.contract import SourceOptions, parse_size
-
-        named = {name: getattr(self, name) for name in ("speed", "trial", "pixel_format")}
-        return SourceOptions(rate_hz=self.rate, size=parse_size(self.size), **named)
-
     def _watch(self, reader: "LiveReader") -> None:
-        told_s = -1.0
+        told_s, told = -1.0, set[str]()
         for reading in reader.readings():
-            if not self.sink and time.monotonic() - told_s >= 1:
+            if time.monotonic() - told_s >= 1:
                 told_s = time.monotonic()
-                say(str(reading))
+                for trouble in set(reader.troubles) - told:
+                    told.add(trouble)
+                    _tell(trouble)
+                for error in () if self.page else (sender.error for sender in reader.senders if sender.error):
+                    raise error
+                if not self.sink:
+                    say(str(reading))
 
     def _list(self) -> None:
         from sliplens.live import SOURCES, list_cameras
 
         cameras = list_cameras()
         rows = [(str(one.path), one.name, *mode.in_words()) for one in cameras for mode in one.modes]
-        print_table("Cameras", _COLUMNS, rows) if rows else say("no camera is there that can be read")
+        columns = ("device", "name", "format", "size", "frames/s")
+        print_table("Cameras", columns, rows) if rows else say("no camera is there that can be read")
         for kind in SOURCES.values():
             say(f"  {kind.words}")

@@ -37,6 +37,8 @@ class Latency:
 
     decode_ms: float = 0.0
     """From the bytes of the camera to pixels; a replayed frame is decoded before it is due."""
+    checks_ms: float = 0.0
+    """Following the markers, and the checks of the frame's health."""
     encode_ms: float = 0.0
     """From pixels to the network's input."""
     network_ms: float = 0.0

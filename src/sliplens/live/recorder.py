@@ -1,15 +1,15 @@
 """Recording a running source into a data set, frame by frame, and force samples that come as lines of text."""
 
 import time
-from collections import deque
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Condition, Event, Lock, Thread
+from threading import Event, Lock, Thread
 from typing import TextIO
 
 import numpy as np
 
 from sliplens.errors import RecordingError
+from sliplens.live.mailbox import Outlet
 from sliplens.live.reading import LiveFrame
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.dataset import Dataset, begin_recording, finish_recording, load_dataset
@@ -25,7 +25,7 @@ from sliplens.recordings.journal import Journal, JournalHeader
 from sliplens.recordings.trial import TrialFacts
 
 _MOST_WAITING_BYTES = 256 * 2**20
-_ENDED = 30.0  # seconds that the last frames may take to be written
+_STUCK_S = 30.0  # in which not a single frame could be written
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +45,7 @@ class RecordingState:
     def __str__(self) -> str:
         lost = f", {self.lost:,} lost" if self.lost else ""
         trouble = f"; {self.trouble}" if self.trouble else ""
-        return f"{self.frames:,} frames in {self.seconds:.1f} s{lost}{trouble}"
+        return f"{self.folder}: {self.frames:,} frames in {self.seconds:.1f} s{lost}{trouble}"
 
 
 class Recorder:
@@ -88,22 +88,25 @@ class Recorder:
         self._source, self._simulated, self._reference = source, simulated, reference
         self._lock, taken = begin_recording(self.folder, simulated=simulated)
         self._taken = set(taken)
-        self._waiting: deque[tuple[LiveFrame, Frame | None]] = deque()
-        self._changed, self._closed = Condition(), False
         self._journal: Journal | None = None
         self._last: LiveFrame | None = None
-        self._first_s = 0.0
+        self._first_s = self._seconds = 0.0
         self._shown: Frame | None = None
-        self._written, self._lost, self._seconds = 0, 0, 0.0
-        self._trouble: str | None = None
-        self._thread = Thread(target=self._write, daemon=True)
-        self._thread.start()
+        self._closed = False
+        self._outlet = Outlet(self._append, self._end_trial, most_bytes=_MOST_WAITING_BYTES)
 
     @property
     def state(self) -> RecordingState:
         """How far it is now."""
+        outlet, error, trouble = self._outlet, self._outlet.error, None
+        if error is not None:
+            reason = (error.strerror if isinstance(error, OSError) else None) or error
+            trouble = (
+                f"recording into {self.folder} stopped after {outlet.sent} frames ({reason}); make room, and record "
+                "again: what is there stays"
+            )
         return RecordingState(
-            folder=self.folder, frames=self._written, seconds=self._seconds, lost=self._lost, trouble=self._trouble
+            folder=self.folder, frames=outlet.sent, seconds=self._seconds, lost=outlet.lost, trouble=trouble
         )
 
     def set_reference(self, image: Frame) -> None:
@@ -112,52 +115,35 @@ class Recorder:
 
     def add(self, frame: LiveFrame) -> None:
         """Take a frame; it is written in another thread, and lost where that one is far behind."""
-        with self._changed:
-            full = (len(self._waiting) + 1) * frame.image.nbytes > _MOST_WAITING_BYTES
-            if full or self._closed or self._trouble is not None:
-                self._lost += 1
-                return
-            self._waiting.append((frame, self._reference))
-            self._changed.notify()
+        self._outlet.put((frame, self._reference), size_bytes=frame.image.nbytes)
 
     def close(self) -> Dataset | None:
         """Write what waits and make trials of it; None where there is no frame at all.
 
         Raises
         ------
+        RecordingError
+            If the disk does not answer: what was recorded stays, and the next command that opens the data set finishes
+            it.
         OSError
-            If there is no room: what was recorded stays, and the next command that opens the data set finishes it.
+            If there is no room; the same holds.
         """
-        with self._changed:
-            closed, self._closed = self._closed, True
-            self._changed.notify()
-        self._thread.join(_ENDED)
+        outlet, written = self._outlet, -1
+        while not outlet.close(_STUCK_S):
+            if outlet.sent == written:
+                outlet.discard()
+                raise RecordingError(
+                    f"{self.folder} takes no more frames, {outlet.sent} were written; end this program and look after "
+                    "the disk: the next command that opens it makes trials of what is there"
+                )
+            written = outlet.sent
+        closed, self._closed = self._closed, True
         if not closed:
             finish_recording(self.folder, self._lock)
-        return load_dataset(self.folder) if self._written else None
+        return load_dataset(self.folder) if outlet.sent else None
 
-    def _write(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._waiting or self._closed)
-                if not self._waiting:
-                    break
-                frame, reference = self._waiting.popleft()
-            try:
-                self._append(frame, reference)
-            except OSError as error:
-                with self._changed:
-                    self._lost += 1 + len(self._waiting)
-                    self._waiting.clear()
-                    self._trouble = (
-                        f"recording into {self.folder} stopped after {self._written} frames "
-                        f"({error.strerror or error}); make room, and record again: what is there stays"
-                    )
-        if self._journal is not None:
-            self._journal.close()
-
-    def _append(self, frame: LiveFrame, reference: Frame | None) -> None:
-        last = self._last
+    def _append(self, item: tuple[LiveFrame, Frame | None]) -> None:
+        (frame, reference), last = item, self._last
         if (
             self._journal is None
             or last is None
@@ -174,11 +160,13 @@ class Recorder:
         self._journal.append(frame.image, time_s=time_s, safety_margin=frame.safety_margin, forces=forces)
         self._seconds += frame.time_s - last.time_s if last is not None and time_s > 0 else 0.0
         self._last = frame
-        self._written += 1
 
-    def _begin_trial(self, frame: LiveFrame, reference: Frame | None) -> None:
+    def _end_trial(self) -> None:
         if self._journal is not None:
             self._journal.close()
+
+    def _begin_trial(self, frame: LiveFrame, reference: Frame | None) -> None:
+        self._end_trial()
         number = 1
         while f"{self._facts.trial}-{number}" in self._taken:
             number += 1
@@ -240,15 +228,12 @@ class ForceStream:
         shift_s = frame.time_s - frame.captured_s
         stamps_s, arrived_s = np.array([sample[:2] for sample in samples]).T
         time_s: np.ndarray = np.where(np.isnan(stamps_s), arrived_s, stamps_s + delay_s) + shift_s
-        (rising,) = np.nonzero(np.diff(time_s, prepend=-np.inf) > 0)
-        return replace(
-            frame,
-            forces=Forces(
-                time_s=time_s[rising],
-                force_n=np.array([force for *_, force in samples])[rising],
-                source=str(self.path),
-            ),
-        )
+        force_n = np.array([force for *_, force in samples])
+        # samples that dropped out, and those that come after a later one
+        kept = np.isfinite(force_n).all(axis=1) & (time_s > np.maximum.accumulate(np.append(-np.inf, time_s))[:-1])
+        if not kept.any():
+            return frame
+        return replace(frame, forces=Forces(time_s=time_s[kept], force_n=force_n[kept], source=str(self.path)))
 
     def _follow(self) -> None:
         try:

@@ -1,22 +1,27 @@
 """Where readings go: one row a kind of sink."""
 
 import errno
-import io
+import json
+import os
+import re
+import secrets
 import socket
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
-from PIL import Image
 
 from sliplens.errors import InputError
 from sliplens.extras import Table, require_packages
 from sliplens.files import to_builtins
-from sliplens.live.reading import Reading
+from sliplens.images import encode_jpeg
+from sliplens.live.mailbox import Outlet
+from sliplens.live.reading import LiveFrame, Reading
 from sliplens.recordings.capture import Frame
 
 
@@ -140,11 +145,9 @@ class FoxgloveTopics:
 
         # without a reference to it, its channels are closed
         self._context = context = foxglove.Context()
-        self._image, self._timestamp = CompressedImage, Timestamp
+        self._image, self._timestamp, self._stamps = CompressedImage, Timestamp, _Stamps()
         self._readings = foxglove.Channel(READING_TOPIC, schema=reading_schema(), context=context)
         self._frames = CompressedImageChannel(IMAGE_TOPIC, context=context)
-        # both count from 1970, readings from whenever the machine was started
-        self._epoch_s = time.time() - time.monotonic()
         try:
             if path is not None:
                 self._close = foxglove.open_mcap(str(path), context=context).close
@@ -161,14 +164,11 @@ class FoxgloveTopics:
 
     def send(self, reading: Reading, image: Frame | None, /) -> None:
         """Send the reading and its frame, at the time of its capture."""
-        captured_s = reading.captured_s if np.isfinite(reading.captured_s) else time.monotonic()
-        at_ns = round(1e9 * (captured_s + self._epoch_s))
+        at_ns = self._stamps.of(reading)
         self._readings.log(encode_reading(reading), log_time=at_ns)
         if image is not None:
-            buffer = io.BytesIO()
-            Image.fromarray(image).save(buffer, "JPEG", quality=_QUALITY)
             stamp = self._timestamp(sec=at_ns // 10**9, nsec=at_ns % 10**9)
-            frame = self._image(timestamp=stamp, frame_id="fingertip", data=buffer.getvalue(), format="jpeg")
+            frame = self._image(timestamp=stamp, frame_id=_FRAME_ID, data=encode_jpeg(image, _QUALITY), format="jpeg")
             self._frames.log(frame, log_time=at_ns)
 
     def close(self) -> None:
@@ -177,6 +177,19 @@ class FoxgloveTopics:
 
 
 _QUALITY = 90
+_FRAME_ID = "fingertip"
+
+
+class _Stamps:
+    """Times of captures as other programs count them: readings count from whenever the machine was started."""
+
+    def __init__(self) -> None:
+        self._epoch_s = time.time() - time.monotonic()  # once, so that what follows stays in order
+
+    def of(self, reading: Reading) -> int:
+        """Nanoseconds since 1970."""
+        captured_s = reading.captured_s if np.isfinite(reading.captured_s) else time.monotonic()
+        return round(1e9 * (captured_s + self._epoch_s))
 
 
 def _open_foxglove(address: str) -> Sink:
@@ -244,10 +257,140 @@ def _open_rerun(address: str) -> Sink:
     return RerunFile(_new_file(address, kind="rerun"))
 
 
+@dataclass(frozen=True, kw_only=True)
+class RosTopic:
+    """What is sent to ROS on one topic."""
+
+    name: str
+    """Below the key of the sink."""
+    kind: str
+    """Type of its messages."""
+    fields: Callable[[Reading, Frame | None, Any], dict[str, Any] | None]
+    """Fields of the message of a reading, with a header at hand; None where there is none to send."""
+
+
+ROS_TOPICS = (
+    RosTopic(
+        name="margin",
+        kind="std_msgs/msg/Float32",
+        fields=lambda reading, *_: None if reading.margin is None else {"data": reading.margin},
+    ),
+    RosTopic(
+        name="reading",
+        kind="std_msgs/msg/String",
+        fields=lambda reading, *_: {"data": encode_reading(reading).decode()},
+    ),
+    RosTopic(
+        name="image/compressed",
+        kind="sensor_msgs/msg/CompressedImage",
+        fields=lambda _, image, header: (
+            None
+            if image is None
+            else {
+                "header": header,
+                "format": "jpeg",
+                "data": np.frombuffer(encode_jpeg(image, _QUALITY), dtype=np.uint8),
+            }
+        ),
+    ),
+)
+"""Topics of ROS 2 that the sink `zenoh` sends; a margin that is withheld is not sent at all."""
+_ZENOH_ADDRESS = "tcp/127.0.0.1:7447"
+_ZENOH_PATIENCE_MS = 3000
+
+
+class ZenohTopics:
+    """Messages of ROS 2 in its own encoding (CDR) over Zenoh, for nodes that reach it by a bridge or by `rmw_zenoh`.
+
+    Each is sent twice, and goes on the way only where somebody listens: under the name of its topic, as
+    `zenoh-bridge-ros2dds` has it, and under the name that `rmw_zenoh` makes of domain, topic, type and its hash, with
+    the attachment that it asks for.
+
+    Parameters
+    ----------
+    key
+        Key of all topics, such as `tip`, which ROS names `/tip/margin`, `/tip/reading` and `/tip/image/compressed`.
+    address
+        Router or bridge to connect to.
+
+    References
+    ----------
+    Open Source Robotics Foundation, *rmw_zenoh design* (topics, attachments).
+    """
+
+    def __init__(self, key: str, address: str = _ZENOH_ADDRESS) -> None:
+        require_packages("zenoh", "rosbags", extra="sinks", purpose="--sink zenoh")
+        import zenoh  # noqa: PLC0415 (an extra)
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+        from zenoh import ext  # noqa: PLC0415
+
+        self._types, self._ext = get_typestore(Stores.LATEST), ext
+        config = zenoh.Config()
+        for name, value in (
+            ("mode", "client"),
+            ("connect/endpoints", [address]),
+            ("connect/timeout_ms", _ZENOH_PATIENCE_MS),
+            ("scouting/multicast/enabled", False),  # it is told where to go, and calls out to nobody else
+        ):
+            config.insert_json5(name, json.dumps(value))
+        try:
+            self._session = zenoh.open(config)
+            self._publishers = {topic: self._publishers_of(f"{key}/{topic.name}", topic.kind) for topic in ROS_TOPICS}
+        except zenoh.ZError as error:
+            raise InputError(
+                f"--sink zenoh reaches nobody at {address} ({error}); start zenoh-bridge-ros2dds or rmw_zenohd there, "
+                "or name another with zenoh:KEY@tcp/HOST:PORT"
+            ) from None
+        self._stamps, self._id, self._sent = _Stamps(), secrets.token_bytes(16), 0
+
+    def _publishers_of(self, name: str, kind: str) -> tuple[Any, Any]:
+        package, _, message = kind.split("/")
+        domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+        own = f"{domain}/{name}/{package}::msg::dds_::{message}_/{self._types.hash_rihs01(kind)}"
+        return self._session.declare_publisher(name), self._session.declare_publisher(own)
+
+    def send(self, reading: Reading, image: Frame | None, /) -> None:
+        """Send what there is of the reading on each topic, at the time of its capture."""
+        at_ns = self._stamps.of(reading)
+        ext, types = self._ext, self._types
+        stamp = types.types["builtin_interfaces/msg/Time"](sec=at_ns // 10**9, nanosec=at_ns % 10**9)
+        header = types.types["std_msgs/msg/Header"](stamp=stamp, frame_id=_FRAME_ID)
+        self._sent += 1
+        attachment = ext.z_serialize((ext.Int64(self._sent), ext.Int64(at_ns), self._id))
+        for topic, (by_name, by_type) in self._publishers.items():
+            fields = topic.fields(reading, image, header)
+            if fields is None:
+                continue
+            message = bytes(types.serialize_cdr(types.types[topic.kind](**fields), topic.kind))
+            by_name.put(message)
+            by_type.put(message, attachment=attachment)
+
+    def close(self) -> None:
+        """Leave the router."""
+        self._session.close()
+
+
+def _open_zenoh(address: str) -> Sink:
+    key, at, where = address.partition("@")
+    if not re.fullmatch(r"[A-Za-z]\w*(/[A-Za-z]\w*)*", key) or bool(at) != bool(where):
+        raise InputError(
+            f"--sink zenoh:{address} names no key that ROS can have; give letters and digits, as zenoh:tip or "
+            "zenoh:tip@tcp/127.0.0.1:7447"
+        )
+    return ZenohTopics(key, where or _ZENOH_ADDRESS)
+
+
 SINKS = Table[Callable[[str], Sink]](
     "sink",
     "sliplens.sinks",
-    {"json": _open_json, "udp": _open_udp, "mcap": _open_mcap, "foxglove": _open_foxglove, "rerun": _open_rerun},
+    {
+        "json": _open_json,
+        "udp": _open_udp,
+        "mcap": _open_mcap,
+        "foxglove": _open_foxglove,
+        "rerun": _open_rerun,
+        "zenoh": _open_zenoh,
+    },
 )
 """Sinks by kind, each opened with an address; an installed package adds its own by the entry point `sliplens.sinks`."""
 
@@ -264,7 +407,71 @@ def open_sink(name: str) -> Sink:
     return SINKS.pick(kind)(address)
 
 
+_MOST_WAITING_BYTES = 64 * 2**20  # a second or two of a camera
+_READING_BYTES = 4096
+_FLUSH_S = 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class SinkState:
+    """How far a sink is."""
+
+    name: str
+    sent: int
+    """Readings that it took."""
+    lost: int
+    """Readings that it was too slow for, or that came after it broke off."""
+    trouble: str | None
+    """Why it broke off, with the cure; None while it goes on."""
+
+    def __str__(self) -> str:
+        lost = f", {self.lost:,} lost" if self.lost else ""
+        trouble = f"; {self.trouble}" if self.trouble else ""
+        return f"{self.name}: {self.sent:,} readings sent{lost}{trouble}"
+
+
+class Sender:
+    """Sends readings to a sink in a thread of its own: a slow one loses readings, and delays none.
+
+    Parameters
+    ----------
+    name
+        As `open_sink` takes it.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name, sink = name, open_sink(name)
+        self._outlet = Outlet[tuple[Reading, Frame | None]](
+            lambda item: sink.send(*item), sink.close, most_bytes=_MOST_WAITING_BYTES
+        )
+
+    @property
+    def state(self) -> SinkState:
+        """How far it is now."""
+        outlet, error, trouble = self._outlet, self._outlet.error, None
+        if error is not None:
+            reason = (error.strerror if isinstance(error, OSError) else None) or error
+            trouble = f"--sink {self._name} broke off after {outlet.sent} readings ({reason}); begin it anew"
+        return SinkState(name=self._name, sent=outlet.sent, lost=outlet.lost, trouble=trouble)
+
+    @property
+    def error(self) -> Exception | None:
+        """What broke it off."""
+        return self._outlet.error
+
+    def put(self, reading: Reading, frame: LiveFrame | None) -> None:
+        """Take a reading and its frame, without waiting."""
+        image = None if frame is None else frame.image
+        size_bytes = _READING_BYTES + (0 if image is None else image.nbytes)
+        self._outlet.put((reading, image), size_bytes=size_bytes)
+
+    def close(self) -> None:
+        """Send what waits, for 5 seconds at most, and end the sink."""
+        if not self._outlet.close(_FLUSH_S):
+            self._outlet.discard()
+
+
 __all__ = [
-    "IMAGE_TOPIC", "READING_TOPIC", "SINKS", "Datagrams", "FoxgloveTopics", "JsonLines", "RerunFile", "Sink",
-    "encode_reading", "open_sink", "reading_schema",
+    "IMAGE_TOPIC", "READING_TOPIC", "ROS_TOPICS", "SINKS", "Datagrams", "FoxgloveTopics", "JsonLines", "RerunFile",
+    "RosTopic", "Sender", "Sink", "SinkState", "ZenohTopics", "encode_reading", "open_sink", "reading_schema",
 ]  # fmt: skip

@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 
 from sliplens.errors import ImageError, InputError, SourceError
 from sliplens.extras import Table
-from sliplens.images import list_images
+from sliplens.images import is_image, list_images, natural_key
 from sliplens.live.camera import CameraSource
 from sliplens.live.contract import LiveSource, Pace, SourceKind, SourceOptions
 from sliplens.live.reading import LiveFrame
@@ -139,21 +139,27 @@ class FolderSource(LiveSource):
 
     def frames(self) -> Iterator[LiveFrame]:
         """Images in the natural order of their names; one that stays damaged is missing in the numbers."""
-        looked, number, last_s = -1, 0, -np.inf
+        looked, number, last_s, broken_s = -1, 0, -np.inf, np.inf
         while not self._closed.is_set():
-            changed = self._folder.stat().st_mtime_ns
-            waiting = False
-            for path in list_images(self._folder) if changed != looked else []:
-                if path.name in self._seen:
-                    continue
-                written_s, before = path.stat().st_mtime, time.monotonic()
+            try:
+                changed = self._folder.stat().st_mtime_ns
+                new = self._new_images() if changed != looked else []
+            except OSError as error:
+                raise SourceError(
+                    f"{self.name} cannot be read ({error.strerror}); make it again, and begin anew"
+                ) from None
+            looked = changed
+            for path in new:
+                before = time.monotonic()
                 try:
-                    image = read_frame(path, size=frame_size(path))
-                except ImageError:
-                    if time.time() - written_s < _WRITTEN_S:
-                        waiting = True  # the next ones too, so that they come in order
+                    written_s, image = path.stat().st_mtime, read_frame(path, size=frame_size(path))
+                except (ImageError, OSError):
+                    broken_s = min(broken_s, before)
+                    if path.exists() and before - broken_s < _WRITTEN_S:
+                        looked = -1  # it may be half written; the next ones wait too, so that they come in order
                         break
-                    image = None
+                    written_s, image = 0.0, None
+                broken_s = np.inf
                 self._seen.add(path.name)
                 number += 1
                 if image is None:
@@ -167,8 +173,12 @@ class FolderSource(LiveSource):
                     captured_s=now_s - max(0.0, time.time() - written_s),
                     decode_ms=1e3 * (now_s - before),
                 )
-            looked = -1 if waiting else changed
             self._closed.wait(_POLL_S)
+
+    def _new_images(self) -> list[Path]:
+        """Images that were not seen yet, in the natural order of their names; only those are looked at."""
+        paths = (path for path in self._folder.iterdir() if path.name not in self._seen)
+        return sorted(filter(is_image, paths), key=lambda path: natural_key(path.name))
 
 
 _NETWORK = ("rtsp", "rtp", "udp", "tcp", "http", "https", "rtmp", "srt")

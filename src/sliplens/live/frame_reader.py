@@ -1,0 +1,278 @@
+"""From a frame to its reading: the untouched sensor, markers, health, network and smoothing, all in one thread."""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from threading import Event
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from sliplens.errors import ImageError, InputError
+from sliplens.friction import FrictionLike, SlipLearner, as_friction
+from sliplens.live.contract import LiveSource
+from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading
+from sliplens.markers import TrackedFrame, Tracker
+from sliplens.models.checkpoint import Run
+from sliplens.models.engines import Engine
+from sliplens.models.predictions import LEVEL
+from sliplens.recordings.capture import Frame
+from sliplens.recordings.labels.lag import soften
+from sliplens.recordings.trial import ContactState, contact_states
+
+
+@runtime_checkable
+class HealthWatch(Protocol):
+    """Judges frames against the reference that it was made for."""
+
+    def check(self, frame: LiveFrame, markers: TrackedFrame | None, /) -> tuple[Check, ...]:
+        """Check a frame, and its markers where they are followed; a check that is not fine withholds its margin."""
+        ...
+
+
+@runtime_checkable
+class SlipWatch(Protocol):
+    """Tells slip from the motion of the markers, frame after frame."""
+
+    def update(self, positions_px: Float[np.ndarray, "markers 2"], time_s: float, /) -> MarkerReading:
+        """Take the markers of a frame, NaN where one is not seen."""
+        ...
+
+
+_JUMP_S = 1.0
+_NO_CONTACT = "nothing touches the sensor, and without a contact there is no margin; press it"
+_STILL_S = 0.3
+_STILL_FRAMES = 5
+_STILL_GREY = 0.75
+_DARK, _BRIGHT = 8.0, 247.0
+
+
+class _ReferenceTaker:
+    """Looks for a moment in which the picture is still and well exposed, and keeps a frame of it."""
+
+    def __init__(self) -> None:
+        self._since: LiveFrame | None = None
+        self._soft: np.ndarray | None = None
+        self._frames = 0
+
+    def offer(self, frame: LiveFrame) -> Frame | None:
+        """Take the next frame; gives the reference once the picture was still for long enough."""
+        soft = soften(frame.image)
+        moved = self._soft is None or float(np.abs(soft - self._soft).mean()) > _STILL_GREY
+        if moved or self._since is None:
+            self._since, self._soft, self._frames = frame, soft, 1
+            return None
+        self._frames += 1
+        if self._frames < _STILL_FRAMES or frame.time_s - self._since.time_s < _STILL_S:
+            return None
+        brightness = float(soft.mean())
+        if not _DARK < brightness < _BRIGHT:
+            return None
+        return frame.image
+
+
+class LowPass:
+    """Exponential filter of values that come at any times; it delays slow changes by its time constant."""
+
+    def __init__(self, *, time_constant_s: float) -> None:
+        self.time_constant_s = time_constant_s
+        self._before: tuple[Float[np.ndarray, " values"], float] | None = None
+
+    def forget(self) -> None:
+        """Begin anew with the next values."""
+        self._before = None
+
+    def update(self, values: Float[np.ndarray, " values"], time_s: float) -> Float[np.ndarray, " values"]:
+        """Filtered values at a time; the values themselves where the time constant is 0."""
+        if self.time_constant_s > 0 and self._before is not None:
+            before, then_s = self._before
+            values = before + (values - before) * -np.expm1(-max(0.0, time_s - then_s) / self.time_constant_s)
+        self._before = values, time_s
+        return values
+
+
+class FrameReader:
+    """Reads frames one after another, each against the untouched sensor; `read` is called in one thread.
+
+    Parameters are those of `LiveReader`; `on_reference` is called with each image of the untouched sensor.
+    """
+
+    def __init__(
+        self,
+        source: LiveSource,
+        network: Run | None,
+        *,
+        friction: FrictionLike | None,
+        smoothing_s: float,
+        health: Callable[[Frame, Run | None], HealthWatch] | None,
+        slip: Callable[[Float[np.ndarray, "markers 2"]], SlipWatch] | None,
+        on_reference: Callable[[Frame], None],
+    ) -> None:
+        self.source, self.network = source, network
+        self.engine: Engine | None = None
+        """What runs the network; known once it has begun."""
+        self.reference: Frame | None = None
+        """The sensor untouched, as the next frame is compared with it."""
+        self.asked = Event()
+        """Set to have a new reference taken as soon as the picture is still."""
+        self._friction = None if friction is None else SlipLearner(as_friction(friction))
+        if self._friction is not None:
+            if network is None:
+                raise InputError("--friction makes a margin of what a network reads; name one with --network")
+            network.require_ratio()
+        self._smooth = LowPass(time_constant_s=smoothing_s)
+        self._make_health, self._make_slip, self._on_reference = health, slip, on_reference
+        self._health: HealthWatch | None = None
+        self._slip: SlipWatch | None = None
+        self._tracker: Tracker | None = None
+        self._taker: _ReferenceTaker | None = None
+        self._last: LiveFrame | None = None
+        self._dropped = 0
+
+    def begin(self, engine: Engine | None, reference: Frame | None) -> None:
+        """Take the source, which is open, as it is now, and an image of the untouched sensor if there is one."""
+        self.engine, self._size = engine, self.source.size
+        if reference is None:
+            self._taker = _ReferenceTaker()
+            return
+        if reference.shape[:2] != self._size:
+            raise ImageError(
+                f"the reference has {_in_pixels(reference.shape[:2])} pixels, the frames of {self.source.name} have "
+                f"{_in_pixels(self._size)}; name an image of this camera with --reference, or leave it out"
+            )
+        self._set_reference(reference)
+
+    def missing(self, why: str) -> Reading:
+        """Reading where no frame came."""
+        last = self._last
+        return Reading(
+            number=-1 if last is None else last.number,
+            time_s=np.nan if last is None else last.time_s,
+            captured_s=np.nan if last is None else last.captured_s,
+            withheld=why,
+            dropped=self._dropped,
+        )
+
+    def read(self, frame: LiveFrame) -> Reading:
+        """Read the next frame."""
+        last, self._last = self._last, frame
+        self._dropped += 0 if last is None else max(0, frame.number - last.number - 1)
+        begin = Reading(
+            number=frame.number,
+            time_s=frame.time_s,
+            captured_s=frame.captured_s,
+            dropped=self._dropped,
+            true_margin=frame.safety_margin,
+        )
+        if jump_s := 0.0 if last is None else self._clock_jump(last, frame):
+            self._begin_anew()
+            told = f"the clock of {self.source.name} jumped by {jump_s:+.3g} s; the next frame is read again"
+            return self._withhold(begin, frame, told)
+        if frame.size != self._size:
+            told = f"the frames of {self.source.name} are now {_in_pixels(frame.size)} pixels, they were "
+            cure = "set the camera as it was, or start again"
+            return self._withhold(begin, frame, f"{told}{_in_pixels(self._size)}; {cure}")
+        self._look_for_reference(frame)
+        if self.reference is None:
+            still = "the picture must be still for a moment: leave the sensor untouched"
+            return self._withhold(begin, frame, f"there is no reference frame yet; {still}")
+        begun = time.perf_counter()
+        followed = markers = None
+        if self._tracker is not None and self._slip is not None:
+            followed = self._tracker.update(frame.image)
+            markers = self._slip.update(followed.position_px[: len(self._tracker.rest)], frame.time_s)
+        health = () if self._health is None else self._health.check(frame, followed)
+        latency = Latency(decode_ms=frame.decode_ms, checks_ms=1e3 * (time.perf_counter() - begun))
+        withheld = next((check.sentence for check in health if not check.ok), None)
+        reading = replace(begin, slip=markers and markers.state, markers=markers, health=health, latency=latency)
+        untouched = any(check.name == "touch" and not check.ok for check in health)
+        if untouched or (markers is not None and markers.contact is False):
+            reading = replace(reading, contact_state=ContactState.NO_CONTACT)
+            withheld = withheld or (None if self.network is None else _NO_CONTACT)
+        if self._friction is not None:
+            slipping_s = None if markers is None else markers.slipping_s
+            touches = reading.contact_state != ContactState.NO_CONTACT
+            self._friction.update(frame.time_s, slipping_s=slipping_s, touches=touches)
+        if self.network is None or withheld is not None:
+            return self._withhold(reading, frame, withheld)
+        return self._estimate(reading, frame)
+
+    def _withhold(self, reading: Reading, frame: LiveFrame, why: str | None) -> Reading:
+        self._smooth.forget()
+        latency = replace(reading.latency, decode_ms=frame.decode_ms, total_ms=_since_ms(frame.captured_s))
+        return replace(reading, withheld=why, latency=latency)
+
+    def _estimate(self, reading: Reading, frame: LiveFrame) -> Reading:
+        assert self.network is not None
+        assert self.engine is not None
+        assert self.reference is not None
+        begun = time.perf_counter()
+        inputs = self.network.encode(frame.image[None], self.reference)
+        encoded = time.perf_counter()
+        friction = None if self._friction is None else self._friction.friction
+        estimate = self.engine.estimate(self.network, inputs, friction=friction)
+        done = time.perf_counter()
+        ratio = None if estimate.ratio is None else float(estimate.ratio.mean[0])
+        if self._friction is not None and ratio is not None and estimate.ratio is not None:
+            self._friction.note(ratio, sigma=float(estimate.ratio.sigma[0]), time_s=frame.time_s)
+        interval = estimate.interval(LEVEL)
+        values = [estimate.margin] if interval is None else [estimate.margin, *interval]
+        values = self._smooth.update(np.clip(np.concatenate(values), 0, 1), frame.time_s)
+        [state] = contact_states(values[:1], without=ContactState.UNKNOWN)
+        margin, *ends = values.tolist()
+        low, high = ends or (None, None)
+        return replace(
+            reading,
+            margin=margin,
+            low=low,
+            high=high,
+            ratio=ratio,
+            friction=None if friction is None else str(friction),
+            contact_state=state,
+            lag_s=self._smooth.time_constant_s,
+            latency=replace(
+                reading.latency,
+                encode_ms=1e3 * (encoded - begun),
+                network_ms=1e3 * (done - encoded),
+                total_ms=_since_ms(frame.captured_s),
+            ),
+        )
+
+    def _look_for_reference(self, frame: LiveFrame) -> None:
+        if self.asked.is_set():
+            self.asked.clear()
+            self._taker = _ReferenceTaker()
+        if self._taker is not None and (image := self._taker.offer(frame)) is not None:
+            self._taker = None
+            self._set_reference(image)
+
+    def _set_reference(self, image: Frame) -> None:
+        self._on_reference(image)
+        self.reference = image
+        self._health = None if self._make_health is None else self._make_health(image, self.network)
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Forget what came before, where frames no longer follow each other."""
+        self._smooth.forget()
+        if self._make_slip is not None and self.reference is not None:
+            try:
+                self._tracker = Tracker(self.reference)
+                self._slip = self._make_slip(self._tracker.rest.centre_px)
+            except (ImageError, InputError):
+                self._tracker = self._slip = None  # it shows no markers, or too few
+
+    def _clock_jump(self, last: LiveFrame, frame: LiveFrame) -> float:
+        """Seconds by which the clock of the source jumped; 0 where it went on."""
+        passed_s = frame.time_s - last.time_s
+        off_s = passed_s - self.source.speed * (frame.captured_s - last.captured_s)
+        return 0.0 if passed_s > 0 and abs(off_s) <= _JUMP_S else off_s
+
+
+def _in_pixels(size: tuple[int, ...]) -> str:
+    return f"{size[0]} x {size[1]}"
+
+
+def _since_ms(captured_s: float) -> float:
+    return 1e3 * (time.monotonic() - captured_s)

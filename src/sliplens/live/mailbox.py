@@ -1,0 +1,107 @@
+"""What threads hand to each other: a place for the newest items, and an outlet that works them off."""
+
+from collections import deque
+from collections.abc import Callable
+from threading import Condition, Thread
+from typing import Generic, TypeVar
+
+Item = TypeVar("Item")
+
+
+class Mailbox(Generic[Item]):
+    """Place where one thread leaves what another takes; where too many wait, the oldest is lost and counted."""
+
+    def __init__(self) -> None:
+        self._changed, self._items = Condition(), deque[Item]()
+        self.closed = False
+        """Whether no more come; what waits can still be taken."""
+        self.lost = 0
+        """Items that were left here and never taken."""
+
+    def put(self, item: Item, *, most: int = 1) -> None:
+        """Leave an item, in place of the oldest where so many wait; into a closed one it is lost."""
+        with self._changed:
+            if self.closed:
+                self.lost += 1
+                return
+            while len(self._items) >= most:
+                self._items.popleft()
+                self.lost += 1
+            self._items.append(item)
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Let whoever waits know that no more come."""
+        with self._changed:
+            self.closed = True
+            self._changed.notify_all()
+
+    def discard(self) -> None:
+        """Close it, and lose what waits."""
+        self.close()
+        with self._changed:
+            self.lost += len(self._items)
+            self._items.clear()
+
+    def take(self, timeout_s: float | None = None) -> Item | None:
+        """Wait for the oldest item; None where none came in time, or none will come any more."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._items or self.closed, timeout_s)
+            return self._items.popleft() if self._items else None
+
+
+class Outlet(Generic[Item]):
+    """Thread that hands items on, one after another, so that whoever makes them waits for nothing.
+
+    Parameters
+    ----------
+    send
+        Called with each item; after an exception nothing more is sent, and `error` tells it.
+    end
+        Called once, in the same thread, when no more will be sent.
+    most_bytes
+        Size of the items that may wait; of more, the oldest is lost.
+    """
+
+    def __init__(self, send: Callable[[Item], None], end: Callable[[], None], *, most_bytes: int) -> None:
+        self._send, self._end, self._most_bytes = send, end, most_bytes
+        self._box: Mailbox[Item] = Mailbox()
+        self.sent = 0
+        """Items that were handed on."""
+        self.error: Exception | None = None
+        """What ended it before it was closed."""
+        self._thread = Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    @property
+    def lost(self) -> int:
+        """Items that were not handed on, it being too slow or ended."""
+        return self._box.lost
+
+    def put(self, item: Item, *, size_bytes: int) -> None:
+        """Take an item, without waiting."""
+        self._box.put(item, most=max(1, self._most_bytes // size_bytes))
+
+    def close(self, patience_s: float) -> bool:
+        """Take no more, and wait until all are handed on; False where that takes longer."""
+        self._box.close()
+        self._thread.join(patience_s)
+        return not self._thread.is_alive()
+
+    def discard(self) -> None:
+        """Hand on nothing more."""
+        self._box.discard()
+
+    def _run(self) -> None:
+        try:
+            while (item := self._box.take()) is not None:
+                self._send(item)
+                self.sent += 1
+        except Exception as error:  # whatever it was, it is told where the items come from
+            self.error = error
+            self._box.lost += 1
+            self._box.discard()
+        try:
+            self._end()
+        except Exception as error:
+            self.error = self.error or error
