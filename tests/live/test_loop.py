@@ -251,11 +251,11 @@ def test_what_is_told_of_friction_shapes_the_margin_and_a_slip_narrows_it(
         assert reading.margin == pytest.approx(float(again.margin[0]), abs=1e-4)
 
 
-def test_friction_needs_a_network_that_tells_f_t_over_f_n():
+def test_friction_needs_a_network_that_tells_f_t_over_f_n(difference_run: Path):
     with pytest.raises(InputError, match="makes a margin of what a network reads; name one with --network"):
         plain_reader("simulated", friction=0.6)
     with pytest.raises(InputError, match="answers with the margin alone and cannot use it"):
-        plain_reader("simulated", "chromatouch-difference", friction=0.6)
+        plain_reader("simulated", difference_run, friction=0.6)
 
 
 def test_a_network_of_another_sensor_is_refused_before_anything_runs(difference_run: Path):
