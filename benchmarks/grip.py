@@ -83,7 +83,7 @@ def hold(
     loop = GripLoop(
         plant, eyes if controller != "fixed" else NoEyes(), make_controller(controller, settings), latency_s=latency_s
     )
-    table, _ = run_scripts(loop, scripts)
+    table = run_scripts(loop, scripts)
     return Outcome(
         dropped=table.dropped,
         excess=table.force_excess,

@@ -17,7 +17,7 @@ def test_many_episodes_make_a_record_and_a_page_and_are_kept(tmp_path: Path, cap
     assert "0 of 4" in told
     assert "4 episodes, 0.0 % dropped" in told
     grip = load_result(tmp_path / "grip", Grip, command="sliplens grip")
-    assert grip.settings == {"force_n": 3.5}
+    assert grip.setup.settings == {"force_n": 3.5}
     assert set(grip.episodes.mass_kg) == {0.05}
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "What the margin holds" in page
@@ -35,7 +35,7 @@ def test_many_episodes_make_a_record_and_a_page_and_are_kept(tmp_path: Path, cap
         (("--condition", "oily"), "there is no condition named 'oily'"),
         (("--set", "target"), "write --set NAME=NUMBER"),
         (("--set", "speed=3"), "has no constant 'speed'"),
-        (("--mass", "-1"), "mass_kg must be positive"),
+        (("--mass", "-1"), "mass_kg must be above 0"),
         (("--network", "nothing"), "the run nothing does not exist"),
     ],
 )

@@ -1,9 +1,11 @@
 """A gripper that misbehaves: nothing passes the ceiling, what falls silent is held, and nothing opens by itself."""
 
 import math
+import os
 import socket
 import threading
 import time
+from contextlib import suppress
 
 import pytest
 
@@ -25,13 +27,18 @@ class FakeGripper:
         self._thread.start()
 
     def _serve(self) -> None:
-        connection, _ = self._server.accept()
-        with connection, connection.makefile("rwb") as stream:
+        self._connection, _ = self._server.accept()
+        # whoever hangs up in the middle of an answer resets the connection
+        with suppress(ConnectionError), self._connection, self._connection.makefile("rwb") as stream:
             for line in stream:
                 self.heard.append(line.decode().strip())
                 if self.answer is not None:
                     stream.write(self.answer)
                     stream.flush()
+
+    def send(self, answer: bytes) -> None:
+        """Say something unasked."""
+        self._connection.sendall(answer)
 
     def close(self) -> None:
         self._server.close()
@@ -81,6 +88,39 @@ def test_a_wrong_answer_is_told_in_a_sentence(fake, answer, told):
     gripper.close()
 
 
+def test_a_late_answer_is_forgotten_and_the_next_one_counts(fake):
+    fake.answer = None
+    gripper = open_gripper(fake.address, timeout_s=0.05)
+    with pytest.raises(GripperError, match="did not answer"):
+        gripper.set_force(1.0)
+    fake.send(b"ERR too late\n")
+    fake.answer = b"OK 2.000 0.0300\n"
+    wait_until(lambda: gripper._ready(0.0))
+    gripper._timeout_s = 2.0
+    assert gripper.read_state().force_n == 2.0
+    gripper.close()
+
+
+def test_a_serial_line_is_spoken_as_tcp_is():
+    gripper_end, ours = os.openpty()
+    gripper = open_gripper(os.ttyname(ours), timeout_s=2.0)
+    told = []
+
+    def answer() -> None:
+        told.append(os.read(gripper_end, 100))
+        os.write(gripper_end, b"OK 1.500 0.0")  # in two pieces
+        os.write(gripper_end, b"400\n")
+
+    answering = threading.Thread(target=answer)
+    answering.start()
+    assert gripper.read_state().width_m == 0.04
+    answering.join()
+    assert told == [b"S\n"]
+    gripper.close()
+    os.close(gripper_end)
+    os.close(ours)
+
+
 @pytest.mark.parametrize("force_n", [4.0001, 1e9, math.inf])
 def test_no_force_passes_the_ceiling(force_n):
     dry = DryRun()
@@ -127,6 +167,59 @@ def test_a_gripper_that_fails_is_told_again_until_it_takes_the_force(fake):
         fake.answer = b"OK 1.500 0.0400\n"
         wait_until(lambda: gripper.failure is None)
     assert set(fake.heard) == {"F 1.500"}
+
+
+class Broken(DryRun):
+    """A gripper whose driver raises whatever it likes, until it is mended."""
+
+    broken = True
+
+    def set_force(self, force_n: float) -> None:
+        if self.broken:
+            raise RuntimeError("the driver lost its mind")
+        super().set_force(force_n)
+
+    def set_width(self, width_m: float) -> None:
+        raise RuntimeError(f"the driver lost its mind at {width_m}")
+
+
+def test_whatever_a_driver_raises_the_watchdog_lives_and_holds():
+    driver = Broken()
+    with GuardedGripper(driver, watchdog_s=SOON_S) as gripper:
+        gripper.set_force(1.5)
+        assert "lost its mind" in str(gripper.failure)
+        assert gripper.holding
+        driver.broken = False
+        wait_until(lambda: driver.sent)
+    assert set(driver.sent) == {"F 1.500"}
+
+
+def test_a_gripper_that_fails_to_open_goes_on_holding():
+    driver = Broken()
+    driver.broken = False
+    with GuardedGripper(driver, watchdog_s=SOON_S) as gripper:
+        gripper.set_force(1.5)
+        with pytest.raises(RuntimeError):
+            gripper.set_width(0.08)
+        wait_until(lambda: len(driver.sent) > 2)
+    assert set(driver.sent) == {"F 1.500"}
+
+
+def test_an_open_gripper_holds_nothing_and_may_be_opened_further():
+    dry = DryRun()
+    with GuardedGripper(dry, watchdog_s=SOON_S) as gripper:
+        gripper.set_force(1.0)
+        gripper.set_width(0.04)
+        time.sleep(2 * SOON_S)
+        assert not gripper.holding
+        gripper.set_width(0.08)
+    assert dry.sent == ["F 1.000", "W 0.0400", "W 0.0800"]
+
+
+@pytest.mark.parametrize("width_m", [-0.01, math.nan, math.inf])
+def test_a_width_that_cannot_be_is_refused(width_m):
+    with GuardedGripper(DryRun()) as gripper, pytest.raises(InputError, match="give a width of 0 or more"):
+        gripper.set_width(width_m)
 
 
 @pytest.mark.parametrize("address", ["tcp://nowhere", "tcp://:80", "/dev/no-such-device"])

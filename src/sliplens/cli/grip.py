@@ -1,7 +1,9 @@
 """`sliplens grip`."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 from sliplens.cli.command import Command, Output
 from sliplens.cli.console import print_table
@@ -37,6 +39,8 @@ class Grip(Command):
     """Mass of the object in kilograms; drawn if not given."""
     friction: float | None = None
     """Coefficient of friction at the beginning; drawn if not given."""
+    told_friction: Annotated[str | None, tyro.conf.arg(metavar="MU|LOW..HIGH|each")] = None
+    """What a network that tells F_t / F_n is told of it: 0.62, 0.3..0.9, or each for that of each episode."""
     pull: float | None = None
     """Pull on the object in newtons, for 1.5 s; drawn if not given."""
     wet_patch: float | None = None
@@ -70,6 +74,7 @@ class Grip(Command):
             rendered=rendered,
             script={name: value for name, value in script.items() if value is not None},
             settings=dict(map(_constant, self.set)),
+            friction=self.told_friction,
             latency_s=self.latency,
             method=self.method if rendered and self.method != "none" else None,
             out=self.output / "grip",

@@ -1,10 +1,10 @@
 """Grips that hold what would slip, with the safety margin in the loop: simulated, and out to a real gripper."""
 
-from sliplens.grip.controllers import CONTROLLERS, Controller, Observation
-from sliplens.grip.episodes import make_controller, run_episodes, run_scripts
+from sliplens.grip.controllers import CONTROLLERS, Controller, Observation, make_controller
+from sliplens.grip.episodes import run_episodes, run_scripts
 from sliplens.grip.fingertip import Fingertip
 from sliplens.grip.loop import Eyes, GripLoop, NoEyes, RenderedEyes, Sight, SlipWatch, TableEyes, Tick
-from sliplens.grip.plant import OBJECTS, GripperModel, HeldObject, Plant, PlantState, World
+from sliplens.grip.plant import OBJECTS, GripperModel, HeldObject, Plant, PlantState, World, least_force
 from sliplens.grip.readings import ReadingTable, load_readings, measure_readings
 from sliplens.grip.scripts import CONDITIONS, Scripts, draw_scripts, pick_object
 
@@ -31,6 +31,7 @@ __all__ = [
     "Tick",
     "World",
     "draw_scripts",
+    "least_force",
     "load_readings",
     "make_controller",
     "measure_readings",

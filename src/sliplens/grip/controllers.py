@@ -1,15 +1,16 @@
 """Controllers of the grip force: what to press with, told from what the fingertips read."""
 
-from dataclasses import dataclass, field
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from sliplens.errors import InputError
 from sliplens.extras import Table
 from sliplens.grip.plant import PERIOD_S
-
-_FAINT = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +80,7 @@ _SETTLED_S = 1.0
 
 
 @dataclass(kw_only=True)
-class MarginGrip:
+class MarginGrip(ABC):
     """What grips on the margin share: caution, dead band, fast up and slow down, reflex, and what to do when blind.
 
     What is acted on is r = read - caution (read - low), the mean over the fingers that read; with a caution of 1 it is
@@ -95,13 +96,13 @@ class MarginGrip:
     0.1 suit."""
     zero: float = 0.5
     """r_0 before any slip, a share: what may be read where the object already slides."""
-    trained_n: float = 2.0
-    """Largest normal force that the network was trained with."""
+    trained_n: float = 2.25
+    """Normal force up to which the network reads as it was trained to; its training ended at 2 N."""
     sag_per_n: float = 0.18
-    """Margin by which it reads too low for each newton beyond, as a share (measured)."""
+    """Share of the margin by which it reads too low for each newton beyond (measured up to 4 N)."""
     start_n: float = 2.0
     """Force to lift with."""
-    least_n: float = 0.4
+    least_n: float = 0.5
     """Force never loosened below: with less the network sees no touch."""
     dead_band: float = 0.05
     """Share of the force within which nothing changes."""
@@ -121,16 +122,16 @@ class MarginGrip:
     _slipped_s: np.ndarray = field(init=False, default_factory=lambda: np.full(1, -np.inf))
     _seen_s: np.ndarray = field(init=False, default_factory=lambda: np.zeros(1))
 
+    @abstractmethod
     def law(
         self, force_n: Float[np.ndarray, " episodes"], margin: Float[np.ndarray, " episodes"]
     ) -> Float[np.ndarray, " episodes"]:
         """Grip force in newtons that a margin, a share, asks for."""
-        raise NotImplementedError
 
     def margin_of(self, seen: Observation) -> Float[np.ndarray, " episodes"]:
         """Margin to act on, a share; NaN where no finger reads."""
         margin = seen.margin - self.caution * (seen.margin - seen.low)
-        margin = margin + self.sag_per_n * np.maximum(seen.force_n - self.trained_n, 0)[:, None]
+        margin = margin / (1 - self.sag_per_n * np.maximum(seen.force_n - self.trained_n, 0))[:, None]
         reads = np.isfinite(margin)
         return np.where(reads, margin, 0).sum(axis=1) / np.where(reads.any(axis=1), reads.sum(axis=1), np.nan)
 
@@ -212,7 +213,8 @@ class Reflex:
 class Oracle(MarginLaw):
     """The margin law on the true margin, as old as a reading: the best that any network could do for it."""
 
-    target: float = 0.2
+    target: float = 0.6
+    zero: float = 0.0
 
     def margin_of(self, seen: Observation) -> Float[np.ndarray, " episodes"]:
         """True margin, a share; the lesser of both fingers."""
@@ -233,3 +235,35 @@ CONTROLLERS = Table(
     },
 )
 """Controllers by name; an installed package adds its own by the entry point `sliplens.controllers`."""
+
+
+TOLD = {"zero": 0.0, "target": 0.4}
+"""Constants of the laws on the margin where the friction is told: what is read is then the margin itself."""
+
+
+def make_controller(name: str, settings: Mapping[str, float] | None = None, *, told: bool = False) -> Controller:
+    """Make a controller of the table, some of its constants changed; `told`: readings know the friction.
+
+    Raises
+    ------
+    InputError
+        If there is no such controller, or it has no such constant.
+
+    Examples
+    --------
+    >>> from sliplens.grip import make_controller
+    >>> make_controller("fixed", {"force_n": 1.5})
+    FixedForce(force_n=1.5)
+    """
+    kind, settings = CONTROLLERS.pick(name), dict(settings or {})
+    if told and issubclass(kind, MarginGrip):
+        settings = TOLD | settings
+    known = [field.name for field in fields(kind) if field.init]  # pyright: ignore[reportArgumentType]
+    for one, value in settings.items():
+        if one not in known:
+            raise InputError(f"the controller {name} has no constant {one!r}; choose of {', '.join(known)}")
+        if not np.isfinite(value) or value < 0:
+            raise InputError(f"{one} of the controller {name} must be a number not below 0, got {value:g}")
+    if settings.get("target", 0) >= 1 or settings.get("zero", 0) >= 1:
+        raise InputError("margins are shares of the friction: give a target and a zero below 1")
+    return kind(**settings)

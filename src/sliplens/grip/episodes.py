@@ -2,11 +2,11 @@
 
 import shutil
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -14,11 +14,12 @@ from jaxtyping import Float, Float32, UInt8
 from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError
 from sliplens.explainers import explain
-from sliplens.files import output_folder
-from sliplens.grip.controllers import CONTROLLERS, Controller
+from sliplens.files import output_folder, to_builtins
+from sliplens.friction import Friction, FrictionLike, as_friction
+from sliplens.grip.controllers import Controller, make_controller
 from sliplens.grip.loop import GripLoop, RenderedEyes, TableEyes, Tick
-from sliplens.grip.plant import GRAVITY_M_S2, PERIOD_S, HeldObject, Plant
-from sliplens.grip.readings import ReadingTable, load_readings, measure_readings
+from sliplens.grip.plant import PERIOD_S, Episodes, HeldObject, Plant, least_force
+from sliplens.grip.readings import ReadingTable, load_readings, measure_readings, require_calibration
 from sliplens.grip.scripts import EPISODE_S, LIFT_S, Scripts, draw_scripts, hand_motion, pick_object
 from sliplens.mechanics import stick_ratio
 from sliplens.models import Run, load
@@ -28,7 +29,7 @@ from sliplens.recordings import Recording
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
 from sliplens.recordings.trial import ContactState, contact_states
-from sliplens.results.grip import EpisodeTable, Grip, GripTrace
+from sliplens.results.grip import EpisodeTable, Grip, GripSetup, GripTrace
 
 _BATCH = 500
 """Episodes stepped together: few enough for a processor's caches."""
@@ -51,32 +52,6 @@ class _Batch:
     maps: Float32[np.ndarray, "moments side side"]
 
 
-def make_controller(name: str, settings: Mapping[str, float] | None = None) -> Controller:
-    """Make a controller of the table, some of its constants changed.
-
-    Raises
-    ------
-    InputError
-        If there is no such controller, or it has no such constant.
-
-    Examples
-    --------
-    >>> from sliplens.grip import make_controller
-    >>> make_controller("fixed", {"force_n": 1.5})
-    FixedForce(force_n=1.5)
-    """
-    kind, settings = CONTROLLERS.pick(name), dict(settings or {})
-    known = [field.name for field in fields(kind) if field.init]  # pyright: ignore[reportArgumentType]
-    for one, value in settings.items():
-        if one not in known:
-            raise InputError(f"the controller {name} has no constant {one!r}; choose of {', '.join(known)}")
-        if not np.isfinite(value) or value < 0:
-            raise InputError(f"{one} of the controller {name} must be a number not below 0, got {value:g}")
-    if settings.get("target", 0) >= 1 or settings.get("zero", 0) >= 1:
-        raise InputError("margins are shares of the friction: give a target and a zero below 1")
-    return kind(**settings)
-
-
 def run_episodes(
     object: str = "cup",
     controller: str | Controller = "margin",
@@ -87,9 +62,10 @@ def run_episodes(
     rendered: bool = False,
     readings: ReadingTable | None = None,
     error_scale: float = 1.0,
+    friction: FrictionLike | Literal["each"] | None = None,
     latency_s: float = 0.02,
     seed: int = 0,
-    script: Mapping[str, float | None] | None = None,
+    script: Mapping[str, float] | None = None,
     settings: Mapping[str, float] | None = None,
     method: str | None = None,
     out: Path | str | None = None,
@@ -121,6 +97,9 @@ def run_episodes(
         Errors of the network; those that come with it if None, and measured first (minutes) where there are none.
     error_scale
         Ratio by which the network's errors are made worse, or better; only where they are looked up.
+    friction
+        What is told of the coefficient of friction, as `predict` takes it, for a network that tells F_t / F_n; `each`
+        tells each episode its own, as it begins. Slips that the markers tell narrow a range down.
     latency_s
         From an image to the command that answers it, in seconds.
     script
@@ -151,44 +130,56 @@ def run_episodes(
         make_controller(controller, settings)  # a mistake is told before anything is measured
     elif settings:
         raise InputError("settings are for the controllers of the table; set those of your own where you make it")
-    fixed: dict[str, Any] = dict(script or {})
-    scripts = draw_scripts(held, condition, episodes=episodes, seed=seed, **fixed)
-    run = _load_calibrated(network)
+    told: Friction | Literal["each"] | None = None
+    if friction is not None:
+        told = "each" if isinstance(friction, str) and friction == "each" else as_friction(friction)
+    scripts = draw_scripts(held, condition, episodes=episodes, seed=seed, script=script)
+    run = network if isinstance(network, Run) else load(network)
+    require_calibration(run)
+    if told is not None:
+        run.require_ratio()
     if not rendered and readings is None:
         readings = _readings_of(run, on_progress)
-    facts: dict[str, Any] = {
-        "object": object,
-        "condition": condition,
-        "controller": controller if isinstance(controller, str) else type(controller).__name__,
-        "settings": dict(settings or {}),
-        "latency_s": latency_s,
-        "seed": seed,
-        "network": run.manifest.weights_sha256[:12],
-        "rendered": rendered,
-    }
+    setup = GripSetup(
+        object=object,
+        condition=condition,
+        controller=controller if isinstance(controller, str) else type(controller).__name__,
+        settings=dict(settings or _constants(controller)),
+        network=run.manifest.weights_sha256[:12],
+        friction=None if told is None else "that of each episode as it begins" if isinstance(told, str) else str(told),
+        latency_s=latency_s,
+        rendered=rendered,
+        seed=seed,
+    )
     job = _Job(
-        held=held, scripts=scripts, controller=controller, settings=settings, run=run, readings=readings,
-        rendered=rendered, error_scale=error_scale, latency_s=latency_s, seed=seed, condition=condition, method=method,
+        setup=setup, held=held, scripts=scripts, controller=controller, run=run, readings=readings, friction=told,
+        error_scale=error_scale, method=method,
     )  # fmt: skip
     if out is None:
-        return job.all(facts, None, on_progress)
-    known = None if readings is None else (readings.network, readings.seed, len(readings))
-    config = facts | {"episodes": episodes, "error_scale": error_scale, "method": method, "script": dict(script or {})}
-    with output_folder(Path(out), stage="grip", config={**config, "readings": known}, overwrite=overwrite) as output:
+        return job.all(None, on_progress)
+    config = to_builtins(setup) | {
+        "episodes": episodes,
+        "error_scale": error_scale,
+        "method": method,
+        "script": dict(script or {}),
+        "readings": None if readings is None else (readings.network, readings.seed, len(readings)),
+    }
+    with output_folder(Path(out), stage="grip", config=config, overwrite=overwrite) as output:
         if output.complete:
             grip = load_result(output.folder, Grip, command="sliplens grip")
         else:
-            grip = job.all(facts, output.folder, on_progress)
-    told = f"{episodes} episode{'s' * (episodes > 1)}, {100 * grip.drop_rate:.1f} % dropped"
-    wrote(on_progress, Path(out), told, kept=output.complete)
+            grip = job.all(output.folder, on_progress)
+    counted = f"{episodes} episode{'s' * (episodes > 1)}, {100 * grip.drop_rate:.1f} % dropped"
+    wrote(on_progress, Path(out), counted, kept=output.complete)
     return grip
 
 
-def _load_calibrated(network: str | Path | Run) -> Run:
-    run = network if isinstance(network, Run) else load(network)
-    if run.manifest.calibration is None:
-        raise InputError("the network was never calibrated and tells no interval to grip by; choose another network")
-    return run
+def _constants(controller: str | Controller) -> dict[str, float]:
+    """Constants of a controller that is none of the table, as far as it is a dataclass and tells them."""
+    if isinstance(controller, str) or not is_dataclass(controller):
+        return {}
+    named = {field.name: getattr(controller, field.name) for field in fields(controller) if field.init}
+    return {name: float(value) for name, value in named.items() if isinstance(value, int | float)}
 
 
 def _readings_of(run: Run, on_progress: OnProgress | None) -> ReadingTable:
@@ -205,22 +196,19 @@ def _readings_of(run: Run, on_progress: OnProgress | None) -> ReadingTable:
 class _Job:
     """All that the episodes need."""
 
+    setup: GripSetup
     held: HeldObject
     scripts: Scripts
     controller: str | Controller
-    settings: Mapping[str, float] | None
     run: Run
     readings: ReadingTable | None
-    rendered: bool
+    friction: Friction | Literal["each"] | None
     error_scale: float
-    latency_s: float
-    seed: int
-    condition: str
     method: str | None
 
-    def all(self, facts: dict[str, Any], folder: Path | None, on_progress: OnProgress | None) -> Grip:
+    def all(self, folder: Path | None, on_progress: OnProgress | None) -> Grip:
         """Run every batch that is not in the folder yet, and write what they add up to."""
-        begin, size, total = time.perf_counter(), 1 if self.rendered else _BATCH, len(self.scripts)
+        begin, size, total = time.perf_counter(), 1 if self.setup.rendered else _BATCH, len(self.scripts)
         done: list[_Batch] = []
         with stage(on_progress, "Gripping") as count:
             for number, first in enumerate(range(0, total, size)):
@@ -229,7 +217,7 @@ class _Job:
                 done.append(keep_part(part, _Batch, partial(self.batch, number, chosen, folder)))
                 count(first + len(chosen), total)
         grip = Grip(
-            **facts,
+            setup=self.setup,
             seconds=time.perf_counter() - begin,
             episodes=EpisodeTable.joined([one.episodes for one in done]),
             trace=done[0].trace,
@@ -243,36 +231,57 @@ class _Job:
 
     def batch(self, number: int, scripts: Scripts, folder: Path | None) -> _Batch:
         """Run some episodes; what the cameras saw is saved where there is a folder."""
-        chosen = self.controller
+        setup, chosen = self.setup, self.controller
         if isinstance(chosen, str):
-            chosen = make_controller(chosen, self.settings)
-        own = np.random.SeedSequence((self.seed, number))
-        filmed: list[np.ndarray] = []
-        if self.rendered:
-            eyes = RenderedEyes(self.run, seed=int(own.generate_state(1)[0]), frames=2 * _TICKS * len(self.scripts))
-        else:
-            assert self.readings is not None
-            rng, tips = np.random.default_rng(own), scripts.fingertips
-            eyes = TableEyes(self.readings, fingertips=tips, rng=rng, error_scale=self.error_scale)
-        loop = GripLoop(Plant(self.held, episodes=len(scripts)), eyes, chosen, latency_s=self.latency_s, lift_s=LIFT_S)
-        keep = self.rendered and (folder is not None or self.method is not None)
-        table, ticks = run_scripts(loop, scripts, condition=self.condition, filmed=filmed if keep else None)
+            chosen = make_controller(chosen, setup.settings, told=self.friction is not None)
+        eyes = self._eyes(scripts, np.random.SeedSequence((setup.seed, number)))
+        plant = Plant(self.held, episodes=len(scripts))
+        loop = GripLoop(plant, eyes, chosen, latency_s=setup.latency_s, lift_s=LIFT_S)
+        ticks: list[Tick] = []
+        keep = setup.rendered or number == 0
+        table = run_scripts(loop, scripts, condition=setup.condition, on_tick=ticks.append if keep else None)
         pictures, maps = np.zeros((0, 1, 1, 3), dtype=np.uint8), np.zeros((0, 1, 1), dtype=np.float32)
-        if keep and isinstance(eyes, RenderedEyes):
-            frames = np.stack(filmed)
+        if isinstance(eyes, RenderedEyes):
+            frames = np.stack([tick.sight.frames for tick in ticks if tick.sight.frames is not None])
             if folder is not None:
-                _save_trials(folder, eyes, ticks, frames, condition=self.condition, number=number)
+                _save_trials(folder, eyes, ticks, frames, condition=setup.condition, number=number)
             if self.method is not None and number == 0:
                 pictures = np.ascontiguousarray(frames[[round(at / PERIOD_S) for at in MOMENTS_S], 0])
                 why = explain(self.run, pictures, reference=eyes.references[0], method=self.method)
                 maps = why.relevance.cpu().numpy()
-        return _Batch(episodes=table, trace=_trace(ticks, scripts), pictures=pictures, maps=maps)
+        return _Batch(episodes=table, trace=_trace(ticks), pictures=pictures, maps=maps)
+
+    def _eyes(self, scripts: Scripts, seed: np.random.SeedSequence) -> RenderedEyes | TableEyes:
+        known = None
+        if self.friction is not None:
+            own = scripts.friction.tolist()
+            known = [Friction(one) if isinstance(self.friction, str) else self.friction for one in own]
+        if self.setup.rendered:
+            frames = 2 * _TICKS * len(self.scripts)
+            return RenderedEyes(
+                self.run,
+                seed=int(seed.generate_state(1)[0]),
+                frames=frames,
+                friction=None if known is None else known[0],
+            )
+        assert self.readings is not None
+        return TableEyes(
+            self.readings,
+            fingertips=scripts.fingertips,
+            rng=np.random.default_rng(seed),
+            error_scale=self.error_scale,
+            friction=known,
+        )
 
 
 def run_scripts(
-    loop: GripLoop, scripts: Scripts, *, condition: str | Sequence[str] = "", filmed: list[np.ndarray] | None = None
-) -> tuple[EpisodeTable, list[Tick]]:
-    """Run episodes to their end in a loop of your own; gives what became of each, and every tick.
+    loop: GripLoop,
+    scripts: Scripts,
+    *,
+    condition: str | Sequence[str] = "",
+    on_tick: Callable[[Tick], None] | None = None,
+) -> EpisodeTable:
+    """Run episodes to their end in a loop of your own, and tell what became of each.
 
     Parameters
     ----------
@@ -282,21 +291,19 @@ def run_scripts(
         What happens in each.
     condition
         Name to note for all of them, or one for each.
-    filmed
-        List that the images of a rendered episode are added to.
+    on_tick
+        Called with each turn of the loop.
     """
     count = len(scripts)
     force, least, lasted, under = np.zeros((4, count))
     peak, peak_least, friction = np.zeros(count), np.zeros(count), np.full(count, np.inf)
-    ticks: list[Tick] = []
     for _ in range(_TICKS):
         time_s, holds = loop.plant.state.time_s, ~loop.plant.state.dropped
-        world = scripts.world(time_s)
-        needed = loop.plant.least_force(world, hand_acceleration_m_s2=hand_motion(time_s)[2])
         dark = np.stack([time_s >= scripts.lamp_at_s, np.zeros(count, dtype=bool)], axis=1)
-        tick = loop.tick(world, dark=dark)
-        if filmed is not None and isinstance(loop.eyes, RenderedEyes):
-            filmed.append(loop.eyes.frames)
+        tick = loop.tick(scripts.world(time_s), dark=dark)
+        if on_tick is not None:
+            on_tick(tick)
+        needed, world = _needed(tick), tick.world
         if time_s >= _LIFTED_S:
             on = holds * PERIOD_S
             force += on * tick.state.force_n
@@ -308,44 +315,43 @@ def run_scripts(
             peak = np.maximum(peak, np.where(holds, tick.state.force_n, 0))
             peak_least = np.maximum(peak_least, np.where(holds, needed, 0))
         friction = np.minimum(friction, world.friction.mean(axis=1))
-        ticks.append(tick)
     state = loop.plant.state
     names = np.broadcast_to(np.asarray(condition, dtype=str), count).copy()
-    table = EpisodeTable(
+    return EpisodeTable(
         condition=names, mass_kg=scripts.mass_kg + scripts.water_kg, friction=friction,
         dropped=state.dropped, crushed=state.crushed, slip_m=state.slipped_m,
         mean_force_n=force / lasted, peak_force_n=peak, least_force_n=least / lasted, peak_least_force_n=peak_least,
         force_excess=force / least - 1, peak_excess=peak / peak_least - 1, under_20_s=under,
     )  # fmt: skip
-    return table, ticks
 
 
-def _trace(ticks: list[Tick], scripts: Scripts) -> GripTrace:
-    """Trace of the first episode."""
+def _needed(tick: Tick) -> Episodes:
+    """Least force that held in a step; none before the object hangs in the hand."""
+    begun_s = tick.state.time_s - PERIOD_S
+    least = least_force(tick.world, hand_acceleration_m_s2=hand_motion(begun_s)[2])
+    return least if begun_s >= _LIFTED_S - 1e-9 else 0 * least
+
+
+def _trace(ticks: list[Tick]) -> GripTrace:
+    """Trace of the first episode; empty where no tick was kept."""
 
     def mean(values: Float[np.ndarray, "episodes 2"]) -> float:
         own = values[0][np.isfinite(values[0])]
         return float(own.mean()) if len(own) else float("nan")
 
-    needed = []
-    for tick in ticks:
-        time_s = tick.state.time_s - PERIOD_S
-        world = scripts.world(time_s)
-        load = world.mass_kg[0] * (GRAVITY_M_S2 + hand_motion(time_s)[2]) + world.pull_n[0]
-        needed.append(max(float(load), 0.0) / float(world.friction[0].sum()) if time_s >= _LIFTED_S else 0.0)
     states = [tick.state for tick in ticks]
     return GripTrace(
         time_s=np.array([one.time_s for one in states]),
         command_n=np.array([float(tick.command_n[0]) for tick in ticks]),
         force_n=np.array([float(one.force_n[0]) for one in states]),
-        least_force_n=np.array(needed),
+        least_force_n=np.array([float(_needed(tick)[0]) for tick in ticks]),
         load_n=np.array([float(one.load_n[0]) for one in states]),
         true_margin=np.array([float(np.nan_to_num(one.margin[0], nan=1.0).min()) for one in states]),
         margin=np.array([mean(tick.sight.margin) for tick in ticks]),
         low=np.array([mean(tick.sight.low) for tick in ticks]),
         high=np.array([mean(tick.sight.high) for tick in ticks]),
         slip_m=np.array([float(one.slipped_m[0]) for one in states]),
-        slip_seen=np.array([bool(tick.seen.slip[0]) for tick in ticks]),
+        slip_seen=np.array([bool(tick.seen.slip[0]) for tick in ticks], dtype=bool),
     )
 
 
@@ -389,7 +395,7 @@ def _save_trials(
 
 def _finish(folder: Path, grip: Grip, on_progress: OnProgress | None) -> None:
     """Write the record, and the table of the data set where there is one."""
-    if grip.rendered:
+    if grip.setup.rendered:
         paths = sorted((folder / "data").glob("trials/*.parquet"))
         write_dataset_table(folder / "data", [trial_info(path, split="test") for path in paths], simulated=True)
         note(on_progress, "The clip is for the eye only: lossy video moves markers; measure in the data set.")
@@ -397,4 +403,4 @@ def _finish(folder: Path, grip: Grip, on_progress: OnProgress | None) -> None:
     shutil.rmtree(folder / "parts")
 
 
-__all__ = ["MOMENTS_S", "make_controller", "run_episodes", "run_scripts"]
+__all__ = ["MOMENTS_S", "run_episodes", "run_scripts"]

@@ -6,15 +6,14 @@ nothing.
 """
 
 import math
+import os
+import select
 import socket
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
-from io import BufferedIOBase, RawIOBase
+from io import FileIO
 from pathlib import Path
-from types import TracebackType
 from typing import Protocol, runtime_checkable
 
 from sliplens.errors import InputError, SliplensError
@@ -62,16 +61,19 @@ class LineGripper:
     """A gripper spoken to in lines of ASCII, over a serial port or TCP.
 
     `F 1.250` sets the force in newtons, `W 0.0400` the width in metres, `S` asks; each is answered by one line,
-    `OK force_n width_m` or `ERR reason`. A late, broken or foreign answer is a `GripperError`.
+    `OK force_n width_m` or `ERR reason`. A late, broken or foreign answer is a `GripperError`; what comes later than
+    that is thrown away before the next line is sent, and answers nothing.
 
     Parameters
     ----------
-    stream
-        Anything that reads and writes bytes line by line; see `open_gripper`.
+    wire
+        Socket, or file of a serial device, that carries the lines; see `open_gripper`.
+    timeout_s
+        Time, in seconds, within which an answer has to come.
     """
 
-    def __init__(self, stream: BufferedIOBase | RawIOBase, *, close: Callable[[], None] | None = None) -> None:
-        self._stream, self._close = stream, close or stream.close
+    def __init__(self, wire: socket.socket | FileIO, *, timeout_s: float = 0.1) -> None:
+        self._wire, self._timeout_s = wire, timeout_s
 
     def set_force(self, force_n: float) -> None:
         """Press with so many newtons."""
@@ -87,36 +89,48 @@ class LineGripper:
 
     def close(self) -> None:
         """Let go of the connection."""
-        self._close()
+        self._wire.close()
 
     def _ask(self, line: str) -> GripperState:
         try:
-            self._stream.write(f"{line}\n".encode("ascii"))
-            self._stream.flush()
-            answer = self._stream.readline(_ANSWER_BYTES)
+            while self._ready(0.0):
+                self._read()
+            os.write(self._wire.fileno(), f"{line}\n".encode("ascii"))
+            answer, ends_s = b"", time.monotonic() + self._timeout_s
+            while b"\n" not in answer and len(answer) < _ANSWER_BYTES and self._ready(ends_s - time.monotonic()):
+                answer += self._read()
         except (OSError, ValueError) as error:
             raise GripperError(f"the gripper cannot be reached ({error}); check its cable and power") from None
-        words = answer.decode("ascii", errors="replace").split()
-        if not answer.endswith(b"\n"):
+        told, end, _ = answer.partition(b"\n")
+        text = told.decode("ascii", errors="replace").strip()
+        if not end:
             raise GripperError(f"the gripper did not answer {line!r} in time; check its cable and power")
+        words = text.split()
         if words[:1] == ["ERR"]:
             raise GripperError(f"the gripper refused {line!r}: {' '.join(words[1:]) or 'no reason told'}")
         try:
-            said, force, width = words
-            state = GripperState(force_n=float(force), width_m=float(width))
-        except ValueError:
-            said = ""
-            state = GripperState(force_n=math.nan, width_m=math.nan)
-        if said != "OK" or not (math.isfinite(state.force_n) and math.isfinite(state.width_m)):
-            told = answer.decode("ascii", errors="replace").strip()
+            said, force_n, width_m = words[0], *map(float, words[1:])
+        except (ValueError, IndexError):
+            said, force_n, width_m = "", math.nan, math.nan
+        if said != "OK" or not (math.isfinite(force_n) and math.isfinite(width_m)):
             raise GripperError(
-                f"the gripper answered {told!r} to {line!r}, not `OK force_n width_m`; check its protocol"
+                f"the gripper answered {text!r} to {line!r}, not `OK force_n width_m`; check its protocol"
             )
-        return state
+        return GripperState(force_n=force_n, width_m=width_m)
+
+    def _ready(self, wait_s: float) -> bool:
+        """Whether there is something to read within so many seconds."""
+        return bool(select.select([self._wire.fileno()], [], [], max(0.0, wait_s))[0])
+
+    def _read(self) -> bytes:
+        heard = os.read(self._wire.fileno(), _ANSWER_BYTES)
+        if not heard:
+            raise OSError("it has hung up")
+        return heard
 
 
 def open_gripper(address: str, *, timeout_s: float = 0.1) -> LineGripper:
-    """Open a gripper that speaks the line protocol.
+    """Open a gripper that speaks the line protocol; on Linux and macOS.
 
     Parameters
     ----------
@@ -132,42 +146,33 @@ def open_gripper(address: str, *, timeout_s: float = 0.1) -> LineGripper:
     GripperError
         If nobody is there.
     """
-    if address.startswith("tcp://"):
-        host, _, port = address.removeprefix("tcp://").rpartition(":")
-        if not host or not port.isdigit():
-            raise InputError(f"{address} is no address of a gripper; write tcp://HOST:PORT")
-        try:
-            connection = socket.create_connection((host.strip("[]"), int(port)), timeout=timeout_s)
-        except (OSError, OverflowError) as error:
-            raise GripperError(f"no gripper answers at {address} ({error}); check its power and the port") from None
-        stream = connection.makefile("rwb")
-
-        def close() -> None:
-            with suppress(OSError):  # what was not sent to a gripper that is gone
-                stream.close()
-            connection.close()
-
-        return LineGripper(stream, close=close)
-    return _open_serial(Path(address), timeout_s)
+    if not address.startswith("tcp://"):
+        return LineGripper(_open_serial(Path(address)), timeout_s=timeout_s)
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    if not host or not port.isdigit():
+        raise InputError(f"{address} is no address of a gripper; write tcp://HOST:PORT")
+    try:
+        connection = socket.create_connection((host.strip("[]"), int(port)), timeout=timeout_s)
+    except (OSError, OverflowError) as error:
+        raise GripperError(f"no gripper answers at {address} ({error}); check its power and the port") from None
+    return LineGripper(connection, timeout_s=timeout_s)
 
 
-def _open_serial(path: Path, timeout_s: float) -> LineGripper:
-    """Open a serial device; reading ends after the timeout, so that a silent gripper is noticed."""
+def _open_serial(path: Path) -> FileIO:
+    """Open a serial device whose bytes come as they are."""
     if not path.exists():
         raise InputError(f"there is no serial device {path}; name one, or tcp://HOST:PORT")
     try:
         import termios  # noqa: PLC0415 (not on every system)
+        import tty  # noqa: PLC0415 (the same)
     except ImportError:
         raise InputError("serial devices are opened on Linux and macOS alone; use tcp://HOST:PORT") from None
     try:
         stream = path.open("r+b", buffering=0)
-        settings = termios.tcgetattr(stream.fileno())
-        settings[3] &= ~(termios.ICANON | termios.ECHO)
-        settings[6][termios.VMIN], settings[6][termios.VTIME] = 0, max(1, round(10 * timeout_s))
-        termios.tcsetattr(stream.fileno(), termios.TCSANOW, settings)
+        tty.setraw(stream.fileno())
     except (OSError, termios.error) as error:
         raise GripperError(f"{path} cannot be opened as a serial device ({error}); check who uses it") from None
-    return LineGripper(stream)
+    return stream
 
 
 class DryRun:
@@ -198,9 +203,9 @@ class DryRun:
 class GuardedGripper:
     """A gripper behind a guard: a ceiling that no force passes, and a watchdog that holds.
 
-    When no command comes for `watchdog_s`, or the gripper failed to take one, the guard holds: it tells the last force
-    again and again until commands return, and never opens. A force that is no number holds, too; a width is refused
-    while holding, for opening drops what is held.
+    When no command comes for `watchdog_s`, or the gripper fails at one in whatever way, the guard holds what was
+    gripped: it tells the last force again and again until commands return, and never opens. A force that is no number
+    holds, too; a width is refused while holding, for opening drops what is held.
 
     Parameters
     ----------
@@ -222,14 +227,14 @@ class GuardedGripper:
         self._heard = time.monotonic()
         self.failure: str | None = None
         """What the gripper last failed at; None while it takes its commands."""
-        self._holding = False
         self._watch = threading.Thread(target=self._guard, name="sliplens gripper watchdog", daemon=True)
         self._watch.start()
 
     @property
     def holding(self) -> bool:
-        """Whether the guard holds, for commands stay away or the gripper fails."""
-        return self._holding
+        """Whether the guard holds, for commands stay away or the gripper fails; an open gripper holds nothing."""
+        late = time.monotonic() - self._heard > self._limit
+        return self._force is not None and (late or self.failure is not None)
 
     def set_force(self, force_n: float) -> None:
         """Press with so many newtons, at most the ceiling, at least none; what is no number holds."""
@@ -238,15 +243,17 @@ class GuardedGripper:
             if not math.isnan(force_n):
                 self._force = min(max(force_n, 0.0), self._ceiling)
             self._tell()
-            self._holding = self.failure is not None
 
     def set_width(self, width_m: float) -> None:
         """Open to so many metres; refused while holding."""
+        if not 0 <= width_m < math.inf:
+            raise InputError(f"a gripper cannot open to {width_m:g} m; give a width of 0 or more")
         with self._lock:
-            if self._holding:
+            if self.holding:
                 raise GripperError("the guard holds the object and opens nothing; send a force first")
-            self._heard, self._force = time.monotonic(), None
+            self._heard = time.monotonic()
             self._gripper.set_width(width_m)
+            self._force = None  # not before: a gripper that fails at it still has to hold
 
     def read_state(self) -> GripperState:
         """Measured force and width."""
@@ -262,9 +269,7 @@ class GuardedGripper:
     def __enter__(self) -> "GuardedGripper":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _tell(self) -> None:
@@ -273,15 +278,13 @@ class GuardedGripper:
         try:
             self._gripper.set_force(self._force)
             self.failure = None
-        except (SliplensError, OSError) as error:
-            self.failure = str(error)
+        except Exception as error:  # whatever it was: a watchdog that dies of it would hold nothing
+            self.failure = str(error) or type(error).__name__
 
     def _guard(self) -> None:
         while not self._stop.wait(self._limit / 4):
             with self._lock:
-                late = time.monotonic() - self._heard > self._limit
-                if late or self.failure is not None:
-                    self._holding = True
+                if self.holding:
                     self._tell()
 
 

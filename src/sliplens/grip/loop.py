@@ -1,17 +1,20 @@
 """The loop of a grip: images are read, a controller answers, the gripper acts, and the object moves or holds."""
 
 import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
+from sliplens.errors import InputError
+from sliplens.friction import Friction, FrictionLike, SlipLearner, as_friction
 from sliplens.grip.controllers import Controller, Observation
 from sliplens.grip.fingertip import Fingertip, mean_shear
-from sliplens.grip.plant import PERIOD_S, Plant, PlantState, World
+from sliplens.grip.plant import PERIOD_S, Episodes, Fingers, Plant, PlantState, World
 from sliplens.grip.readings import ReadingTable
 from sliplens.markers import Tracker
 from sliplens.models import Engine, Run, make_engine
@@ -30,22 +33,30 @@ class Sight:
     high: Float[np.ndarray, "episodes 2"]
     shear_px: Float[np.ndarray, "episodes 2"]
     """Mean displacement of the inner markers the way of the pull, in pixels."""
+    frames: UInt8[np.ndarray, "2 height width 3"] | None = None
+    """What the cameras saw, where anything was filmed."""
 
 
 @runtime_checkable
 class Eyes(Protocol):
     """What looks at the fingertips: images and a network, or a table of what the network said of such images."""
 
-    def look(self, state: PlantState) -> Sight:
-        """Read both fingertips of every episode."""
+    def look(self, state: PlantState, slipping_s: Episodes) -> Sight:
+        """Read both fingertips of every episode.
+
+        `slipping_s`: how many seconds ago a slip began that the markers have just told; NaN where they tell none.
+        """
         ...
 
 
 class TableEyes:
     """Readings looked up in what was measured of the network, with its noise.
 
+    Where friction is told, the margin is that of the closed form, 1 - ratio / mu, expected over what is known of mu.
+
     `fingertips`: which pair of the table's fingertips each episode holds with. `error_scale` makes the network worse on
-    purpose, or better: its errors, and the reach of its interval, times so much.
+    purpose, or better: its errors, and the reach of its interval, times so much. `friction`: what is told, in each
+    episode; `InputError` where the network tells no F_t / F_n.
     """
 
     def __init__(
@@ -55,28 +66,66 @@ class TableEyes:
         fingertips: Float[np.ndarray, " episodes"],
         rng: np.random.Generator,
         error_scale: float = 1.0,
+        friction: Sequence[Friction] | None = None,
     ) -> None:
         pair = fingertips.astype(np.int64) % (len(table) // 2)
         self._table, self._tips = table, 2 * pair[:, None] + np.arange(2)
         self._rng, self._scale = rng, error_scale
+        self._learners = None if friction is None else [SlipLearner(one) for one in friction]
+        if self._learners is not None and not table.ratio:
+            raise InputError("friction was told, but these readings are of the margin alone; measure a ratio network")
 
-    def look(self, state: PlantState) -> Sight:
+    def look(self, state: PlantState, slipping_s: Episodes) -> Sight:
         """Read both fingertips of every episode."""
         true = state.margin
         pressing = np.isfinite(true)
         known = np.where(pressing, true, 1.0)
         force = np.broadcast_to(state.force_n[:, None], known.shape)
-        margin, low, high, shear = self._table.read(self._tips, force, friction=state.holding_friction, margins=known)
+        friction, table = state.holding_friction, self._table
+        margin, low, high, shear, *ratio = table.read(self._tips, force, friction=friction, margins=known)
         noise = self._rng.standard_normal((2, *known.shape))
-        change = (self._scale - 1) * (margin - known) + self._table.noise * self._scale * noise[0]
+        if self._learners is None:
+            change = (self._scale - 1) * (margin - known) + table.noise * self._scale * noise[0]
+            reach = [(self._scale - 1) * (end - margin) for end in (low, high)]
+            margin, low, high = margin + change, low + change + reach[0], high + change + reach[1]
+        else:
+            sliding = np.where(state.sliding, state.kinetic_ratio[:, None], 1 - known)
+            held = np.where(pressing, state.friction * sliding, 0.0)
+            error = self._scale * (ratio[0] - held + table.ratio_noise * noise[0])
+            margin, low, high = self._tell(held + error, self._scale * ratio[1], state.time_s, slipping_s)
         shear = np.copysign(shear, state.shear_n) if (state.shear_n < 0).any() else shear
-        wider = [(self._scale - 1) * (end - margin) for end in (low, high)]
         return Sight(
-            margin=np.where(pressing, margin + change, 1.0),
-            low=np.where(pressing, np.clip(low + change + wider[0], 0, 1), 1.0),
-            high=np.where(pressing, np.clip(high + change + wider[1], 0, 1), 1.0),
+            margin=np.where(pressing, margin, 1.0),
+            low=np.where(pressing, np.clip(low, 0, 1), 1.0),
+            high=np.where(pressing, np.clip(high, 0, 1), 1.0),
             shear_px=np.where(pressing, shear, 0.0) + _SHEAR_NOISE_PX * noise[1],
         )
+
+    def _tell(self, ratio: Fingers, sigma: Fingers, time_s: float, slipping_s: Episodes) -> tuple[Fingers, ...]:
+        """Margin and the ends of its 90 % interval from F_t / F_n and what each episode knows of its friction."""
+        assert self._learners is not None
+        for learner, since_s, read, doubt in zip(
+            self._learners, slipping_s.tolist(), ratio.mean(axis=1).tolist(), sigma.mean(axis=1).tolist(), strict=True
+        ):
+            learner.update(time_s, slipping_s=None if math.isnan(since_s) else since_s)
+            learner.note(read, sigma=doubt, time_s=time_s)
+        most = max(len(learner.friction.nodes[0]) for learner in self._learners)
+        values, weights = (np.stack([_fill(learner.friction.nodes[row], most) for learner in self._learners])
+                           for row in (0, 1))  # fmt: skip
+        values, weights = np.where(values > 0, values, 1.0)[:, None], weights[:, None]
+        margins = np.clip(1 - ratio[..., None] / values, 0, 1)
+        margin = (weights * margins).sum(axis=-1)
+        variance = (weights * ((margins - margin[..., None]) ** 2 + (sigma[..., None] / values) ** 2)).sum(axis=-1)
+        reach = _REACH_90 * np.sqrt(variance)
+        return margin, margin - reach, margin + reach
+
+
+_REACH_90 = 1.645
+"""Standard deviations to either side that hold 90 % of a Gaussian."""
+
+
+def _fill(values: np.ndarray, count: int) -> np.ndarray:
+    return np.pad(values, (0, count - len(values)))
 
 
 class RenderedEyes:
@@ -85,27 +134,35 @@ class RenderedEyes:
     Markers are followed in one finger an image, turn by turn; in between a finger keeps its last displacement.
     """
 
-    def __init__(self, run: Run, *, seed: int, engine: str | Engine = "auto", frames: int = 4000) -> None:
+    def __init__(
+        self,
+        run: Run,
+        *,
+        seed: int,
+        engine: str | Engine = "auto",
+        frames: int = 4000,
+        friction: FrictionLike | None = None,
+    ) -> None:
         first = Fingertip(seed=seed)
         self.fingertips = (first, Fingertip(seed=seed + 1, day=first.day))
         self._run, self._pool = run, ThreadPoolExecutor(2)
         self._engine = make_engine(engine, run, frames=frames, batch_size=2) if isinstance(engine, str) else engine
         self._trackers = [Tracker(tip.reference) for tip in self.fingertips]
         self._shear, self._turn = np.zeros(2), 0
-        self.frames = np.stack([tip.reference for tip in self.fingertips])
-        """What the two cameras saw last, (2, height, width, 3)."""
-
-    def _follow(self, finger: int) -> float:
-        tracker = self._trackers[finger]
-        tracked = tracker.update(self.frames[finger])
-        return float(mean_shear(tracker.rest.centre_px, tracked.position_px[: len(tracker.rest.centre_px)]))
+        self._learner = None if friction is None else SlipLearner(as_friction(friction))
+        if self._learner is not None:
+            run.require_ratio()
 
     @property
-    def references(self) -> np.ndarray:
-        """The two untouched sensors, T_0, (2, height, width, 3)."""
+    def references(self) -> UInt8[np.ndarray, "2 height width 3"]:
+        """The two untouched sensors, T_0."""
         return np.stack([tip.reference for tip in self.fingertips])
 
-    def look(self, state: PlantState) -> Sight:
+    def _follow(self, frame: UInt8[np.ndarray, "height width 3"]) -> float:
+        tracker = self._trackers[self._turn]
+        return float(mean_shear(tracker.rest.centre_px, tracker.update(frame).position_px[: len(tracker.rest)]))
+
+    def look(self, state: PlantState, slipping_s: Episodes) -> Sight:
         """Film both fingertips and read them."""
         margins, friction, shear = state.margin[0], state.holding_friction[0], state.shear_n[0]
 
@@ -119,17 +176,40 @@ class RenderedEyes:
             )
 
         # a core each: drawing is mostly torch, which lets go of the interpreter
-        self.frames = np.stack(list(self._pool.map(draw, range(2))))
+        frames = np.stack(list(self._pool.map(draw, range(2))))
         self._turn = 1 - self._turn
-        following = self._pool.submit(self._follow, self._turn)
+        following = self._pool.submit(self._follow, frames[self._turn])
         parts = [
-            self._run.encode(frame[None], tip.reference)
-            for frame, tip in zip(self.frames, self.fingertips, strict=True)
+            self._run.encode(frame[None], tip.reference) for frame, tip in zip(frames, self.fingertips, strict=True)
         ]
-        estimate = self._engine.estimate(self._run, torch.cat(parts))
+        known, learner = None, self._learner
+        if learner is not None:
+            since_s = float(slipping_s[0])
+            learner.update(state.time_s, slipping_s=None if math.isnan(since_s) else since_s)
+            known = learner.friction
+        estimate = self._engine.estimate(self._run, torch.cat(parts), friction=known)
+        if learner is not None and estimate.ratio is not None:
+            learner.note(
+                float(estimate.ratio.mean.mean()), sigma=float(estimate.ratio.sigma.mean()), time_s=state.time_s
+            )
         low, high = estimate.interval(LEVEL) or (estimate.margin, estimate.margin)
         self._shear[self._turn] = following.result()
-        return Sight(margin=estimate.margin[None], low=low[None], high=high[None], shear_px=self._shear[None].copy())
+        return Sight(
+            margin=estimate.margin[None],
+            low=low[None],
+            high=high[None],
+            shear_px=self._shear[None].copy(),
+            frames=frames,
+        )
+
+
+class NoEyes:
+    """No fingertips at all: for controllers that read nothing."""
+
+    def look(self, state: PlantState, slipping_s: Episodes) -> Sight:
+        """Read nothing."""
+        nothing = np.full((len(slipping_s), 2), np.nan)
+        return Sight(margin=nothing, low=nothing, high=nothing, shear_px=0 * state.shear_n + np.nan)
 
 
 _SPAN = 3
@@ -178,6 +258,8 @@ class SlipWatch:
 class Tick:
     """One turn of the loop."""
 
+    world: World
+    """What acted on the objects during the step."""
     state: PlantState
     """After the step."""
     command_n: Float[np.ndarray, " episodes"]
@@ -207,8 +289,7 @@ class GripLoop:
     Squeeze a cup that stands on the table with the force that a controller asks for:
 
     >>> import numpy as np
-    >>> from sliplens.grip import CONTROLLERS, GripLoop, Plant, draw_scripts, pick_object
-    >>> from sliplens.grip.loop import NoEyes
+    >>> from sliplens.grip import CONTROLLERS, GripLoop, NoEyes, Plant, draw_scripts, pick_object
     >>> scripts = draw_scripts("cup", "dry", episodes=1, seed=0)
     >>> loop = GripLoop(Plant(pick_object("cup")), NoEyes(), CONTROLLERS["fixed"](force_n=2.0))
     >>> for _ in range(30):
@@ -225,17 +306,21 @@ class GripLoop:
         self._past: list[tuple[PlantState, Sight]] = []
         self._watch = SlipWatch()
         self._command = np.zeros(len(plant.state.force_n))
+        self._slipping_s = np.full(len(plant.state.force_n), np.nan)
 
-    def tick(
-        self, world: World, *, dark: Bool[np.ndarray, "episodes 2"] | None = None, command_n: np.ndarray | None = None
-    ) -> Tick:
-        """Look, command, step; `dark` fingers read nothing, `command_n` comes in place of the controller's."""
-        now, sight = self.plant.state, self.eyes.look(self.plant.state)
+    def tick(self, world: World, *, dark: Bool[np.ndarray, "episodes 2"] | None = None) -> Tick:
+        """Look, command, step; `dark` fingers read nothing."""
+        now, sight = self.plant.state, self.eyes.look(self.plant.state, self._slipping_s)
         if dark is not None and dark.any():
-            parts = {name: np.where(dark, np.nan, value) for name, value in vars(sight).items()}
-            sight = Sight(**parts)
+            blind = {
+                name: np.where(dark, np.nan, getattr(sight, name)) for name in ("margin", "low", "high", "shear_px")
+            }
+            sight = replace(sight, **blind)
         self._past = [*self._past[-self._delay :], (now, sight)] if self._delay else [(now, sight)]
         then, read = self._past[0]
+        slip = self._watch.update(read.shear_px, then.force_n, lifted=then.time_s > self._lift_s)
+        # it began among the images that were averaged before it
+        self._slipping_s = np.where(slip, now.time_s - then.time_s + 1.5 * _SPAN * PERIOD_S, np.nan)
         seen = Observation(
             time_s=now.time_s,
             force_n=then.force_n,
@@ -243,18 +328,9 @@ class GripLoop:
             load_n=then.load_n,
             margin=read.margin,
             low=read.low,
-            slip=self._watch.update(read.shear_px, then.force_n, lifted=then.time_s > self._lift_s),
+            slip=slip,
             true_margin=np.nan_to_num(then.margin, nan=1.0),
         )
-        self._command = np.asarray(self.controller.command(seen) if command_n is None else command_n, dtype=np.float64)
+        self._command = np.asarray(self.controller.command(seen), dtype=np.float64)
         state = self.plant.step(self._command, world)
-        return Tick(state=state, command_n=self._command, sight=sight, seen=seen)
-
-
-class NoEyes:
-    """No fingertips at all: for controllers that read nothing."""
-
-    def look(self, state: PlantState) -> Sight:
-        """Read nothing."""
-        nothing = np.full(state.shear_n.shape, np.nan)
-        return Sight(margin=nothing, low=nothing, high=nothing, shear_px=nothing)
+        return Tick(world=world, state=state, command_n=self._command, sight=sight, seen=seen)

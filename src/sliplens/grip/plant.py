@@ -212,10 +212,11 @@ class Plant:
         self.state = _keep_dropped(old, new) if old.dropped.any() else new
         return self.state
 
-    def least_force(self, world: World, *, hand_acceleration_m_s2: Episodes | float = 0.0) -> Episodes:
-        """Least grip force that holds, in newtons: (m (g + a) + pull) over the sum of both mu_s."""
-        load = world.mass_kg * (GRAVITY_M_S2 + hand_acceleration_m_s2) + world.pull_n
-        return np.maximum(load, 0) / world.friction.sum(axis=1)
+
+def least_force(world: World, *, hand_acceleration_m_s2: float = 0.0) -> Episodes:
+    """Least grip force that holds, in newtons: (m (g + a) + pull) over the sum of both mu_s."""
+    load = world.mass_kg * (GRAVITY_M_S2 + hand_acceleration_m_s2) + world.pull_n
+    return np.maximum(load, 0) / world.friction.sum(axis=1)
 
 
 def _keep_dropped(old: PlantState, new: PlantState) -> PlantState:

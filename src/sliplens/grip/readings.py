@@ -1,6 +1,6 @@
 """What a network says of a grip's frames: measured once for many fingertips, then looked up."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,10 @@ class ReadingTable:
     """Mean displacement of the inner markers down the image, in pixels: the way of the pull."""
     noise: float
     """Standard deviation of the margin read anew of the same state, in margin units."""
+    ratio: dict[str, Float32[np.ndarray, "fingertips frictions forces margins"]] = field(default_factory=dict)
+    """`mean` and `sigma` of F_t / F_n as it was read; empty for a network that answers with the margin alone."""
+    ratio_noise: float = 0.0
+    """Standard deviation of the ratio read anew of the same state."""
 
     def __len__(self) -> int:
         return len(self.margin)
@@ -51,7 +55,8 @@ class ReadingTable:
     def of(self, fingertips: slice) -> "ReadingTable":
         """Table of some of the fingertips."""
         parts = {name: getattr(self, name)[fingertips] for name in ("margin", "low", "high", "shear_px")}
-        return replace(self, seed=self.seed + (fingertips.start or 0), **parts)
+        ratio = {name: values[fingertips] for name, values in self.ratio.items()}
+        return replace(self, seed=self.seed + (fingertips.start or 0), ratio=ratio, **parts)
 
     def read(
         self,
@@ -63,7 +68,8 @@ class ReadingTable:
     ) -> tuple[Float[np.ndarray, "*contacts"], ...]:
         """Margin, both ends of its interval, and shear in pixels, of contacts in these states, without noise.
 
-        Forces and frictions beyond the measured ones are read as the outermost.
+        Mean and sigma of F_t / F_n follow, of a network that tells it. Forces and frictions beyond the measured ones
+        are read as the outermost.
         """
         places = [
             _place(np.log(FRICTIONS), np.log(np.maximum(friction, 1e-6))),
@@ -82,10 +88,11 @@ class ReadingTable:
         return tuple(np.asarray(values) for values in np.moveaxis(total, -1, 0))
 
     @property
-    def _stacked(self) -> Float32[np.ndarray, "fingertips frictions forces margins 4"]:
+    def _stacked(self) -> Float32[np.ndarray, "fingertips frictions forces margins values"]:
         cached = self.__dict__.get("_cache")
         if cached is None:
-            cached = np.stack([self.margin, self.low, self.high, self.shear_px], axis=-1)
+            ratio = [self.ratio[name] for name in ("mean", "sigma") if self.ratio]
+            cached = np.stack([self.margin, self.low, self.high, self.shear_px, *ratio], axis=-1)
             object.__setattr__(self, "_cache", cached)
         return cached
 
@@ -94,6 +101,12 @@ def _place(grid: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """Cell of a grid that each value lies in, and how far in it, 0 to 1."""
     at = np.clip(np.searchsorted(grid, values, side="right") - 1, 0, len(grid) - 2)
     return at, np.clip((values - grid[at]) / (grid[at + 1] - grid[at]), 0, 1)
+
+
+def require_calibration(run: Run) -> None:
+    """Refuse a network that tells no interval to grip by."""
+    if run.manifest.calibration is None:
+        raise InputError("the network was never calibrated and tells no interval to grip by; train it with validation")
 
 
 def measure_readings(
@@ -117,8 +130,7 @@ def measure_readings(
     InputError
         If the network was never calibrated, and so cannot say how sure it is.
     """
-    if run.manifest.calibration is None:
-        raise InputError("the network was never calibrated and tells no interval to grip by; train it with validation")
+    require_calibration(run)
     mu, force, gamma = np.meshgrid(FRICTIONS, FORCES_N, MARGINS, indexing="ij")
     # full stick shows no friction: one of them is enough
     shown = (gamma < 1) | (mu == FRICTIONS[0])
@@ -138,25 +150,30 @@ def measure_readings(
         estimate = ready.estimate(run, run.encode(np.concatenate([frames, twice]), tip.reference))
         ends = estimate.interval(LEVEL)
         assert ends is not None  # it is calibrated
-        count, table = len(frames), np.empty((4, *mu.shape), dtype=np.float32)
-        for row, values in zip(
-            table, (estimate.margin, *ends, mean_shear(film.motion.rest_px, film.motion.centres_px)), strict=True
-        ):
-            row[shown] = values[:count]
+        ratio = [] if estimate.ratio is None else [estimate.ratio.mean, estimate.ratio.sigma]
+        count = len(frames)
+        shear = mean_shear(film.motion.rest_px, film.motion.centres_px)
+        rows = [estimate.margin[:count], *(end[:count] for end in ends), shear, *(one[:count] for one in ratio)]
+        table = np.empty((len(rows), *mu.shape), dtype=np.float32)
+        for row, values in zip(table, rows, strict=True):
+            row[shown] = values
             row[1:, :, -1] = row[0, :, -1]
         found.append(table)
-        repeats.append(estimate.margin[count:] - estimate.margin[:count][again])
+        repeats.append(np.stack([one[count:] - one[:count][again] for one in (estimate.margin, *ratio[:1])]))
         if on_progress is not None:
             on_progress(number + 1, fingertips)
-    margin, low, high, shear = np.stack(found, axis=1)
+    margin, low, high, shear_px, *ratios = np.stack(found, axis=1)
+    noise, *ratio_noise = (np.std(np.concatenate(repeats, axis=1), axis=1) / np.sqrt(2)).tolist()
     return ReadingTable(
         network=run.manifest.weights_sha256,
         seed=seed,
         margin=margin,
         low=low,
         high=high,
-        shear_px=shear,
-        noise=float(np.std(np.concatenate(repeats)) / np.sqrt(2)),
+        shear_px=shear_px,
+        noise=noise,
+        ratio=dict(zip(("mean", "sigma"), ratios, strict=False)),
+        ratio_noise=sum(ratio_noise),
     )
 
 

@@ -1,6 +1,6 @@
 """What happens in an episode: mass, friction, pulls, jolts, a wet patch, water, a lamp that goes out."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import TypeAlias
 
@@ -140,7 +140,7 @@ def draw_scripts(
     episodes: int,
     seed: int,
     fingertips: int = 64,
-    **fixed: float | None,
+    script: Mapping[str, float] | None = None,
 ) -> Scripts:
     """Draw what happens in some episodes, the same for the same seed.
 
@@ -154,19 +154,19 @@ def draw_scripts(
         How many, and the seed they are drawn from.
     fingertips
         How many pairs of fingertips to choose from.
-    fixed
+    script
         Columns of `Scripts`, in their units (kilograms, seconds, newtons, ratios), that are the same in all episodes
-        rather than drawn, such as `mass_kg`; None leaves one to chance.
+        rather than drawn, such as `mass_kg`.
 
     Raises
     ------
     InputError
-        If there is no such object or condition, or a fixed value cannot be.
+        If there is no such object or condition, or a value of the script cannot be.
 
     Examples
     --------
     >>> from sliplens.grip import draw_scripts
-    >>> scripts = draw_scripts("cup", "patch", episodes=2, seed=0, mass_kg=0.06)
+    >>> scripts = draw_scripts("cup", "patch", episodes=2, seed=0, script={"mass_kg": 0.06})
     >>> scripts.mass_kg, scripts.patch_at_s
     (array([0.06, 0.06]), array([2.5, 2.5]))
     """
@@ -189,17 +189,17 @@ def draw_scripts(
         fingertips=rng.integers(fingertips, size=episodes).astype(np.float64),
     )  # fmt: skip
     scripts = CONDITIONS.pick(condition)(scripts, held, own)
-    given = {name: value for name, value in fixed.items() if value is not None}
-    names = {field.name for field in fields(Scripts)}
-    for name, value in given.items():
+    names, fixed = {field.name for field in fields(Scripts)}, script or {}
+    for name, value in fixed.items():
         if name not in names:
             raise InputError(f"an episode has no {name}; choose of {', '.join(sorted(names))}")
-        if not np.isfinite(value) or (name in _POSITIVE and value <= 0):
-            raise InputError(f"{name} must be {'positive' if name in _POSITIVE else 'a number'}, got {value:g}")
-    return replace(scripts, **{name: np.full(episodes, float(value)) for name, value in given.items()})
+        if not _BOUNDS.get(name, -np.inf) < value < np.inf:
+            bound = f"above {_BOUNDS[name]:g}" if name in _BOUNDS else "finite"
+            raise InputError(f"{name} must be {bound}, got {value:g}")
+    return replace(scripts, **{name: np.full(episodes, float(value)) for name, value in fixed.items()})
 
 
-_POSITIVE = {"mass_kg", "friction", "kinetic_ratio", "patch_factor"}
+_BOUNDS = {"mass_kg": 0, "friction": 0, "kinetic_ratio": 0, "patch_factor": 0, "drift": -1, "water_kg": -1e-9}
 
 
 def pick_object(name: str) -> HeldObject:

@@ -411,8 +411,8 @@ def _takes_what(function: Callable[Given, object]) -> Callable[[Callable[..., Re
 def read_live(*given: object, **options: object) -> Iterator[Reading]:
     """Readings of a running sensor, one after another; who is slow gets the newest.
 
-    Parameters are those of `LiveReader`, which also takes a new reference while it runs, and tells every reading to
-    whoever subscribes.
+    Parameters are those of `LiveReader`, such as the coefficient of `friction` that is told; that also takes a new
+    reference while it runs, and tells every reading to whoever subscribes.
 
     Raises
     ------

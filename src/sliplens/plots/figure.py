@@ -226,7 +226,7 @@ DRAWERS: dict[str, Callable[[Any, Axes, int], object]] = {
     "Diagnosis": _diagnosis,
     "Predictions": _predictions,
     "Tracking": _tracking,
-    "Grip": lambda result, ax, _: plot_grip_force(result.trace, ax=ax).set_title(result.controller),
+    "Grip": lambda result, ax, _: plot_grip_force(result.trace, ax=ax).set_title(result.setup.controller),
     "Strip": lambda result, ax, _: plot_readings(result, ax=ax),
 }
 """What draws a record, by the name of its class."""

@@ -30,14 +30,17 @@ def plate_trace(grip: Grip) -> Plate:
     first = grip.episodes.where(np.arange(1))
     fate = "fell" if first.dropped[0] else "was held"
     told = f"{float(first.mean_force_n[0]):.2f} N, {percent(float(first.force_excess[0]))} over the least that holds"
-    how = "filmed and read by the network" if grip.rendered else "looked up in the network's measured errors"
+    setup = grip.setup
+    how = "filmed and read by the network" if setup.rendered else "looked up in the network's measured errors"
+    friction = "" if setup.friction is None else f" The coefficient of friction was taken for {setup.friction}."
     return Plate(
         name="grip-episode",
         figure=figure,
         alt=f"Force, margin and slip over time: the object {fate}, mean force {told}",
-        caption=f"A {grip.object}, {grip.condition}, held by the controller {grip.controller}: it {fate}, with a mean "
-        f"force of {told}. Readings were {how}, and answered after {1e3 * grip.latency_s:.0f} ms and the actuator's "
-        "lag. The margin read is the mean of both fingers, the true one that of the finger with less.",
+        caption=f"A {setup.object}, {setup.condition}, held by the controller {setup.controller}: it {fate}, with a "
+        f"mean force of {told}. Readings were {how}, and answered after {1e3 * setup.latency_s:.0f} ms and the "
+        f"actuator's lag. The margin read is the mean of both fingers, the true one that of the finger with less."
+        + friction,
         numbers=named_columns(names, rows_of(*(getattr(grip.trace, name) for name in names))),
     )
 
@@ -66,11 +69,11 @@ def plate_moments(grip: Grip) -> Plate:
 
 def table_episodes(grip: Grip) -> Table:
     """Sum up all episodes."""
-    table = grip.episodes
+    table, setup = grip.episodes, grip.setup
     quartiles = np.quantile(table.force_excess, (0.25, 0.5, 0.75))
     return make_table(
-        f"What became of {len(table):,} episode{'s' * (len(table) > 1)}: {grip.object}, {grip.condition}, controller "
-        f"{grip.controller}.",
+        f"What became of {len(table):,} episode{'s' * (len(table) > 1)}: {setup.object}, {setup.condition}, controller "
+        f"{setup.controller}.",
         ("Episodes", "Dropped", "Crushed", "Slip, median", "Mean force", "Over the least (quartiles)", "Under 20 %"),
         [
             (

@@ -58,20 +58,30 @@ class GripTrace(Columns):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Grip:
-    """Episodes of one controller."""
+class GripSetup:
+    """What is held, by what, and with which readings."""
 
     object: str
     condition: str
     controller: str
     settings: dict[str, float]
-    """Constants of the controller that were changed."""
+    """Constants of the controller that were changed; all of one that is none of the table."""
     network: str
+    """First 12 hex digits of the hash of its weights."""
+    friction: str | None
+    """What was told of the friction, in words; None where nothing was."""
     latency_s: float
     """From an image to the command that answers it."""
     rendered: bool
     """Whether the fingertips were filmed and read, rather than looked up in the network's measured errors."""
     seed: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grip:
+    """Episodes of one controller."""
+
+    setup: GripSetup
     seconds: float
     """Time the episodes took to run."""
     episodes: EpisodeTable
