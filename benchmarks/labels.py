@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labels import FoundLabels, LabelSettings, estimate_lag, label_trial, measure_motion
+from sliplens.recordings.labels import FoundLabels, LabelSettings, estimate_lag, label_trial, measure_motion, soften
 from sliplens.simulation import SimulationRecipe, TrialPlan, plan_trials
 from sliplens.simulation.filming import Film
 from sliplens.simulation.loading import TRIAL_S, Loading
@@ -66,7 +66,7 @@ def film_trial(plan: TrialPlan) -> Seen:
     """Simulate a trial and measure the motion of its frames."""
     loading, film = prepare_trial(plan)
     frames = np.arange(SAMPLES_A_FRAME // 2, plan.frames, SAMPLES_A_FRAME)
-    return Seen(plan=plan, loading=loading, frames=frames, motion=measure_motion(_draw(film, frames)))
+    return Seen(plan=plan, loading=loading, frames=frames, motion=measure_motion(map(soften, _draw(film, frames))))
 
 
 def _draw(film: Film, frames: np.ndarray) -> Iterator[UInt8[np.ndarray, "height width 3"]]:

@@ -1,4 +1,5 @@
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,27 @@ def test_an_interrupted_replacement_goes_on_too(tmp_path: Path):
     with output_folder(target, stage="test", config={}, overwrite=True) as out:
         assert (out.folder / "piece").read_text() == "x"
     assert not (target / "data.txt").exists()
+
+
+def test_a_folder_that_another_is_writing_is_refused_and_left_alone(tmp_path: Path):
+    target = tmp_path / "result"
+    with output_folder(target, stage="test", config={"seed": 1}) as out:
+        (out.folder / "piece").write_text("x")
+        for seed in (1, 2):
+            with pytest.raises(InputError, match="another sliplens is writing"):
+                make(target, {"seed": seed})
+        assert (out.folder / "piece").read_text() == "x"
+    assert (target / "piece").exists()
+
+
+def test_what_was_killed_while_it_replaced_a_folder_leaves_it_whole(tmp_path: Path):
+    target = tmp_path / "result"
+    make(target, {"seed": 1})
+    target.rename(tmp_path / ".result.replaced")  # as if killed right then
+    assert make(target, {"seed": 1}) is True
+    shutil.copytree(target, tmp_path / ".result.replaced")  # and a moment later
+    assert make(target, {"seed": 1}) is True
+    assert [path.name for path in tmp_path.iterdir()] == ["result"]
 
 
 def test_a_mistake_before_the_first_piece_leaves_nothing_behind(tmp_path: Path):

@@ -23,6 +23,11 @@ import numpy as np
 from sliplens._version import __version__
 from sliplens.errors import InputError
 
+try:
+    import fcntl
+except ImportError:  # Windows: nothing keeps two commands from one folder there
+    fcntl = None
+
 RUN_FILE = "run.json"
 """Provenance of a folder."""
 MANIFEST_FILE = "manifest.json"
@@ -189,6 +194,20 @@ def partial_folder(target: Path) -> Path:
     return target.with_name(f".{target.name}.partial")
 
 
+def hold(path: Path) -> int | None:
+    """Hold a file or folder against other processes until what is given is closed; None where another one holds it."""
+    descriptor = os.open(path if fcntl else os.devnull, os.O_RDONLY)
+    try:
+        if fcntl is not None:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        return None
+    except OSError:  # a file system without locks
+        pass
+    return descriptor
+
+
 @contextmanager
 def output_folder(
     target: Path, *, stage: str, config: Any, overwrite: bool = False, run_file: str = RUN_FILE, resumable: bool = True
@@ -198,11 +217,14 @@ def output_folder(
     The caller writes into a hidden folder beside the target (`.NAME.partial`). On success it gets `run.json` (stage,
     configuration and its hash, versions, machine, time) and takes the target's name. When the caller is interrupted the
     partial folder stays, and the next call with the same configuration finds it again, so that finished pieces need not
-    be made twice; a partial folder of another configuration is dropped. A folder of another format begins empty every
-    time (not `resumable`), and has its `run_file` where that format's readers do not look.
+    be made twice; a partial folder of another configuration is dropped, one that another process is writing an
+    `InputError`. A folder of another format begins empty every time (not `resumable`), and has its `run_file` where
+    that format's readers do not look.
     """
     recipe = to_builtins(config)
     config_hash = hash_json({"stage": stage, "config": recipe, "sliplens": __version__})
+    if (aside := _aside(target)).exists():  # whoever replaced it was killed, before or after the new one took its place
+        shutil.rmtree(aside) if target.exists() else aside.rename(target)
     empty = target.is_dir() and not any(target.iterdir())
     if target.exists() and not (target / run_file).is_file() and not (overwrite and empty):
         raise InputError(f"{target} exists and was not made by sliplens; choose another output folder")
@@ -212,29 +234,64 @@ def output_folder(
         yield Output(folder=target, complete=True)
         return
     partial = partial_folder(target)
-    state = partial / ".recipe"
-    if partial.exists() and not (resumable and state.is_file() and state.read_text() == config_hash):
-        shutil.rmtree(partial)
+    with _held(partial, target):
+        state = partial / ".recipe"
+        if not (resumable and state.is_file() and state.read_text() == config_hash):
+            _empty(partial)
+        if resumable:
+            state.write_text(config_hash)
+        try:
+            yield Output(folder=partial, complete=False)
+        except BaseException:
+            # what is finished stays for the next try; where nothing is, nothing is left behind
+            if not resumable or not any(path.is_file() and path != state for path in partial.rglob("*")):
+                shutil.rmtree(partial)
+            raise
+        finished = datetime.now(UTC).isoformat(timespec="seconds")
+        provenance = Provenance(
+            stage=stage,
+            config=recipe,
+            config_hash=config_hash,
+            versions=versions(),
+            machine=machine(),
+            finished=finished,
+        )
+        (partial / run_file).parent.mkdir(parents=True, exist_ok=True)
+        write_json(partial / run_file, provenance)
+        state.unlink(missing_ok=True)
+        _take_place(partial, target)
+
+
+@contextmanager
+def _held(partial: Path, target: Path) -> Iterator[None]:
+    """Make the folder in which a target is made, and keep other processes out of it."""
     try:
         partial.mkdir(parents=True, exist_ok=True)
+        held = hold(partial)
     except OSError as error:
         raise InputError(f"cannot write to {target.parent} ({error.strerror}); choose another output folder") from None
-    if resumable:
-        state.write_text(config_hash)
+    if held is None:
+        raise InputError(f"another sliplens is writing {target}; wait until it is done, or choose another folder")
     try:
-        yield Output(folder=partial, complete=False)
-    except BaseException:
-        # what is finished stays for the next try; where nothing is, nothing is left behind
-        if not resumable or all(path == state for path in partial.iterdir()):
-            shutil.rmtree(partial)
-        raise
-    state.unlink(missing_ok=True)
-    finished = datetime.now(UTC).isoformat(timespec="seconds")
-    provenance = Provenance(
-        stage=stage, config=recipe, config_hash=config_hash, versions=versions(), machine=machine(), finished=finished
-    )
-    (partial / run_file).parent.mkdir(parents=True, exist_ok=True)
-    write_json(partial / run_file, provenance)
+        yield
+    finally:
+        os.close(held)
+
+
+def _take_place(partial: Path, target: Path) -> None:
+    """Put a folder in the place of the target; one of them is whole at any moment."""
+    aside = _aside(target)
     if target.exists():
-        shutil.rmtree(target)
+        target.rename(aside)
     partial.rename(target)
+    if aside.exists():
+        shutil.rmtree(aside)
+
+
+def _aside(target: Path) -> Path:
+    return target.with_name(f".{target.name}.replaced")
+
+
+def _empty(folder: Path) -> None:
+    for path in folder.iterdir():
+        shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()

@@ -21,6 +21,25 @@ def test_recordings_and_tables_are_paired_by_name(tmp_path: Path):
     assert find_rows(tmp_path) == pair_recordings(tmp_path)
 
 
+def test_recordings_that_end_like_tables_and_names_of_any_script_find_theirs(tmp_path: Path):
+    touch(tmp_path, "left.mp4", "left.csv", "lift_ft.mp4", "lift_ft.csv", "\u676f\u5b50.mp4", "\u676f\u5b50.csv")
+    touch(tmp_path, "pru\u0308fung.mp4", "pr\u00fcfung_forces.csv")
+    rows = {row.trial: row.forces and row.forces.name for row in pair_recordings(tmp_path)}
+    assert rows == {
+        "left": "left.csv",
+        "lift_ft": "lift_ft.csv",
+        "\u676f\u5b50": "\u676f\u5b50.csv",
+        "pr\u00fcfung": "pr\u00fcfung_forces.csv",
+    }
+
+
+def test_a_data_set_made_of_a_folder_in_that_folder_is_no_recording(tmp_path: Path):
+    touch(tmp_path, "cup.mp4")
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "dataset.json").touch()
+    assert [row.trial for row in pair_recordings(tmp_path)] == ["cup"]
+
+
 @pytest.mark.parametrize(
     ("names", "words"),
     [

@@ -153,4 +153,4 @@ def test_a_source_is_read_through_its_profile_and_what_is_said_of_the_reference_
 def test_what_a_user_says_of_forces_counts_more_than_the_profile():
     profile = replace(TIP, normal_axis="y", normal_sign=-1, reference="first still")
     settings = profile.settings(LabelSettings(normal_axis="x"))
-    assert (settings.normal_axis, settings.normal_sign, settings.reference) == ("x", -1, "first still")
+    assert (settings.normal_axis, settings.normal_sign, settings.reference_method) == ("x", -1, "first still")

@@ -5,6 +5,7 @@ import pytest
 
 from sliplens.errors import RecordingError
 from sliplens.recordings import Recording
+from sliplens.recordings.capture import Forces
 
 
 def test_an_empty_trial_is_refused(recording: Recording):
@@ -28,6 +29,13 @@ def test_time_must_rise(recording: Recording):
     time[4] = time[3]
     with pytest.raises(RecordingError, match=r"time does not rise at frame 4 \(0\.1 s, then 0\.1 s\)"):
         replace(recording, time_s=time)
+
+
+@pytest.mark.parametrize(("step_s", "words"), [(1e9, "more than a day"), (1e-9, "declare the right unit of time")])
+def test_times_that_no_sensor_has_are_refused_before_any_array_is_made_of_their_span(step_s: float, words: str):
+    time_s = np.append(0, step_s + np.arange(200) * min(step_s, 0.01))
+    with pytest.raises(RecordingError, match=words):
+        Forces(time_s=time_s, force_n=np.ones((201, 3)), source="sensor")
 
 
 def test_one_value_a_frame(recording: Recording):

@@ -8,7 +8,7 @@ import pytest
 
 from sliplens.cli import main
 from sliplens.files import output_folder
-from sliplens.recordings import Dataset, Recording, load_dataset
+from sliplens.recordings import Dataset, Recording, import_recordings, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
 from sliplens.simulation import SimulationRecipe, simulate_dataset
@@ -51,6 +51,14 @@ def test_splits_of_one_data_set_share_sensors_alone(data: Dataset):
     assert shared.sensors == (("chromatouch-1", "chromatouch-1"),)
 
 
+def test_simulated_trials_that_were_imported_are_told_by_what_they_show(data: Dataset, tmp_path: Path):
+    imported = import_recordings(data.folder, out=tmp_path / "imported", condition="wet")
+    assert not {trial.sha256 for trial in data.trials} & {trial.sha256 for trial in imported.trials}
+    for shared in (compare_datasets(data, imported), compare_datasets(imported, data)):
+        assert not shared.by_seeds
+        assert shared.trials == tuple((trial.trial, trial.trial) for trial in data.trials)
+
+
 def recorded(folder: Path, *recordings: Recording) -> Dataset:
     for recording in recordings:
         save_recording(recording, trial_path(folder, recording.trial))
@@ -78,7 +86,7 @@ def test_the_command_tells_what_is_shared_and_what_a_network_knows(
     data: Dataset, capsys: pytest.CaptureFixture, difference_run: Path
 ):
     assert main(["check", str(data.folder), str(data.folder), "--split", "train", "--other-split", "test"]) == 0
-    assert "share 0 trials, 0 days, 1 sensors (told by their seeds and hashes)" in " ".join(
+    assert "share 0 trials, 0 days, 1 sensors (told by their seeds and frames)" in " ".join(
         capsys.readouterr().out.split()
     )
     assert main(["check", str(data.folder), str(difference_run)]) == 0

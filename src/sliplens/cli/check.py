@@ -58,7 +58,7 @@ class Check:
             if pairs:
                 print_table(f"Shared {what}", (str(self.data), str(other)), list(pairs))
         counts = ", ".join(f"{len(getattr(shared, what))} {what}" for what in ("trials", "days", "sensors"))
-        told = "seeds and hashes" if shared.by_seeds else "names and hashes"
+        told = "seeds and frames" if shared.by_seeds else "names and frames"
         say(f"{self.data} and {other} share {counts} (told by their {told})")
 
     def _ask(self, data: "Dataset", network: Path) -> None:

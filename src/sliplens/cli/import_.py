@@ -31,6 +31,9 @@ class Import(Command):
     by name; or a manifest (CSV: trial, video, forces, sensor, day, object, condition, mu, reference)."""
     output: Output
     """Folder to make: a data set for `sliplens train`."""
+    reference: Path | None = None
+    """Image of the untouched sensor; a frame before the contact, by --reference-method, if neither it nor
+    --reference-frame is given."""
     sensor: str | None = None
     """Name of the sensor, or its profile: a file that `sliplens sensor new` made, or chromatouch, digit, gelsight-mini
     or tactip. A network is trained for one sensor. Needed unless the source tells it."""
@@ -58,14 +61,13 @@ class Import(Command):
     def run(self) -> None:
         """Read, label, write, and show what was found."""
         from sliplens.recordings.importing import import_recordings
-        from sliplens.report.trials import write_trials_page
 
         terminal = Terminal()
         data = self.call(import_recordings, out=self.output, on_progress=terminal)
         if self.audit:
             draw_audits(data, data.folder / "audit", terminal)
         show_labelling("Imported", data)
-        wrote(write_trials_page(data), "all trials at a glance: margins, friction, flags")
+        show_trials(data)
         if data.left_out:
             print_table("Left out", ("trial", "why"), [(one.trial, one.why) for one in data.left_out])
             raise SystemExit(1)
@@ -77,6 +79,13 @@ def draw_audits(data: "Dataset", folder: Path, terminal: Terminal) -> None:
 
     if write_audits(data, folder, on_progress=terminal):
         wrote(folder, "a page a trial: look at them before you train")
+
+
+def show_trials(data: "Dataset") -> None:
+    """Write the page of all trials."""
+    from sliplens.report.trials import write_trials_page
+
+    wrote(write_trials_page(data), "all trials at a glance: margins, friction, flags")
 
 
 def show_labelling(title: str, data: "Dataset") -> None:

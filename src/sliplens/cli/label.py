@@ -8,7 +8,7 @@ import tyro
 
 from sliplens.cli.command import Command, Data
 from sliplens.cli.console import Terminal
-from sliplens.cli.import_ import draw_audits, show_labelling
+from sliplens.cli.import_ import draw_audits, show_labelling, show_trials
 from sliplens.recordings.options import LabelSettings
 
 
@@ -43,3 +43,4 @@ class Label(Command):
         if self.audit:
             draw_audits(labelled, out / "audit", terminal)
         show_labelling("Labelled", labelled)
+        show_trials(labelled)

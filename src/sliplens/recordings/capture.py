@@ -131,6 +131,9 @@ class Capture(TrialFacts):
         return float(np.clip(1 / np.median(np.diff(self.time_s)), 1, 120))
 
 
+_SHORTEST_S, _LONGEST_S = 1e-6, 86400.0  # steps of time that a camera or a force sensor may take
+
+
 def _require_rising(time_s: Float[np.ndarray, " samples"], *, what: str) -> None:
     steps = np.diff(time_s)
     if not np.all(steps > 0):
@@ -139,3 +142,11 @@ def _require_rising(time_s: Float[np.ndarray, " samples"], *, what: str) -> None
             f"{what}: time does not rise at sample {at} ({time_s[at - 1]:.6f} s, then {time_s[at]:.6f} s); "
             "sort the samples or mend their stamps"
         )
+    if np.any(steps > _LONGEST_S):
+        at = int(np.argmax(steps > _LONGEST_S)) + 1
+        raise RecordingError(
+            f"{what}: sample {at} comes {steps[at - 1]:.3g} s after the one before, more than a day; mend or drop its "
+            "stamp"
+        )
+    if len(steps) and np.median(steps) < _SHORTEST_S:
+        raise RecordingError(f"{what}: samples are {np.median(steps):.3g} s apart; declare the right unit of time")

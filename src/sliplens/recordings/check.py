@@ -1,7 +1,10 @@
 """Does a data set hold what it says: hashes, laws of the labels, splits."""
 
+import os
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +14,7 @@ from sliplens.errors import SliplensError
 from sliplens.files import hash_file
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, tell_flags, trial_path
-from sliplens.recordings.store import forces_path, load_recording, read_header
+from sliplens.recordings.store import forces_path, load_recording, read_header, stream_frames
 from sliplens.recordings.trial import SIGNALS, ContactState, Recording
 
 # margins are stored in double precision; labels made in single precision may differ by this much from their forces
@@ -55,12 +58,16 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
         for path in sorted([*(folder / "trials").glob("*"), *(folder / "forces").glob("*")])
         if path not in listed
     ]
-    for info in counted(data.trials, on_progress):
-        findings += [Finding(where=info.trial, what=what) for what in _check_trial(folder, info, on_progress)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # hashes and decoding let go of the interpreter's lock
+        checked = pool.map(lambda info: tuple(_check_trial(folder, info)), data.trials)
+        for info, wrong in zip(counted(data.trials, on_progress), checked, strict=True):
+            findings += [Finding(where=info.trial, what=what) for what in wrong]
+            with suppress(SliplensError):  # what cannot be read is found
+                tell_flags(info.trial, read_header(trial_path(folder, info.trial)).labelling, on_progress)
     return tuple(findings)
 
 
-def _check_trial(folder: Path, info: TrialInfo, on_progress: OnProgress | None) -> Iterator[str]:
+def _check_trial(folder: Path, info: TrialInfo) -> Iterator[str]:
     path = trial_path(folder, info.trial)
     if not path.is_file():
         yield "has no file"
@@ -71,14 +78,16 @@ def _check_trial(folder: Path, info: TrialInfo, on_progress: OnProgress | None) 
     if info.forces_sha256 and (not samples.is_file() or hash_file(samples) != info.forces_sha256):
         yield "has samples of forces that are missing or changed since the table was made"
     try:
-        header, recording = read_header(path), load_recording(path)
+        header = read_header(path)
+        recording = load_recording(path, pixels=header.truth is not None)
+        for _ in stream_frames(path) if header.truth is None else ():
+            pass  # each can be decoded; one at a time, however many there are
     except SliplensError as error:
         yield f"cannot be read: {error}"
         return
     for name, value in vars(info).items():
         if hasattr(header, name) and value != getattr(header, name):
             yield f"has {name} {getattr(header, name)}, the table says {value}"
-    tell_flags(info.trial, header.labelling, on_progress)
     yield from _check_laws(recording)
 
 

@@ -3,12 +3,12 @@
 import os
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 from threading import Event, Lock
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -31,8 +31,9 @@ from sliplens.recordings.dataset import (
 from sliplens.recordings.edits import EDITS_FILE, apply_edits, edits_in_force, read_edits
 from sliplens.recordings.formats.stored import read_stored, read_stored_trial
 from sliplens.recordings.labelling import Edit, EditKind, Labelling, ReferenceChoice
-from sliplens.recordings.labels import Reason, choose_reference, label_trial, measure_motion, require_inside
-from sliplens.recordings.manifest import ManifestRow, find_rows, read_manifest
+from sliplens.recordings.labels import Reason, choose_reference, label_trial, measure_motion, require_inside, soften
+from sliplens.recordings.labels.lag import Soft
+from sliplens.recordings.manifest import ManifestRow, find_rows
 from sliplens.recordings.options import LabelSettings, ReadOptions
 from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, is_profile, load_profile
 from sliplens.recordings.source import open_source
@@ -45,11 +46,16 @@ from sliplens.recordings.splits import (
     write_split_record,
 )
 from sliplens.recordings.store import (
-    encode_frames,
+    ROW_GROUP,
+    Spool,
+    decode_pixels,
+    encode_pixels,
     forces_path,
+    in_turn,
     read_first_reference,
     read_header,
     save_forces,
+    stream_frames,
     write_trial,
 )
 from sliplens.recordings.trial import Labels
@@ -60,6 +66,7 @@ def import_recordings(
     *,
     out: Path | str,
     forces: Path | str | None = None,
+    reference: Path | str | None = None,
     sensor: SensorProfile | Path | str | None = None,
     day: int | None = None,
     condition: str | None = None,
@@ -89,6 +96,9 @@ def import_recordings(
         Folder to make.
     forces
         Table of forces beside a video or folder of images (CSV); short for `reading.forces`.
+    reference
+        Image of the untouched sensor, where a manifest names none; if None, as the source tells, else chosen among the
+        frames before the contact.
     sensor
         Name of the sensor, or its profile (`SensorProfile`, its TOML file, the name of one that comes with sliplens),
         which frames go through and which is kept with them.
@@ -115,19 +125,24 @@ def import_recordings(
     RecordingError
         If a trial has neither labels nor forces, nothing touches, or it never slips and no friction is given.
     """
-    reading, labelling = reading or ReadOptions(), labelling or LabelSettings()
     paths = [Path(source) for source in ([sources] if isinstance(sources, Path | str) else sources)]
-    if forces is not None:
-        reading = replace(reading, forces=Path(forces))
-    if reading.forces is not None and len(paths) > 1:
-        raise InputError("one table of forces goes with one recording; name what belongs together in a manifest (CSV)")
     profile = load_profile(sensor) if sensor is not None and is_profile(sensor) else None
-    facts = {"sensor": sensor if profile is None else None, "day": day, "condition": condition, "object": object}
+    asked = _Asked(
+        reading=replace(reading or ReadOptions(), **({} if forces is None else {"forces": Path(forces)})),
+        labelling=labelling or LabelSettings(),
+        reference=None if reference is None else Path(reference),
+        profile=profile,
+        format=format,
+        facts={"sensor": sensor if profile is None else None, "day": day, "condition": condition, "object": object},
+    )
+    if asked.reading.forces is not None and len(paths) > 1:
+        raise InputError("one table of forces goes with one recording; name what belongs together in a manifest (CSV)")
+    if splits is not None and (validation_trials is not None or test_trials is not None):
+        raise InputError("splits come from a file or from numbers of trials, not from both; leave one out")
     before = load_dataset(out) if add else None
     with stage(on_progress, "Opening the recordings") as count:
-        jobs, left_out = _open_all(
-            paths, format=format, reading=reading, labelling=labelling, profile=profile, facts=facts, on_progress=count
-        )
+        found = [(path, asked.find_rows(path)) for path in paths]
+        jobs, left_out = asked.open(found, count)
     known = {info.trial for info in before.trials} if before else set()
     if kept := [job.capture.trial for job in jobs if job.capture.trial in known]:
         note(on_progress, f"{len(kept)} trials are in {out} already and stay as they are, such as {kept[0]}")
@@ -135,22 +150,11 @@ def import_recordings(
     if before is not None and not jobs:
         return _tell(replace(before, left_out=tuple(left_out)), on_progress, kept=True)
     _require_names([job.capture for job in jobs], left_out)
-    if splits is not None and (validation_trials is not None or test_trials is not None):
-        raise InputError("splits come from a file or from numbers of trials, not from both; leave one out")
     plan = splits if splits is None or isinstance(splits, SplitPlan) else read_splits(Path(splits))
     config = {
-        **facts,
-        "profile": profile,
-        "format": format,
+        **asked.recipe(found),
         "validation_trials": validation_trials,
         "test_trials": test_trials,
-        "sources": [_fingerprint(path) for path in [*paths, *_named_by(paths)]],
-        "reading": {
-            name: _fingerprint(value) if isinstance(value, Path) else value
-            for name in reading.given()
-            for value in [getattr(reading, name)]
-        },
-        "labelling": labelling,
         "splits": None if plan is None else plan.rules,
         **({} if before is None else {"added_to": before.hash}),
     }
@@ -203,79 +207,105 @@ class _Job:
     """Whether it is left out where it cannot be imported, rather than stopping the others."""
 
 
-def _open_all(
-    paths: Sequence[Path],
-    *,
-    format: str | None,
-    reading: ReadOptions,
-    labelling: LabelSettings,
-    profile: SensorProfile | None,
-    facts: Mapping[str, object],
-    on_progress: OnProgress,
-) -> tuple[list[_Job], list[LeftOut]]:
-    """Open what was named; of a manifest or a folder of recordings what cannot be opened is left out."""
-    given = {name: fact for name, fact in facts.items() if fact is not None}
-    jobs, left_out = [], []
-    for path in paths:
-        rows = None if format is not None or reading.forces is not None else find_rows(path)
-        if rows is None:
-            settings = labelling if profile is None else profile.settings(labelling)
-            opened = open_source(path, format=format, options=reading, sensor=profile, whole=True)
-            jobs += [_Job(capture=replace(one, **given), settings=settings, profile=profile) for one in opened]
-            continue
-        for number, row in enumerate(rows, start=1):
-            try:
-                jobs += _open_row(row, reading, labelling, profile, given)
-            except SliplensError as error:
-                left_out.append(LeftOut(trial=row.trial, source=str(row.video), why=str(error)))
-            on_progress(number, len(rows))
-    return jobs, left_out
+_Source: TypeAlias = tuple[Path, Sequence[ManifestRow] | None]
+"""What was named, and its rows if it is a manifest or a folder of recordings."""
 
 
-def _open_row(
-    row: ManifestRow,
-    reading: ReadOptions,
-    labelling: LabelSettings,
-    profile: SensorProfile | None,
-    given: Mapping[str, object],
-) -> list[_Job]:
-    """Open the recordings of a row, which says more than the command; its profile takes the place of the command's."""
-    named = row.sensor is not None and is_profile(row.sensor)
-    profile = load_profile(str(row.sensor)) if named else None if row.sensor else profile
-    facts = {**given, **{name: getattr(row, name) for name in ("day", "object", "condition") if getattr(row, name)}}
-    if row.sensor is not None:
-        facts["sensor"] = row.sensor
-    if profile is not None:
-        facts["sensor"] = profile.name
-        labelling = profile.settings(labelling)
-    index = row.reference if isinstance(row.reference, int) else None
-    if row.mu is not None or index is not None:
-        changes = {name: value for name, value in (("mu", row.mu), ("reference_frame", index)) if value is not None}
-        labelling = replace(labelling, **changes)
-    opened = open_source(
-        row.video,
-        options=replace(reading, forces=row.forces),
-        reference=row.reference if isinstance(row.reference, Path) else None,
-        reference_frame=index,
-        sensor=profile,
-        whole=True,
-    )
-    if len(opened) == 1:
-        facts["trial"] = row.trial
-    captures = [replace(one, **facts) for one in opened]
-    _require_names(captures)
-    for capture in captures:
-        _require_forces(capture)
-    return [_Job(capture=one, settings=labelling, profile=profile, one_of_many=True) for one in captures]
+@dataclass(frozen=True, kw_only=True)
+class _Asked:
+    """What is said of all recordings together."""
+
+    reading: ReadOptions
+    labelling: LabelSettings
+    reference: Path | None
+    """Image of the untouched sensor."""
+    profile: SensorProfile | None
+    format: str | None
+    facts: Mapping[str, Any]
+    """Sensor, day, condition and object; None where nothing is said."""
+
+    def __post_init__(self) -> None:
+        if self.reference is not None and self.labelling.reference_frame is not None:
+            raise InputError("the untouched sensor is named twice; give --reference or --reference-frame, not both")
+
+    def find_rows(self, path: Path) -> tuple[ManifestRow, ...] | None:
+        """Rows of a manifest or a folder of recordings; None where a path is one recording."""
+        return None if self.format is not None or self.reading.forces is not None else find_rows(path)
+
+    def open(self, sources: Sequence[_Source], on_progress: OnProgress) -> tuple[list[_Job], list[LeftOut]]:
+        """Open what was named; of a manifest or a folder of recordings what cannot be opened is left out."""
+        jobs, left_out = [], []
+        for path, rows in sources:
+            if rows is None:
+                jobs += self._open(path)
+            for number, row in enumerate(rows or (), start=1):
+                try:
+                    jobs += self._open_row(row)
+                except SliplensError as error:
+                    left_out.append(LeftOut(trial=row.trial, source=str(row.video), why=str(error)))
+                on_progress(number, len(rows or ()))
+        return jobs, left_out
+
+    def _open(self, path: Path) -> list[_Job]:
+        profile = self.profile
+        settings = self.labelling if profile is None else profile.settings(self.labelling)
+        facts = {name: fact for name, fact in self.facts.items() if fact is not None}
+        if profile is not None:
+            facts["sensor"] = profile.name
+        opened = open_source(
+            path, reference=self.reference, format=self.format, options=self.reading, sensor=profile, whole=True
+        )
+        return [_Job(capture=replace(one, **facts), settings=settings, profile=profile) for one in opened]
+
+    def _open_row(self, row: ManifestRow) -> list[_Job]:
+        """Open the recordings of a row, which says more than the command; its profile takes the place of ours."""
+        own = {name: fact for name in self.facts if (fact := getattr(row, name)) is not None}
+        profile = self.profile
+        if row.sensor is not None:
+            profile = load_profile(row.sensor) if is_profile(row.sensor) else None
+        image, index = self.reference, self.labelling.reference_frame
+        if row.reference is not None:
+            image, index = (None, row.reference) if isinstance(row.reference, int) else (row.reference, None)
+        mu = self.labelling.mu if row.mu is None else row.mu
+        said = replace(
+            self,
+            reading=replace(self.reading, forces=row.forces),
+            labelling=replace(self.labelling, reference_frame=index, mu=mu),
+            reference=image,
+            profile=profile,
+            facts={**self.facts, **own},
+        )
+        jobs = said._open(row.video)
+        if len(jobs) == 1:
+            jobs = [replace(jobs[0], capture=replace(jobs[0].capture, trial=row.trial))]
+        _require_names([job.capture for job in jobs])
+        for job in jobs:
+            _require_forces(job.capture)
+        return [replace(job, one_of_many=True) for job in jobs]
+
+    def recipe(self, sources: Sequence[_Source]) -> dict[str, object]:
+        """All that shapes the trials."""
+
+        def told(value: object) -> object:
+            return _fingerprint(value) if isinstance(value, Path) else value
+
+        return {
+            **self.facts,
+            "profile": self.profile,
+            "format": self.format,
+            "sources": [_fingerprint(part) for path, rows in sources for part in _parts(path, rows)],
+            "reference": told(self.reference),
+            "reading": {name: told(getattr(self.reading, name)) for name in self.reading.given()},
+            "labelling": self.labelling,
+        }
 
 
-def _named_by(paths: Sequence[Path]) -> list[Path]:
-    """Files that manifests name: what changes in them changes the data set."""
-    manifests = [path for path in paths if path.is_file() and find_rows(path)]
-    rows = [row for path in manifests for row in read_manifest(path)]
-    references = [row.reference for row in rows if isinstance(row.reference, Path)]
-    named = [*(row.video for row in rows), *(row.forces for row in rows if row.forces), *references]
-    return [path for path in named if path.exists()]
+def _parts(path: Path, rows: Sequence[ManifestRow] | None) -> list[Path]:
+    """Files that a source is made of: what changes in them changes the data set, unlike what else lies beside them."""
+    if rows is None:
+        return [path]
+    named = [part for row in rows for part in (row.video, row.forces, row.reference) if isinstance(part, Path)]
+    return [*([path] if path.is_file() else []), *(part for part in named if part.exists())]
 
 
 def _link_trials(source: Path, folder: Path) -> None:
@@ -286,13 +316,22 @@ def _link_trials(source: Path, folder: Path) -> None:
             try:
                 os.link(one, other)
             except OSError:  # another disk, or one that has no links
-                shutil.copyfile(one, other)
+                part = shutil.copyfile(one, f"{other}.part")
+                Path(part).replace(other)
 
-    for name in ("trials", "forces", SENSORS_FOLDER, "audit"):
+    for name in ("trials", "forces", "audit"):
         if (source / name).is_dir():
             shutil.copytree(source / name, folder / name, copy_function=link, dirs_exist_ok=True)
-    if (source / EDITS_FILE).is_file():
-        shutil.copyfile(source / EDITS_FILE, folder / EDITS_FILE)
+    _keep_words(source, folder)
+
+
+def _keep_words(source: Path, folder: Path) -> None:
+    """Copy what a data set keeps of its sensors, splits and edits."""
+    if (source / SENSORS_FOLDER).is_dir():
+        shutil.copytree(source / SENSORS_FOLDER, folder / SENSORS_FOLDER, dirs_exist_ok=True)
+    for name in (SPLITS_FILE, EDITS_FILE):
+        if (source / name).is_file():
+            shutil.copyfile(source / name, folder / name)
 
 
 def label_dataset(
@@ -343,11 +382,7 @@ def label_dataset(
             named = [replace(row, split=info.split) for row, info in zip(table, data.trials, strict=True)]
             simulated = all(capture.simulated for capture in captures)
             write_dataset_table(output.folder, named, simulated=simulated, left_out=data.left_out)
-            if (data.folder / SENSORS_FOLDER).is_dir():
-                shutil.copytree(data.folder / SENSORS_FOLDER, output.folder / SENSORS_FOLDER, dirs_exist_ok=True)
-            for name in (SPLITS_FILE, EDITS_FILE):
-                if (data.folder / name).is_file():
-                    shutil.copyfile(data.folder / name, output.folder / name)
+            _keep_words(data.folder, output.folder)
     if count := sum(len(job.edits) for job in jobs):
         note(on_progress, f"{count} edits by hand were applied, to {sum(bool(job.edits) for job in jobs)} trials")
     if gone := sorted({edit.trial for edit in edits} - {info.trial for info in data.trials}):
@@ -385,7 +420,9 @@ def relabel_trial(
     edits = read_edits(data.folder) if edits is None else edits
     job = _relabelling(data, read_stored_trial(data, info), labelling or LabelSettings(), edits)
     rng = np.random.default_rng((job.settings.seed, data.trials.index(info)))
-    return _label(job, rng, image_motion)[1]
+    path = trial_path(data.folder, trial)
+    motion = measure_motion(map(soften, stream_frames(path))) if image_motion is None else image_motion
+    return _label(job, _Footage(motion=motion, read=lambda places: stream_frames(path, set(places))), rng)[1]
 
 
 def _relabelling(data: Dataset, capture: Capture, labelling: LabelSettings, edits: Sequence[Edit]) -> _Job:
@@ -520,8 +557,8 @@ def import_trial(
 ) -> None:
     """Write a recording as a trial of a data set, with the labels that came with it, or found; whole or not at all.
 
-    The frames are read several times, never all at once: to see the image move, to find the untouched sensor, and to
-    write them. The samples of the force sensor, from which labels can be made anew, are kept in `forces_file`.
+    The frames are decoded once, never all at once. The samples of the force sensor, from which labels can be made anew,
+    are kept in `forces_file`.
     """
     job = _Job(capture=capture, settings=settings or LabelSettings())
     _import_job(job, path, rng=rng, forces_file=forces_file, on_progress=on_progress)
@@ -532,24 +569,52 @@ def _import_job(
 ) -> None:
     capture = job.capture
     _require_forces(capture)
-    try:
-        reference, labels = _label(job, rng)
-    except RecordingError as error:
-        raise RecordingError(f"{capture.source}: {error}") from None
-    # before the trial, whose file tells that all of it is there
-    if forces_file is not None and capture.forces is not None:
-        save_forces(capture.forces, forces_file)
-    images = encode_frames(_frames(capture, on_progress))
-    first = capture.reference if labels.labelling and labels.labelling.first_reference else None
-    write_trial(
-        path,
-        images,
-        facts=capture,
-        time_s=capture.frame_time_s,
-        labels=labels,
-        reference=reference,
-        first_reference=first,
-    )
+    with Spool(path.parent) as images:
+        footage = _read_footage(capture, images, on_progress)
+        try:
+            reference, labels = _label(job, footage, rng)
+        except RecordingError as error:
+            raise RecordingError(f"{capture.source}: {error}") from None
+        # before the trial, whose file tells that all of it is there
+        if forces_file is not None and capture.forces is not None:
+            save_forces(capture.forces, forces_file)
+        write_trial(
+            path,
+            images.chunks(ROW_GROUP),
+            facts=capture,
+            time_s=capture.frame_time_s,
+            labels=labels,
+            reference=reference,
+            first_reference=capture.reference if labels.labelling and labels.labelling.first_reference else None,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Footage:
+    """Frames of a recording for whoever labels it, decoded once before."""
+
+    motion: Float[np.ndarray, " frames"]
+    """See `measure_motion`."""
+    read: Callable[[Sequence[int]], Iterator[Frame]]
+    """Gives frames of rising numbers."""
+
+
+def _read_footage(capture: Capture, images: Spool, on_progress: OnProgress | None) -> _Footage:
+    """Decode the frames of a recording and put them by, encoded as they are stored."""
+
+    def keep() -> Iterator[Soft]:
+        for image, soft in in_turn(lambda frame: (encode_pixels(frame), soften(frame)), _frames(capture)):
+            images.append(image)
+            yield soft
+            if on_progress is not None:
+                on_progress(len(images), len(capture))
+
+    def read(places: Sequence[int]) -> Iterator[Frame]:
+        for place in places:
+            where = f"frame {place} of {capture.source}"
+            yield decode_pixels(images[place], size=(*capture.frame_size, 3), where=where)
+
+    return _Footage(motion=measure_motion(keep()), read=read)
 
 
 def _require_forces(capture: Capture) -> None:
@@ -559,23 +624,20 @@ def _require_forces(capture: Capture) -> None:
         )
 
 
-def _label(
-    job: _Job, rng: np.random.Generator, image_motion: Float[np.ndarray, " frames"] | None = None
-) -> tuple[Frame, Labels]:
+def _label(job: _Job, footage: _Footage, rng: np.random.Generator) -> tuple[Frame, Labels]:
     """Image of the untouched sensor, and the labels that came with the recording, or are found."""
     capture, settings = job.capture, job.settings
     index = capture.reference_index if settings.reference_frame is None else settings.reference_frame
     labels, found, image = capture.labels, None, capture.reference
     if labels is None:
         assert capture.forces is not None
-        motion = measure_motion(_frames(capture)) if image_motion is None else image_motion
-        labels = found = label_trial(capture.frame_time_s, motion, capture.forces, settings=settings, rng=rng)
+        labels = found = label_trial(capture.frame_time_s, footage.motion, capture.forces, settings=settings, rng=rng)
     if image is not None and index is None:
         method = "recorded apart from the frames" if found else "came with the recording"
         choice = capture.reference_choice or ReferenceChoice(method=method)
     elif found is not None:
         untouched = np.array([reason is Reason.NO_CONTACT for reason in found.reason])
-        choice = choose_reference(capture.read_frames, untouched, index=index, method=settings.reference)
+        choice = choose_reference(footage.read, untouched, index=index, method=settings.reference_method)
     elif index is None:
         raise RecordingError("no frame is known to be untouched; name one with --reference-frame")
     elif not 0 <= index < len(capture):
@@ -583,7 +645,8 @@ def _label(
     else:
         choice = ReferenceChoice(index=index, method="named")
     if image is None or index is not None:
-        image = next(islice(capture.read_frames(), choice.index, None))
+        assert choice.index is not None  # without an image it is one of the frames
+        (image,) = footage.read([choice.index])
     labelling = labels.labelling or Labelling(
         source=capture.source,
         forces=capture.forces.source if capture.forces else None,
@@ -597,7 +660,7 @@ def _label(
     return image, replace(labels, labelling=labelling)
 
 
-def _frames(capture: Capture, on_progress: OnProgress | None = None) -> Iterator[Frame]:
+def _frames(capture: Capture) -> Iterator[Frame]:
     """Frames of a capture, which must be as many as it promised and of one size."""
     read = 0
     for frame in capture.read_frames():
@@ -608,8 +671,6 @@ def _frames(capture: Capture, on_progress: OnProgress | None = None) -> Iterator
             )
         read += 1
         yield frame
-        if on_progress is not None:
-            on_progress(read, len(capture))
     if read != len(capture):
         raise RecordingError(
             f"{capture.source} promised {len(capture)} frames but gave {read}; copy or export it again"

@@ -3,6 +3,7 @@
 Each frame is handed to the system before the next is taken: a process that is killed loses the one it was writing.
 """
 
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import suppress
@@ -16,6 +17,7 @@ import pyarrow as pa
 
 from sliplens.codec import from_builtins, to_builtins
 from sliplens.errors import RecordingError
+from sliplens.files import hold
 from sliplens.images import decode_png, encode_png
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling, ReferenceChoice
@@ -29,11 +31,6 @@ from sliplens.recordings.store import (
     write_trial,
 )
 from sliplens.recordings.trial import TrialFacts, labels_of_margins
-
-try:
-    import fcntl
-except ImportError:  # Windows: nobody is kept from recording twice into one folder there
-    fcntl = None
 
 JOURNAL_FOLDER = "recording"
 """Folder beside the trials of a data set that holds what is being recorded, or was when it was cut off."""
@@ -112,19 +109,16 @@ class JournalLock:
     def __init__(self, data: Path) -> None:
         self.folder = data / JOURNAL_FOLDER
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._file = (self.folder / _LOCK).open("w")
-        if fcntl is not None:
-            try:
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                self._file.close()
-                raise RecordingError(
-                    f"{data} is being recorded; stop the recording first, or choose another folder"
-                ) from None
+        (self.folder / _LOCK).touch()
+        self._held = hold(self.folder / _LOCK)
+        if self._held is None:
+            raise RecordingError(f"{data} is being recorded; stop the recording first, or choose another folder")
 
     def release(self) -> None:
         """Let go; what is there stays for whoever opens the data set next."""
-        self._file.close()
+        if self._held is not None:
+            os.close(self._held)
+            self._held = None
 
     def discard(self) -> None:
         """Remove the folder, everything in it being in trials, and let go."""

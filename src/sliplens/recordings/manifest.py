@@ -2,6 +2,7 @@
 
 import csv
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
@@ -13,7 +14,7 @@ from sliplens.recordings.formats.tables import trial_name
 
 _VIDEOS = frozenset({".mp4", ".m4v", ".mkv", ".mov", ".avi", ".webm", ".mpg", ".mpeg"})
 _TABLES = frozenset({".csv", ".tsv", ".txt"})
-_FORCE_WORDS = re.compile(r"[-_. ]?(forces?|wrench|ft)$", re.IGNORECASE)
+_FORCE_WORDS = re.compile(r"[-_. ](forces?|wrench|ft)$", re.IGNORECASE)
 _LONGEST = 100_000  # characters of a field; those of a manifest are paths and words
 
 
@@ -56,7 +57,8 @@ def find_rows(source: Path) -> tuple[ManifestRow, ...] | None:
 def pair_recordings(folder: Path) -> tuple[ManifestRow, ...]:
     """Pair the videos, folders of images and bags of a folder with the tables of forces of the same name.
 
-    The table of `cup.mp4` is `cup.csv`, or `cup_forces.csv`. What is neither is passed over.
+    The table of `cup.mp4` is `cup.csv`, or `cup_forces.csv`. What is neither is passed over; so are data sets
+    of sliplens, which may well have been made of this very folder.
 
     Raises
     ------
@@ -65,14 +67,16 @@ def pair_recordings(folder: Path) -> tuple[ManifestRow, ...]:
     """
     tables: dict[str, list[Path]] = {}
     recordings: dict[str, list[Path]] = {}
-    for path in sorted(folder.iterdir()):
+    seen = [path for path in sorted(folder.iterdir()) if not path.name.startswith(".")]
+    texts = [path for path in seen if path.is_file() and path.suffix.lower() in _TABLES]
+    for path in seen:
         bag = path.is_dir() or path.suffix in {".mcap", ".db3"}
-        if path.name.startswith("."):
-            continue
-        if path.is_file() and path.suffix.lower() in _TABLES:
-            tables.setdefault(_FORCE_WORDS.sub("", path.stem), []).append(path)
-        elif path.suffix.lower() in _VIDEOS or (bag and recognise(path)):
-            recordings.setdefault(path.stem if path.is_file() else path.name, []).append(path)
+        if path.suffix.lower() in _VIDEOS or (bag and recognise(path) not in {None, "sliplens"}):
+            recordings.setdefault(_same(path.stem if path.is_file() else path.name), []).append(path)
+    for path in texts:
+        stem = _same(path.stem)
+        # a recording may itself be named lift_ft
+        tables.setdefault(stem if stem in recordings else _FORCE_WORDS.sub("", stem), []).append(path)
     if not recordings:
         raise RecordingError(
             f"{folder} holds no recording (looked for videos such as .mp4, bags, and folders of images); check the path"
@@ -90,6 +94,11 @@ def pair_recordings(folder: Path) -> tuple[ManifestRow, ...]:
     )
     _require_different(rows, str(folder))
     return rows
+
+
+def _same(name: str) -> str:
+    """Name as one spelling: some systems write an umlaut as two characters."""
+    return unicodedata.normalize("NFC", name)
 
 
 def read_manifest(path: Path) -> tuple[ManifestRow, ...]:

@@ -82,7 +82,7 @@ class LabelSettings:
     """Least normal force of a contact, in newtons; chosen from the noise if not given."""
     force_range: float | None = None
     """What each axis of the force sensor can measure, in newtons; frames beyond are not valid."""
-    reference: ReferenceMethod = "least contact energy"
+    reference_method: ReferenceMethod = "least contact energy"
     """How to choose the untouched frame among those before the contact, where the source does not tell it."""
     reference_frame: int | None = None
     """Number of the untouched frame, by hand."""

@@ -188,8 +188,8 @@ class SensorProfile:
             for name in ("normal_axis", "normal_sign")
             if getattr(given, name) is None and getattr(self, name) is not None
         }
-        if given.reference == LabelSettings.reference:
-            more["reference"] = self.reference
+        if given.reference_method == LabelSettings.reference_method:
+            more["reference_method"] = self.reference
         return replace(given, **more)
 
     def _scale(self, size: tuple[int, int]) -> tuple[float, float]:

@@ -1,14 +1,18 @@
 """One trial on disk: a Parquet file, a row a frame, with its header and reference frame beside the rows."""
 
 import os
+import tempfile
+from array import array
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from hashlib import sha256
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeAlias
+from types import TracebackType
+from typing import Any, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
@@ -18,12 +22,15 @@ from jaxtyping import Float, UInt8
 
 from sliplens.codec import from_builtins, to_builtins
 from sliplens.errors import RecordingError
+from sliplens.files import hash_json
 from sliplens.images import decode_png, encode_png
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.trial import OPTIONAL_LABELS, SIGNALS, ContactState, GroundTruth, Labels, Recording, TrialFacts
 
 Pixels: TypeAlias = UInt8[np.ndarray, "height width *channels"]
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
 
 SCHEMA_VERSION = 2
 CODEC = "rows+zstd"
@@ -59,24 +66,58 @@ def encode_pixels(pixels: Pixels) -> bytes:
 
 
 def encode_frames(frames: Iterable[Pixels]) -> Iterator[list[bytes]]:
-    """Encode frames side by side while the next are made, and give them in chunks of a row group.
+    """Encode frames side by side while the next are made, and give them in chunks of a row group."""
+    images = in_turn(encode_pixels, frames)  # Zstandard lets go of the interpreter's lock
+    yield from iter(lambda: list(islice(images, ROW_GROUP)), [])
 
-    Two frames a processor are held as pixels, however many there are.
+
+def in_turn(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
+    """Do a work in threads while the next items are made, and give what comes of each in their order.
+
+    Two items a processor are held, however many there are.
     """
     workers = os.cpu_count() or 1
-    with ThreadPoolExecutor(workers) as pool:  # Zstandard lets go of the interpreter's lock
-        images = _in_turn(pool, frames, ahead=2 * workers)
-        yield from iter(lambda: list(islice(images, ROW_GROUP)), [])
-
-
-def _in_turn(pool: ThreadPoolExecutor, frames: Iterable[Pixels], *, ahead: int) -> Iterator[bytes]:
-    waiting: deque[Future[bytes]] = deque()
-    for frame in frames:
-        waiting.append(pool.submit(encode_pixels, frame))
-        if len(waiting) == ahead:
+    waiting: deque[Future[_Result]] = deque()
+    with ThreadPoolExecutor(workers) as pool:
+        for item in items:
+            waiting.append(pool.submit(work, item))
+            if len(waiting) == 2 * workers:
+                yield waiting.popleft().result()
+        while waiting:
             yield waiting.popleft().result()
-    while waiting:
-        yield waiting.popleft().result()
+
+
+class Spool:
+    """Pieces put by in a file that has no name and is gone when it is closed, to be read again in any order."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (closed on exit)
+        self._ends = array("q", [0])
+
+    def append(self, piece: bytes) -> None:
+        """Put a piece by."""
+        self._file.write(piece)
+        self._ends.append(self._ends[-1] + len(piece))
+
+    def __len__(self) -> int:
+        return len(self._ends) - 1
+
+    def __getitem__(self, place: int) -> bytes:
+        begin, end = self._ends[place : place + 2]
+        self._file.seek(begin)
+        return self._file.read(end - begin)
+
+    def chunks(self, size: int) -> Iterator[list[bytes]]:
+        """Pieces in their order, so many together."""
+        for first in range(0, len(self), size):
+            yield [self[place] for place in range(first, min(first + size, len(self)))]
+
+    def __enter__(self) -> "Spool":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._file.close()
 
 
 def decode_pixels(data: bytes | pa.Buffer, *, size: Sequence[int], where: str) -> Pixels:
@@ -296,6 +337,16 @@ def read_frames(path: Path, places: Sequence[int]) -> UInt8[np.ndarray, "frames 
     for place, frame in zip(sorted(wanted), stream_frames(path, wanted), strict=True):
         found[np.equal(places, place)] = frame
     return found
+
+
+def hash_frames(path: Path) -> str:
+    """Hash of what a stored trial shows, whatever its labels say: its reference, first and last frame, and how many."""
+    file, header = _open(path)
+    with file, reading(path):
+        last = file.num_row_groups - 1
+        ends = [file.read_row_group(group, columns=["image"]).column("image")[at] for group, at in ((0, 0), (last, -1))]
+        shown = [file.schema_arrow.metadata[b"reference"], *(one.as_py() for one in ends)]
+    return hash_json([header.frames, *(sha256(one).hexdigest() for one in shown)])
 
 
 def _read_truth(table: pa.Table, header: TruthHeader, size: tuple[int, ...], path: Path) -> GroundTruth:

@@ -116,6 +116,14 @@ def test_of_too_few_frames_no_lag_is_told(trial: Trial, rng: np.random.Generator
     assert not estimate_lag(trial.frame_time_s[:49], trial.motion[:49], trial.forces(), rng=rng).doubt.startswith("49")
 
 
+def test_a_camera_that_runs_on_long_after_the_forces_ended_still_tells_the_lag(trial: Trial, rng: np.random.Generator):
+    more = trial.frame_time_s[-1] + np.arange(1, 600) / FRAME_HZ
+    time_s, motion = np.append(trial.frame_time_s, more), np.append(trial.motion, np.zeros(len(more)))
+    lag = estimate_lag(time_s + 0.03, motion, trial.forces(), rng=rng)
+    assert not lag.doubt
+    assert lag.lag_s == pytest.approx(0.03, abs=0.005)
+
+
 def test_clocks_of_another_zero_are_refused(trial: Trial, rng: np.random.Generator):
     forces = replace(trial.forces(), time_s=trial.time_s + 1e9)
     with pytest.raises(RecordingError, match=r"no lag up to 0.25 s lets the forces of sensor cover the frames; bring"):

@@ -3,6 +3,7 @@
 import codecs
 import csv
 import re
+import unicodedata
 from array import array
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -347,8 +348,9 @@ def evenly_spaced(count: int, *, frame_rate: float) -> Float[np.ndarray, " frame
 
 
 def trial_name(text: str) -> str:
-    """Name of a trial: letters, digits, dots, dashes and underscores."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "-", text).strip("-.") or "trial"
+    """Name of a trial: letters of any script, digits, dots, dashes and underscores."""
+    # some systems write an umlaut as two characters
+    return re.sub(r"[^\w.-]+", "-", unicodedata.normalize("NFC", text)).strip("-.") or "trial"
 
 
 def require_trial_name(trial: str) -> None:

@@ -376,6 +376,8 @@ def image_witness(
 
     `change_n` is the length of the force's change in the time before each frame, as `image_motion` is the image's.
     """
+    if len(image_motion) < _BESIDE:
+        return lambda _time_s, _size_n: True  # where no frame tells, the force is believed
     step = typical_step(frame_time_s)
     reach = longest_lag_s if lag.doubt else 2 * lag.sigma_s + 1.5 * step
     base = float(np.quantile(image_motion[1:], 0.1))
@@ -389,7 +391,7 @@ def image_witness(
         beside = ~near & (after[1:] <= reach + _QUIET_S)
         motion = image_motion[1:]
         if not near.any() or beside.sum() < _BESIDE:
-            return True  # where no frame tells, the force is believed
+            return True
         quiet = float(np.median(motion[beside]))
         spread = 1.4826 * float(np.median(np.abs(motion[beside] - quiet)))
         return bool(motion[near].max() - quiet > max(_SEEN_SHARE * yielded * size_n, _SEEN_SIGMAS * spread))

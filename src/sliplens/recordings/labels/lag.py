@@ -15,7 +15,11 @@ from sliplens.recordings.labels.axes import infer_axes, mean_force, typical_step
 _MOTION_BLOCKS = 28
 
 
-def soften(frame: Frame) -> Float32[np.ndarray, "rows columns 3"]:
+Soft: TypeAlias = Float32[np.ndarray, "rows columns 3"]
+"""Means of square blocks of a frame, in grey levels."""
+
+
+def soften(frame: Frame) -> Soft:
     """Means of square blocks of a frame, in grey levels; what fills no block at the right and below is left out."""
     height, width, _ = frame.shape
     side = max(1, min(height, width) // _MOTION_BLOCKS)
@@ -29,12 +33,11 @@ def soften(frame: Frame) -> Float32[np.ndarray, "rows columns 3"]:
     return (blocks / np.float32(side * side)).astype(np.float32)
 
 
-def measure_motion(frames: Iterable[Frame]) -> Float[np.ndarray, " frames"]:
+def measure_motion(softened: Iterable[Soft]) -> Float[np.ndarray, " frames"]:
     """Mean absolute difference of each softened frame from the one before it, in grey levels; 0 for the first."""
     motion: list[float] = []
     previous = None
-    for frame in frames:
-        soft = soften(frame)
+    for soft in softened:
         motion.append(0.0 if previous is None else float(np.mean(np.abs(soft - previous))))
         previous = soft
     return np.array(motion, dtype=np.float64)
@@ -69,12 +72,19 @@ def estimate_lag(
     peak when stretches of the trial are drawn anew.
 
     `image_motion` is that of `measure_motion`, its first value not used; `longest_s` the longest lag tried, either way.
-    Of too few frames to correlate no lag is told: it is 0, and its doubt says why. Too little overlap is a
-    `RecordingError`.
+    Frames that no lag brings to the forces, as of a camera that ran on, play no part. Of too few frames to correlate no
+    lag is told: it is 0, and its doubt says why. Forces without a frame are a `RecordingError`.
     """
+    reached = (frame_time_s >= forces.time_s[0] - longest_s) & (frame_time_s <= forces.time_s[-1] + longest_s)
+    if not reached.any():
+        raise RecordingError(
+            f"no lag up to {longest_s:g} s lets the forces of {forces.source} cover the frames; "
+            "bring both clocks to the same zero on import"
+        )
+    frame_time_s, image_motion = frame_time_s[reached], image_motion[reached]
     intervals = len(frame_time_s) - 1
     if intervals < _LEAST_INTERVALS:
-        doubt = f"{len(frame_time_s)} frames are too few to tell a lag from, {_LEAST_INTERVALS + 1} are needed"
+        doubt = f"{intervals + 1} frames are too few to tell a lag from, {_LEAST_INTERVALS + 1} are needed"
         return Lag(lag_s=0.0, sigma_s=0.0, doubt=doubt)
     step = typical_step(frame_time_s) / _STEPS_A_FRAME
     reach = int(np.ceil(longest_s / step))
@@ -83,10 +93,7 @@ def estimate_lag(
     covered = ~np.isnan(changes)
     usable = covered.mean(axis=1) >= _OVERLAP
     if not usable.any():
-        raise RecordingError(
-            f"no lag up to {longest_s:g} s lets the forces of {forces.source} cover the frames; "
-            "bring both clocks to the same zero on import"
-        )
+        return Lag(lag_s=0.0, sigma_s=0.0, doubt="the forces cover too few of the frames to tell a lag from")
     lags, changes, covered = lags[usable], np.nan_to_num(changes[usable]), covered[usable]
     weights = np.concatenate((np.ones((1, intervals)), _block_weights(intervals, draws=draws, rng=rng)))
     motion, release = image_motion[1:], _find_release(forces, sudden_s=_SUDDEN_STEPS * typical_step(frame_time_s))

@@ -1,7 +1,6 @@
 """The reference frame of a trial, the sensor untouched: named, or chosen; and how it drifts."""
 
-from collections.abc import Callable, Iterator
-from itertools import islice
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,7 +19,7 @@ _SMOOTH = 9
 
 
 def choose_reference(
-    read_frames: Callable[[], Iterator[Frame]],
+    read: Callable[[Sequence[int]], Iterable[Frame]],
     untouched: Bool[np.ndarray, " frames"],
     *,
     index: int | None = None,
@@ -35,8 +34,8 @@ def choose_reference(
     image alike and should not decide. The least energy is the default, for the first frame of a recording often holds
     the hand that started it. Of a long stretch 200 frames are compared, evenly spread.
 
-    `untouched`: frames without contact, as the forces say; `index`: the reference by hand, which may touch. To have
-    neither, or a number or method that is none, is a `RecordingError`.
+    `read`: gives frames of rising numbers; `untouched`: frames without contact, as the forces say; `index`: the
+    reference by hand, which may touch. To have neither, or a number or method that is none, is a `RecordingError`.
     """
     if method not in REFERENCE_METHODS:
         raise RecordingError(f"the reference cannot be chosen by {method!r}; choose {' or '.join(REFERENCE_METHODS)}")
@@ -48,16 +47,14 @@ def choose_reference(
     before = places[places - places[:1] == np.arange(len(places))]
     chosen, how = index, "named"
     if index is None and method == "first still":
-        opening = islice(read_frames(), int(before[0]), int(before[-1]) + 1)
-        chosen, how = int(before[0]) + _first_still(measure_motion(opening)), method
+        chosen, how = int(before[0]) + _first_still(measure_motion(map(soften, read(before.tolist())))), method
     ends = min(_ENDS, len(places) // 2)
     first, last = places[:ends].tolist(), places[len(places) - ends :].tolist()
     # all of them, or so many evenly spread from the first to the last
     compared = before[np.linspace(0, len(before) - 1, min(len(before), _COMPARED)).round().astype(int)].tolist()
     wanted = {*compared, *first, *last, *([] if chosen is None else [chosen])}
-    # no further than to the last of them
-    opening = islice(read_frames(), max(wanted) + 1)
-    soft = {place: soften(frame) for place, frame in enumerate(opening) if place in wanted}
+    places_wanted = sorted(wanted)
+    soft = dict(zip(places_wanted, map(soften, read(places_wanted)), strict=True))
     middle = np.median(np.stack([soft[place] for place in compared or sorted(wanted)]), axis=0)
     if chosen is None:
         chosen, how = min(compared, key=lambda place: _energy(soft[place] - middle)), method
