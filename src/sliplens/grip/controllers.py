@@ -237,7 +237,7 @@ CONTROLLERS = Table(
 """Controllers by name; an installed package adds its own by the entry point `sliplens.controllers`."""
 
 
-TOLD = {"zero": 0.0, "target": 0.4}
+TOLD = {"zero": 0.0, "target": 0.6}
 """Constants of the laws on the margin where the friction is told: what is read is then the margin itself."""
 
 
