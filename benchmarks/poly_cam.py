@@ -42,7 +42,7 @@ BUDGET = 0.25
 RECIPE = SimulationRecipe(dry_trials=8, wet_trials=0, frames_per_trial=24, seed=7)
 
 
-def choose_frames(trained: Run, data: Dataset, *, real: Path, count: int) -> tuple[Tensor, Tensor]:
+def pick_inputs(trained: Run, data: Dataset, *, real: Path, count: int) -> tuple[Tensor, Tensor]:
     """Inputs and references: real difference images where the network takes them, then simulated frames."""
     chosen = [frames_from_dataset(trained, data, split="test")]
     if trained.manifest.input == "difference" and real.is_dir():
@@ -187,7 +187,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             found, gpu = {}, []
             for run in options.run:
                 trained = load(run)
-                images, references = choose_frames(trained, data, real=options.real, count=options.frames)
+                images, references = pick_inputs(trained, data, real=options.real, count=options.frames)
                 found[str(run)] = measure(run, images, references, options=options)
                 gpu.append(
                     [gpu_milliseconds(trained, images[-1], references[-1], budget=one) for one in (1.0, options.budget)]

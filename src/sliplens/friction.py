@@ -122,7 +122,7 @@ class Friction:
         with np.errstate(divide="ignore"):
             posterior = np.log(weights) + exponent
         posterior = np.exp(posterior - posterior.max())
-        return Friction(values, posterior, note="learnt from slips").without_the_negligible()
+        return Friction(values, posterior, note="learnt from slips")._without_negligible()
 
     def next_grasp(self, spread: float = GRASP_SPREAD) -> "Friction":
         """Friction of another grasp of the same object, which differs by a Gaussian share of deviation `spread`."""
@@ -135,9 +135,9 @@ class Friction:
         grid, _ = _anything().nodes
         share = np.exp(-0.5 * (np.log(grid / values[:, None]) / spread) ** 2)
         moved = weights @ (share / np.maximum(share.sum(axis=1, keepdims=True), 1e-300))
-        return Friction(grid, moved, note=self.note).without_the_negligible()
+        return Friction(grid, moved, note=self.note)._without_negligible()
 
-    def without_the_negligible(self) -> "Friction":
+    def _without_negligible(self) -> "Friction":
         """The same without values that are a million times less likely than the likeliest."""
         values, weights = self.nodes
         kept = weights > _NEGLIGIBLE * weights.max()
@@ -236,11 +236,10 @@ def as_friction(told: FrictionLike) -> Friction:
     """
     if isinstance(told, Friction):
         return told
-    if isinstance(told, tuple):
-        return Friction.between(*told)
+    parts = told.split("..") if isinstance(told, str) else told if isinstance(told, tuple) else (told,)
     try:
-        numbers = [float(part) for part in told.split("..")] if isinstance(told, str) else [float(told)]
-    except ValueError:
+        numbers = [float(part) for part in parts]
+    except (TypeError, ValueError):
         numbers = []
     if len(numbers) not in {1, 2}:
         raise InputError(f"{told!r} is no friction; give a number such as 0.62, or a range such as 0.5..0.8")

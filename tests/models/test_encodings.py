@@ -25,6 +25,15 @@ def test_the_untouched_sensor_is_black_as_a_difference_and_itself_as_a_raw_frame
     torch.testing.assert_close(ENCODINGS["raw"].empty(frames[0], image_size=16), expected)
 
 
+def test_a_pair_is_the_frame_and_beside_it_the_untouched_sensor(frames: np.ndarray):
+    reference = frames[::-1][0]
+    seen = ENCODINGS["pair"].encode(frames, reference, image_size=16)
+    torch.testing.assert_close(seen[:, :3], torch.from_numpy(frames).permute(0, 3, 1, 2) / 255)
+    empty = ENCODINGS["pair"].empty(reference, image_size=16)
+    assert torch.equal(empty[:3], empty[3:])
+    assert torch.equal(seen[:, 3:], empty[3:].expand(3, -1, -1, -1))
+
+
 def test_a_difference_forgets_its_amplitude(frames: np.ndarray):
     black = np.zeros_like(frames[0])
     halves = frames // 2 * 2  # even, so that half of it is exact

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.plots.saliency import choose_frames
+from sliplens.plots.saliency import choose_columns
 from sliplens.report import load_results, write_report
 from sliplens.results.explanation import ExplainedFrame
 
@@ -224,7 +224,7 @@ def test_panel_takes_the_nearest_labels_of_one_condition():
     frames = (frame("a", 0.97), frame("b", 1.0, "wet"), frame("c", 0.22), frame("d", 0.19), frame("e", 0.03))
     frames += (frame("f", 0.96), frame("g", 0.95), frame("h", 0.94))
 
-    condition, chosen = choose_frames(frames)
+    condition, chosen = choose_columns(frames)
 
     assert condition == "dry"
     assert chosen == [(1.0, 0), (0.8, None), (0.6, None), (0.4, None), (0.2, 3), (0.0, 4)]
@@ -233,10 +233,10 @@ def test_panel_takes_the_nearest_labels_of_one_condition():
 def test_few_frames_are_all_shown_from_stick_to_slip():
     frames = (frame("a", 0.0), frame("b", 1.0), frame("c", 1.0), frame("d", 0.25), frame("e", 0.9, "wet"))
 
-    assert choose_frames(frames) == ("dry", [(1.0, 1), (1.0, 2), (0.25, 3), (0.0, 0)])
+    assert choose_columns(frames) == ("dry", [(1.0, 1), (1.0, 2), (0.25, 3), (0.0, 0)])
 
 
 def test_frames_without_labels_are_shown_in_their_order():
     frames = tuple(frame(str(index), None) for index in range(9))
 
-    assert choose_frames(frames) == ("dry", [(None, index) for index in range(6)])
+    assert choose_columns(frames) == ("dry", [(None, index) for index in range(6)])

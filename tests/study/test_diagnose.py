@@ -21,7 +21,7 @@ from sliplens.simulation import SimulationRecipe, simulate_dataset
 from sliplens.study import diagnose as diagnosing
 from sliplens.study.diagnose import (
     cluster_explanations,
-    compare_errors,
+    excess_error,
     find_slices,
     friction_slopes,
     hold_against,
@@ -108,10 +108,10 @@ def test_slices_are_named_for_what_their_frames_have_in_common(errors, rng):
 def test_a_group_is_compared_with_the_rest_as_trials_drawn_again_do(errors, rng):
     inside = errors.friction < 0.5
     planted = replace(errors, prediction=errors.prediction + np.repeat(rng.normal(0, 0.1, TRIALS), FRAMES) * inside)
-    gap, sizes = compare_errors(planted, inside, rng), np.abs(planted.error)
+    gap, sizes = excess_error(planted, inside, rng), np.abs(planted.error)
     assert gap.estimate == pytest.approx(sizes[inside].mean() - sizes[~inside].mean())
     # one day alone: else the interval is over days
-    gap = compare_errors(replace(planted, day=np.ones(len(planted), dtype=np.int64)), inside, rng)
+    gap = excess_error(replace(planted, day=np.ones(len(planted), dtype=np.int64)), inside, rng)
     drawn = []
     for _ in range(1000):
         rows = np.concatenate([at * FRAMES + np.arange(FRAMES) for at in rng.integers(0, TRIALS, TRIALS)])
@@ -119,7 +119,7 @@ def test_a_group_is_compared_with_the_rest_as_trials_drawn_again_do(errors, rng)
     low, high = np.quantile(drawn, [0.025, 0.975])
     # two ways to draw: alike within a fourth of their width
     assert (gap.low, gap.high) == pytest.approx((low, high), abs=0.25 * (high - low))
-    assert compare_errors(errors, np.ones(len(errors), dtype=bool), rng).estimate == 0
+    assert excess_error(errors, np.ones(len(errors), dtype=bool), rng).estimate == 0
 
 
 def test_kinds_of_explanations_are_recovered_whatever_their_size(rng):

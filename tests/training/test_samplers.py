@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 
 from sliplens.training.data import EpochShuffle, EvenShares
@@ -12,6 +13,14 @@ def test_each_epoch_has_an_order_of_its_own_that_repeats():
     assert sorted(first) == sorted(second) == list(range(20))
     assert first != second
     assert list(shuffle) == first
+
+
+@pytest.mark.parametrize(("count", "drawn"), [(20, 7), (7, 20), (5, 15)])
+def test_an_epoch_may_draw_more_or_fewer_and_none_much_oftener_than_another(count: int, drawn: int):
+    shuffle = EpochShuffle(count, seed=1, drawn=drawn)
+    times = np.bincount(shuffle.order(2), minlength=count)
+    assert len(shuffle) == times.sum() == drawn
+    assert np.ptp(times) <= 1
 
 
 @pytest.mark.parametrize(("count", "processes"), [(20, 1), (20, 2), (23, 2), (23, 4)])

@@ -1,6 +1,7 @@
 """Training and evaluation as calls of the library, from a data set to a record."""
 
 import gc
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,26 @@ import pytest
 
 import sliplens as sl
 from sliplens.errors import InputError
+from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset
+
+
+class Notes:
+    """Keeps the sentences that a command would show."""
+
+    def __init__(self) -> None:
+        self.sentences: list[str] = []
+
+    def __call__(self, done: int, total: int, /) -> None: ...
+
+    def wrote(self, path: Path, what: str, /, *, kept: bool = False) -> None: ...
+
+    def stage(self, _title: str, /) -> AbstractContextManager[OnProgress]:
+        return nullcontext(self)
+
+    def note(self, message: str, /) -> None:
+        self.sentences.append(message)
+
 
 SMALL: dict[str, Any] = {"image_size": 32, "epochs": 2, "batch_size": 11, "head": "point", "untouched_share": 0.0}
 
@@ -45,6 +65,19 @@ def test_what_was_written_comes_back_as_it_was_returned(small_dataset: Dataset, 
     assert kept.lead_times == first.lead_times
     for name in ("prediction", "low_90", "high_90", "sigma"):
         np.testing.assert_array_equal(getattr(kept.predictions, name), getattr(first.predictions, name))
+
+
+def test_a_network_that_is_adapted_stays_of_its_kind(small_dataset: Dataset):
+    once: dict[str, Any] = SMALL | {"epochs": 1}
+    start = sl.train(small_dataset, **once, input="raw")
+    notes = Notes()
+    short: dict[str, Any] = {"epochs": 1, "epoch_frames": 32, "learning_rate": 1e-12}
+    run = sl.train(small_dataset, recipe="adapt", start_from=start, **short, on_progress=notes)
+    for name in ("input", "backbone", "head", "image_size"):
+        assert getattr(run.manifest, name) == getattr(start.manifest, name)
+    assert any("6 labelled trials" in sentence for sentence in notes.sentences)
+    with pytest.raises(InputError, match="teaches a network that is there; name it with --start-from"):
+        sl.train(small_dataset, recipe="adapt")
 
 
 def test_several_processes_need_a_folder(small_dataset: Dataset):

@@ -20,11 +20,12 @@ class Train(Command):
     """Folder to make: weights, manifest, learning curve."""
     recipe: str = "default"
     """default: a distribution over the margin, AdamW. thesis: as the thesis trained, one output and Ranger21. ratio:
-    teaches the network of --start-from F_t / F_n, for where friction is told; its margins stay. The options below
-    change it."""
-    input: str = "difference"
-    """What the network sees of a frame T_n and of the untouched sensor T_0. difference: |T_n - T_0|, each image divided
-    by its own maximum. raw: T_n. signed: T_n - T_0. amplitude: |T_n - T_0| as strong as it is."""
+    adapt: teaches the network of --start-from a sensor of your own, from some ten trials, in minutes. ratio: teaches it
+    F_t / F_n, for where friction is told; its margins stay. The options below change it."""
+    input: str | None = None
+    """What the network sees of a frame T_n and of the untouched sensor T_0. difference, unless --start-from sees
+    something else: |T_n - T_0|, each image divided by its own maximum. raw: T_n. signed: T_n - T_0. amplitude:
+    |T_n - T_0| as strong as it is. pair: T_n and T_0 side by side."""
     start_from: Path | None = None
     """Network whose weights to start from, a run or one that comes with sliplens: to teach it your own sensor, or to go
     on at another image size. Its input, backbone and head must be those asked for."""
@@ -72,5 +73,5 @@ class Train(Command):
         run = train(out=self.output, **options, on_progress=Terminal())
         picture = self.output / "curves.png"
         if run.training is not None and not picture.is_file():
-            title = f"{self.output.name}, {self.input} images of {self.data.name}"
+            title = f"{self.output.name}, {run.manifest.input} images of {self.data.name}"
             draw_learning_curve(run.training, picture, title=title)

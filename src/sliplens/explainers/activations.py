@@ -69,7 +69,7 @@ class _Call(NamedTuple):
 
 
 def find_layers(
-    model: nn.Module, images: Float[Tensor, "batch 3 height width"], *, names: Sequence[str] | None = None
+    model: nn.Module, images: Float[Tensor, "batch colours height width"], *, names: Sequence[str] | None = None
 ) -> tuple[Layer, ...]:
     """Find the layers to explain, in the order in which they run: fine to coarse in the usual network.
 
@@ -98,7 +98,7 @@ def find_layers(
 
 
 def recall_layers(
-    model: nn.Module, images: Float[Tensor, "batch 3 height width"], *, names: Sequence[str] | None = None
+    model: nn.Module, images: Float[Tensor, "batch colours height width"], *, names: Sequence[str] | None = None
 ) -> tuple[Layer, ...]:
     """As `find_layers`, whose pass costs as much as a whole Grad-CAM; made again only where its answer may change."""
     modules = tuple((name, weakref.ref(module)) for name, module in model.named_modules())
@@ -112,7 +112,7 @@ def recall_layers(
 _RECALLED: weakref.WeakKeyDictionary[nn.Module, tuple[object, tuple[Layer, ...]]] = weakref.WeakKeyDictionary()
 
 
-def find_published_layers(model: nn.Module, images: Float[Tensor, "batch 3 height width"]) -> tuple[Layer, ...]:
+def find_published_layers(model: nn.Module, images: Float[Tensor, "batch colours height width"]) -> tuple[Layer, ...]:
     """Layers as the public code finds them: every module that ends just before the size of the output changes.
 
     Modules are listed as they end, insides before their block: the size goes down and up again inside a block with two

@@ -52,12 +52,12 @@ class Comparison:
     """
 
     model: nn.Module
-    images: Float[Tensor, "batch 3 height width"]
+    images: Float[Tensor, "batch colours height width"]
     """Images x in the network's own type and on its device."""
-    references: Float[Tensor, "batch_or_one 3 height width"]
+    references: Float[Tensor, "batch_or_one colours height width"]
     """Reference b, one for each image or one for all."""
 
-    def predict(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, " batch"]:
+    def predict(self, images: Float[Tensor, "batch colours height width"]) -> Float[Tensor, " batch"]:
         """Run the network and return one margin an image, with the graph where gradients are on."""
         output = self.model(images)
         if not isinstance(output, Tensor):
@@ -95,7 +95,7 @@ class Comparison:
         return comparison
 
     @property
-    def reference(self) -> Float[Tensor, "batch 3 height width"]:
+    def reference(self) -> Float[Tensor, "batch colours height width"]:
         """Reference b of each image."""
         return self.references.expand_as(self.images)
 
@@ -173,7 +173,7 @@ def _require_images(images: Batch) -> None:
         )
     if images.shape[0] == 0:
         raise ImageError("there is no image to explain, the batch is empty; pass at least one image")
-    if images.shape[1] != 3:
+    if images.shape[1] not in {3, 6}:
         raise ImageError(
             f"images have {images.shape[1]} channels instead of 3; pass RGB images with the channels on the second axis"
         )
@@ -185,9 +185,10 @@ def _require_images(images: Batch) -> None:
 
 
 def _require_reference(reference: Tensor | None, *, images: Tensor) -> Tensor:
-    """The reference with a batch axis of one (shared) or of the batch's length, zeros when None is given."""
+    """The reference with a batch axis of one (shared) or of the batch's length; that of the images if None."""
     if reference is None:
-        return torch.zeros_like(images[:1])
+        # the untouched sensor: no difference, or the reference that is seen beside the frame
+        return torch.zeros_like(images[:1]) if images.shape[1] == 3 else torch.cat([images[:, 3:]] * 2, dim=1)
     shared = tuple(reference.shape) == tuple(images.shape[1:])
     if not shared and reference.shape != images.shape:
         raise ImageError(
@@ -197,6 +198,13 @@ def _require_reference(reference: Tensor | None, *, images: Tensor) -> Tensor:
     reference = reference[None] if shared else reference
     _require_unit_interval(reference, what="reference")
     return reference
+
+
+def black_frames(images: Float[Tensor, "*batch colours height width"]) -> Float[Tensor, "*batch colours height width"]:
+    """Images whose frame is black; the reference beside it, where the network sees one, stays."""
+    black = images.clone()
+    black[..., :3, :, :] = 0
+    return black
 
 
 def _require_unit_interval(images: Tensor, *, what: str) -> None:
@@ -240,7 +248,8 @@ class Explainer(Protocol):
             Images x, float in [0, 1], shape (batch, 3, height, width).
         reference
             What the images are compared with, float in [0, 1], one for all (3, height, width) or one each
-            (batch, 3, height, width); by default zeros, the untouched sensor of difference images.
+            (batch, 3, height, width); by default zeros, the untouched sensor of difference images. Images with six
+            channels hold the reference in the last three, which stays: the frame is explained.
 
         Raises
         ------

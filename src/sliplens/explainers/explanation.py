@@ -39,7 +39,7 @@ class Approximation:
 class Explanation:
     """Why a network predicts f(x) rather than f(reference), for a batch of images."""
 
-    images: Float[Tensor, "batch 3 height width"]
+    images: Float[Tensor, "batch colours height width"]
     """Images x as the network saw them, in [0, 1]."""
     relevance: Float[Tensor, "batch height width"]
     """Signed contribution of each pixel in margin units (float32): above zero where it raises the prediction."""

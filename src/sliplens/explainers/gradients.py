@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.explainers.contract import Comparison, Method, freeze, require_at_least_one
+from sliplens.explainers.contract import Comparison, Method, black_frames, freeze, require_at_least_one
 from sliplens.explainers.explanation import Explanation, check_slopes
 from sliplens.progress import OnProgress
 
@@ -80,7 +80,7 @@ class IntegratedGradients(Method):
     def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
         black, slopes = comparison, []
         if self.black:
-            black = replace(comparison, references=torch.zeros_like(comparison.references))
+            black = replace(comparison, references=black_frames(comparison.references))
         pairs = (black.images, black.reference, black.prediction, black.reference_prediction)
 
         def integral(index: int) -> Tensor:
@@ -99,8 +99,8 @@ class IntegratedGradients(Method):
     def integrate(
         self,
         comparison: Comparison,
-        image: Float[Tensor, "3 height width"],
-        reference: Float[Tensor, "3 height width"],
+        image: Float[Tensor, "colours height width"],
+        reference: Float[Tensor, "colours height width"],
         prediction: Float[Tensor, ""],
         reference_prediction: Float[Tensor, ""],
     ) -> Line:
@@ -170,7 +170,7 @@ class ExpectedGradients(Method):
     gradients*, Nature Machine Intelligence 2021, eq. 3.
     """
 
-    background: Float[Tensor, "frames 3 height width"] | None = None
+    background: Float[Tensor, "frames colours height width"] | None = None
     """Frames without slip as the network takes them, float in [0, 1], shape (frames, 3, height, width); the call's
     reference is then not used. Without one the call's reference is the whole background, and a warning says so."""
     integrated: IntegratedGradients = field(default_factory=IntegratedGradients)

@@ -115,7 +115,7 @@ def scale_to(
 
 
 def local_change(
-    image: Float[Tensor, "3 height width"], reference: Float[Tensor, "3 height width"], *, widths: int = 1
+    image: Float[Tensor, "colours height width"], reference: Float[Tensor, "colours height width"], *, widths: int = 1
 ) -> Float[Tensor, "height width"]:
     """Mean of |x - b| over the colours and a square of some `CHANGE_WINDOW` around each pixel, the border repeated."""
     change = (image - reference).abs().mean(dim=0)

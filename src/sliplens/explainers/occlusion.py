@@ -19,7 +19,7 @@ from sliplens.recordings import Recording
 
 
 def find_markers(
-    image: Float[Tensor, "3 height width"], reference: Float[Tensor, "3 height width"]
+    image: Float[Tensor, "colours height width"], reference: Float[Tensor, "colours height width"]
 ) -> Float[Tensor, "markers 2"]:
     """Places (x, y) of the markers that an image shows, in pixels; the reference tells whether they show at all.
 
@@ -30,6 +30,7 @@ def find_markers(
     ImageError
         If too few markers are found.
     """
+    image, reference = image[:3], reference[:3]
     if not float(reference.std(dim=(1, 2)).max()):
         # a uniform reference is that of differences, in which a marker shows twice or, at rest, not at all
         raise InputError(
@@ -44,13 +45,13 @@ def find_markers(
 class KnownMarkers:
     """What tells the markers of images in which they do not show: those of the image it knows that is most alike."""
 
-    images: Float[Tensor, "frames 3 height width"]
+    images: Float[Tensor, "frames colours height width"]
     """As the network gets them, in [0, 1]."""
     places: tuple[Float[Tensor, "_markers 2"], ...]
     """x and y of the markers of each, in pixels of these images."""
 
     def __call__(
-        self, image: Float[Tensor, "3 height width"], _reference: Float[Tensor, "3 height width"]
+        self, image: Float[Tensor, "colours height width"], _reference: Float[Tensor, "colours height width"]
     ) -> Float[Tensor, "_markers 2"]:
         """Places of the markers of the nearest image: noise, or the next frame, leaves it the nearest."""
         unlike = [(image.to(known) - known).abs().mean() for known in self.images]
@@ -79,7 +80,7 @@ def markers_in_recording(recording: Recording, row: int, *, image_size: int) -> 
 
 
 Places: TypeAlias = Float[Tensor, "markers 2"]
-FindPlaces: TypeAlias = Callable[[Float[Tensor, "3 height width"], Float[Tensor, "3 height width"]], Places]
+FindPlaces: TypeAlias = Callable[[Float[Tensor, "colours height width"], Float[Tensor, "colours height width"]], Places]
 """From an image and its reference, in [0, 1], to x and y of its markers in pixels."""
 
 

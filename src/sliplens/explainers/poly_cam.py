@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from sliplens.errors import InputError
 from sliplens.explainers.activations import Layer, capture, find_layers, find_published_layers
-from sliplens.explainers.contract import Comparison, Method
+from sliplens.explainers.contract import Comparison, Method, black_frames
 from sliplens.explainers.explanation import (
     Approximation,
     Explanation,
@@ -85,9 +85,9 @@ SCORES = {
 class _Regions:
     """One image and the regions of all its channels, those of every layer in a row."""
 
-    image: Float[Tensor, "3 height width"]
+    image: Float[Tensor, "colours height width"]
     """Image x."""
-    empty: Float[Tensor, "3 height width"]
+    empty: Float[Tensor, "colours height width"]
     """What is shown outside a region, b."""
     masks: list[Float[Tensor, "_channels _rows _columns"]]
     """Masks M in [0, 1] at the resolution of each layer; see `to_masks`."""
@@ -97,7 +97,7 @@ class _Regions:
         """Channels whose mask is not empty; an empty one keeps nothing and removes nothing. A mask of NaN is active."""
         return torch.nonzero(torch.cat([(masks != 0).flatten(1).any(dim=1) for masks in self.masks])).flatten()
 
-    def blends(self, channels: Int[Tensor, " some"]) -> Float[Tensor, "images 3 height width"]:
+    def blends(self, channels: Int[Tensor, " some"]) -> Float[Tensor, "images colours height width"]:
         """Masked images of some channels, in rising order: all that are kept, then all that are removed."""
         parts, first = [], 0
         for masks in self.masks:
@@ -277,7 +277,7 @@ class PolyCam(Method):
         """Weight >= 0 of each channel, layer by layer, and how far they are estimates."""
         score = SCORES[self.score]
         image, empty = comparison.prediction[index], comparison.reference_prediction[index]
-        black = torch.zeros_like(comparison.images[index])
+        black = black_frames(comparison.images[index])
         if score.as_published:
             empty = comparison.predict(black[None])[0]
         regions = _Regions(

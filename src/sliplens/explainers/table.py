@@ -132,7 +132,7 @@ def network_images(
     trained: Run,
     frames: UInt8[np.ndarray, "batch height width 3"],
     reference: UInt8[np.ndarray, "height width 3"] | None,
-) -> tuple[UInt8[Tensor, "batch 3 size size"], Float[Tensor, "3 size size"]]:
+) -> tuple[UInt8[Tensor, "batch colours size size"], Float[Tensor, "colours size size"]]:
     """Images of a network before they are normalised, 8 bits, and the input of the untouched sensor, in [0, 1]."""
     if not len(frames):
         raise ImageError("there is no frame to explain; give one at least")
@@ -151,7 +151,7 @@ def network_images(
 
 def network_inputs(
     trained: Run, frames: UInt8[np.ndarray, "batch _ _ 3"], reference: UInt8[np.ndarray, "_ _ 3"] | None
-) -> tuple[Float[Tensor, "batch 3 size size"], Float[Tensor, "3 size size"]]:
+) -> tuple[Float[Tensor, "batch colours size size"], Float[Tensor, "colours size size"]]:
     """Inputs of a network and that of the untouched sensor, in [0, 1] on its device."""
     images, empty = network_images(trained, frames, reference)
     return trained.encoding.normalise(images).to(trained.device), empty.to(trained.device)

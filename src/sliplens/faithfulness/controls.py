@@ -18,7 +18,7 @@ from sliplens.faithfulness.map_quality import stability
 from sliplens.intervals import paired_difference
 from sliplens.results.faithfulness import CHANCE, Lead
 
-Images = Float[Tensor, "images 3 height width"]
+Images = Float[Tensor, "images colours height width"]
 ControlMaps = Float[Tensor, "images height width"]
 Maps = Float[np.ndarray, "images height width"]
 _QUARTER_GREY_LEVEL = 0.001

@@ -103,11 +103,11 @@ def deletion_steps(shape: tuple[int, int], *, steps: int | None = None) -> Int[n
 
 def deletion_curves(
     predict: Predict,
-    images: Float[Tensor, "images 3 height width"],
+    images: Float[Tensor, "images colours height width"],
     orders: Int[np.ndarray, "images pixels"],
     *,
     fill: Fill,
-    references: Float[Tensor, "images 3 height width"] | None = None,
+    references: Float[Tensor, "images colours height width"] | None = None,
     steps: int | None = None,
     seed: int = 0,
     batch_size: int = 128,

@@ -47,7 +47,10 @@ def noisy_linear(
 
 
 def _solve(
-    images: Float[Tensor, "batch 3 height width"], gone: Bool[Tensor, "batch 3 height width"], *, tolerance: float
+    images: Float[Tensor, "batch 3 height width"],
+    gone: Bool[Tensor, "batch 3 height width"],
+    *,
+    tolerance: float,
 ) -> Float[Tensor, "batch 3 height width"]:
     """Images whose removed pixels are the weighted means of their neighbours, from the solution at half the size on.
 
@@ -91,7 +94,10 @@ def _solve(
 
 
 def _begin(
-    images: Float[Tensor, "batch 3 height width"], left: Float[Tensor, "batch 3 height width"], *, tolerance: float
+    images: Float[Tensor, "batch 3 height width"],
+    left: Float[Tensor, "batch 3 height width"],
+    *,
+    tolerance: float,
 ) -> Float[Tensor, "batch 3 height width"]:
     """A first guess: the solution at half the size, or the mean of what is left of a small or whole image."""
     known = left.sum(dim=(2, 3), keepdim=True)
@@ -105,8 +111,10 @@ def _begin(
     return functional.interpolate(half, size=images.shape[-2:], mode="bilinear", align_corners=False)
 
 
-Images = Float[Tensor, "images 3 height width"]
-Painter = Callable[[Int[Tensor, " batch"], Bool[Tensor, "batch height width"]], Float[Tensor, "batch 3 height width"]]
+Images = Float[Tensor, "images colours height width"]
+Painter = Callable[
+    [Int[Tensor, " batch"], Bool[Tensor, "batch height width"]], Float[Tensor, "batch colours height width"]
+]
 """From numbers of images, and the pixels that are gone of each, to the images without them."""
 Fill = Callable[[Images, Images | None, int], Painter]
 """From inputs in [0, 1], their references (the untouched sensor) if they are known, and a seed, to a painter."""
@@ -174,7 +182,7 @@ less.
 
 
 def get_fill(name: str) -> Fill:
-    """Fill of a name.
+    """Fill of a name, for the frame: the reference beside it, where the network sees one, stays.
 
     Raises
     ------
@@ -190,4 +198,12 @@ def get_fill(name: str) -> Fill:
     >>> paint(torch.tensor([0]), torch.tensor([[[True, False]]]))[0, 0]
     tensor([[0.5000, 1.0000]])
     """
-    return FILLS.pick(name)
+    fill = FILLS.pick(name)
+
+    def prepare(images: Images, references: Images | None, seed: int) -> Painter:
+        if images.shape[1] == 3:
+            return fill(images, references, seed)
+        paint = fill(images[:, :3], None if references is None else references[:, :3], seed)
+        return lambda rows, gone: torch.cat([paint(rows, gone), images[rows, 3:]], dim=1)
+
+    return prepare

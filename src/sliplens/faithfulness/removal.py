@@ -24,7 +24,9 @@ Units = Int[np.ndarray, "height width"]
 Predict: TypeAlias = Callable[[Tensor], Tensor] | Engine
 """From inputs (batch, 3, height, width) to answers (batch,), in margin units; or an engine made ready for many passes,
 which keeps all cores busy (`sliplens.models.engines.prepare`)."""
-Redraw: TypeAlias = Callable[[int, Bool[np.ndarray, "variants markers"]], Float[Tensor, "variants 3 height width"]]
+Redraw: TypeAlias = Callable[
+    [int, Bool[np.ndarray, "variants markers"]], Float[Tensor, "variants colours height width"]
+]
 """From the number of an image, and the markers that are put back in each variant, to the network's inputs.
 
 It is the true fill: any other puts pixels where no marker ever was, and a network may answer to that; here every image
@@ -243,11 +245,11 @@ def _paint(
 
 def removal_curves(
     predict: Predict,
-    images: Float[Tensor, "images 3 height width"],
+    images: Float[Tensor, "images colours height width"],
     orders: Int[np.ndarray, "orders images pixels"],
     *,
     fill: Fill,
-    references: Float[Tensor, "images 3 height width"] | None = None,
+    references: Float[Tensor, "images colours height width"] | None = None,
     areas: Sequence[float] = AREAS,
     seed: int = 0,
     batch_size: int = 64,
@@ -298,13 +300,13 @@ def removal_curves(
 
 def score_maps(
     predict: Predict,
-    images: Float[Tensor, "images 3 height width"],
+    images: Float[Tensor, "images colours height width"],
     influence: Mapping[str, Float[np.ndarray, "images height width"]],
     units: Sequence[Units],
     *,
     fill: Fill,
     rng: np.random.Generator,
-    references: Float[Tensor, "images 3 height width"] | None = None,
+    references: Float[Tensor, "images colours height width"] | None = None,
     towards: Float[np.ndarray, " images"] | None = None,
     random_orders: int = RANDOM_ORDERS,
     areas: Sequence[float] = AREAS,
@@ -344,7 +346,7 @@ def score_maps(
 
 def answer_scenes(
     predict: Predict,
-    redraw: Callable[[Bool[np.ndarray, "variants markers"]], Float[Tensor, "variants 3 height width"]],
+    redraw: Callable[[Bool[np.ndarray, "variants markers"]], Float[Tensor, "variants colours height width"]],
     *,
     batch_size: int = 64,
 ) -> Callable[[Bool[np.ndarray, "variants markers"]], Float64[np.ndarray, " variants"]]:

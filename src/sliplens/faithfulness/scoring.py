@@ -153,7 +153,7 @@ def score_by_deletion(
     return replace(own, control=control)
 
 
-def prepare_passes(trained: Run, inputs: Float[Tensor, "images 3 size size"], passes: int) -> Engine:
+def prepare_passes(trained: Run, inputs: Float[Tensor, "images colours size size"], passes: int) -> Engine:
     """Make an engine ready for so many passes of a network, checked on a few of its inputs, on the network's device."""
     some = inputs[:_CHECKED_IMAGES].to(trained.device)
     return prepare(trained.model, some, trained.predict(some).to(trained.device), passes=passes)

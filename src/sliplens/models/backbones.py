@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
@@ -210,6 +211,27 @@ def with_ratio(model: nn.Module, weights: Mapping[str, Tensor]) -> nn.Module:
     return model
 
 
+REFERENCE_SIGNS = {"raw": 0.0, "difference": -1.0, "amplitude": -1.0}
+"""What the reference half of a `pair` network's first layer begins with, over its frame half, by the input of the
+network it starts from: nothing, which leaves the answers of a raw network what they were, or the opposite, T_n - T_0,
+which is |T_n - T_0| but for the sign."""
+
+
+def with_reference(weights: Mapping[str, Tensor], *, sign: float) -> dict[str, Tensor]:
+    """Weights for a network that sees the reference beside the frame, from those of one that does not."""
+    first = next(name for name, value in weights.items() if value.ndim == 4)
+    return {**weights, first: torch.cat([weights[first], sign * weights[first]], dim=1)}
+
+
+def _see(model: nn.Module, colours: int) -> None:
+    """Replace the first convolution by one that takes so many channels, untrained."""
+    name, first = next((name, module) for name, module in model.named_modules() if isinstance(module, nn.Conv2d))
+    known = ("out_channels", "kernel_size", "stride", "padding", "dilation", "groups", "padding_mode")
+    options: dict[str, Any] = {option: getattr(first, option) for option in known}
+    parent, _, own = name.rpartition(".")
+    setattr(model.get_submodule(parent), own, nn.Conv2d(colours, **options, bias=first.bias is not None))
+
+
 def head_outputs(head: str) -> int:
     """Outputs that a head needs of its backbone."""
     if head not in HEADS:
@@ -229,10 +251,10 @@ BACKBONES: Table[Callable[..., nn.Module]] = Table(
 entry point `sliplens.backbones`."""
 
 
-def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point") -> nn.Module:
+def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point", colours: int = 3) -> nn.Module:
     """Build a classifier from scratch, its last layer replaced by one output: the safety margin.
 
-    It takes (batch, 3, height, width) and returns (batch, 1), untrained, drawn from torch's current random state.
+    It takes (batch, colours, height, width) and returns (batch, 1), untrained, drawn from torch's current random state.
 
     Parameters
     ----------
@@ -241,6 +263,8 @@ def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point") -> nn.
     head
         `point` for one number, `histogram` for the mean of a distribution (`HistogramRegressor`), `margin-and-ratio`
         for a second distribution beside it, over F_t / F_n.
+    colours
+        Channels of the input, see `Encoding.colours`.
 
     References
     ----------
@@ -257,4 +281,6 @@ def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point") -> nn.
     if backbone not in BACKBONES:
         raise ModelError(f"there is no backbone named {backbone!r}; choose a TorchVision classifier such as resnet18")
     model = BACKBONES[backbone](num_classes=head_outputs(head))
+    if colours != 3:
+        _see(model, colours)
     return model if head == "point" else HistogramRegressor(model, ratio=head == "margin-and-ratio")

@@ -101,7 +101,7 @@ class Run:
 
     def encode(
         self, frames: Shaped[np.ndarray, "batch height width 3"], reference: Shaped[np.ndarray, "_ _ 3"] | None
-    ) -> Float[Tensor, "batch 3 size size"]:
+    ) -> Float[Tensor, "batch colours size size"]:
         """Encode frames as the network was trained on them.
 
         `reference`: the sensor untouched; None for frames that were compared before, or that need not be. Frames of
@@ -115,6 +115,11 @@ class Run:
                 )
         self.require_frame_size(frames.shape[1:3])
         size = self.manifest.image_size
+        if reference is None and self.encoding.colours > 3:
+            raise InputError(
+                f"a network on {self.encoding.name} images sees the untouched sensor beside the frame; name its image "
+                "with --reference IMAGE, or a frame of it with --reference-frame N"
+            )
         if reference is None:
             return self.encoding.normalise(self.encoding.resize(frames, image_size=size))
         return self.encoding.encode(frames, reference, image_size=size)
@@ -161,18 +166,20 @@ class Run:
 
     @torch.no_grad()
     def answers(self, batches: Iterable[Tensor]) -> tuple[Tensor, ...]:
-        """What the network answers (`Answers`) to batches of encoded frames, (batch, 3, size, size), on its device."""
+        """What the network answers (`Answers`) to batches of encoded frames, on its device."""
         network = Answers(self.model)
         parts = [network(batch.to(self.device)) for batch in batches]
         return tuple(torch.cat(answers) for answers in zip(*parts, strict=True))
 
-    def predict(self, inputs: Float[Tensor, "batch 3 size size"], *, batch_size: int = 64) -> Float[Tensor, " batch"]:
+    def predict(
+        self, inputs: Float[Tensor, "batch colours size size"], *, batch_size: int = 64
+    ) -> Float[Tensor, " batch"]:
         """Safety margin of encoded frames; not clipped, so that an answer outside [0, 1] shows as what it is."""
         return self.answers(inputs.split(batch_size))[0].cpu()
 
     def estimate(
         self,
-        inputs: Float[Tensor, "batch 3 size size"],
+        inputs: Float[Tensor, "batch colours size size"],
         *,
         friction: FrictionLike | None = None,
         batch_size: int = 64,
@@ -316,11 +323,11 @@ def tell_each(
     trained_friction: Float[np.ndarray, " quantiles"],
     calibration: Calibration | None = None,
 ) -> Estimate:
-    """Tell each frame the friction of its own trial, exactly; frames of which it is not known (NaN) stay untold."""
+    """Tell each frame the friction of its own trial, exactly."""
     assert estimate.probabilities is not None
     assert estimate.ratio is not None
-    margin, probabilities = estimate.margin.copy(), estimate.probabilities.copy()
-    for value in np.unique(friction[np.isfinite(friction)]):
+    margin, probabilities = np.empty_like(estimate.margin), np.empty_like(estimate.probabilities)
+    for value in np.unique(friction):
         rows = friction == value
         ratio = replace(estimate.ratio, probabilities=estimate.ratio.probabilities[rows])
         some = replace(estimate, margin=margin[rows], probabilities=probabilities[rows], ratio=ratio)
@@ -347,12 +354,11 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> Run:
     """
     require_folder(folder, what="the run")
     weights, manifest = folder / WEIGHTS_FILE, read_manifest(folder)
-    get_encoding(manifest.input)
     if not weights.is_file():
         raise CheckpointError(f"{weights} is missing; train the network again or copy the whole folder")
     if hash_file(weights) != manifest.weights_sha256:
         raise CheckpointError(f"{weights} is not the file its manifest describes; copy the whole folder again")
-    model = build_model(manifest.backbone, head=manifest.head)
+    model = build_model(manifest.backbone, head=manifest.head, colours=get_encoding(manifest.input).colours)
     try:
         model.load_state_dict(load_file(weights, device="cpu"))
     except (SafetensorError, RuntimeError) as error:

@@ -13,6 +13,7 @@ from sliplens.extras import Table
 from sliplens.images import absolute_difference, signed_difference
 
 Frames = UInt8[np.ndarray, "batch height width 3"]
+Compared = UInt8[np.ndarray, "batch height width colours"]
 Reference = UInt8[np.ndarray, "_ _ 3"]
 
 
@@ -26,15 +27,17 @@ class Encoding:
     """
 
     name: str
-    compare: Callable[[Frames, Reference], Frames]
+    compare: Callable[[Frames, Reference], Compared]
     empty_is_black: bool
     """Whether an untouched sensor is a black image, so that no reference frame is needed to explain."""
     own_maximum: bool = True
     """Whether each image is divided by its own maximum, as in the thesis; else by 255, which keeps its amplitude."""
     neutral: float = 0.0
     """What stands for no change, in the network's input."""
+    colours: int = 3
+    """Channels of the input: those of the frame, then those of the reference where the network sees that beside it."""
 
-    def resize(self, compared: Frames, *, image_size: int) -> UInt8[Tensor, "batch 3 size size"]:
+    def resize(self, compared: Compared, *, image_size: int) -> UInt8[Tensor, "batch colours size size"]:
         """Bring compared frames to the network's square size, in 8 bits.
 
         Bilinear with antialiasing: the noise of neighbouring pixels averages out instead of aliasing.
@@ -47,7 +50,7 @@ class Encoding:
         )
         return resized.round().clamp(0, 255).to(torch.uint8)
 
-    def normalise(self, images: UInt8[Tensor, "batch 3 size size"]) -> Float[Tensor, "batch 3 size size"]:
+    def normalise(self, images: UInt8[Tensor, "batch colours size size"]) -> Float[Tensor, "batch colours size size"]:
         """Scale to [0, 1]: by each image's own maximum, as the thesis does, or by 255; an all-black image stays black.
 
         Polak, section 4 ("max normalization").
@@ -57,11 +60,13 @@ class Encoding:
         largest = images.amax(dim=(-3, -2, -1), keepdim=True).clamp(min=1)
         return images.float() / largest
 
-    def encode(self, frames: Frames, reference: Reference, *, image_size: int) -> Float[Tensor, "batch 3 size size"]:
+    def encode(
+        self, frames: Frames, reference: Reference, *, image_size: int
+    ) -> Float[Tensor, "batch colours size size"]:
         """Encode frames against their reference frame."""
         return self.normalise(self.resize(self.compare(frames, reference), image_size=image_size))
 
-    def empty(self, reference: Reference, *, image_size: int) -> Float[Tensor, "3 size size"]:
+    def empty(self, reference: Reference, *, image_size: int) -> Float[Tensor, "colours size size"]:
         """Encode the untouched sensor itself: what an explanation is measured against."""
         return self.encode(reference[None], reference, image_size=image_size)[0]
 
@@ -71,14 +76,20 @@ def _keep(frames: Frames, reference: Reference) -> Frames:
     return frames
 
 
+def _put_beside(frames: Frames, reference: Reference) -> Compared:
+    return np.concatenate([_keep(frames, reference), np.broadcast_to(reference, frames.shape)], axis=-1)
+
+
 _ROWS = {
-    # |T_n - T_0| by its own maximum and T_n itself, both as the thesis; T_n - T_0; |T_n - T_0| with its amplitude
+    # |T_n - T_0| by its own maximum and T_n itself, both as the thesis; T_n - T_0; |T_n - T_0| with its amplitude;
+    # T_n and T_0, on one scale
     "difference": Encoding(name="difference", compare=absolute_difference, empty_is_black=True),
     "raw": Encoding(name="raw", compare=_keep, empty_is_black=False),
     "signed": Encoding(
         name="signed", compare=signed_difference, empty_is_black=False, own_maximum=False, neutral=128 / 255
     ),
     "amplitude": Encoding(name="amplitude", compare=absolute_difference, empty_is_black=True, own_maximum=False),
+    "pair": Encoding(name="pair", compare=_put_beside, empty_is_black=False, own_maximum=False, colours=6),
 }
 ENCODINGS = Table("input", "sliplens.encodings", _ROWS)
 """Encodings by name; an installed package adds its own by the entry point `sliplens.encodings`."""

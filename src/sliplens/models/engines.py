@@ -46,7 +46,7 @@ class Engine:
         return (margins for margins, *_ in self.answers(batches))
 
     def estimate(
-        self, trained: Run, inputs: Float[Tensor, "batch 3 size size"], *, friction: FrictionLike | None = None
+        self, trained: Run, inputs: Float[Tensor, "batch colours size size"], *, friction: FrictionLike | None = None
     ) -> Estimate:
         """Safety margins of images that the network of the engine has encoded, with how sure it is.
 
@@ -60,7 +60,7 @@ class Engine:
 class EngineJob:
     """What an engine is made for."""
 
-    images: Float[Tensor, "batch 3 height width"]
+    images: Float[Tensor, "batch colours height width"]
     """Images of the size to come, on the network's device."""
     batch_size: int
     streams: int
@@ -77,7 +77,7 @@ class EngineKind:
     """Passes of a network from which it pays to prepare the engine; None for one that is taken by name alone."""
     build: Callable[[nn.Module, EngineJob], RunBatches]
     """Called with a network in evaluation mode, one number an image."""
-    batch_size: Callable[[Float[Tensor, "batch 3 height width"]], int] = (
+    batch_size: Callable[[Float[Tensor, "batch colours height width"]], int] = (
         # a graphics card wants to be filled
         lambda images: 64 if images.device.type == "cpu" else 256
     )
@@ -88,7 +88,7 @@ class EngineKind:
 
 def prepare(
     model: nn.Module,
-    images: Float[Tensor, "batch 3 height width"],
+    images: Float[Tensor, "batch colours height width"],
     predictions: Float[Tensor, " batch"],
     *,
     passes: int,
@@ -205,7 +205,7 @@ def make_engine(
     """
     if onnx_file is not None:
         require_file_of(onnx_file, trained)
-    *_, images = trial_inputs(trained.manifest.image_size)
+    *_, images = trial_inputs(trained)
     return prepare(
         trained.model,
         images.to(trained.device),

@@ -60,7 +60,7 @@ class _Enough(Exception):  # noqa: N818 (no error: it ends a pass early)
 
 @torch.no_grad()
 def read_features(
-    model: nn.Module, layer: str, images: Float[Tensor, "batch 3 height width"]
+    model: nn.Module, layer: str, images: Float[Tensor, "batch colours height width"]
 ) -> Float[np.ndarray, "batch features"]:
     """Mean over the image of each channel of a layer; what comes after it is not run."""
     kept: list[Tensor] = []
@@ -80,7 +80,7 @@ def read_features(
 
 
 @torch.no_grad()
-def find_layer(model: nn.Module, images: Float[Tensor, "batch 3 height width"]) -> str | None:
+def find_layer(model: nn.Module, images: Float[Tensor, "batch colours height width"]) -> str | None:
     """Last module of those that answer with an eighth of the image's side; None where none does."""
     found: list[str] = []
     names = {module: name for name, module in model.named_modules() if name}

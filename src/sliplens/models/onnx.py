@@ -40,16 +40,17 @@ _COMPARED = {
     "amplitude": "|T_n - T_0|",
     "signed": "floor(T_n / 2) + 128 - floor(T_0 / 2)",
     "raw": "T_n",
+    "pair": "T_n, then T_0",
 }
 
 
 def export_onnx(run: Run | Path | str, out: Path | str, *, overwrite: bool = False) -> Path:
     """Write a network as an ONNX file, which appears once ONNX Runtime gives the same answers as the network.
 
-    Input `image` is float32 (batch, 3, size, size), encoded and normalised; outputs are `margin` (batch,), for a
-    histogram `probabilities` (batch, bins), and `ratio_probabilities` of a network that tells F_t / F_n. The batch may
-    be of any size. Properties of the model, as JSON: `sliplens.manifest`, `sliplens.input` (how frames become an input)
-    and `sliplens.output` (edges of the bins).
+    Input `image` is float32 (batch, 3, size, size), of a `pair` network (batch, 6, size, size), encoded and normalised;
+    outputs are `margin` (batch,), for a histogram `probabilities` (batch, bins), and `ratio_probabilities` of a network
+    that tells F_t / F_n. The batch may be of any size. Properties of the model, as JSON: `sliplens.manifest`,
+    `sliplens.input` (how frames become an input) and `sliplens.output` (edges of the bins).
 
     Parameters
     ----------
@@ -70,7 +71,7 @@ def export_onnx(run: Run | Path | str, out: Path | str, *, overwrite: bool = Fal
     require_packages(*ONNX_PACKAGES, extra="onnx", purpose="an ONNX file")
     trained = run if isinstance(run, Run) else load(run)
     size = trained.manifest.image_size
-    proto = convert_network(trained.model, torch.zeros(1, 3, size, size))
+    proto = convert_network(trained.model, torch.zeros(1, trained.encoding.colours, size, size))
     _describe(proto, trained)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
@@ -83,7 +84,7 @@ def export_onnx(run: Run | Path | str, out: Path | str, *, overwrite: bool = Fal
     return path
 
 
-def convert_network(model: nn.Module, images: Float[Tensor, "batch 3 height width"]) -> "ModelProto":
+def convert_network(model: nn.Module, images: Float[Tensor, "batch colours height width"]) -> "ModelProto":
     """A network as ONNX holds it: input `image`, outputs named by `answer_names`, a batch of any size.
 
     `model`: in evaluation mode, one number an image; it stays as it is.
@@ -130,7 +131,7 @@ def _describe(proto: "ModelProto", trained: Run) -> None:
         INPUT_NOTES: {
             "encoding": encoding.name,
             "frame_size": manifest.frame_size,
-            "channels": "RGB",
+            "channels": "RGB" * (encoding.colours // 3),
             "compare": _COMPARED.get(encoding.name, encoding.name),
             "image_size": manifest.image_size,
             "resize": "bilinear, antialiased, pixel centres at halves, rounded to 8 bits",
@@ -154,7 +155,7 @@ def check_parity(path: Path, trained: Run) -> None:
     names, differences = list(answer_names(trained.model)), []
     try:
         session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-        for inputs in trial_inputs(trained.manifest.image_size):
+        for inputs in trial_inputs(trained):
             expected = network(inputs.to(trained.device))
             for found, answer in zip(session.run(names, {INPUT: inputs.numpy()}), expected, strict=True):
                 differences.append(difference(found, answer.cpu().numpy()))
@@ -179,10 +180,10 @@ def difference(found: np.ndarray, expected: np.ndarray) -> float:
     return float(np.max(np.abs(found - expected) / np.maximum(np.abs(expected), 1)))
 
 
-def trial_inputs(size: int) -> Iterator[Float[Tensor, "batch 3 size size"]]:
+def trial_inputs(trained: Run) -> Iterator[Float[Tensor, "batch colours size size"]]:
     """Inputs that a network and its copies are compared on: black, white and noise, alone and in a batch."""
-    generator = torch.Generator().manual_seed(0)
-    for shape in ((1, 3, size, size), (7, 3, size, size)):
+    generator, size = torch.Generator().manual_seed(0), trained.manifest.image_size
+    for shape in ((count, trained.encoding.colours, size, size) for count in (1, 7)):
         yield from (torch.zeros(shape), torch.ones(shape), torch.rand(shape, generator=generator))
 
 

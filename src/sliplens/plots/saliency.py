@@ -138,7 +138,7 @@ NOMINAL_MARGINS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 _TOLERANCE = 0.1  # half the distance between two columns
 
 
-def choose_frames(frames: tuple[ExplainedFrame, ...]) -> tuple[str, list[tuple[float | None, int | None]]]:
+def choose_columns(frames: tuple[ExplainedFrame, ...]) -> tuple[str, list[tuple[float | None, int | None]]]:
     """Pick the condition, and a frame's index for each nominal margin (None where none is near).
 
     The nearest label wins and ties go to the first frame: the network's answer plays no part.

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from sliplens.plots.contact_sheet import TIMES, brighten, brightening
 from sliplens.plots.layout import Picture, figure_picture, place_axes, place_text, save_page, write_over, written_whole
-from sliplens.plots.saliency import choose_frames, overlay_saliency, plot_colour_bar, stretch_saliency
+from sliplens.plots.saliency import choose_columns, overlay_saliency, plot_colour_bar, stretch_saliency
 from sliplens.plots.style import drawing_style
 from sliplens.report.results import Results
 from sliplens.results.explanation import Explained
@@ -199,7 +199,7 @@ def shown_frames(results: Results, explained: Explained) -> list[ShownFrame]:
         first = rows[0].trial
         ranked = sorted((row for row in rows if row.trial == first), key=lambda row: -row.level)
         return [ShownFrame(level=row.level, index=places[row.id]) for row in ranked]
-    _, chosen = choose_frames(explained.frames)
+    _, chosen = choose_columns(explained.frames)
     return [ShownFrame(level=level, index=index) for level, index in chosen if index is not None]
 
 

@@ -44,7 +44,7 @@ class Explained:
     """Hash of the network that was explained."""
     frames: tuple[ExplainedFrame, ...]
     methods: dict[str, MethodNotes]
-    images: UInt8[np.ndarray, "frames 3 size size"]
+    images: UInt8[np.ndarray, "frames colours size size"]
     """Inputs of the network before normalisation, 8 bits."""
     pictures: UInt8[np.ndarray, "frames size size 3"]
     """The normalised inputs, 8 bits, for people to look at."""

@@ -245,7 +245,7 @@ def find_slices(errors: ErrorTable, *, seed: int) -> tuple[tuple[ErrorSlice, ...
             bounds[int(tree.children_right[node])] = {**ranges, at: (cut, high)}
         elif (inside := leaves[held] == node).any():
             name = ", ".join(features[column - 1][1](*ends) for column, ends in ranges.items()) or "all frames"
-            there, excess = tested.where(inside), compare_errors(tested, inside, rng, comparisons=int(tree.n_leaves))
+            there, excess = tested.where(inside), excess_error(tested, inside, rng, comparisons=int(tree.n_leaves))
             error, bias, trials = float(np.abs(there.error).mean()), float(there.error.mean()), len(set(there.trial))
             own = ErrorSlice(name=name, frames=len(there), trials=trials, error=error, bias=bias, excess=excess)
             found.append((node, own))
@@ -265,7 +265,7 @@ def _mean(
     return mean_interval(values, clusters=[table.day.astype(str), table.trial], rng=rng, limits=limits)
 
 
-def compare_errors(
+def excess_error(
     table: ErrorTable, inside: Bool[np.ndarray, " frames"], rng: np.random.Generator, *, comparisons: int = 1
 ) -> Difference:
     """Mean size of the error inside a group less that outside, with a 95 % interval; 0 where all are of one group.
@@ -356,7 +356,7 @@ def refilm(
         known = [film for film in films if np.isfinite(film.loading.safety_margin[at])]
         drawn = np.concatenate([film.film.draw(slice(at, at + 1)).numpy() for film in known])
         inputs = run.encode(drawn, frame.reference).to(run.device)
-        pictures[frame.id] = (255 * inputs).round().byte().permute(0, 2, 3, 1).cpu().numpy()
+        pictures[frame.id] = (255 * inputs[:, :3]).round().byte().permute(0, 2, 3, 1).cpu().numpy()
         for film, answer in zip(known, run.predict(inputs).tolist(), strict=True):
             truth = (film.loading.friction_coefficient[at], film.loading.safety_margin[at])
             rows.append((frame.id, frame.trial, condition, frame.day, *truth, answer, reading_slope(film, at)))
@@ -444,7 +444,7 @@ def say_errors(errors: ErrorTable, rng: np.random.Generator) -> str:
     if {"dry", "wet"} - set(groups):
         return text
     both = ErrorTable.joined([groups["wet"], groups["dry"]])
-    gap = compare_errors(both, both.condition == "wet", rng)
+    gap = excess_error(both, both.condition == "wet", rng)
     return f"{text} Wet less dry: {_gap(gap, points=True)}{'' if gap.sure else ', which may be chance'}."
 
 

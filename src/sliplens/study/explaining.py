@@ -42,9 +42,9 @@ class ChosenFrames:
     condition: tuple[str, ...]
     safety_margin: Float32[np.ndarray, " frames"]
     """Labels; NaN where a frame has none."""
-    images: UInt8[Tensor, "frames 3 size size"]
+    images: UInt8[Tensor, "frames colours size size"]
     """Resized network inputs before normalisation."""
-    references: Float32[Tensor, "frames 3 size size"]
+    references: Float32[Tensor, "frames colours size size"]
     """What each explanation is measured against: the untouched sensor, in [0, 1]."""
     source: str
     """Either "simulated" or "real": a recorded data set or a folder of images."""
@@ -248,7 +248,7 @@ def explain_frames(
             warnings=explanation.warnings,
         )
 
-    pictures = (255 * inputs).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous().cpu().numpy()
+    pictures = (255 * inputs[:, :3]).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous().cpu().numpy()
     maps: dict[str, list[_Map]] = {method: [] for method in methods}
     for method, index in counted(list(product(methods, range(len(inputs)))), on_progress):
         part = parts and parts / f"{method}-{index:05d}"
@@ -303,7 +303,7 @@ def _of_all(names: Sequence[str], count: int) -> str:
     return f"{len(names)} of {count} frame{'s' if count > 1 else ''} ({', '.join(names[:_NAMED])}{more})"
 
 
-def network_inputs(trained: Run, explained: Explained) -> Float[Tensor, "frames 3 size size"]:
+def network_inputs(trained: Run, explained: Explained) -> Float[Tensor, "frames colours size size"]:
     """What the network got of explained frames, in [0, 1], on its device."""
     return trained.encoding.normalise(torch.from_numpy(explained.images)).to(trained.device)
 

@@ -41,7 +41,7 @@ def study_explainers(methods: Sequence[str] = STUDY_METHODS, *, budget: float = 
 
 def with_markers(
     explainers: Mapping[str, Explainer],
-    images: Float[Tensor, "frames 3 size size"],
+    images: Float[Tensor, "frames colours size size"],
     places: Callable[[], Sequence[Float[Tensor, "_markers 2"]]],
 ) -> dict[str, Explainer]:
     """The same, but those that look for markers are told their places in each image, which are asked only for them."""
@@ -92,9 +92,9 @@ class Material:
 
     trained: Run
     explained: Explained
-    inputs: Float[Tensor, "frames 3 size size"]
+    inputs: Float[Tensor, "frames colours size size"]
     """What the network got, in [0, 1]."""
-    references: Float[Tensor, "frames 3 size size"]
+    references: Float[Tensor, "frames colours size size"]
     """The untouched sensor for each frame."""
     chosen: tuple[ChosenFrame, ...]
     markers: Mapping[str, MarkedFrame]

@@ -135,7 +135,7 @@ def stage_frames(trained: Run, explained: Explained, data: Dataset) -> tuple[Sta
 def redrawing(trained: Run, frames: Sequence[StagedFrame]) -> Redraw:
     """Draw frames with some of their `markers` put back, as the network gets them, on its device."""
 
-    def redraw(image: int, back: Bool[np.ndarray, "variants markers"]) -> Float[Tensor, "variants 3 size size"]:
+    def redraw(image: int, back: Bool[np.ndarray, "variants markers"]) -> Float[Tensor, "variants colours size size"]:
         frame = frames[image]
         film = frame.scene.film
         every = np.zeros((len(back), len(film.marker_rest_px)), dtype=bool)

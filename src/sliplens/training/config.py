@@ -33,15 +33,20 @@ class TrainConfig:
     augmentation: str = "default"
     untouched_share: float = 0.05
     """Images of the untouched sensor, as full stick, for each labelled frame."""
-    frozen: bool = False
-    """Leave all as it is but the rows of the last layer that answer with F_t / F_n: margins stay to the bit.
-    What that layer sees is computed once, without augmentation."""
+    learns: Literal["all", "weights", "ratio"] = "all"
+    """What changes. all: weights, and the statistics of batch normalisation. weights: these statistics stay, for few
+    trials tell them badly. ratio: the rows of the last layer that answer with F_t / F_n, so that margins stay to the
+    bit; what that layer sees is computed once, without augmentation."""
+    epoch_frames: int | None = None
+    """Images of an epoch, drawn from all: few trials come again, of long ones some; each frame once if None."""
+    patience: int | None = None
+    """Epochs without gain on the validation trials after which it stops; none if None."""
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("image_size", "epochs", "batch_size", "learning_rate"):
+        for name in ("image_size", "epochs", "batch_size", "learning_rate", "epoch_frames", "patience"):
             value = getattr(self, name)
-            if not (isfinite(value) and value > 0):
+            if value is not None and not (isfinite(value) and value > 0):
                 raise InputError(f"{name} must be positive, got {value}")
         if self.image_size < 32:
             raise InputError(f"image_size must be at least 32 pixels, got {self.image_size}")
@@ -54,10 +59,10 @@ class TrainConfig:
         if self.optimizer not in {"adamw", "ranger21"}:
             raise InputError(f"there is no optimizer named {self.optimizer!r}; choose adamw or ranger21")
         wrong = self.head != "margin-and-ratio" or self.optimizer != "adamw" or self.augmentation != "none"
-        if self.frozen and (wrong or self.weight_decay):
+        if self.learns == "ratio" and (wrong or self.weight_decay):
             raise InputError(
-                "a frozen network learns F_t / F_n alone, by AdamW without weight decay and augmentation; leave out "
-                "--head, --optimizer and --augmentation"
+                "a network whose margins stay learns F_t / F_n alone, by AdamW without weight decay and augmentation; "
+                "leave out --head, --optimizer and --augmentation"
             )
         head_outputs(self.head)
         get_augmentation(self.augmentation)
@@ -75,14 +80,25 @@ _RECIPES = {
         untouched_share=0.0,
     ),
     "ratio": TrainConfig(
-        recipe="ratio", head="margin-and-ratio", epochs=20, weight_decay=0.0, augmentation="none", frozen=True
+        recipe="ratio", head="margin-and-ratio", epochs=20, weight_decay=0.0, augmentation="none", learns="ratio"
+    ),
+    "adapt": TrainConfig(
+        recipe="adapt",
+        head="histogram",
+        epochs=20,
+        batch_size=32,
+        learning_rate=5e-4,
+        learns="weights",
+        epoch_frames=640,
+        patience=6,
     ),
 }
 RECIPES = Table("recipe", "sliplens.recipes", _RECIPES)
 """`thesis` is that of Polak, section 4: ShuffleNetV2 x1.0 from scratch, one output, Ranger21 with its defaults, mean
 squared error, 25 epochs, batches of 124, 224 x 224 pixels, a learning rate of 8e-4, mixed precision, the best
 checkpoint on validation, rotation, noise and blur. `default` is ours; docs/networks.md tells why. `ratio` teaches a
-network that is there its second answer, F_t / F_n, in minutes."""
+network that is there its second answer, F_t / F_n, and `adapt` a sensor of your own from few trials, both in
+minutes."""
 
 
 def get_recipe(name: str) -> TrainConfig:

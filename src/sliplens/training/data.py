@@ -48,10 +48,10 @@ class Augmentation:
     """What stands for no change in the input; `colour` scales about it."""
 
     def __call__(
-        self, images: Float[Tensor, "batch 3 size size"], *, generator: torch.Generator
-    ) -> Float[Tensor, "batch 3 size size"]:
+        self, images: Float[Tensor, "batch colours size size"], *, generator: torch.Generator
+    ) -> Float[Tensor, "batch colours size size"]:
         """Augment a batch; the same generator state gives the same images."""
-        batch = len(images)
+        batch, colours = images.shape[:2]
         device = images.device
 
         def uniform(*shape: int) -> Tensor:
@@ -67,11 +67,12 @@ class Augmentation:
         images = images.contiguous(memory_format=torch.channels_last)
         if float(uniform(1)) < self.blur_probability:
             images = transforms.gaussian_blur(images, [3, 3], [0.1 + (self.blur_sd_px - 0.1) * float(uniform(1))])
-        scale = 1 + self.colour * (2 * uniform(batch, 3, 1, 1) - 1)
+        # one camera saw the reference and the frame
+        scale = 1 + self.colour * (2 * uniform(batch, 3, 1, 1) - 1).repeat(1, colours // 3, 1, 1)
         # in place: images of a batch are large, and the sampled ones are ours
         images.sub_(self.neutral).mul_(scale).add_(self.neutral)
         height, width = images.shape[-2:]
-        noise = torch.randn((batch, height, width, 3), generator=generator, device=device).permute(0, 3, 1, 2)
+        noise = torch.randn((batch, height, width, colours), generator=generator, device=device).permute(0, 3, 1, 2)
         return images.add_(noise.mul_(uniform(batch, 1, 1, 1) * self.noise_sd)).clamp_(0, 1)
 
 
@@ -95,7 +96,7 @@ class FrameSet(TorchDataset):
     """Resized 8-bit inputs with their labels; a batch is indexed at once, not frame by frame."""
 
     encoding: Encoding
-    images: UInt8[Tensor, "frames 3 size size"]
+    images: UInt8[Tensor, "frames colours size size"]
     """Compared and resized frames, uint8, as `Encoding.resize` returns them."""
     safety_margin: Float32[Tensor, " frames"]
     """Labels in [0, 1]."""
@@ -206,7 +207,7 @@ def load_frames(
     if not sum(counts):
         raise RecordingError(f"{data.folder}: no frame of the {len(trials)} trials has a label; label them first")
     total = sum(count + copies_of(count) for count in counts)
-    images = _allocate((total, 3, image_size, image_size), scratch)
+    images = _allocate((total, encoding.colours, image_size, image_size), scratch)
     labels, ratios, frictions, times, rows = [], [], [], [], []
     for done, info in enumerate(trials, start=1):
         recording = data.load(info, truth=False)
@@ -242,7 +243,7 @@ def load_frames(
     )
 
 
-def _allocate(shape: tuple[int, int, int, int], scratch: Path | None) -> UInt8[Tensor, "frames 3 size size"]:
+def _allocate(shape: tuple[int, int, int, int], scratch: Path | None) -> UInt8[Tensor, "frames colours size size"]:
     """Room for images: in memory, or in a file without a name, which is gone when nothing uses it any more."""
     size = int(np.prod(shape))
     if scratch is None or size <= _free_memory() / 2:
@@ -267,8 +268,9 @@ class EpochShuffle(Sampler[int]):
     of all processes are the n-th batch of one. Those that do not divide are left out of this epoch.
     """
 
-    def __init__(self, count: int, *, seed: int, rank: int = 0, processes: int = 1) -> None:
+    def __init__(self, count: int, *, seed: int, drawn: int | None = None, rank: int = 0, processes: int = 1) -> None:
         self.count = count
+        self.drawn = drawn or count
         self.seed = seed
         self.rank = rank
         self.processes = processes
@@ -280,15 +282,17 @@ class EpochShuffle(Sampler[int]):
 
     def __len__(self) -> int:
         """Count the frames of this process."""
-        return self.count // self.processes
+        return self.drawn // self.processes
 
     def __iter__(self) -> Iterator[int]:
-        """Yield every index once, over all processes."""
+        """Yield the indices of this process."""
         return iter(self.order(self.epoch)[self.rank :: self.processes][: len(self)])
 
     def order(self, epoch: int) -> list[int]:
-        """Every index once, in the order of an epoch."""
-        return np.random.default_rng((self.seed, epoch)).permutation(self.count).tolist()
+        """Indices in the order of an epoch: each once, or as many as are drawn, none again before all others."""
+        rng = np.random.default_rng((self.seed, epoch))
+        rounds = [rng.permutation(self.count) for _ in range(-(-self.drawn // self.count))]
+        return np.concatenate(rounds)[: self.drawn].tolist()
 
 
 class EvenShares(Sampler[list[int]]):
@@ -310,12 +314,11 @@ class EvenShares(Sampler[list[int]]):
 
 
 def make_loaders(
-    train: FrameSet, validation: FrameSet, *, seed: int, batch_size: int, rank: int, processes: int
+    train: FrameSet, validation: FrameSet, *, shuffle: EpochShuffle, batch_size: int
 ) -> tuple[DataLoader, DataLoader]:
     """Loaders of this process; `batch_size` is its share of the batch."""
     common: dict[str, Any] = {"collate_fn": _as_is}
-    shuffle = EpochShuffle(len(train), seed=seed, rank=rank, processes=processes)
-    shares = EvenShares(len(validation), batch_size=batch_size, rank=rank, processes=processes)
+    shares = EvenShares(len(validation), batch_size=batch_size, rank=shuffle.rank, processes=shuffle.processes)
     # a last small batch would make batch normalisation noisy
     shuffled = DataLoader(train, sampler=shuffle, batch_size=batch_size, drop_last=True, **common)
     return shuffled, DataLoader(validation, batch_sampler=shares, **common)

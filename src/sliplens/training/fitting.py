@@ -13,7 +13,7 @@ import lightning
 import numpy as np
 import torch
 from jaxtyping import Float
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from lightning.pytorch.loggers import Logger
 from torch import Tensor, nn
 
@@ -21,7 +21,15 @@ from sliplens.codec import save_result
 from sliplens.errors import InputError, ModelError, RecordingError
 from sliplens.files import output_folder, partial_folder, scratch_folder, versions
 from sliplens.models import Manifest, Run, build_model, load_checkpoint, save_checkpoint
-from sliplens.models.backbones import HistogramRegressor, bin_edges, histogram_targets, last_layer, with_ratio
+from sliplens.models.backbones import (
+    REFERENCE_SIGNS,
+    HistogramRegressor,
+    bin_edges,
+    histogram_targets,
+    last_layer,
+    with_ratio,
+    with_reference,
+)
 from sliplens.models.calibration import (
     LEVELS,
     Calibration,
@@ -31,9 +39,9 @@ from sliplens.models.calibration import (
     raw_interval,
 )
 from sliplens.models.checkpoint import Estimate, Ratio, load, tell_each
-from sliplens.models.encodings import get_encoding
+from sliplens.models.encodings import Encoding, get_encoding
 from sliplens.models.novelty import Novelty, fit_novelty
-from sliplens.progress import OnProgress, stage, wrote
+from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset
 from sliplens.results.training import Training
@@ -43,6 +51,9 @@ from sliplens.training.loggers import open_logger
 from sliplens.training.module import Clock, DivergedError, Regressor
 from sliplens.training.trainer import make_trainer, run_trainer, share_of_batch
 
+_ENOUGH_TRIALS, _FEW_TRIALS = 30, 300
+"""Labelled trials after which adapting gains little more, and below which it beats a network that begins with nothing;
+of `benchmarks/adapt.py`."""
 _NOVELTY_FRAMES = 2000
 """Frames from which the place of healthy inputs in the features is told, at most."""
 
@@ -51,7 +62,7 @@ def train(
     data: Dataset | Path | str,
     out: Path | str | None = None,
     *,
-    input: str = "difference",
+    input: str | None = None,
     recipe: str = "default",
     start_from: Run | Path | str | None = None,
     condition: str | None = None,
@@ -74,7 +85,7 @@ def train(
     out
         Folder to write: weights, manifest, learning curve; nothing is kept if None.
     input
-        What the network sees, a row of `ENCODINGS`.
+        What the network sees, a row of `ENCODINGS`; `difference` if None, or what the network of `start_from` sees.
     recipe
         Row of `RECIPES`.
     start_from
@@ -99,17 +110,18 @@ def train(
     ModelError
         If the network to start from is of another kind, or the loss is no longer finite.
     """
-    config = replace(get_recipe(recipe), **{name: value for name, value in changes.items() if value is not None})
+    start = load(start_from) if isinstance(start_from, str | Path) else start_from
+    config = _configure(recipe, {name: value for name, value in changes.items() if value is not None}, start)
+    input = input or ("difference" if start is None else start.manifest.input)
     trainer = make_trainer(config, accelerator=accelerator, devices=devices, num_nodes=num_nodes)
     share_of_batch(config.batch_size, trainer.world_size)
-    start = load(start_from) if isinstance(start_from, str | Path) else start_from
     if start is not None:
         require_same_kind(start, config, input)
-    elif config.frozen:
-        raise InputError(f"the recipe {recipe} teaches a network that is there; name it with --start-from")
     data = data if isinstance(data, Dataset) else load_dataset(data)
     encoding, trials = get_encoding(input), _choose_trials(data, condition)
     _require_varied_labels(data, trials[0])
+    for sentence in _advise(config, *trials, start=start):
+        note(on_progress, sentence)
     # what shapes the result besides the recipe
     origin = {"input": encoding.name, "condition": condition, "data_hash": data.hash}
     if start is not None:
@@ -171,6 +183,17 @@ def train(
     return trained
 
 
+def _configure(recipe: str, changes: dict[str, Any], start: Run | None) -> TrainConfig:
+    """Recipe with changes; a network that is taught something more stays of its kind."""
+    config = replace(get_recipe(recipe), **changes)
+    if config.learns == "all":
+        return config
+    if start is None:
+        raise InputError(f"the recipe {recipe} teaches a network that is there; name it with --start-from")
+    kind = ("backbone", "image_size", *(("head",) if config.learns == "weights" else ()))
+    return replace(config, **{name: getattr(start.manifest, name) for name in kind} | changes)
+
+
 def _choose_trials(data: Dataset, condition: str | None) -> tuple[tuple[TrialInfo, ...], tuple[TrialInfo, ...]]:
     try:
         train, validation = (data.select(split=split, condition=condition) for split in ("train", "validation"))
@@ -182,6 +205,24 @@ def _choose_trials(data: Dataset, condition: str | None) -> tuple[tuple[TrialInf
         shown = " and ".join(f"{height} x {width}" for height, width in sizes)
         raise RecordingError(f"{data.folder} mixes frames of {shown} pixels; train on one sensor at a time")
     return train, validation
+
+
+def _advise(
+    config: TrainConfig, train: Sequence[TrialInfo], validation: Sequence[TrialInfo], *, start: Run | None
+) -> Iterator[str]:
+    """Say how many trials to record, where there are few."""
+    count = len(train) + len(validation)
+    if config.learns == "weights":
+        enough = f"record {_ENOUGH_TRIALS}" if count < _ENOUGH_TRIALS else "more add little"
+        yield (
+            f"{count} labelled trials, {len(validation)} of them held out: on sensors that were simulated to try this, "
+            f"{_ENOUGH_TRIALS} reached what it gives, so {enough}, on several days and to the slip"
+        )
+    elif start is None and count < _FEW_TRIALS:
+        yield (
+            f"{count} labelled trials are few for a network that begins with nothing; begin with one that is there: "
+            "--recipe adapt --start-from chromatouch-difference"
+        )
 
 
 def _require_varied_labels(data: Dataset, trials: Sequence[TrialInfo]) -> None:
@@ -335,15 +376,9 @@ def fit(
     rank, processes, first = trainer.global_rank, trainer.world_size, trainer.is_global_zero
     share = share_of_batch(config.batch_size, processes)
     _check_frames(config, train, validation, processes)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)  # the initial weights; forked, so that the caller's random state is untouched
-        # channels last: depthwise convolutions run up to half as fast again on a CPU
-        model = build_model(config.backbone, head=config.head).to(memory_format=torch.channels_last)
-    if start is not None:
-        require_same_kind(start, config, train.encoding.name)
-        fill = model.load_state_dict if start.manifest.head == config.head else partial(with_ratio, model)
-        fill(start.model.state_dict())
-    per_epoch = len(train) // config.batch_size
+    model = _begin(config, train.encoding, start)
+    shuffle = EpochShuffle(len(train), seed=config.seed, drawn=config.epoch_frames, rank=rank, processes=processes)
+    per_epoch = shuffle.drawn // config.batch_size
     clock = Clock(
         steps=config.epochs * per_epoch,
         max_minutes=config.max_minutes,
@@ -352,12 +387,12 @@ def fit(
     )
 
     def batch_rows(epoch: int, batch: int) -> list[str]:
-        order = EpochShuffle(len(train), seed=config.seed).order(epoch)[rank::processes]
+        order = shuffle.order(epoch)[rank::processes]
         rows = [(train.frame[row], train.trial[row]) for row in order[batch * share : (batch + 1) * share]]
         return [f"{'the reference frame' if frame < 0 else f'frame {frame}'} of {trial}" for frame, trial in rows]
 
     network: nn.Module = model
-    if config.frozen:
+    if config.learns == "ratio":
         network, train, validation = _last_layer_alone(model, train, validation, config=config, report=on_progress)
     module = Regressor(
         network,
@@ -368,10 +403,12 @@ def fit(
     )
     checkpoints = folder / "checkpoints"
     best = ModelCheckpoint(dirpath=checkpoints, filename="best", monitor="validation_mse", save_last=True)
-    trainer.callbacks += [clock, best]  # pyright: ignore[reportAttributeAccessIssue] (made when Lightning runs)
+    # what the checkpoint does not hold is kept by Lightning's own state of it
+    early = EarlyStopping("validation_mse", patience=config.patience) if config.patience else None
+    trainer.callbacks += [clock, best, *filter(None, [early])]  # pyright: ignore[reportAttributeAccessIssue]
     trainer.loggers = [logger] if logger is not None and first else []
     trainer.log_every_n_steps = min(50, per_epoch)  # pyright: ignore[reportAttributeAccessIssue]
-    loaders = make_loaders(train, validation, seed=config.seed, batch_size=share, rank=rank, processes=processes)
+    loaders = make_loaders(train, validation, shuffle=shuffle, batch_size=share)
 
     def save_best() -> float:
         # our own file of tensors and plain numbers, read back without unpickling anything else
@@ -384,7 +421,7 @@ def fit(
             validation,
             batch_size=config.batch_size,
             trained_friction=train.friction,
-            kept=start.manifest.calibration if start and config.frozen else None,
+            kept=start.manifest.calibration if start and config.learns == "ratio" else None,
         )
         _put_back(network, model)
         manifest = Manifest(
@@ -418,7 +455,7 @@ def fit(
             seed=config.seed,
             epochs=clock.rows[-1][0],
             minutes=clock.seconds / 60,
-            stopped_by=clock.stopped_by,
+            stopped_by="no gain" if early is not None and early.stopped_epoch else clock.stopped_by,
             best_validation_mse=best_mse,
             parameters=sum(value.numel() for value in model.parameters()),
             processes=processes,
@@ -440,6 +477,23 @@ def fit(
     training = describe(save_best())
     shutil.rmtree(checkpoints)
     return training
+
+
+def _begin(config: TrainConfig, encoding: Encoding, start: Run | None) -> nn.Module:
+    """Network with random weights, or with those of the network that it starts from."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)  # forked, so that the caller's random state is untouched
+        model = build_model(config.backbone, head=config.head, colours=encoding.colours)
+    # channels last: depthwise convolutions run up to half as fast again on a CPU
+    model = model.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    if start is not None:
+        require_same_kind(start, config, encoding.name)
+        weights = start.model.state_dict()
+        if encoding.colours > start.encoding.colours:
+            weights = with_reference(weights, sign=REFERENCE_SIGNS[start.manifest.input])
+        fill = model.load_state_dict if start.manifest.head == config.head else partial(with_ratio, model)
+        fill(weights)
+    return model
 
 
 def _last_layer_alone(
@@ -464,13 +518,13 @@ def _put_back(network: nn.Module, model: nn.Module) -> None:
 def _find_novelty(
     model: nn.Module, config: TrainConfig, train: FrameSet, validation: FrameSet, *, start: Run | None
 ) -> Novelty | None:
-    if start is not None and config.frozen:
+    if start is not None and config.learns == "ratio":
         return start.manifest.novelty  # its early layers stay as they were
     return fit_novelty(model, *(_spread_batches(some, batch_size=config.batch_size) for some in (train, validation)))
 
 
 def _check_frames(config: TrainConfig, train: FrameSet, validation: FrameSet, processes: int) -> None:
-    if len(train) < config.batch_size:
+    if (config.epoch_frames or len(train)) < config.batch_size:
         raise InputError(f"{len(train)} training frames do not fill a batch of {config.batch_size}; lower batch_size")
     if config.head == "margin-and-ratio":
         for what, frames in (("training", train), ("validation", validation)):
@@ -490,8 +544,9 @@ def require_same_kind(start: Run, config: TrainConfig, encoding: str) -> None:
     """Refuse to start from a network whose weights would mean something else."""
     for name, value in (("input", encoding), ("backbone", config.backbone), ("head", config.head)):
         kept = getattr(start.manifest, name)
-        # a second answer can be learnt beside the first
-        if kept != value and (kept, value) != ("histogram", "margin-and-ratio"):
+        # a second answer can be learnt beside the first, and the reference be seen beside the frame
+        grown = (value == "pair" and kept in REFERENCE_SIGNS) or (kept, value) == ("histogram", "margin-and-ratio")
+        if kept != value and not grown:
             raise ModelError(
                 f"the network to start from has the {name} {kept}, and {value} is to be trained; "
                 f"train {kept}, or start from another network"

@@ -64,7 +64,7 @@ class Regressor(lightning.LightningModule):
         centres = None if edges is None else torch.from_numpy((edges[1:] + edges[:-1]) / 2).float()
         self.register_buffer("ratio_centres", centres, persistent=False)
 
-        if config.frozen:
+        if config.learns == "ratio":
             # without weight decay, a row without a slope stays as it is to the bit
             for value in last_layer(model).parameters():
                 value.register_hook(lambda slope: torch.cat([torch.zeros_like(slope[:BINS]), slope[BINS:]]))
@@ -72,6 +72,13 @@ class Regressor(lightning.LightningModule):
     def forward(self, images: Float[Tensor, "batch *input"]) -> Float[Tensor, " batch"]:
         """Predict the safety margin."""
         return self.model(images).reshape(len(images))
+
+    def on_train_epoch_start(self) -> None:
+        """Take batch normalisation that is to stay as it is out of training."""
+        if self.config.learns == "weights":
+            for module in self.modules():
+                if isinstance(module, nn.modules.batchnorm._BatchNorm):
+                    module.eval()
 
     def training_step(self, batch: tuple[Tensor, Tensor, Tensor], batch_idx: int) -> Tensor:
         """One step; a loss that is not finite stops the training."""

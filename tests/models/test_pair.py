@@ -1,0 +1,120 @@
+"""A network that sees the untouched sensor beside the frame."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import sliplens as sl
+from sliplens.errors import InputError, ModelError
+from sliplens.explainers import explain
+from sliplens.faithfulness import FILLS, get_fill
+from sliplens.models import Run, build_model, load_checkpoint, save_checkpoint
+from sliplens.models.backbones import REFERENCE_SIGNS, with_reference
+from sliplens.recordings import Dataset, Recording
+from sliplens.training import get_recipe
+from sliplens.training.data import get_augmentation
+from sliplens.training.fitting import require_same_kind
+
+
+def begun(folder: Path) -> Run:
+    """A pair network that begins with the weights of another."""
+    other = load_checkpoint(folder)
+    model = build_model(head=other.manifest.head, colours=6)
+    model.load_state_dict(with_reference(other.model.state_dict(), sign=REFERENCE_SIGNS[other.manifest.input]))
+    return Run(model=model.eval(), manifest=replace(other.manifest, input="pair"))
+
+
+@pytest.fixture
+def touch(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Frames and their reference; each frame has a pixel that is white, so that its own maximum is the whole range."""
+    frames = recording.frames.copy()
+    frames[:, 0, 0] = 255
+    return frames, recording.reference
+
+
+def test_without_weight_on_the_reference_it_answers_as_a_raw_network(raw_run: Path, touch: tuple[np.ndarray, ...]):
+    frames, reference = touch
+    # at full size, where a white pixel stays white
+    raw, pair = (
+        replace(run, manifest=replace(run.manifest, image_size=48))
+        for run in (load_checkpoint(raw_run), begun(raw_run))
+    )
+    torch.testing.assert_close(
+        pair.predict(pair.encode(frames, reference)), raw.predict(raw.encode(frames, reference)), atol=1e-5, rtol=0
+    )
+    other = 255 - reference
+    assert torch.equal(pair.predict(pair.encode(frames, other)), pair.predict(pair.encode(frames, reference)))
+
+
+def test_begun_with_differences_the_untouched_sensor_is_no_difference(difference_run: Path, recording: Recording):
+    reference = recording.reference
+    difference, pair = load_checkpoint(difference_run), begun(difference_run)
+    torch.testing.assert_close(
+        pair.predict(pair.encode(reference[None], reference)),
+        difference.predict(difference.encode(reference[None], reference)),
+        atol=1e-5,
+        rtol=0,
+    )
+
+
+def test_it_begins_with_a_network_whose_first_layer_means_as_much(raw_run: Path, difference_run: Path):
+    config = replace(get_recipe("default"), head="point")
+    for folder in (raw_run, difference_run):
+        require_same_kind(load_checkpoint(folder), config, "pair")
+    with pytest.raises(ModelError, match="has the input pair, and raw is to be trained"):
+        require_same_kind(begun(raw_run), config, "raw")
+
+
+def test_it_does_without_no_reference(raw_run: Path, recording: Recording):
+    with pytest.raises(InputError, match="name its image with --reference IMAGE"):
+        sl.predict(begun(raw_run), recording.frames)
+    with pytest.raises(InputError, match="sees the untouched sensor beside the frame"):
+        begun(raw_run).encode(recording.frames, None)
+
+
+def test_from_training_to_an_explanation(small_dataset: Dataset, raw_run: Path, tmp_path: Path):
+    run = sl.train(
+        small_dataset, input="pair", start_from=raw_run, image_size=32, epochs=1, batch_size=11, head="point"
+    )
+    save_checkpoint(tmp_path, run.model, run.manifest)
+    again = load_checkpoint(tmp_path)
+    assert (again.manifest.input, again.encoding.colours) == ("pair", 6)
+    found = sl.evaluate(again, small_dataset)
+    recording = small_dataset.load(small_dataset.select(split="test")[0])
+    frames, reference = recording.frames[1:3], recording.reference
+    rows = sl.predict(again, frames, reference=reference).frame().to_pydict()["prediction"]
+    tested = found.predictions
+    own = tested.prediction[tested.trial == recording.trial][:2]
+    np.testing.assert_allclose(rows, own, atol=1e-5)
+    for method in ("integrated-gradients", "occlusion"):
+        explanation = explain(again, frames, reference=reference, method=method)
+        np.testing.assert_allclose(explanation.prediction.numpy(), own, atol=1e-5)
+        # the untouched sensor, twice
+        empty = again.predict(again.encode(reference[None], reference))
+        torch.testing.assert_close(explanation.reference_prediction, empty.expand(2), atol=1e-5, rtol=0)
+    with sl.LiveReader(frames, again, reference=reference, engine="folded", health=None, slip=None) as reader:
+        *_, last = reader.readings()
+    assert last.margin == pytest.approx(np.clip(own[-1], 0, 1), abs=1e-4)
+
+
+@pytest.mark.parametrize("name", list(FILLS))
+def test_what_is_removed_is_the_frame(name: str):
+    images = torch.rand(2, 6, 16, 16, generator=torch.Generator().manual_seed(0))
+    gone = torch.zeros(2, 16, 16, dtype=torch.bool)
+    gone[:, 4:9, 4:9] = True
+    painted = get_fill(name)(images, torch.cat([images[:, 3:]] * 2, dim=1), 0)(torch.arange(2), gone)
+    assert torch.equal(painted[:, 3:], images[:, 3:])
+    alone = get_fill(name)(images[:, :3], images[:, 3:], 0)(torch.arange(2), gone)
+    torch.testing.assert_close(painted[:, :3], alone)
+
+
+def test_white_balance_and_place_change_frame_and_reference_alike():
+    augmentation = get_augmentation("default")
+    assert augmentation is not None
+    half = torch.rand(4, 3, 16, 16, generator=torch.Generator().manual_seed(0))
+    still = replace(augmentation, noise_sd=0.0)
+    changed = still(torch.cat([half, half], dim=1), generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(changed[:, :3], changed[:, 3:])
