@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 import subprocess
 import sys
 import urllib.error
@@ -19,7 +18,6 @@ from sliplens.app.server import is_loopback
 from sliplens.recordings.check import check_dataset
 
 pytest.importorskip("nicegui", reason="the page needs NiceGUI (extra live)")
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome") or shutil.which("chromium-browser")
 MARGIN = "parseInt(document.querySelector('.sl-number').textContent)"
 CAPTION = "document.querySelector('.sl-caption').textContent"
 
@@ -50,17 +48,6 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
             assert process.wait(timeout=60) == 0
         finally:
             process.kill()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    sync_api = pytest.importorskip("playwright.sync_api", reason="a browser is led by Playwright")
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium on this machine")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")

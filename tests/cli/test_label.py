@@ -296,3 +296,8 @@ def test_edits_that_do_not_fit_their_data_set_are_told(
     assert run("label", tmp_path / "data", "--no-audit") == 0
     assert "edits gone, which is no trial of the data set" in capsys.readouterr().err
     assert path.read_text() == line % "gone"
+
+
+def test_the_page_is_refused_what_it_cannot_heed(relabelled: Path, capsys: pytest.CaptureFixture[str]):
+    assert "leave --output" in refused(capsys, "label", relabelled, "--page", "-o", "elsewhere")
+    assert "add --page" in refused(capsys, "label", relabelled, "--by", "ana")

@@ -1,5 +1,6 @@
-"""The page of a running sensor: its margin as a number, its picture with what the network looks at, and its health."""
+"""Pages in a browser: that of a running sensor, and that on which labels are repaired by hand."""
 
+from sliplens.app.labels import LabelPage
 from sliplens.app.server import LivePage
 
-__all__ = ["LivePage"]
+__all__ = ["LabelPage", "LivePage"]

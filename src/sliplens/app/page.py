@@ -2,14 +2,12 @@
 
 import secrets
 from collections.abc import Awaitable, Callable
-from functools import cache, wraps
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fastapi import FastAPI
 from nicegui import binding, run, ui
 from nicegui.events import GenericEventArguments, KeyEventArguments
-from starlette.websockets import WebSocket
 
 from sliplens.app.feed import CHART_S, LIVE_METHOD, Viewer
 from sliplens.errors import InputError, SliplensError
@@ -24,10 +22,6 @@ if TYPE_CHECKING:
 TARGET = 0.2, 0.4
 """Margins that people keep when they hold something."""
 _MOST_PRESS_N, _MOST_PULL_N = 3.0, 2.4
-_ICON = (
-    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 16 16"><path d="M2 12a6 6 0 1 1 12 0" fill="none" '
-    'stroke="#009E73" stroke-width="3"/><path d="M8 12 5 6" stroke="#D55E00" stroke-width="2"/></svg>'
-)
 
 
 class LiveView(ui.element, component="live_view.js"):
@@ -53,48 +47,6 @@ class Hand:
 
     press_n: float = 1.5
     pull_n: float = 0.0
-
-
-def make_app(page: "LivePage") -> FastAPI:
-    """Application that shows a page: the only one of its process, as NiceGUI has but one."""
-    app = _application()
-    if getattr(app.state, "page", None) is not None:
-        raise InputError("a page is being shown by this process already; close that one first")
-    app.state.page, app.state.hand = page, Hand()
-    return app
-
-
-def release_app() -> None:
-    """Let the next page be shown."""
-    _application().state.page = None
-
-
-@cache
-def _application() -> FastAPI:
-    app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
-
-    @app.websocket("/frames/{name}")
-    async def frames(socket: WebSocket, name: str) -> None:
-        viewer = app.state.page.feed.expected.get(name)
-        if viewer is None:
-            await socket.close(code=1008)
-        else:
-            await viewer.serve(socket)
-
-    @ui.page("/", title="sliplens", dark=None)
-    def index() -> None:
-        _build(app.state.page, app.state.hand)
-
-    ui.run_with(
-        app,
-        title="sliplens",
-        favicon=_ICON,
-        dark=None,
-        tailwind=False,
-        binding_refresh_interval=0.25,
-        show_welcome_message=False,
-    )
-    return app
 
 
 class _Acts:
@@ -166,7 +118,7 @@ def _told(act: Callable[[], Awaitable[None]]) -> Callable[[], Awaitable[None]]:
     return acted
 
 
-def _build(page: "LivePage", hand: Hand) -> None:
+def build_live(page: "LivePage") -> None:
     """Page of one viewer."""
     feed, reader = page.feed, page.reader
     viewer, name = Viewer(feed), secrets.token_urlsafe(9)
@@ -178,7 +130,7 @@ def _build(page: "LivePage", hand: Hand) -> None:
     ui.query(".nicegui-content").classes("sl-page")
     with LiveView(page, name):
         if isinstance(reader.source, SimulatedSource):
-            _build_hand(hand, reader.source)
+            _build_hand(page.hand, reader.source)
         with ui.element("div").classes("sl-buttons"):
             ui.button("Reference (R)", on_click=_told(acts.take_reference)).tooltip(
                 "take a new image of the untouched sensor, as soon as the picture is still"

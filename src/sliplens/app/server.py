@@ -1,4 +1,4 @@
-"""Server of the page: on this machine alone, or with a token."""
+"""Server of pages: on this machine alone, or with a token."""
 
 import asyncio
 import errno
@@ -6,28 +6,134 @@ import secrets
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import cache
 from http.cookies import CookieError, SimpleCookie
 from ipaddress import ip_address
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 from urllib.parse import parse_qs, urlsplit
 
-from sliplens.app.feed import Feed
 from sliplens.errors import InputError
 from sliplens.extras import require_packages
-from sliplens.live.loop import LiveReader
 from sliplens.recordings.trial import TrialFacts
 
 if TYPE_CHECKING:
+    from fastapi import FastAPI
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
+    from starlette.websockets import WebSocket
+
+    from sliplens.live.loop import LiveReader
 
 _PORT = 8090
 _PATIENCE_S = 10.0
 _DAY_S = 24 * 3600
+_ICON = (
+    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 16 16"><path d="M2 12a6 6 0 1 1 12 0" fill="none" '
+    'stroke="#009E73" stroke-width="3"/><path d="M8 12 5 6" stroke="#D55E00" stroke-width="2"/></svg>'
+)
 
 
-class LivePage:
+_Page = TypeVar("_Page", bound="Page")
+
+
+class Page:
+    """Page for browsers; a context manager that serves it while it is entered. One at a time runs in a process.
+
+    `host` and `port` are those of `LivePage`.
+    """
+
+    def __init__(self, *, host: str = "127.0.0.1", port: int | None = None) -> None:
+        require_packages("nicegui", extra="live", purpose="the page")
+        if port is not None and not 0 <= port <= 65535:
+            raise InputError(f"--port must be from 0 to 65535, got {port}")
+        self._host, self._port = host, port
+        self.token = None if is_loopback(host) else secrets.token_urlsafe(24)
+        """What a visitor must show; None where only this machine can visit."""
+        self._stack = ExitStack()
+
+    @property
+    def address(self) -> str:
+        """Where a browser finds it, with the token where it needs one; known while it is entered."""
+        port = self._socket.getsockname()[1]
+        host = self._host
+        if not is_loopback(host) and _is_unspecified(host):
+            host = socket.gethostname()
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{port}/" + ("" if self.token is None else f"?token={self.token}")
+
+    def __enter__(self: _Page) -> _Page:
+        with ExitStack() as stack:
+            self._socket = stack.enter_context(_listen(self._host, self._port))
+            self._open(stack)
+            app = _application()
+            if getattr(app.state, "page", None) is not None:
+                raise InputError("a page is being shown by this process already; close that one first")
+            app.state.page = self
+            stack.callback(setattr, app.state, "page", None)
+            gate = Gate(app, token=self.token, port=self._socket.getsockname()[1])
+            stack.enter_context(_serving(gate, self._socket, self))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def _open(self, stack: ExitStack) -> None:
+        """Make what it shows, and let the stack end it."""
+
+    def start(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Begin to show; viewers are served in this loop."""
+
+    def build(self) -> None:
+        """Make the elements of one viewer, in the place where NiceGUI has called."""
+        raise NotImplementedError
+
+    async def serve(self, name: str, socket: "WebSocket") -> None:
+        """Serve the socket of a viewer; here is none."""
+        del name
+        await socket.close(code=1008)
+
+    def read_image(self, trial: str, number: int) -> bytes | None:
+        """Frame of a trial as PNG; None where there is none."""
+        del trial, number
+
+
+@cache
+def _application() -> "FastAPI":
+    """Application of this process, for NiceGUI has but one: it asks the page that is shown."""
+    import nicegui  # noqa: PLC0415 (the extra)
+    from fastapi import FastAPI, Response  # noqa: PLC0415 (comes with it)
+    from starlette.websockets import WebSocket  # noqa: PLC0415
+
+    app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
+
+    @app.websocket("/frames/{name}")
+    async def frames(socket: WebSocket, name: str) -> None:
+        await app.state.page.serve(name, socket)
+
+    @app.get("/images/{trial}/{number}")
+    def images(trial: str, number: int) -> Response:
+        image = app.state.page.read_image(trial, number)
+        return Response(status_code=404) if image is None else Response(image, media_type="image/png")
+
+    @nicegui.ui.page("/", title="sliplens", dark=None)
+    def index() -> None:
+        app.state.page.build()
+
+    nicegui.ui.run_with(
+        app,
+        title="sliplens",
+        favicon=_ICON,
+        dark=None,
+        tailwind=False,
+        binding_refresh_interval=0.25,
+        show_welcome_message=False,
+    )
+    return app
+
+
+class LivePage(Page):
     """Page of a reader, for browsers; a context manager that serves it while it is entered.
 
     Several may look at once: they see the same frames, and cost one inference. One page at a time runs in a process.
@@ -61,53 +167,42 @@ class LivePage:
 
     def __init__(
         self,
-        reader: LiveReader,
+        reader: "LiveReader",
         *,
         host: str = "127.0.0.1",
         port: int | None = None,
         record_into: Path | str = "recorded",
         facts: TrialFacts | None = None,
     ) -> None:
-        require_packages("nicegui", extra="live", purpose="the page")
-        if port is not None and not 0 <= port <= 65535:
-            raise InputError(f"--port must be from 0 to 65535, got {port}")
+        super().__init__(host=host, port=port)
         self.reader, self.record_into, self.facts = reader, Path(record_into), facts
-        self._host, self._port = host, port
-        self.token = None if is_loopback(host) else secrets.token_urlsafe(24)
-        """What a visitor must show; None where only this machine can visit."""
-        self._stack = ExitStack()
 
-    @property
-    def address(self) -> str:
-        """Where a browser finds it, with the token where it needs one; known while it is entered."""
-        port = self._socket.getsockname()[1]
-        host = self._host
-        if not is_loopback(host) and _is_unspecified(host):
-            host = socket.gethostname()
-        host = f"[{host}]" if ":" in host else host
-        return f"http://{host}:{port}/" + ("" if self.token is None else f"?token={self.token}")
+    def _open(self, stack: ExitStack) -> None:
+        # explainers, and with them torch
+        from sliplens.app.feed import Feed  # noqa: PLC0415
+        from sliplens.app.page import Hand  # noqa: PLC0415
 
-    def __enter__(self) -> "LivePage":
-        # an extra, and a second to import
-        from sliplens.app.page import make_app, release_app  # noqa: PLC0415
+        self.feed, self.hand = Feed(self.reader), Hand()
+        stack.callback(self.feed.close)
 
-        with ExitStack() as stack:
-            self._socket = stack.enter_context(_listen(self._host, self._port))
-            self.feed = Feed(self.reader)
-            stack.callback(self.feed.close)
-            app = make_app(self)
-            stack.callback(release_app)
-            gate = Gate(app, token=self.token, port=self._socket.getsockname()[1])
-            stack.enter_context(_serving(gate, self._socket, self.feed))
-            self._stack = stack.pop_all()
-        return self
+    def start(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Make pictures of readings from now on."""
+        self.feed.start(loop)
 
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
+    def build(self) -> None:
+        """Make the page of one viewer."""
+        from sliplens.app.page import build_live  # noqa: PLC0415
+
+        build_live(self)
+
+    async def serve(self, name: str, socket: "WebSocket") -> None:
+        """Send readings to a viewer that was made, until it is gone."""
+        viewer = self.feed.expected.get(name)
+        await (super().serve(name, socket) if viewer is None else viewer.serve(socket))
 
 
 @contextmanager
-def _serving(app: "ASGIApp", listening: socket.socket, feed: Feed) -> Iterator[None]:
+def _serving(app: "ASGIApp", listening: socket.socket, page: Page) -> Iterator[None]:
     """Serve in a thread of its own, which has started when this is entered and ended when it is left."""
     import nicegui  # noqa: PLC0415 (the extra)
     import uvicorn  # noqa: PLC0415 (comes with it)
@@ -124,7 +219,7 @@ def _serving(app: "ASGIApp", listening: socket.socket, feed: Feed) -> Iterator[N
     server = uvicorn.Server(config)
 
     async def serve() -> None:
-        feed.start(asyncio.get_running_loop())
+        page.start(asyncio.get_running_loop())
         # not by the lifespan that `ui.run_with` makes: it walks over all objects of the process, and a tuple that
         # another thread is just making then fails with a SystemError
         async with nicegui.app.router.lifespan_context(nicegui.app):
@@ -199,7 +294,7 @@ class Gate:
             kept = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict; Max-Age={_DAY_S}"
             await _answer(send, 303, [("location", scope["path"]), ("set-cookie", kept)], "")
         else:
-            await _refuse(scope, send, 401, "open the whole address that `sliplens live` printed, with its token")
+            await _refuse(scope, send, 401, "open the whole address that sliplens printed, with its token")
 
     def _refusal(self, headers: dict[str, str]) -> str | None:
         host = headers.get("host", "")

@@ -24,7 +24,7 @@ EXAMPLES = {
     "sensor": "sliplens sensor new --from tip.mp4 -o tip.toml",
     "simulate": "sliplens simulate runs/mine/data --preset small",
     "import": "sliplens import cup.mp4 --forces cup.csv --sensor tip -o runs/mine/data",
-    "label": "sliplens label runs/mine/data --mu 0.7 -o runs/mine/data-again",
+    "label": "sliplens label runs/mine/data --page",
     "split": "sliplens split runs/mine/data --preset trials --dry-run",
     "check": "sliplens check runs/mine/data",
     "view": "sliplens view runs/mine/data --trial cup",
@@ -46,7 +46,7 @@ TASKS = {
     "look": ("See what sliplens does, without any data", ("demo",)),
     "read": ("Read the safety margin from images, a video or a bag", ("predict", "view")),
     "explain": ("See which parts of an image a margin comes from", ("explain", "score")),
-    "teach": ("Teach a network your own sensor", ("sensor", "import", "check", "train", "evaluate")),
+    "teach": ("Teach a network your own sensor", ("sensor", "import", "check", "label", "train", "evaluate")),
     "judge": ("Find out where a network fails, and which explanation can be believed", ("diagnose", "study")),
     "live": ("Read a running camera, and hold what it feels", ("live", "grip")),
 }

@@ -1,14 +1,17 @@
 """`sliplens label`."""
 
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Event
 from typing import Annotated
 
 import tyro
 
 from sliplens.cli.command import Command, Data
-from sliplens.cli.console import Terminal
+from sliplens.cli.console import Terminal, say
 from sliplens.cli.import_ import draw_audits, show_labelling, show_trials
+from sliplens.errors import InputError
 from sliplens.recordings.options import LabelSettings
 
 
@@ -18,7 +21,7 @@ class Label(Command):
 
     For another friction, axis or threshold than on import, or to see how well the labels of a simulated data set come
     back when only its frames and forces are known. Splits stay. Without --output the data set itself gets the new
-    labels, once all of them are there.
+    labels, once all of them are there. Repairs that were made by hand with --page are followed.
     """
 
     data: Data
@@ -29,12 +32,28 @@ class Label(Command):
     """Draw a page for each trial, in `audit/` of the folder, from which to judge its labels."""
     audit_only: bool = False
     """Change no label: draw the audit pages of the labels that are there, into `audit/` of the output folder."""
+    page: bool = False
+    """Change no label: show the trials in a browser on this machine, to set reference, contact, slip, tare, sign and
+    bad spans by hand. Each edit is kept beside the data set; ends with Ctrl-C."""
+    by: str | None = None
+    """Who edits on the page; who is logged in if not given."""
+
+    def check(self) -> None:
+        """Refuse what the page cannot heed."""
+        super().check()
+        if self.page and (self.output is not None or self.audit_only):
+            raise InputError("--page keeps edits beside the data set itself; leave --output and --audit-only out")
+        if self.by is not None and not self.page:
+            raise InputError("--by says who edits on the page; add --page, or leave it out")
 
     def run(self) -> None:
         """Label anew, write, and show what was found."""
         from sliplens.recordings.dataset import load_dataset
         from sliplens.recordings.importing import label_dataset
 
+        if self.page:
+            self._repair()
+            return
         terminal, data, out = Terminal(), load_dataset(self.data), self.output or self.data
         if self.audit_only:
             draw_audits(data, out / "audit", terminal)
@@ -44,3 +63,12 @@ class Label(Command):
             draw_audits(labelled, out / "audit", terminal)
         show_labelling("Labelled", labelled)
         show_trials(labelled)
+
+    def _repair(self) -> None:
+        """Show the page until it is ended."""
+        from sliplens.app import LabelPage
+
+        with suppress(KeyboardInterrupt), LabelPage(self.data, labelling=self.labelling, by=self.by) as page:
+            say(f"open {page.address}")
+            Event().wait()
+        say(f"`sliplens label {self.data}` makes the labels follow the edits")
