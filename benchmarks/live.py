@@ -1,20 +1,29 @@
-"""Latency of live readings: from a frame of 640 x 480 pixels, 60 a second, to its margin.
+"""Latency of live readings: from a frame of 640 x 480 pixels, 60 a second, to its margin, with a page open.
 
     python benchmarks/live.py --json                # 10 minutes, and one more with maps
-    python benchmarks/live.py --seconds 30
+    python benchmarks/live.py --minutes 0.5
+    python benchmarks/live.py --minutes 0.5 --page none
 
-`p50_ms` and `p99_ms` are from the moment a replayed frame is due to its reading; `p99_ms_with_maps` is the same while
-another thread explains the newest frame twice a second. `drops` are frames that were never read, `memory_growth_mb` how
-much more memory the process holds at the end than after the first 10 seconds (or a tenth of a shorter run).
+`p50_ms` and `p99_ms` are from the moment a replayed frame is due to its margin, over the frames that have one, while a
+headless Chromium beside it draws the page (`--page browser`); `p99_ms_with_maps` is the same while the page shows maps,
+twice a second. `drops` are frames that were never read, `memory_growth_mb` how much more memory the process holds at
+the end than after the first 10 seconds (or a tenth of a shorter run). `of_it_ms` says where the time of the slowest
+hundredth went, on average: `waiting` is what no part of the reading took, `gc_ms` the longest pause of Python's garbage
+collector.
 """
 
 import argparse
+import gc
 import json
 import os
+import shutil
+import subprocess
+import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Event, Thread
 
 # threads that spin while they wait take the cores from those that work; must be set before torch is imported
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -23,15 +32,16 @@ import numpy as np
 from PIL import Image
 
 import sliplens as sl
+from sliplens.app import LivePage
 from sliplens.live import LiveFrame, Reading, ReplaySource
 from sliplens.recordings.source import open_source
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 SIZE = (480, 640)
 RATE_HZ = 60.0
-MAPS_HZ = 2.0
 WARM_S = 2.0
 """Time at the start that counts for nothing: caches fill and clocks rise."""
+PARTS = ("waiting", "decode", "checks", "encode", "network")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,9 +50,16 @@ class Latencies:
 
     engine: str
     total_ms: np.ndarray
+    """Of each frame that has a margin."""
+    parts_ms: np.ndarray
+    """Of the same, by `PARTS`."""
+    readings: int
+    """Frames that were read, with a margin or without."""
     drops: int
     memory_growth_mb: float
-    parts_ms: dict[str, float]
+    gc_ms: float
+    pictures: int
+    """Pictures that the page had drawn."""
     maps: int
 
 
@@ -62,14 +79,48 @@ def make_frames() -> tuple[np.ndarray, np.ndarray]:
     return np.stack([enlarge(image) for image in trial.frames]), enlarge(trial.reference)
 
 
-def measure(frames: np.ndarray, untouched: np.ndarray, *, seconds: float, maps: bool) -> Latencies:
-    """Read a repeated grip for a while, with maps beside it or without."""
+@contextmanager
+def browser(address: str) -> Iterator[None]:
+    """A headless Chromium that shows an address."""
+    name = shutil.which("chromium") or shutil.which("google-chrome") or shutil.which("chromium-browser")
+    if name is None:
+        raise SystemExit("there is no Chromium on this machine; measure without a page, with --page none")
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        words = [name, "--headless", "--no-sandbox", "--window-size=1280,900", f"--user-data-dir={profile}"]
+        with subprocess.Popen([*words, "--remote-debugging-port=0", address], stderr=subprocess.DEVNULL) as process:
+            try:
+                yield
+            finally:
+                process.terminate()
+
+
+class Pauses:
+    """Longest pause of the garbage collector since it was entered."""
+
+    def __enter__(self) -> "Pauses":
+        self.longest_ms = self._begun = 0.0
+        gc.callbacks.append(self._take)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        gc.callbacks.remove(self._take)
+
+    def _take(self, phase: str, _: dict[str, int]) -> None:
+        if phase == "start":
+            self._begun = time.perf_counter()
+        else:
+            self.longest_ms = max(self.longest_ms, 1e3 * (time.perf_counter() - self._begun))
+
+
+def measure(frames: np.ndarray, untouched: np.ndarray, *, seconds: float, shown: bool, maps: bool) -> Latencies:
+    """Read a repeated grip for a while, with a page or without, and maps on it or not."""
     network = sl.load("chromatouch-difference")
     network = replace(network, manifest=replace(network.manifest, frame_size=SIZE))
     source = ReplaySource(open_source(frames)[0], rate_hz=RATE_HZ, repeat=True)
-    readings: list[tuple[float, float, float, float]] = []
-    memory_mb: list[float] = []
-    newest: list[np.ndarray] = []
+    # made beforehand, so that what is kept here does not look like memory that grows
+    table = np.full((round(1.1 * RATE_HZ * (seconds + WARM_S)), 2 + len(PARTS)), -1.0)
+    kept, last = [0], [""]
+    memory_mb = np.full(round(seconds) + 10, -1.0)
     dropped = [0, 0]
     settles_s = min(10.0, seconds / 10)
 
@@ -77,66 +128,91 @@ def measure(frames: np.ndarray, untouched: np.ndarray, *, seconds: float, maps: 
         if frame is None or reading.time_s < WARM_S:
             dropped[0] = reading.dropped
             return
-        latency = reading.latency
-        readings.append((reading.time_s, latency.total_ms, latency.encode_ms, latency.network_ms))
+        spent = reading.latency
+        own_ms = (spent.decode_ms, spent.checks_ms, spent.encode_ms, spent.network_ms)
+        # a replayed frame was decoded before it was due
+        waiting_ms = spent.total_ms - sum(own_ms[1:])
+        table[kept[0]] = (reading.margin is not None, spent.total_ms, waiting_ms, *own_ms)
+        kept[0] += 1
+        last[0] = str(reading.withheld)
         dropped[1] = reading.dropped
-        newest[:] = [frame.image]
-        if reading.time_s > WARM_S + settles_s and reading.number % int(RATE_HZ) == 0:
-            memory_mb.append(resident_mb())
-
-    stopped, explained = Event(), [0]
-
-    def explain() -> None:
-        while not stopped.wait(1 / MAPS_HZ):
-            if newest:
-                sl.explain(network, newest[0][None], reference=untouched, method="grad-cam")
-                explained[0] += 1
+        since_s = round(reading.time_s - WARM_S - settles_s)
+        if 0 <= since_s < len(memory_mb) and memory_mb[since_s] < 0:
+            memory_mb[since_s] = resident_mb()
 
     reader = sl.LiveReader(source, network, reference=untouched)  # for hours, as far as it knows
     reader.subscribe(keep)
-    with reader:
-        beside = Thread(target=explain, daemon=True)
-        if maps:
-            beside.start()
+    pictures: set[int] = set()
+    explained: set[int] = set()
+    with ExitStack() as stack:
+        stack.enter_context(reader)
+        page = stack.enter_context(LivePage(reader, port=0)) if shown else None
+        if page is not None:
+            stack.enter_context(browser(page.address))
+        pauses = stack.enter_context(Pauses())
         for reading in reader.readings():
+            if page is not None:
+                for viewer in tuple(page.feed.viewers):
+                    viewer.shows_map = maps
+                pictures |= set() if page.feed.picture is None else {page.feed.picture.frame.number}
+                explained |= set() if page.feed.map is None else {page.feed.map.facts.number}
             if reading.time_s >= seconds + WARM_S:
                 break
-        stopped.set()
         engine = reader.engine.name if reader.engine else ""
-    if maps:
-        beside.join()
-    table = np.array(readings)
+    rows = table[: kept[0]]
+    rows = rows[rows[:, 0] > 0, 1:]
+    if not len(rows):
+        raise SystemExit(f"no frame had a margin, so there is nothing to measure; the last: {last[0]}")
+    memory_mb = memory_mb[memory_mb >= 0]
     return Latencies(
         engine=engine,
-        total_ms=table[:, 1],
+        total_ms=rows[:, 0],
+        parts_ms=rows[:, 1:],
+        readings=kept[0],
         drops=dropped[1] - dropped[0],
-        memory_growth_mb=memory_mb[-1] - memory_mb[0] if memory_mb else 0.0,
-        parts_ms={"encode": float(np.median(table[:, 2])), "network": float(np.median(table[:, 3]))},
-        maps=explained[0],
+        memory_growth_mb=memory_mb[-1] - memory_mb[0] if len(memory_mb) else 0.0,
+        gc_ms=pauses.longest_ms,
+        pictures=len(pictures),
+        maps=len(explained),
     )
+
+
+def slowest_parts_ms(latencies: Latencies) -> dict[str, float]:
+    """Mean time of each part over the slowest hundredth of the frames."""
+    slowest = latencies.total_ms >= np.quantile(latencies.total_ms, 0.99)
+    means = latencies.parts_ms[slowest].mean(axis=0)
+    return {name: round(float(value), 1) for name, value in zip(PARTS, means, strict=True)}
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=600.0, help="length of the run without maps")
+    parser.add_argument("--minutes", type=float, default=10.0, help="length of the run without maps")
+    parser.add_argument("--page", choices=("browser", "none"), default="browser", help="what looks at the page")
     parser.add_argument("--json", action="store_true", help="print one line of JSON")
     options = parser.parse_args()
     frames, untouched = make_frames()
+    seconds, shown = 60 * options.minutes, options.page == "browser"
     begun = time.monotonic()
-    alone = measure(frames, untouched, seconds=options.seconds, maps=False)
-    beside = measure(frames, untouched, seconds=max(5.0, options.seconds / 10), maps=True)
+    alone = measure(frames, untouched, seconds=seconds, shown=shown, maps=False)
+    beside = measure(frames, untouched, seconds=max(5.0, seconds / 10), shown=shown, maps=True) if shown else None
+    median_ms = np.median(alone.parts_ms, axis=0)
     result = {
         "p50_ms": round(float(np.median(alone.total_ms)), 2),
         "p99_ms": round(float(np.quantile(alone.total_ms, 0.99)), 2),
-        "p99_ms_with_maps": round(float(np.quantile(beside.total_ms, 0.99)), 2),
+        "p99_ms_with_maps": None if beside is None else round(float(np.quantile(beside.total_ms, 0.99)), 2),
         "drops": alone.drops,
         "memory_growth_mb": round(alone.memory_growth_mb, 1),
-        "seconds": options.seconds,
-        "readings": len(alone.total_ms),
-        "encode_ms": round(alone.parts_ms["encode"], 2),
-        "network_ms": round(alone.parts_ms["network"], 2),
-        "maps": beside.maps,
+        "seconds": seconds,
+        "readings": alone.readings,
+        "with_a_margin": len(alone.total_ms),
+        **{f"{name}_ms": round(float(value), 2) for name, value in zip(PARTS, median_ms, strict=True)},
+        "of_it_ms": slowest_parts_ms(alone),
+        "of_it_ms_with_maps": None if beside is None else slowest_parts_ms(beside),
+        "drops_with_maps": None if beside is None else beside.drops,
+        "gc_ms": round(alone.gc_ms, 1),
+        "pictures": alone.pictures,
+        "maps": None if beside is None else beside.maps,
         "engine": alone.engine,
         "load": round(os.getloadavg()[0], 1),
         "took_s": round(time.monotonic() - begun, 1),
@@ -145,7 +221,7 @@ def main() -> None:
         print(json.dumps(result))
         return
     for name, value in result.items():
-        print(f"{name:18} {value}")
+        print(f"{name:20} {value}")
 
 
 if __name__ == "__main__":

@@ -115,3 +115,23 @@ def test_a_picture_that_nobody_fetches_is_not_drawn_again():
         assert not viewer.wants_picture
 
     with_viewer(act)
+
+
+def test_a_viewer_that_comes_back_before_its_old_connection_is_given_up_goes_on():
+    async def act(feed: Feed, old: Wire, viewer: Viewer) -> None:
+        await old.next()
+        new = Wire()
+        served = asyncio.create_task(viewer.serve(cast("Any", new)))
+        await new.next()
+        await old.answers.put(None)  # the old one is told to be gone only now
+        await asyncio.sleep(0.01)
+        assert feed.viewers == {viewer}
+        for _ in range(2):
+            viewer.wake()
+            await new.answers.put({"serial": (await new.next())["serial"]})
+        assert old.sent.empty()
+        await new.answers.put(None)
+        await served
+        assert not feed.viewers
+
+    with_viewer(act)

@@ -1,7 +1,6 @@
 """What those who look at the page are sent: readings, pictures and maps, each made once for all of them."""
 
 import asyncio
-import io
 import time
 from collections import deque
 from collections.abc import Callable
@@ -9,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from threading import Event, Lock, Thread
 
 import msgspec
@@ -22,9 +22,11 @@ from sliplens.explainers.explanation import CLOSE, Explanation
 from sliplens.explainers.occlusion import marker_regions, to_network_px
 from sliplens.explainers.table import explain
 from sliplens.files import to_builtins
+from sliplens.images import encode_jpeg
 from sliplens.live.loop import LiveReader
 from sliplens.live.reading import LiveFrame, Reading
 from sliplens.live.recorder import RecordingState
+from sliplens.live.sinks import SinkState
 from sliplens.markers import Tracker
 from sliplens.models.checkpoint import Run
 from sliplens.plots.saliency import full_colour
@@ -144,6 +146,9 @@ class Update:
     ended: str | None
     """Why no more readings come; None while they may."""
     recording: RecordingState | None
+    sinks: tuple[SinkState, ...]
+    troubles: tuple[str, ...]
+    """What has ended beside the reading, with the cure."""
     frozen: Reading | None
     """Reading of the picture, where it is frozen."""
     has_map: bool
@@ -223,9 +228,7 @@ class Feed:
     @property
     def rate_hz(self) -> float:
         """Readings of frames a second, over the last two seconds."""
-        since_s = time.monotonic() - _RATE_S
-        with self._lock:
-            return sum(point.at_s > since_s for point in self._points) / _RATE_S
+        return len(self.points_since(time.monotonic() - _RATE_S)) / _RATE_S
 
     @property
     def waiting(self) -> str:
@@ -237,8 +240,9 @@ class Feed:
 
     def points_since(self, at_s: float) -> tuple[Point, ...]:
         """Points of the chart after a time, as `time.monotonic` counts."""
-        with self._lock:
-            return tuple(point for point in self._points if point.at_s > at_s)
+        with self._lock:  # the newest first: the thread that reads waits for this lock
+            newest = tuple(takewhile(lambda point: point.at_s > at_s, reversed(self._points)))
+        return newest[::-1]
 
     def take_reference(self) -> None:
         """Have the reader take a new reference, and say so until it has."""
@@ -302,14 +306,12 @@ class Feed:
     def _draw(self, reading: Reading, frame: LiveFrame) -> Picture:
         shown = Image.fromarray(frame.image)
         shown.thumbnail((_LONGEST_PX, _LONGEST_PX), reducing_gap=1.0)
-        buffer = io.BytesIO()
-        shown.save(buffer, "JPEG", quality=_QUALITY)
         reference = self.reader.reference
         return Picture(
             reading=reading,
             frame=frame,
             reference=reference,
-            jpeg=buffer.getvalue(),
+            jpeg=encode_jpeg(np.asarray(shown), _QUALITY),
             arrows=self._follow(frame, reference) if any(viewer.shows_arrows for viewer in tuple(self.viewers)) else (),
         )
 
@@ -376,7 +378,7 @@ class Feed:
                 full=full,
                 alike=alike,
                 markers=() if alike else _marker_relevance(explanation, picture),
-                warnings=explanation.warnings,
+                warnings=tuple(warning.removeprefix("image 0: ") for warning in explanation.warnings),
             ),
             cells=np.round(127 * (not alike) * np.clip(relevance / full, -1, 1)).astype(np.int8).tobytes(),
         )
@@ -410,6 +412,7 @@ class Viewer:
         """What this viewer waits for, in words."""
         self.shows_map = self.shows_arrows = True
         self._changed = asyncio.Event()
+        self._sending: asyncio.Task[None] | None = None
         self._has_news = True
         self._serial = 0
         self._unanswered: dict[int, float] = {}
@@ -450,9 +453,11 @@ class Viewer:
     async def serve(self, socket: WebSocket) -> None:
         """Send what is new whenever the message before the last was answered, until the viewer is gone."""
         await socket.accept()
+        if self._sending is not None:
+            self._sending.cancel()  # to a connection that was lost, which nobody has been told yet
         self._forget()
         self.feed.viewers.add(self)
-        sending = asyncio.create_task(self._send(socket))
+        self._sending = sending = asyncio.create_task(self._send(socket))
         try:
             while True:
                 answer = msgspec.json.decode(await socket.receive_text(), type=Answer)
@@ -463,8 +468,10 @@ class Viewer:
         except (WebSocketDisconnect, msgspec.MsgspecError, KeyError):
             pass  # it has gone, or speaks another language
         finally:
-            self.feed.viewers.discard(self)
             sending.cancel()
+            if self._sending is sending:
+                self._sending = None
+                self.feed.viewers.discard(self)
             await asyncio.gather(sending, return_exceptions=True)
             with suppress(RuntimeError, WebSocketDisconnect, OSError):
                 await socket.close()
@@ -473,7 +480,8 @@ class Viewer:
         self.wake()
         while True:
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._changed.wait(), _STILL_THERE_S)
+                async with asyncio.timeout(_STILL_THERE_S):  # `wait_for` of Python 3.11 may miss that it is cancelled
+                    await self._changed.wait()
             still_there = not self._changed.is_set()
             self._changed.clear()
             if self.ready and (self._has_news or still_there):
@@ -500,7 +508,9 @@ class Viewer:
             viewers=len(feed.viewers),
             waiting=self.waiting or feed.waiting,
             ended=feed.ended,
-            recording=None if reader.recorder is None else reader.recorder.state,
+            recording=None if (recorder := reader.recorder) is None else recorder.state,
+            sinks=tuple(sender.state for sender in reader.senders),
+            troubles=reader.troubles,
             frozen=None if self.frozen is None else self.frozen.reading,
             has_map=overlay is not None,
             picture=_picture_facts(picture, arrows=self.shows_arrows) if picture is not None and jpeg else None,

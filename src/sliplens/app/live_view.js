@@ -42,6 +42,7 @@ export default {
       <section class="sl-told-of" aria-label="the last seconds and health">
         <canvas class="sl-chart" ref="chart" role="img" aria-label="safety margin over the last seconds"></canvas>
         <div class="sl-recording" ref="recording" hidden></div>
+        <div class="sl-recording" ref="troubles" role="alert"></div>
         <div class="sl-lamps" ref="lamps"></div>
         <dl class="sl-facts" ref="facts"></dl>
       </section>
@@ -89,7 +90,8 @@ export default {
       this.socket = new WebSocket(`${scheme}//${location.host}${this.path}`);
       this.socket.binaryType = "arraybuffer";
       let turn = Promise.resolve(); // pictures are decoded one after another
-      this.socket.onmessage = ({ data }) => (turn = turn.then(() => this.take(data)));
+      // one that cannot be read is passed over: those after it are still taken
+      this.socket.onmessage = ({ data }) => (turn = turn.then(() => this.take(data)).catch(console.error));
       this.socket.onclose = () => {
         this.owed = [];
         if (this.gone) return;
@@ -320,7 +322,7 @@ export default {
         else parts.push(
           `why ${points(map.prediction)} rather than ${points(map.reference_prediction)} untouched: ` +
             `${this.methods[map.method] ?? map.method} of frame ${map.number}`,
-          ...(frozen ? map.warnings : []),
+          ...(frozen ? map.warnings.map((warning) => `▲ ${warning}`) : []),
         );
       }
       if (waiting) parts.push(`⏳ ${waiting}`);
@@ -350,7 +352,7 @@ export default {
       const lamps = [];
       if (reading?.slip) {
         const state = { slip: "bad", sticking: "good" }[reading.slip] ?? "unknown";
-        lamps.push({ name: "markers", state, value: reading.slip, sentence: `the markers tell: ${reading.slip}` });
+        lamps.push({ name: "slip", state, value: reading.slip, sentence: `the markers tell: ${reading.slip}` });
       }
       for (const { name, value, limit, ok, sentence } of reading?.health ?? []) {
         const told = value === null ? "–" : Number(value.toPrecision(2)).toString();
@@ -379,18 +381,19 @@ export default {
       else if (box.firstChild.nodeType === Node.TEXT_NODE) box.firstChild.remove();
     },
     tellFacts() {
-      const { reading, rate_hz, drawn_ms, viewers, recording, ended } = this.update;
+      const { reading, rate_hz, drawn_ms, viewers, recording, ended, sinks, troubles } = this.update;
       const ms = (value) => (value === null || value === undefined ? "–" : `${Math.round(value)} ms`);
       const latency = reading?.latency ?? {};
       const rows = {
         readings: ended ? "ended" : `${rate_hz.toFixed(1)} a second`,
         latency: `${ms(latency.total_ms)} to the reading`,
-        "of that": `decoding ${ms(latency.decode_ms)}, encoding ${ms(latency.encode_ms)}, network ${ms(latency.network_ms)}`,
+        "of that": ["decode", "checks", "encode", "network"].map((part) => `${part} ${ms(latency[`${part}_ms`])}`).join(", "),
         drawn: `${ms(drawn_ms)} after the capture`,
         ...(reading?.friction ? { friction: `taken for ${reading.friction}` } : {}),
         dropped: `${reading?.dropped ?? 0} frames`,
-        state: `${reading?.contact_state ?? "unknown"}`,
+        contact: `${reading?.contact_state ?? "unknown"}`,
         viewers: `${viewers}`,
+        ...(sinks.length ? { sent: sinks.map(({ name, sent, lost }) => `${name} ${sent}, ${lost} lost`).join("; ") } : {}),
       };
       const list = this.$refs.facts;
       // a row more where friction is told, which a withheld reading does not say
@@ -410,8 +413,9 @@ export default {
       if (recording) {
         const lost = recording.lost ? `, ${recording.lost} lost` : "";
         const told = `● recording ${recording.seconds.toFixed(1)} s, ${recording.frames} frames${lost}: ${recording.folder}`;
-        set(line, recording.trouble ?? told);
+        set(line, told);
       }
+      set(this.$refs.troubles, troubles.map((trouble) => `▲ ${trouble}`).join("\n"));
     },
     lookForSilence() {
       if (document.hidden || this.update?.ended) return;

@@ -6,7 +6,7 @@ import secrets
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from functools import cache
+from functools import cache, partial
 from http.cookies import CookieError, SimpleCookie
 from ipaddress import ip_address
 from pathlib import Path
@@ -104,6 +104,7 @@ def _application() -> "FastAPI":
     """Application of this process, for NiceGUI has but one: it asks the page that is shown."""
     import nicegui  # noqa: PLC0415 (the extra)
     from fastapi import FastAPI, Response  # noqa: PLC0415 (comes with it)
+    from starlette.middleware.gzip import GZipMiddleware  # noqa: PLC0415
     from starlette.websockets import WebSocket  # noqa: PLC0415
 
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
@@ -129,6 +130,8 @@ def _application() -> "FastAPI":
         tailwind=False,
         binding_refresh_interval=0.25,
         show_welcome_message=False,
+        # the usual level takes ten times as long, of the cores that read
+        gzip_middleware_factory=partial(GZipMiddleware, compresslevel=1),
     )
     return app
 
