@@ -130,7 +130,7 @@ class Run:
             raise ImageError(
                 f"{what} are {size[0]} x {size[1]} pixels but the network was trained on "
                 f"{self.manifest.frame_size[0]} x {self.manifest.frame_size[1]}; use frames of "
-                "its sensor, or cut these with a profile (`sliplens sensor new --from VIDEO -o tip.toml`, then --sensor "
+                "its sensor, or cut these with a profile (`sliplens sensor new --from VIDEO -o tip.toml`, --sensor "
                 "tip.toml)"
             )
 
