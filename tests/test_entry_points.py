@@ -19,6 +19,7 @@ from sliplens.models.encodings import ENCODINGS
 from sliplens.models.engines import ENGINES
 from sliplens.recordings.formats import FORMATS
 from sliplens.simulation import PRESETS, SENSORS
+from sliplens.simulation.plan import PULLS
 from sliplens.training import RECIPES
 from sliplens.training.data import AUGMENTATIONS
 
@@ -39,6 +40,7 @@ TABLES = {
     "sliplens.estimators": ESTIMATORS,
     "sliplens.sensors": SENSORS,
     "sliplens.presets": PRESETS,
+    "sliplens.pulls": PULLS,
 }
 
 

@@ -16,6 +16,7 @@ from sliplens.simulation import (
     PRESETS,
     FrameTotals,
     Nuisances,
+    Pulls,
     SimulationRecipe,
     plan_trials,
     simulate_dataset,
@@ -42,7 +43,7 @@ RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=24, seed=
 
 
 def simulate(folder: Path, recipe: SimulationRecipe) -> Dataset:
-    with output_folder(folder, stage="simulate", config={"recipe": recipe, "device": "cpu"}) as out:
+    with output_folder(folder, stage="simulate", config={"recipe": recipe.told, "device": "cpu"}) as out:
         simulate_dataset(out.folder, recipe)
     return load_dataset(folder)
 
@@ -162,11 +163,12 @@ def test_outlines_are_the_drawn_circles(trials):
     [
         *PRESETS.values(),
         replace(RECIPE, sensor=FLAT_GEL, nuisances=Nuisances(dry_friction=(0.2, 0.9)), displacement="half-space"),
+        replace(RECIPE, pulls=Pulls(duration_s=(1.0, 4.0))),
         replace(RECIPE, frame_totals=FrameTotals(train=40, validation=20, test=40), release=True, test_days=1),
     ],
 )
 def test_a_recipe_comes_back_from_its_folder(recipe: SimulationRecipe, tmp_path: Path):
-    with output_folder(tmp_path / "data", stage="simulate", config={"recipe": recipe, "device": "cpu"}):
+    with output_folder(tmp_path / "data", stage="simulate", config={"recipe": recipe.told, "device": "cpu"}):
         pass
     assert read_recipe(tmp_path / "data") == recipe
 

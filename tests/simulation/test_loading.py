@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from sliplens.errors import ContactError
 from sliplens.mechanics import stick_ratio
 from sliplens.recordings import ContactState
-from sliplens.simulation.loading import load_at_margins, load_grasp, slide
-from sliplens.simulation.nuisances import Grasp, Nuisances, draw_day, draw_grasp
+from sliplens.simulation.loading import draw_pull, load_at_margins, load_grasp, slide, with_friction
+from sliplens.simulation.nuisances import Grasp, Nuisances, Pulls, draw_day, draw_grasp
 
 FRAMES = 800
 FEW = settings(max_examples=25)
@@ -24,8 +24,9 @@ def drawn(seed, **changes):
     return replace(draw_grasp(nuisances, day=day, wet=bool(seed % 2), rng=rng), **changes)
 
 
-def loaded(seed, *, release=False, frames=FRAMES, **changes):
-    return load_grasp(drawn(seed, **changes), frames=frames, rng=np.random.default_rng(seed), release=release)
+def loaded(seed, *, release=False, frames=FRAMES, pulls=None, **changes):
+    rng = np.random.default_rng(seed)
+    return load_grasp(drawn(seed, **changes), frames=frames, rng=rng, release=release, pulls=pulls)
 
 
 def first_slip(loading):
@@ -36,9 +37,9 @@ seeds = st.integers(0, 10_000)
 
 
 @FEW
-@given(seeds, st.booleans())
-def test_margin_is_one_minus_the_used_share_of_the_friction_that_holds(seed, release):
-    loading = loaded(seed, release=release)
+@given(seeds, st.booleans(), st.sampled_from([None, Pulls()]))
+def test_margin_is_one_minus_the_used_share_of_the_friction_that_holds(seed, release, pulls):
+    loading = loaded(seed, release=release, pulls=pulls)
     pressing = loading.normal_force_n > 0
     capacity = loading.friction_coefficient[pressing] * loading.normal_force_n[pressing]
     np.testing.assert_allclose(
@@ -62,6 +63,63 @@ def test_margin_falls_from_one_to_zero_while_the_pull_grows(seed):
     np.testing.assert_array_equal(loading.static_friction[: slip + 1], loading.friction_coefficient[: slip + 1])
     assert pull[-1] == pytest.approx(loading.friction_coefficient[slip] * loading.normal_force_n[slip], rel=1e-12)
     assert np.all(margin[:-1] > 0)
+
+
+@FEW
+@given(seeds)
+def test_a_varied_pull_slips_where_its_friction_is_used_up_and_nowhere_before(seed):
+    loading = loaded(seed, pulls=Pulls(), frames=300)
+    touch, slip = int(np.argmin(np.isnan(loading.safety_margin))), first_slip(loading)
+    assert np.all(loading.safety_margin[touch:slip] > 0)
+    held = loading.friction_coefficient[slip] * loading.normal_force_n[slip]
+    assert loading.tangential_force_n[slip] == pytest.approx(held, rel=1e-12)
+    assert np.all((loading.retaken >= 0) & (loading.retaken <= loading.let_back + 1e-12) & (loading.let_back <= 1))
+    # whatever happened on the way, the farthest pull grows
+    farthest = 1 - loading.safety_margin[touch:slip] + (loading.let_back - loading.retaken)[touch:slip]
+    assert np.all(np.diff(farthest) >= -1e-9)
+
+
+def test_varied_pulls_have_speeds_over_a_decade_and_rest_jerk_and_are_let_back():
+    durations, kinds = [], {"rest": 0, "jerk": 0, "let back": 0}
+    for seed in range(100):
+        loading = loaded(seed, pulls=Pulls(), frames=400, normal_force_drift=0.0, friction_drift=0.0)
+        slip = first_slip(loading)
+        used = 1 - loading.safety_margin[:slip]
+        begun = int(np.argmax(used > 0)) - 1
+        duration_s = loading.time_s[slip] - loading.time_s[begun]
+        durations.append(duration_s)
+        rates = np.diff(used[begun:]) * duration_s / loading.time_s[1]  # 1 is that of an even pull
+        kinds["rest"] += bool((np.abs(rates) < 1e-9).sum() > 5)
+        kinds["jerk"] += bool(rates.max() > 3 * Pulls().rate)
+        kinds["let back"] += bool((rates < -1e-9).any())
+    assert min(durations) < 0.9
+    assert max(durations) > 7
+    # evenly in the logarithm: half are below the geometric mean, give or take three standard errors
+    assert abs(np.mean(np.array(durations) < np.sqrt(0.8 * 8)) - 0.5) < 3 * 0.5 / np.sqrt(100)
+    low, high = Pulls().duration_s
+    assert low * 0.95 <= min(durations)
+    assert max(durations) <= high * 1.05  # phases round to frames, of 7 to 26 ms
+    # four pulls in ten have each kind; short jerks hide between frames
+    assert min(kinds.values()) > 10
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_how_a_pull_goes_does_not_depend_on_when_it_is_looked_at(seed):
+    fine, coarse = np.linspace(0, 1, 1001), np.linspace(0, 1, 101)
+    one, other = (
+        draw_pull(Pulls(), progress=at, duration_s=2.0, rng=np.random.default_rng(seed)) for at in (fine, coarse)
+    )
+    for name in ("used", "let_back", "retaken"):
+        np.testing.assert_allclose(getattr(one, name)[::10], getattr(other, name), atol=1e-9)
+
+
+def test_the_same_forces_let_another_friction_back_by_another_share():
+    loading = next(one for one in (loaded(seed, pulls=Pulls()) for seed in range(20)) if one.let_back.any())
+    rougher = with_friction(loading, 2 * loading.static_friction)
+    turned = (loading.let_back > 0) & ~np.isnan(rougher.safety_margin)
+    assert turned.any()
+    np.testing.assert_allclose(rougher.let_back[turned], loading.let_back[turned] / 2)
+    np.testing.assert_allclose(1 - rougher.safety_margin[turned], (1 - loading.safety_margin[turned]) / 2)
 
 
 @FEW
@@ -145,9 +203,9 @@ def test_a_release_ends_without_contact_and_slides_on_the_way(seed):
 
 
 @FEW
-@given(st.integers(20, 2000), seeds, st.booleans())
-def test_every_trial_has_every_state(frames, seed, release):
-    loading = loaded(seed, frames=frames, release=release)
+@given(st.integers(20, 2000), seeds, st.booleans(), st.sampled_from([None, Pulls()]))
+def test_every_trial_has_every_state(frames, seed, release, pulls):
+    loading = loaded(seed, frames=frames, release=release, pulls=pulls)
     assert set(loading.contact_state) == set(ContactState) - {ContactState.UNKNOWN}
     assert len(loading.time_s) == frames
 

@@ -124,6 +124,33 @@ def test_kinetic_friction_lets_the_skin_spring_back():
     assert shift[-1] / shift[slip] == pytest.approx(0.7, abs=0.01)
 
 
+def shifted(margin: float, *, let_back: float = 0.0, retaken: float = 0.0) -> np.ndarray:
+    """Shift of the markers along and across the pull, that of the pressing taken off."""
+    pressed, pulled = (load_at_margins(np.array([value]), grasp=CENTRED) for value in (1.0, margin))
+    pulled = replace(pulled, let_back=np.array([let_back]), retaken=np.array([retaken]))
+    first, second = (
+        move_markers(FLAT_GEL, Touch(grasp=CENTRED, marker_depth=0.0), loading=one) for one in (pressed, pulled)
+    )
+    return second.centres_px[0] - first.centres_px[0]
+
+
+def test_a_pull_that_is_let_back_lags_behind_and_a_closed_loop_leaves_nothing():
+    # return-point memory: back where it was let back from, nothing of the loop is left
+    np.testing.assert_allclose(shifted(0.4, let_back=0.5, retaken=0.5), shifted(0.4), atol=1e-9)
+    # let back to 0.3, the skin is farther along than on the way there, and nearer than where it turned
+    way, turned, back = (np.abs(shift).max() for shift in (shifted(0.7), shifted(0.4), shifted(0.7, let_back=0.3)))
+    assert way < back < turned
+    # pulled again half way, it is between the two branches
+    again = np.abs(shifted(0.55, let_back=0.3, retaken=0.15)).max()
+    assert np.abs(shifted(0.55)).max() < again < np.abs(shifted(0.55, let_back=0.15)).max()
+
+
+def test_the_way_back_is_the_way_there_at_twice_the_scale():
+    # Masing's rule: let back by a share, the skin returns by twice its way at half that share
+    returned = shifted(0.4) - shifted(0.4 + 0.5, let_back=0.5)
+    np.testing.assert_allclose(returned, 2 * shifted(1 - 0.25), atol=2e-3 * np.abs(returned).max() + 1e-6)
+
+
 def test_restuck_skin_carries_on_from_where_it_slid():
     grasp = replace(CENTRED, kinetic_ratio=0.7, stick_slip_share=0.5, stick_slip_hz=2.0)
     loading = load_grasp(grasp, frames=8000, rng=np.random.default_rng(0))

@@ -6,7 +6,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sliplens.errors import ContactError, InputError
-from sliplens.simulation import FLAT_GEL, PRESETS, FrameTotals, Nuisances, SimulationRecipe, plan_trials
+from sliplens.files import to_builtins
+from sliplens.simulation import (
+    FLAT_GEL,
+    PRESETS,
+    FrameTotals,
+    Nuisances,
+    Pulls,
+    SimulationRecipe,
+    make_recipe,
+    plan_trials,
+)
 from sliplens.simulation.nuisances import draw_grasp
 
 
@@ -218,3 +228,27 @@ def test_impossible_recipes_are_refused(change, message):
 def test_impossible_ranges_are_refused(change, message):
     with pytest.raises(ContactError, match=message):
         Nuisances(**change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"duration_s": (0.0, 8.0)}, r"the range of duration_s is \(0.0, 8.0\); give a positive low, then a high"),
+        ({"let_back": (0.2, 1.2)}, "let_back must be at most 1, got 1.2; lower its upper end"),
+        ({"most_events": 9}, "9 jerks of 0.1 s leave no time in a pull of 0.8 s; make pulls longer or jerks shorter"),
+        ({"rate": 0.5}, "a rate of 1 or more, got 3 and 0.5"),
+    ],
+)
+def test_impossible_pulls_are_refused(change, message):
+    with pytest.raises(ContactError, match=message):
+        Pulls(**change)
+
+
+def test_steady_pulls_are_told_as_before_there_were_others():
+    steady, varied = make_recipe("small", pulls="steady"), make_recipe("small", pulls="varied")
+    assert steady == make_recipe("small")
+    assert "pulls" not in steady.told
+    assert varied.told["pulls"] == to_builtins(Pulls())
+    assert varied.hash != steady.hash
+    # the same days, sensors and grasps, pulled otherwise
+    assert [plan.seed for plan in plan_trials(varied)] == [plan.seed for plan in plan_trials(steady)]

@@ -49,6 +49,9 @@ class Simulate(Command):
     """How many of the last days test."""
     dry_friction: tuple[float, float] | None = None
     """Least and largest coefficient of friction of the dry object; a wider range makes a network rely on it less."""
+    pulls: Literal["steady", "varied"] | None = None
+    """How objects are pulled. steady: in about 5.8 s, the margin falling evenly. varied: in 0.8 to 8 s, with rests,
+    jerks and lettings back. The preset's own if not given."""
     release: bool = False
     """Let go of the object at the end of each trial."""
     seed: int = 0

@@ -23,7 +23,7 @@ from sliplens.simulation.information import (
     visible_markers,
 )
 from sliplens.simulation.loading import Loading
-from sliplens.simulation.nuisances import Nuisances, Touch
+from sliplens.simulation.nuisances import Nuisances, Pulls, Touch
 from sliplens.simulation.plan import FrameTotals, SimulationRecipe, TrialPlan, plan_trials
 from sliplens.simulation.sensor import SENSORS
 from sliplens.simulation.trials import prepare_trial
@@ -41,7 +41,7 @@ class FilmedTrial:
     film: Film
 
     def touch(self, frame: int) -> Touch:
-        """All that moves the markers of a frame, apart from its margin; what an earlier slip left is not told.
+        """All that moves the markers of a frame, apart from its margin; what an earlier slip or pull left is not told.
 
         Drift and creep are in the force and the friction that hold in this frame.
         """
@@ -74,11 +74,12 @@ def read_recipe(folder: Path) -> SimulationRecipe:
     path = folder / RUN_FILE
     try:
         stored = read_json(path)["config"]["recipe"]
-        totals = stored["frame_totals"]
+        totals, pulls = stored["frame_totals"], stored.get("pulls")
         records: dict[str, Any] = {
             "sensor": SENSORS[stored["sensor"]["name"]],
             "nuisances": Nuisances(**_tuples(stored["nuisances"])),
             "frame_totals": None if totals is None else FrameTotals(**totals),
+            "pulls": None if pulls is None else Pulls(**_tuples(pulls)),
         }
         return SimulationRecipe(**(_tuples(stored) | records))
     except (InputError, KeyError, TypeError, AttributeError):

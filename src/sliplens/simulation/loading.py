@@ -9,7 +9,7 @@ from sliplens.errors import ContactError
 from sliplens.mechanics import safety_margin, stick_ratio
 from sliplens.recordings.trial import ContactState, contact_states
 from sliplens.simulation.geometry import Frames
-from sliplens.simulation.nuisances import Grasp
+from sliplens.simulation.nuisances import Grasp, Pulls
 
 _FALL_S = 0.06
 """Time in which friction falls from static to kinetic once the contact slips (assumed)."""
@@ -86,6 +86,10 @@ class Loading:
     The traction is that of `carried_friction` times the pressure everywhere, from sliding, and on top of it that of a
     Cattaneo-Mindlin contact with the friction that is left and `stick_margin` (Ciavarella and Jaeger's superposition).
     Before the first slip nothing is carried, and the stick margin is the safety margin.
+
+    A pull that is let back slips anew from the rim of the contact, half as far for the same force, and so it does when
+    it is pulled again (Mindlin and Deresiewicz). Where the pull has come back to where it was let back from, nothing of
+    that is left.
     """
 
     time_s: Frames
@@ -97,24 +101,94 @@ class Loading:
     stick_ratio: Frames
     carried_friction: Frames
     stick_margin: Frames
-    """NaN without contact, as the safety margin."""
+    """NaN without contact, as the safety margin; where the pull was let back, that of the newest slip from the rim."""
+    let_back: Frames
+    """Share of the friction by which the pull went back from its farthest; 0 while it is the farthest."""
+    retaken: Frames
+    """Share of the friction by which it was pulled again since."""
     held_s: Frames
     """Time since the object was touched; 0 before."""
     contact_state: tuple[ContactState, ...]
 
+    @property
+    def tractions(self) -> list[tuple[float, Frames, Frames]]:
+        """Sign, friction and margin of the Cattaneo-Mindlin contacts whose sum the traction is."""
+        turned = self.let_back > 0
+        farthest = np.clip(self.safety_margin - self.let_back + self.retaken, 0, 1)
+        farthest = np.where(turned, farthest, self.stick_margin)
+        parts = [(1.0, self.friction_coefficient - self.carried_friction, np.nan_to_num(farthest, nan=1.0))]
+        if self.carried_friction.any():
+            parts.append((1.0, self.carried_friction, np.zeros_like(self.carried_friction)))
+        if turned.any():
+            twice = 2 * self.friction_coefficient
+            parts += [(-1.0, twice, 1 - self.let_back / 2), (1.0, twice, 1 - self.retaken / 2)]
+        return parts
 
-def load_grasp(grasp: Grasp, *, frames: int, rng: np.random.Generator, release: bool = False) -> Loading:
-    """Load a grasp: press to its force, hold, pull with an evenly falling margin, then slide (`slide`).
+
+@dataclass(frozen=True, kw_only=True)
+class Pull:
+    """Course of a pull, frame by frame, in shares of the friction; see `Loading`."""
+
+    used: Frames
+    let_back: Frames
+    retaken: Frames
+
+
+def draw_pull(pulls: Pulls, *, progress: Frames, duration_s: float, rng: np.random.Generator) -> Pull:
+    """Draw a pull that uses the friction up, from 0 at its beginning to 1 at its end.
+
+    `progress`: time since the first tug over the duration; below 0 nothing is pulled, above 1 all is used up.
+    """
+    events = rng.choice(["rest", "jerk", "let back"], size=rng.integers(pulls.most_events + 1))
+    places = np.append(np.sort(rng.uniform(0.05, 0.95, len(events))), 1.0)
+    # time and level of each corner; times are weights first, but those of jerks
+    weights, jerks, levels, backs = [0.0], [0.0], [0.0], []
+
+    def go(level: float, *, weight: float = 0.0, jerk: float = 0.0) -> None:
+        levels.append(level)
+        weights.append(weight)
+        jerks.append(jerk)
+
+    for place, event in zip(places, [*events, "slip"], strict=True):
+        level = max(float(place), levels[-1])
+        go(level, weight=(level - levels[-1]) * pulls.rate ** rng.uniform(-1, 1))
+        if event == "rest":
+            go(level, weight=rng.uniform(*pulls.rest))
+        elif event == "jerk":
+            following = float(places[np.searchsorted(places, level, side="right")])
+            go(level + rng.uniform(0.3, 0.9) * (following - level), jerk=rng.uniform(*pulls.jerk_s) / duration_s)
+        elif event == "let back":
+            backs.append(len(levels))
+            go(level * (1 - rng.uniform(*pulls.let_back)), weight=rng.uniform(*pulls.rest))
+            go(level, weight=rng.uniform(*pulls.rest))
+    shares = np.array(jerks) + np.array(weights) / sum(weights) * (1 - sum(jerks))
+    times = np.cumsum(shares) / shares.sum()
+    used = np.interp(progress, times, levels)
+    let_back, retaken = np.zeros_like(used), np.zeros_like(used)
+    for turn in backs:
+        farthest, lowest = levels[turn - 1], levels[turn]
+        away = (progress > times[turn - 1]) & (progress < times[turn + 1])
+        again = away & (progress > times[turn])
+        let_back[away] = farthest - np.where(again, lowest, used)[away]
+        retaken[again] = used[again] - lowest
+    return Pull(used=used, let_back=let_back, retaken=retaken)
+
+
+def load_grasp(
+    grasp: Grasp, *, frames: int, rng: np.random.Generator, release: bool = False, pulls: Pulls | None = None
+) -> Loading:
+    """Load a grasp: press to its force, hold, pull until the friction is used up, then slide (`slide`).
 
     `release`: let go at the end: the normal force falls to nothing while the object slides, and the last frames have no
-    contact.
+    contact. `pulls`: how the pull is drawn (`draw_pull`), and the trial lasts as long as that takes; if None the margin
+    falls evenly, in a trial of 8 s.
     """
     if frames < MINIMUM_FRAMES:
         raise ContactError(f"a trial of {frames} frames cannot hold all phases; ask for {MINIMUM_FRAMES} or more")
-    touch, pressed, pull, slip, let_go, gone = _phase_ends(frames, rng, release=release)
+    trial_s, (touch, pressed, pull, slip, let_go, gone) = _phase_ends(frames, rng, release=release, pulls=pulls)
     index = np.arange(frames)
     progress = index / (frames - 1)
-    time_s = index * (TRIAL_S / frames)
+    time_s = index * (trial_s / frames)
 
     # the camera knows nothing of the touch: the first frame of contact comes anywhere within its period, and where
     # frames are few, some trials show the lightest touch and some do not
@@ -127,18 +201,22 @@ def load_grasp(grasp: Grasp, *, frames: int, rng: np.random.Generator, release: 
     static = grasp.friction * (1 + grasp.friction_drift * (progress - 0.5) * 2)
 
     pulled = np.clip((index - pull) / (slip - pull), 0, 1)
-    # a slow swing of the puller, small enough that the margin never rises
-    swing = rng.uniform(-0.5, 0.5) * np.sin(2 * np.pi * pulled) / (2 * np.pi)
-    used = np.clip(pulled + swing, 0, 1)
+    if pulls is not None:
+        course = draw_pull(pulls, progress=pulled, duration_s=(slip - pull) * trial_s / frames, rng=rng)
+    else:
+        # a slow swing of the puller, small enough that the margin never rises
+        swing = rng.uniform(-0.5, 0.5) * np.sin(2 * np.pi * pulled) / (2 * np.pi)
+        nothing = np.zeros(frames)
+        course = Pull(used=np.clip(pulled + swing, 0, 1), let_back=nothing, retaken=nothing)
     sliding = slide(time_s - time_s[slip], static_friction=static, grasp=grasp, stuck_until=let_go - slip)
     friction = Friction(
         coefficient=np.where(index < slip, static, sliding.coefficient),
-        used=np.where(index < slip, used, sliding.used),
+        used=np.where(index < slip, course.used, sliding.used),
         carried=np.where(index < slip, 0.0, sliding.carried),
         slips=(index >= slip) & sliding.slips,
     )
     held_s = np.where(index < touch, 0, time_s - time_s[touch])
-    return _label(time_s, normal=normal, static=static, friction=friction, held_s=held_s)
+    return _label(time_s, normal=normal, static=static, friction=friction, held_s=held_s, course=course)
 
 
 def load_at_margins(margins: Frames, *, grasp: Grasp) -> Loading:
@@ -170,8 +248,19 @@ def load_at_states(
     return _label(time_s, normal=normal, static=friction, friction=states, held_s=nothing if held_s is None else held_s)
 
 
-def _label(time_s: Frames, *, normal: Frames, static: Frames, friction: Friction, held_s: Frames) -> Loading:
-    """Label frames of which is known how much of the friction they use."""
+def _label(
+    time_s: Frames,
+    *,
+    normal: Frames,
+    static: Frames,
+    friction: Friction,
+    held_s: Frames,
+    course: Pull | None = None,
+) -> Loading:
+    """Label frames of which is known how much of the friction they use, and whether the pull was let back before."""
+    let_back = retaken = np.zeros(len(time_s))
+    if course is not None:
+        let_back, retaken = course.let_back, course.retaken
     coefficient, carried, slips = friction.coefficient, friction.carried, friction.slips
     tangential = friction.used * coefficient * normal
     # rounding alone would leave a sliding contact a margin of 1e-16
@@ -179,7 +268,7 @@ def _label(time_s: Frames, *, normal: Frames, static: Frames, friction: Friction
     left = coefficient - carried
     on_top = np.clip((friction.used * coefficient - carried) / np.where(left > 0, left, 1), 0, 1)
     again = ~np.isnan(margin) & ~slips & (carried > 0)
-    stick_margin = np.where(again, 1 - on_top, margin)
+    stick_margin = _newest_margin(np.where(again, 1 - on_top, margin), let_back=let_back, retaken=retaken)
     return Loading(
         time_s=time_s,
         normal_force_n=normal,
@@ -190,9 +279,17 @@ def _label(time_s: Frames, *, normal: Frames, static: Frames, friction: Friction
         stick_ratio=stick_ratio(stick_margin),
         carried_friction=carried,
         stick_margin=stick_margin,
+        let_back=let_back,
+        retaken=retaken,
         held_s=held_s,
         contact_state=contact_states(margin, without=ContactState.NO_CONTACT),
     )
+
+
+def _newest_margin(margin: Frames, *, let_back: Frames, retaken: Frames) -> Frames:
+    """Margin of the slip that last began at the rim of the contact."""
+    newest = np.where(retaken > 0, 1 - retaken / 2, 1 - let_back / 2)
+    return np.where((let_back > 0) & ~np.isnan(margin), newest, margin)
 
 
 def with_friction(loading: Loading, friction: Frames) -> Loading:
@@ -202,11 +299,16 @@ def with_friction(loading: Loading, friction: Frames) -> Loading:
     and after the first slip: what slipping leaves behind would have been another.
     """
     same = friction == loading.friction_coefficient
+    # the same forces are other shares of another friction
+    ratio = loading.friction_coefficient / friction
+    let_back, retaken = np.where(same, 1, ratio) * (loading.let_back, loading.retaken)
     normal, tangential = loading.normal_force_n, loading.tangential_force_n
-    known = ((loading.safety_margin > 0) & (loading.carried_friction == 0) & (tangential < friction * normal)) | same
+    farthest = tangential + (let_back - retaken) * friction * normal
+    known = ((loading.safety_margin > 0) & (loading.carried_friction == 0) & (farthest < friction * normal)) | same
     margin = np.where(same, loading.safety_margin, safety_margin(normal, tangential, friction))
     margin = np.where(known, margin, np.nan)
-    stick_margin = np.where(same, loading.stick_margin, margin)
+    newest = _newest_margin(margin, let_back=let_back, retaken=retaken)
+    stick_margin = np.where(same, loading.stick_margin, newest)
     return replace(
         loading,
         friction_coefficient=friction,
@@ -215,18 +317,30 @@ def with_friction(loading: Loading, friction: Frames) -> Loading:
         stick_ratio=stick_ratio(stick_margin),
         carried_friction=np.where(same, loading.carried_friction, 0.0),
         stick_margin=stick_margin,
+        let_back=let_back,
+        retaken=retaken,
         contact_state=contact_states(margin, without=ContactState.NO_CONTACT),
     )
 
 
-def _phase_ends(frames: int, rng: np.random.Generator, *, release: bool) -> tuple[int, int, int, int, int, int]:
-    """First frame after each phase, the lengths varied by a fifth; the pull takes what is left."""
-    shares = np.array((*_PHASES, *(_RELEASE if release else (0.0, 0.0))))
-    lengths = np.round(frames * shares * rng.uniform(0.8, 1.2, len(shares))).astype(int)
+def _phase_ends(
+    frames: int, rng: np.random.Generator, *, release: bool, pulls: Pulls | None
+) -> tuple[float, tuple[int, ...]]:
+    """Length of the trial in seconds, and the first frame after each phase.
+
+    Lengths of the phases vary by a fifth; the pull takes what is left, or the time that it is drawn to take.
+    """
+    shares, trial_s = np.array((*_PHASES, *(_RELEASE if release else (0.0, 0.0)))), TRIAL_S
+    factors = rng.uniform(0.8, 1.2, len(shares))
+    if pulls is not None:
+        seconds = TRIAL_S * shares * factors
+        seconds[3] = np.exp(rng.uniform(*np.log(pulls.duration_s)))
+        trial_s = float(seconds.sum())
+        shares, factors = np.where(shares > 0, seconds / trial_s, 0), np.ones(len(shares))
+    lengths = np.round(frames * shares * factors).astype(int)
     lengths[shares > 0] = np.maximum(1, lengths[shares > 0])
     lengths[3] += frames - lengths.sum()
-    touch, pressed, pull, slip, let_go, gone, _ = np.cumsum(lengths).tolist()
-    return touch, pressed, pull, slip, let_go, gone
+    return trial_s, tuple(np.cumsum(lengths)[:-1].tolist())
 
 
 def _smooth(progress: Frames) -> Frames:

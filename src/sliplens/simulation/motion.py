@@ -113,10 +113,8 @@ def move_markers(sensor: Sensor, touch: Touch, *, loading: Loading, displacement
     # a tilted object pushes a little sideways
     moved = rest + outward[..., None] * np.append(from_centre, np.zeros((len(rest), 1)), axis=1)
     moved += inward[..., None] * np.append(np.tan(grasp.tilt_rad), -1)
-    stick, carried = np.nan_to_num(loading.stick_margin, nan=1.0)[:, None], loading.carried_friction[:, None]
-    # friction and margin of each Cattaneo-Mindlin contact whose sum the traction is
-    tractions = [(loading.friction_coefficient[:, None] - carried, stick), (carried, np.zeros_like(carried))]
-    for friction, margin in tractions[: 1 + carried.any()]:
+    for sign, *contact in loading.tractions:
+        friction, margin = (values[:, None] for values in contact)
         along, across, sunk = partial_slip_displacement(
             from_centre @ pull,
             from_centre @ athwart,
@@ -128,9 +126,9 @@ def move_markers(sensor: Sensor, touch: Touch, *, loading: Loading, displacement
             poisson_ratio=sensor.poisson_ratio,
         )
         skin = model.skin_shear * sphere_m * friction / _FITTED_FRICTION * sunken[:, None]
-        along = (along + skin * (1 - margin**grasp.shear_exponent)) * clamp
-        moved[..., :2] += along[..., None] * pull + (across * clamp)[..., None] * athwart
-        moved[..., 2] -= sunk * clamp
+        along = (along + skin * (1 - margin**grasp.shear_exponent)) * (sign * clamp)
+        moved[..., :2] += along[..., None] * pull + (across * (sign * clamp))[..., None] * athwart
+        moved[..., 2] -= sunk * (sign * clamp)
     return Motion(
         rest_px=geometry.project(rest),
         centres_px=geometry.project(moved),

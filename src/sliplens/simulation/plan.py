@@ -10,10 +10,10 @@ import numpy as np
 from sliplens._version import __version__
 from sliplens.errors import InputError
 from sliplens.extras import Table
-from sliplens.files import hash_json
+from sliplens.files import hash_json, to_builtins
 from sliplens.recordings.splits import hold_out
 from sliplens.simulation.loading import MINIMUM_FRAMES
-from sliplens.simulation.nuisances import Day, Nuisances, draw_day
+from sliplens.simulation.nuisances import Day, Nuisances, Pulls, draw_day
 from sliplens.simulation.sensor import CHROMATOUCH, SENSORS, Sensor
 
 # branches of the seed: what is drawn for one never moves what is drawn for another
@@ -46,6 +46,8 @@ class SimulationRecipe:
     """Frames of each split, if given: trials then differ in length by a tenth to make them up."""
     release: bool = False
     """Let go of the object at the end of each trial."""
+    pulls: Pulls | None = None
+    """How pulls differ; if None all last about 5.8 s, and a sequence of frames tells the time."""
     days: int = 4
     test_day: int | None = None
     """The last day if None."""
@@ -124,7 +126,13 @@ class SimulationRecipe:
     @property
     def hash(self) -> str:
         """Hash of the recipe and of the version of sliplens that follows it."""
-        return hash_json({"recipe": self, "sliplens": __version__})
+        return hash_json({"recipe": self.told, "sliplens": __version__})
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """The recipe as `run.json` keeps it; pulls that are all alike are left out, as before there were others."""
+        told = to_builtins(self)
+        return told if self.pulls else {name: value for name, value in told.items() if name != "pulls"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +160,12 @@ class TrialPlan:
 
 
 def make_recipe(
-    preset: str = "small", *, sensor: str | None = None, dry_friction: tuple[float, float] | None = None, **changes: Any
+    preset: str = "small",
+    *,
+    sensor: str | None = None,
+    pulls: str | None = None,
+    dry_friction: tuple[float, float] | None = None,
+    **changes: Any,
 ) -> SimulationRecipe:
     """Recipe of a preset with changes.
 
@@ -162,6 +175,8 @@ def make_recipe(
         Row of `PRESETS`.
     sensor
         Row of `SENSORS`; the preset's own if None.
+    pulls
+        Row of `PULLS`; the preset's own if None.
     dry_friction
         Least and largest coefficient of friction of the dry object.
     changes
@@ -186,6 +201,8 @@ def make_recipe(
         changes["frame_totals"] = None
     if sensor is not None:
         changes["sensor"] = SENSORS.pick(sensor)
+    if pulls is not None:
+        changes["pulls"] = PULLS.pick(pulls)
     if dry_friction is not None:
         changes["nuisances"] = replace(start.nuisances, dry_friction=dry_friction)
     return replace(start, **changes)
@@ -292,6 +309,8 @@ def _seed(recipe: SimulationRecipe, *branch: int) -> int:
     return int(np.random.SeedSequence(recipe.seed, spawn_key=key).generate_state(2, np.uint64)[0])
 
 
+PULLS: Table[Pulls | None] = Table("kind of pulls", "sliplens.pulls", {"steady": None, "varied": Pulls()})
+"""`steady` pulls last about 5.8 s and the margin falls evenly; no two `varied` ones are alike."""
 _ROWS = {
     "small": SimulationRecipe(dry_trials=96, wet_trials=8, frames_per_trial=48, days=12, series="small"),
     "thesis": SimulationRecipe(

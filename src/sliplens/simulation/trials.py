@@ -29,7 +29,7 @@ def prepare_trial(plan: TrialPlan, *, friction: Float[np.ndarray, " frames"] | N
     grasp_rng, load_rng, rng = np.random.default_rng(plan.seed).spawn(3)
     day, sensor = plan.day_draw, recipe.sensor
     grasp = draw_grasp(recipe.nuisances, day=day, wet=plan.condition == "wet", rng=grasp_rng)
-    loading = load_grasp(grasp, frames=plan.frames, rng=load_rng, release=recipe.release)
+    loading = load_grasp(grasp, frames=plan.frames, rng=load_rng, release=recipe.release, pulls=recipe.pulls)
     if friction is not None:
         loading = with_friction(loading, friction)
     unit = draw_unit(recipe.nuisances, markers=sensor.geometry.markers, rng=unit_rng)
@@ -109,7 +109,8 @@ def simulate(
         Folder to write; a temporary one that lives as long as what is returned if None.
     preset, sensor, changes
         As `make_recipe` takes them: `preset="small"` is made for a laptop, `"thesis"` has the days and frames of the
-        thesis; `dry_trials`, `wet_trials`, `days`, `frames_per_trial` or `seed` change it.
+        thesis; `pulls="varied"` makes no pull like another; `dry_trials`, `wet_trials`, `days`, `frames_per_trial` or
+        `seed` change it.
     device
         Where to draw the frames: cpu, cuda or cuda:1. A GPU's pixels may differ by one grey level.
 
@@ -126,7 +127,7 @@ def simulate(
             data = simulate_dataset(folder, recipe, device=device, on_progress=count)
             weakref.finalize(data, stack.pop_all().close)
         return data
-    out, config = Path(out), {"recipe": recipe, "device": device}
+    out, config = Path(out), {"recipe": recipe.told, "device": device}
     with output_folder(out, stage="simulate", config=config, overwrite=overwrite) as output:
         if not output.complete:
             with stage(on_progress, "Simulating frames") as count:
