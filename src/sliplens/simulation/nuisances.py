@@ -102,7 +102,7 @@ class Pulls:
     most_events: int = 3
     """Rests, jerks and lettings back of a pull, at most."""
     rate: float = 3.0
-    """How much faster or slower than the whole pull a ramp is, at most, before all are made to fit the duration."""
+    """Ratio by which a ramp is faster or slower than the whole pull, at most, before all are made to fit."""
     rest: Range = (0.05, 0.3)
     """Length of a rest and of each way of a letting back, over that of the pull."""
     jerk_s: Range = (0.03, 0.1)
