@@ -6,10 +6,11 @@ not finite is told in one sentence with its place and its cure, by msgspec for J
 
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass
+from math import prod
 from pathlib import Path
 from types import NoneType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
@@ -20,9 +21,10 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 from jaxtyping import AbstractArray, jaxtyped
+from numpy.lib.format import read_array_header_1_0, read_array_header_2_0, read_magic
 
-from sliplens.errors import InputError
-from sliplens.files import read_json, to_builtins, write_json
+from sliplens.errors import InputError, SliplensError
+from sliplens.files import read_json, require_file, to_builtins, write_json
 
 RESULT_FILE = "result.json"
 """Record of a folder."""
@@ -120,6 +122,10 @@ def from_builtins(values: object, kind: type[Record], *, where: Path | str, comm
     """
     try:
         return msgspec.convert(values, kind, dec_hook=_decode, str_keys=True)
+    except SliplensError as error:  # of a record that checks itself
+        raise type(error)(f"{where}: {error}") from None
+    except OverflowError:
+        raise InputError(f"{where} holds a number that is too large; {_cure(command)}") from None
     except msgspec.ValidationError as error:
         # in the words of this package: "expected `str`, got `int` at trials[2].day"
         text, _, place = str(error).partition(" - at ")
@@ -196,33 +202,121 @@ def keep_part(part: Path | None, kind: type[Record], make: Callable[[], Record])
     return load_result(part, kind, command="sliplens")
 
 
-def _load_columns(path: Path, kind: type[_Columns], cure: str) -> _Columns:
-    names = [field.name for field in fields(kind)]
+MOST_EXPANDED, MOST_TIMES = 256 * 2**20, 100
+"""Bytes that a compressed table may hold, or how many times its size; ours hold some ten times theirs."""
+_MOST_ROWS = 2**25
+_MOST_ARRAYS = 2**31  # bytes that arrays or texts of a small file may expand to, a thousand times what most do
+_MOST_TEXT = 2**27  # characters, were all texts of a column as long as the longest, as NumPy keeps them
+COLUMN_KINDS: dict[str, Callable[[pa.DataType], bool]] = {
+    "numbers": lambda kind: pa.types.is_floating(kind) or pa.types.is_integer(kind),
+    "whole numbers": pa.types.is_integer,
+    "true and false": pa.types.is_boolean,
+    "texts": lambda kind: pa.types.is_string(kind) or pa.types.is_large_string(kind),
+    "bytes": lambda kind: pa.types.is_binary(kind) or pa.types.is_large_binary(kind),
+    "values": lambda _: True,
+    "lists of numbers": lambda kind: pa.types.is_fixed_size_list(kind) and pa.types.is_floating(kind.value_type),
+}
+"""What a column may hold, by its words."""
+
+
+@contextmanager
+def telling_parquet(path: Path, *, cure: str, error: type[InputError] = InputError) -> Iterator[None]:
+    """Tell in one sentence what Arrow raises of a missing or damaged file, whatever is read of it inside."""
     try:
-        table = pq.read_table(path)
+        yield
     except FileNotFoundError:
-        raise InputError(f"{path} does not exist; {cure}") from None
-    except (pa.ArrowException, OSError, ValueError, LookupError) as error:
-        raise InputError(f"{path} is not a readable table ({_one_line(error)}); {cure}") from None
-    absent = [name for name in names if name not in table.column_names]
-    if absent:
-        raise InputError(f"{path} lacks the column {absent[0]!r}; {cure}")
+        raise error(f"{path} does not exist; {cure}") from None
+    # names, too, may be no text, and an array of any size may be asked for
+    except (pa.ArrowException, OSError, ValueError, LookupError, MemoryError) as raised:
+        raise error(f"{path} is not a readable Parquet file ({one_line(raised)}); {cure}") from None
+
+
+def open_parquet(
+    path: Path, columns: Mapping[str, str], *, cure: str, error: type[InputError] = InputError
+) -> pq.ParquetFile:
+    """Open a Parquet file that must have these columns, each of a kind (`COLUMN_KINDS`), before any row is read.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or no Parquet, lacks a column or holds another kind in it, or expands too far.
+    """
+    try:
+        size = require_file(path, missing=cure)
+    except InputError as raised:
+        raise error(str(raised)) from None
+    with telling_parquet(path, cure=cure, error=error):
+        file = pq.ParquetFile(path, memory_map=True)
+        schema, rows = file.schema_arrow, file.metadata.num_rows
+        names = schema.names
+        groups = [file.metadata.row_group(group) for group in range(file.num_row_groups)]
+        chunks = [group.column(at) for group in groups for at in range(group.num_columns)]
+        expanded = sum(chunk.total_uncompressed_size for chunk in chunks)
+        kinds = {name: schema.field(name).type for name in columns if names.count(name) == 1}
+        # what is written once and counted often grows as it is read
+        repeated = max(
+            (
+                chunk.total_uncompressed_size * chunk.num_values
+                for chunk in chunks
+                if chunk.physical_type == "BYTE_ARRAY" and any("DICT" in one for one in chunk.encodings)
+            ),
+            default=0,
+        )
+    if absent := sorted(name for name in columns if name not in names):
+        raise error(f"{path} lacks the column {', '.join(map(repr, absent))}; {cure}")
+    for name, kind in columns.items():
+        if name not in kinds:
+            raise error(f"{path} has several columns {name!r}; {cure}")
+        if not COLUMN_KINDS[kind](kinds[name]):
+            raise error(f"{path} holds {kinds[name]} as {name!r} where {kind} belong; {cure}")
+    room = max(MOST_EXPANDED, MOST_TIMES * size)
+    if rows > _MOST_ROWS or expanded > room or repeated > _MOST_ARRAYS:
+        raise error(f"{path} has {size:,} bytes and claims {rows:,} rows of {expanded:,} bytes; {cure}")
+    return file
+
+
+def read_parquet(
+    path: Path, columns: Mapping[str, str], *, cure: str, error: type[InputError] = InputError
+) -> pa.Table:
+    """Columns of a Parquet file as `open_parquet` lets it in, with no value missing."""
+    open_parquet(path, columns, cure=cure, error=error).close()
+    texts = [name for name, kind in columns.items() if kind == "texts"]
+    with telling_parquet(path, cure=cure, error=error):
+        # a text that is repeated is held once until its length is known
+        with pq.ParquetFile(path, memory_map=True, read_dictionary=texts) as file:
+            table = file.read(columns=list(columns))
+        for name in texts:
+            chunks = table.column(name).chunks
+            longest = max((len(text or "") for chunk in chunks for text in chunk.dictionary.to_pylist()), default=0)
+            if longest * table.num_rows > _MOST_TEXT:
+                raise ValueError(f"{table.num_rows:,} texts of {longest:,} characters in {name!r}")
+            plain = pa.chunked_array([chunk.dictionary_decode() for chunk in chunks], pa.string())
+            table = table.set_column(table.column_names.index(name), name, plain)
+    if gaps := [name for name in columns if table.column(name).null_count]:
+        raise error(f"{path} has gaps in the column {gaps[0]!r}; {cure}")
+    return table
+
+
+def _kind_of(hint: Any) -> str:
+    """Kind of a column that a field of `Columns` declares."""
+    shown = _shown(hint)
+    if hint is np.ndarray or shown.startswith("Shaped"):
+        return "texts"
+    return "true and false" if shown.startswith("Bool") else "whole numbers" if "Int" in shown else "numbers"
+
+
+def _load_columns(path: Path, kind: type[_Columns], cure: str) -> _Columns:
+    declared = get_type_hints(kind)
+    kinds = {name: _kind_of(hint) for name, hint in declared.items()}
+    table = read_parquet(path, kinds, cure=cure)
     values = {}
-    for name, hint in get_type_hints(kind).items():
+    for name, hint in declared.items():
         column = table[name]
-        if column.null_count:
-            raise InputError(f"{path} has gaps in the column {name!r}; {cure}")
-        if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
-            value = np.array(column.to_pylist(), dtype=str)
-        else:
-            value = column.to_numpy()
-        texts = hint is np.ndarray or _shown(hint).startswith("Shaped")
+        value = np.array(column.to_pylist(), dtype=str) if kinds[name] == "texts" else column.to_numpy()
         # a context of its own: "rows" of one table need not be as many as "rows" of another
         with jaxtyped("context"):
-            fits = _array_type(hint) is None or isinstance(value, hint)
-        if not fits or (texts and value.dtype.kind != "U"):
-            wanted = "texts belong" if texts else f"{_shown(hint)} belongs"
-            raise InputError(f"{path} holds {column.type} as {name!r} where {wanted}; {cure}")
+            if _array_type(hint) is not None and not isinstance(value, hint):
+                raise InputError(f"{path} holds {column.type} as {name!r} where {_shown(hint)} belongs; {cure}")
         values[name] = value
     return kind(**values)
 
@@ -295,15 +389,26 @@ def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schem
     return None
 
 
+def _require_claimed(archive: zipfile.ZipFile, info: zipfile.ZipInfo, room: int) -> int:
+    """Bytes of an array, which must be as many as its header claims: that much memory is taken before it is read."""
+    with archive.open(info) as member:
+        read = {(1, 0): read_array_header_1_0, (2, 0): read_array_header_2_0}[read_magic(member)]
+        shape, _, kind = read(member)
+    if prod(shape) * kind.itemsize > min(info.file_size, room):
+        raise ValueError(f"{info.filename} claims {kind} of shape {shape}")
+    return info.file_size
+
+
 def _load_arrays(path: Path, declared: Mapping[str, Any], cure: str) -> dict[str, Any]:
     """Arrays of the fields of a record, each alone or a mapping of several."""
+    room = max(_MOST_ARRAYS, MOST_TIMES * require_file(path, missing=cure))
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            for info in archive.zip.infolist():
+                room -= _require_claimed(archive.zip, info, room)
             arrays = {name: archive[name] for name in archive}
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; {cure}") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path} cannot be read as arrays ({_one_line(error)}); {cure}") from None
+    except (OSError, ValueError, LookupError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path} cannot be read as arrays ({one_line(error)}); {cure}") from None
     given = {}
     with jaxtyped("context"):  # "frames" of one array are as many as "frames" of another
         for name, hint in declared.items():
@@ -355,7 +460,8 @@ def _read_json(path: Path, command: str) -> object:
     return read_json(path, missing=f"make it with `{command}`", damaged=_cure(command))
 
 
-def _one_line(error: Exception) -> str:
+def one_line(error: Exception) -> str:
+    """Text of an error, without the line breaks and stacks of Arrow."""
     return " ".join(str(error).split())[:200]
 
 

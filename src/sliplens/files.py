@@ -5,6 +5,7 @@ import json
 import os
 import platform
 import shutil
+import stat
 import sys
 import tempfile
 import tomllib
@@ -112,27 +113,65 @@ def write_json(path: Path, value: Any) -> None:
     part.replace(path)
 
 
+MOST_TEXT = 64 * 2**20
+"""Bytes of a JSON or TOML file; the table of a hundred thousand trials has 40 million."""
+_DEEPEST = 64  # lists and objects in one another; ours are less than ten deep
+
+
+def require_file(path: Path, *, missing: str = "check the path", most: int | None = None) -> int:
+    """Size in bytes of a regular file, no larger than `most`; whoever opens a pipe or a device may wait for ever.
+
+    Raises
+    ------
+    InputError
+        If it does not exist, is a folder, a pipe, a socket or a device, or is larger.
+    """
+    try:
+        status = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(f"{path} does not exist; {missing}") from None
+    except (OSError, ValueError) as error:  # a name that is too long, or holds what no name can
+        raise InputError(f"{path} cannot be read ({getattr(error, 'strerror', None) or error}); {missing}") from None
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, a socket or a device"
+        raise InputError(f"{path} is {kind}, not a file; {missing}")
+    if most is not None and status.st_size > most:
+        raise InputError(f"{path} has {status.st_size:,} bytes, and no such file has more than {most:,}; {missing}")
+    return status.st_size
+
+
+def parse_json(text: bytes | str, *, where: object, cure: str) -> Any:
+    """What JSON from a file holds; text that is none, or nothing of ours nests so deep, is an `InputError`."""
+    try:
+        value = msgspec.json.decode(text)
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:  # a whole number may have too many digits
+        raise InputError(f"{where} is not valid JSON ({error}); {cure}") from None
+    level = [value]
+    for _ in range(_DEEPEST):
+        if any(isinstance(one, int) and abs(one) >= 2**64 for one in level):
+            raise InputError(f"{where} holds a whole number of more than 64 bits; {cure}")
+        inner = (one.values() if isinstance(one, dict) else one for one in level if isinstance(one, dict | list))
+        if not (level := [each for one in inner for each in one]):
+            return value
+    raise InputError(f"{where} nests more than {_DEEPEST} deep; {cure}")
+
+
 def read_json(
     path: Path, *, missing: str = "name a folder that a sliplens command wrote", damaged: str = "make the folder again"
 ) -> Any:
     """Read a JSON file; what is missing or damaged is told with its cure."""
-    try:
-        return msgspec.json.decode(path.read_bytes())
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; {missing}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{path} is not valid JSON ({error}); {damaged}") from None
+    require_file(path, missing=missing, most=MOST_TEXT)
+    return parse_json(path.read_bytes(), where=path, cure=damaged)
 
 
 def read_toml(path: Path, *, what: str) -> dict[str, Any]:
     """Read a TOML file; what is missing or damaged is told with its cure. `what` says what it holds."""
+    require_file(path, missing=f"name a TOML file of {what}", most=MOST_TEXT)
     try:
         # Windows editors put a mark before the text that TOML does not know
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not valid TOML: {error}; mend it there") from None
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}); name a TOML file of {what}") from None
 
 
 def require_folder(path: Path, *, what: str) -> Path:
@@ -229,7 +268,8 @@ def output_folder(
     if target.exists() and not (target / run_file).is_file() and not (overwrite and empty):
         raise InputError(f"{target} exists and was not made by sliplens; choose another output folder")
     if target.exists() and not overwrite:
-        if read_json(target / run_file).get("config_hash") != config_hash:
+        kept = read_json(target / run_file)
+        if not (isinstance(kept, dict) and kept.get("config_hash") == config_hash):
             raise InputError(f"{target} holds a result of other settings; choose another folder or pass --overwrite")
         yield Output(folder=target, complete=True)
         return

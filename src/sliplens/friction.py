@@ -18,9 +18,20 @@ LOWEST, HIGHEST = 0.05, 2.0
 GRASP_SPREAD = 0.06
 """Standard deviation of an object's friction from one grasp to the next, as a share of it: the trials of a simulated
 day lie evenly within a tenth of its friction."""
+MOST_FRICTION = 20.0
+"""Larger than the coefficient of anything that slides: beyond, something sticks, or the number is none."""
 _NODES = 400
 """Over two decades a step is then 1 %, finer than any slip tells."""
 _NEGLIGIBLE = 1e-6
+
+
+def require_friction(value: float) -> None:
+    """Check that a coefficient of friction can be one."""
+    if not 0 < value <= MOST_FRICTION:
+        raise InputError(
+            f"a coefficient of friction is a positive number up to {MOST_FRICTION:g}, got {value:g}; give F_t / F_n at "
+            "which the object slips, such as 0.6"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +73,7 @@ class Friction:
         values = np.atleast_1d(np.asarray(self.values, dtype=np.float64))
         weights = np.ones(len(values)) if self.weights is None else np.asarray(self.weights, dtype=np.float64)
         for value in values.tolist():
-            if not (math.isfinite(value) and value > 0):
-                raise InputError(
-                    f"a coefficient of friction is a positive number, got {value:g}; give F_t / F_n at which the "
-                    "object slips, such as 0.6"
-                )
+            require_friction(value)
         if weights.shape != values.shape or not (np.all(weights >= 0) and 0 < weights.sum() < math.inf):
             raise InputError(f"{len(values)} values of friction need as many weights, none negative and not all zero")
         object.__setattr__(self, "values", values)
@@ -75,7 +82,7 @@ class Friction:
     @classmethod
     def between(cls, low: float, high: float, *, values: int = 41) -> "Friction":
         """Friction anywhere in a range, evenly; at so many values, each in the middle of its share of the range."""
-        if not 0 < low < high < math.inf:
+        if not 0 < low < high <= MOST_FRICTION:
             raise InputError(f"a range of friction runs from a positive low to a larger high, got {low:g}..{high:g}")
         middles = low + (high - low) * (np.arange(values) + 0.5) / values
         return cls(middles, note=f"{low:g} to {high:g}, told as a range")

@@ -2,6 +2,9 @@
 
 import io
 import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +12,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from sliplens.errors import ImageError, InputError
-from sliplens.files import require_folder
+from sliplens.files import require_file, require_folder
 
 __all__ = ["absolute_difference", "list_images", "read_image", "signed_difference", "write_png"]
 
@@ -27,7 +30,41 @@ _OTHER_MODES = {
     "F": "floating-point pixels",
 }
 _BITS_PER_SAMPLE = 258  # TIFF tag
-_DAMAGE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)  # what Pillow raises
+MOST_PIXELS = 100_000_000
+"""Pixels of a frame; a larger one is a damaged header, and would ask for gigabytes."""
+_DAMAGE = (OSError, SyntaxError, ValueError, MemoryError, Image.DecompressionBombError)  # what Pillow raises
+
+
+@contextmanager
+def telling_damage(words: str, cure: str, *, kind: type[InputError] = ImageError) -> Iterator[None]:
+    """Tell in these words what Pillow raises of an image inside that is damaged, or expands too far."""
+    try:
+        yield
+    except _DAMAGE as error:
+        raise kind(f"{words} ({error}); {cure}") from None
+
+
+def require_image(path: Path) -> None:
+    """Check that a path is a file that can be opened, as `require_file` does, in the words of images."""
+    try:
+        require_file(path)
+    except InputError as error:
+        raise ImageError(str(error)) from None
+
+
+@contextmanager
+def open_image(
+    source: Path | io.BytesIO, *, formats: Sequence[str] = ("PNG", "TIFF", "JPEG", "BMP")
+) -> Iterator[Image.Image]:
+    """Open an image, none of its pixels read; a `ValueError` where it claims more than any camera has."""
+    with warnings.catch_warnings():
+        # Pillow's own limit lies near ours, and its warning is no sentence for people
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        image = Image.open(source, formats=formats)
+    with image:
+        if image.width * image.height > MOST_PIXELS:
+            raise ValueError(f"{image.width} x {image.height} pixels are more than any camera has")
+        yield image
 
 
 def read_image(path: Path, *, size: tuple[int, int] | None = None) -> UInt8[np.ndarray, "height width 3"]:
@@ -49,24 +86,19 @@ def read_image(path: Path, *, size: tuple[int, int] | None = None) -> UInt8[np.n
     ...     read_image(Path(folder) / "frame.png").shape
     (4, 6, 3)
     """
-    try:
-        with Image.open(path) as image:
-            bits = max(getattr(image, "tag_v2", {}).get(_BITS_PER_SAMPLE, (8,)))
-            if image.mode != "RGB" or bits > 8:
-                what = f"{bits} bits a pixel" if bits > 8 else _OTHER_MODES.get(image.mode, f"mode {image.mode}")
-                cure = "drop the alpha channel" if image.mode == "RGBA" else "convert it to 8-bit RGB"
-                raise ImageError(f"{path} has {what}; {cure}")
-            pixels = np.array(image)
-    except FileNotFoundError:
-        raise ImageError(f"{path} does not exist; check the path") from None
-    except _DAMAGE as error:
-        raise ImageError(f"{path} cannot be read as an image ({error}); copy or export it again") from None
-    if size is not None and pixels.shape[:2] != tuple(size):
-        raise ImageError(
-            f"{path} is {pixels.shape[0]} x {pixels.shape[1]} pixels, {size[0]} x {size[1]} are needed; "
-            "use frames of the sensor the network was trained for"
-        )
-    return pixels
+    require_image(path)
+    with telling_damage(f"{path} cannot be read as an image", "copy or export it again"), open_image(path) as image:
+        if size is not None and image.size[::-1] != tuple(size):
+            raise ImageError(
+                f"{path} is {image.height} x {image.width} pixels, {size[0]} x {size[1]} are needed; "
+                "use frames of the sensor the network was trained for"
+            )
+        bits = max(getattr(image, "tag_v2", {}).get(_BITS_PER_SAMPLE, (8,)))
+        if image.mode != "RGB" or bits > 8:
+            what = f"{bits} bits a pixel" if bits > 8 else _OTHER_MODES.get(image.mode, f"mode {image.mode}")
+            cure = "drop the alpha channel" if image.mode == "RGBA" else "convert it to 8-bit RGB"
+            raise ImageError(f"{path} has {what}; {cure}")
+        return np.array(image)
 
 
 def write_png(path: Path, pixels: UInt8[np.ndarray, "height width *channels"]) -> None:
@@ -90,13 +122,11 @@ def encode_jpeg(pixels: UInt8[np.ndarray, "height width 3"], quality: int) -> by
 
 def decode_png(data: bytes, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
     """Pixels of an RGB PNG held in memory."""
-    try:
-        with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
-            if image.mode != "RGB":
-                raise ImageError(f"{where} has {_OTHER_MODES.get(image.mode, image.mode)}; make the data set again")
-            return np.array(image)
-    except _DAMAGE as error:
-        raise ImageError(f"{where} cannot be read as PNG ({error}); make the data set again") from None
+    told = telling_damage(f"{where} cannot be read as PNG", "make the data set again")
+    with told, open_image(io.BytesIO(data), formats=("PNG",)) as image:
+        if image.mode != "RGB":
+            raise ImageError(f"{where} has {_OTHER_MODES.get(image.mode, image.mode)}; make the data set again")
+        return np.array(image)
 
 
 def list_images(folder: Path) -> list[Path]:

@@ -4,6 +4,7 @@ Whatever takes long takes `on_progress`, called with how many are done and how m
 also names them where the callback can show that (`Stages`), as the command line's can.
 """
 
+import re
 from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -12,6 +13,18 @@ from typing import Protocol, TypeAlias, TypeVar, runtime_checkable
 OnProgress: TypeAlias = Callable[[int, int], None]
 """Takes how many are done, and how many there are."""
 Item = TypeVar("Item")
+
+
+def visible(text: str) -> str:
+    r"""Text with what a terminal would obey written out: names and words of files may hold control characters.
+
+    Examples
+    --------
+    >>> from sliplens.progress import visible
+    >>> visible("cup" + chr(27) + "[2J")
+    'cup\\x1b[2J'
+    """
+    return re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", lambda found: repr(found[0])[1:-1], text)
 
 
 @runtime_checkable

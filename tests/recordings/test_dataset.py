@@ -126,16 +126,23 @@ def test_an_empty_stored_trial_is_refused(tmp_path: Path, recording: Recording):
         load_recording(path)
 
 
-@pytest.mark.parametrize(("column", "value"), [("contact_state", "flying"), ("safety_margin", "half")])
+@pytest.mark.parametrize(
+    ("column", "value", "said"),
+    [
+        ("contact_state", "flying", "the contact state 'flying', which is none"),
+        ("safety_margin", "half", "string as 'safety_margin' where numbers belong"),
+        ("image", 3, "int64 as 'image' where bytes belong"),
+    ],
+)
 def test_a_stored_trial_with_labels_that_no_trial_has_is_refused(
-    tmp_path: Path, recording: Recording, column: str, value: str
+    tmp_path: Path, recording: Recording, column: str, value: object, said: str
 ):
     path = tmp_path / "a.parquet"
     save_recording(recording, path)
     table = pq.read_table(path)
     place = table.column_names.index(column)
     pq.write_table(table.set_column(place, column, pa.array([value] * table.num_rows)), path)
-    with pytest.raises(RecordingError, match=rf"a\.parquet holds labels that no trial has \(.*{value}.*\); make"):
+    with pytest.raises(RecordingError, match=rf"a\.parquet holds .*{said}.*; make the data set again"):
         load_recording(path)
 
 
@@ -143,7 +150,7 @@ def test_a_parquet_file_of_something_else_is_refused(tmp_path: Path, recording: 
     path = tmp_path / "a.parquet"
     save_recording(recording, path)
     pq.write_table(pq.read_table(path).drop_columns(["image", "time_s"]), path)
-    with pytest.raises(RecordingError, match=r"a\.parquet lacks image, time_s"):
+    with pytest.raises(RecordingError, match=r"a\.parquet lacks the column .*'image', 'time_s'"):
         load_recording(path)
 
 

@@ -370,7 +370,7 @@ def test_a_mistake_in_the_file_is_told_with_its_rule(tmp_path: Path, text: str, 
 
 def test_a_file_that_cannot_be_read_is_told(tmp_path: Path):
     for path in (tmp_path / "nothing.toml", tmp_path):
-        with pytest.raises(InputError, match=r"cannot be read .*; name a TOML file of rules"):
+        with pytest.raises(InputError, match=r"is a folder, not a file|does not exist; name a TOML file of rules"):
             read_splits(path)
     (tmp_path / "latin.toml").write_bytes('[[split]]\nname = "train"\nobject = "Nuß"'.encode("latin-1"))
     with pytest.raises(InputError, match=r"latin\.toml is not valid TOML: "):

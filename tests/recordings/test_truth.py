@@ -56,7 +56,7 @@ def test_a_file_that_lost_a_column_of_its_truth_is_refused(tmp_path: Path, recor
     path = tmp_path / "a.parquet"
     save_recording(replace(recording, truth=truth), path)
     pq.write_table(pq.read_table(path).drop_columns(["contact_map"]), path)
-    with pytest.raises(RecordingError, match=r"a\.parquet lacks contact_map of its truth; make the data set again"):
+    with pytest.raises(RecordingError, match=r"a\.parquet lacks the column 'contact_map'; make the data set again"):
         load_recording(path)
 
 

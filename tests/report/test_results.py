@@ -122,10 +122,10 @@ def test_missing_file_is_told(workspace, name, message):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("test-raw/predictions.parquet", r"is not a readable table"),
-        ("network-raw/curve.parquet", r"is not a readable table"),
+        ("test-raw/predictions.parquet", r"is not a readable Parquet file"),
+        ("network-raw/curve.parquet", r"is not a readable Parquet file"),
         ("maps-raw-real/arrays.npz", r"cannot be read as arrays"),
-        ("score-raw/table.parquet", r"is not a readable table"),
+        ("score-raw/table.parquet", r"is not a readable Parquet file"),
     ],
 )
 def test_damaged_file_is_told(workspace, name, message):

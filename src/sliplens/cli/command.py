@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import tyro
 
@@ -100,6 +100,8 @@ class SourceCommand(Command):
     """Topic of the images; the only one if not given."""
     camera_key: str | None = None
     """Feature of a LeRobot data set with the images."""
+    allow_large: tuple[Literal["frames", "pixels", "samples", "span"], ...] = ()
+    """Limits that do not hold, where a recording really is so large."""
     sensor: Path | None = None
     """Profile of the sensor: a file that `sliplens sensor new` made, or chromatouch, digit, gelsight-mini or tactip."""
 
@@ -108,4 +110,5 @@ class SourceCommand(Command):
         """What is said of the source, as the library takes it."""
         from sliplens.recordings.options import ReadOptions
 
-        return ReadOptions(frame_rate=self.frame_rate, image_topic=self.image_topic, camera_key=self.camera_key)
+        said = ("frame_rate", "image_topic", "camera_key", "allow_large")
+        return ReadOptions(**{name: getattr(self, name) for name in said})

@@ -14,25 +14,29 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sliplens.progress import OnProgress
+from sliplens.progress import OnProgress, visible
 
 OUT, ERR = Console(), Console(stderr=True)
 
 
+def _shown(text: str) -> str:
+    return escape(visible(text))
+
+
 def fail(message: str) -> None:
     """Print an error, in one line however narrow the terminal."""
-    ERR.print(f"[bold red]sliplens:[/] {escape(message)}", soft_wrap=True, highlight=False)
+    ERR.print(f"[bold red]sliplens:[/] {_shown(message)}", soft_wrap=True, highlight=False)
 
 
 def say(message: str) -> None:
     """Print a line of plain text."""
-    OUT.print(escape(message), soft_wrap=True, highlight=False)
+    OUT.print(_shown(message), soft_wrap=True, highlight=False)
 
 
 def wrote(path: Path, what: str, *, kept: bool = False) -> None:
     """Say what was written where, or that it was there already."""
     verb, what = ("kept", "made before with the same settings; --overwrite makes it again") if kept else ("wrote", what)
-    OUT.print(f"[green]{verb}[/] {escape(str(path))}  [dim]{escape(what)}[/]", soft_wrap=True, highlight=False)
+    OUT.print(f"[green]{verb}[/] {_shown(str(path))}  [dim]{_shown(what)}[/]", soft_wrap=True, highlight=False)
 
 
 class Terminal:
@@ -43,14 +47,9 @@ class Terminal:
     """
 
     def __init__(self) -> None:
-        self._bars = rich_progress.Progress(
-            rich_progress.TextColumn("{task.description}"),
-            rich_progress.BarColumn(bar_width=30),
-            rich_progress.MofNCompleteColumn(),
-            rich_progress.TimeElapsedColumn(),
-            rich_progress.TimeRemainingColumn(),
-            console=OUT,
-        )
+        told = [getattr(rich_progress, f"{name}Column")() for name in ("MofNComplete", "TimeElapsed", "TimeRemaining")]
+        columns = rich_progress.TextColumn("{task.description}"), rich_progress.BarColumn(bar_width=30), *told
+        self._bars = rich_progress.Progress(*columns, console=OUT)
         self._open: list[rich_progress.TaskID] = []
         self._notes: Counter[str] = Counter()
         self._lock = RLock()
@@ -91,7 +90,7 @@ class Terminal:
 
     def _tell_notes(self) -> None:
         for message in fold_equal(self._notes.elements()):
-            ERR.print(f"  note: {escape(message)}", soft_wrap=True, highlight=False)
+            ERR.print(f"  note: {_shown(message)}", soft_wrap=True, highlight=False)
         self._notes.clear()
 
 
@@ -117,7 +116,7 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
             numbers = column is not columns[0] and any(re.match(r"[-+]?\d", cell) for cell in column.cells)
             table.add_column(column.head, justify="right" if numbers else "left")
         for cells in zip(*(column.cells for column in shown), strict=True):
-            table.add_row(*map(escape, cells))
+            table.add_row(*map(_shown, cells))
         OUT.print(table)
 
 

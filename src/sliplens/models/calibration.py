@@ -58,6 +58,10 @@ class Traction:
     """Evenly spaced quantiles of the coefficient of friction over the training frames, from the least to the largest:
     what the network expects where it is told none."""
 
+    def __post_init__(self) -> None:
+        if not self.friction or min(self.friction) <= 0 or list(self.friction) != sorted(self.friction):
+            raise ValueError("quantiles of friction are positive and rise")
+
 
 def spread(
     values: Float[np.ndarray, " frames"],

@@ -17,6 +17,7 @@ from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.extras import require_device
 from sliplens.files import MANIFEST_FILE, find_run, hash_file, require_folder
 from sliplens.friction import Friction, FrictionLike, as_friction
+from sliplens.images import MOST_PIXELS
 from sliplens.models.backbones import Answers, bin_edges, build_model, ratio_edges
 from sliplens.models.calibration import Calibration, Traction, raw_interval, spread
 from sliplens.models.encodings import Encoding, get_encoding
@@ -26,6 +27,7 @@ from sliplens.results.training import Training
 
 WEIGHTS_FILE = "model.safetensors"
 SCHEMA_VERSION = 1
+_LARGEST_INPUT = 4096  # pixels along a side, several times what any backbone was made for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +56,12 @@ class Manifest:
     """First 12 hex digits of the hash of every trial that trained or validated it, or what it started from."""
     started_from: str = ""
     """Hash of the weights it started from; empty for random ones."""
+
+    def __post_init__(self) -> None:
+        height, width = self.frame_size
+        if not 1 <= self.image_size <= _LARGEST_INPUT or min(height, width) <= 0 or height * width > MOST_PIXELS:
+            sizes = f"frames of {height} x {width} pixels at {self.image_size}"
+            raise ValueError(f"no network reads {sizes}")
 
 
 _DARKEST_FRAME, _BRIGHTEST_DIFFERENCE = 8.0, 64.0
@@ -362,12 +370,16 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> Run:
         raise CheckpointError(f"{weights} is not the file its manifest describes; copy the whole folder again")
     model = build_model(manifest.backbone, head=manifest.head, colours=get_encoding(manifest.input).colours)
     try:
-        model.load_state_dict(load_file(weights, device="cpu"))
+        values, own = load_file(weights, device="cpu"), model.state_dict()
+        model.load_state_dict(values)
     except (SafetensorError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
         raise CheckpointError(
             f"{weights} does not hold a {manifest.backbone} with a {manifest.head} head ({reason})"
         ) from None
+    strange = [name for name in own if values[name].dtype != own[name].dtype or not values[name].isfinite().all()]
+    if strange:
+        raise CheckpointError(f"{weights} holds what is no number in {strange[0]}; train the network again")
     # channels last: depthwise convolutions run up to half as fast again on a CPU
     model = model.to(device, memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
     # the networks of the package come without their learning curve

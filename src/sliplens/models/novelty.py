@@ -44,6 +44,13 @@ class Novelty:
     frames: int
     """Validation frames."""
 
+    def __post_init__(self) -> None:
+        width = len(self.mean)
+        if {len(self.scale), *map(len, self.directions)} - {width} or len(self.variances) != len(self.directions):
+            raise ValueError("mean, scale and directions of features are of different lengths")
+        if not min(*self.scale, *self.variances, self.rest, 1.0) > 0:
+            raise ValueError("deviations and variances of features are positive")
+
     def distance(self, features: Float[np.ndarray, "frames features"]) -> Float[np.ndarray, " frames"]:
         """Distance of features, as `read_features` gives them."""
         unit = (features - np.array(self.mean)) / np.array(self.scale)

@@ -136,6 +136,9 @@ _SHORTEST_S, _LONGEST_S = 1e-6, 86400.0  # steps of time that a camera or a forc
 
 def _require_rising(time_s: Float[np.ndarray, " samples"], *, what: str) -> None:
     steps = np.diff(time_s)
+    if not np.isfinite(time_s).all():
+        at = int(np.argmin(np.isfinite(time_s)))
+        raise RecordingError(f"{what}: the time of sample {at} is {time_s[at]}, no number; mend its stamp")
     if not np.all(steps > 0):
         at = int(np.argmax(~(steps > 0))) + 1
         raise RecordingError(

@@ -12,7 +12,7 @@ from sliplens.progress import OnProgress, note
 from sliplens.recordings.journal import JOURNAL_FOLDER, JournalLock, finish_journal, journals_of
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, load_profile, profile_text
-from sliplens.recordings.store import SCHEMA_VERSION, forces_path, load_recording, read_header
+from sliplens.recordings.store import SCHEMA_VERSION, forces_path, load_recording, read_header, require_stored
 from sliplens.recordings.trial import Labels, Recording, TrialFacts
 
 DATASET_FILE = "dataset.json"
@@ -30,6 +30,9 @@ class TrialInfo(TrialFacts):
     sha256: str
     forces_sha256: str = ""
     """Hash of the samples of the force sensor; empty where none are kept."""
+
+    def __post_init__(self) -> None:
+        require_stored(self)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ import msgspec
 
 from sliplens.codec import from_builtins, to_builtins
 from sliplens.errors import InputError, RecordingError
+from sliplens.files import MOST_TEXT, parse_json, require_file
 from sliplens.recordings.dataset import Dataset
 from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.labelling import Edit, EditKind
@@ -55,15 +56,17 @@ def read_edits(folder: Path) -> tuple[Edit, ...]:
         If a line of the file is damaged.
     """
     path = folder / EDITS_FILE
-    if not path.is_file():
+    if not path.exists():
         return ()
+    require_file(path, most=MOST_TEXT)
     edits = []
     for number, line in enumerate(path.read_bytes().splitlines(), start=1):
         if not line.strip():
             continue
         try:
-            edits.append(from_builtins(msgspec.json.decode(line), Edit, where=path, command="sliplens label --page"))
-        except (msgspec.DecodeError, UnicodeDecodeError, InputError) as error:
+            values = parse_json(line, where=path, cure="")
+            edits.append(from_builtins(values, Edit, where=path, command="sliplens label --page"))
+        except InputError as error:
             why = str(error).removeprefix(f"{path} ").partition(";")[0]
             raise RecordingError(
                 f"line {number} of {path} is no edit ({why}); mend that line or take it out, the others stay"

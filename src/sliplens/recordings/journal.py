@@ -15,9 +15,9 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 
-from sliplens.codec import from_builtins, to_builtins
+from sliplens.codec import from_builtins, one_line, to_builtins
 from sliplens.errors import RecordingError
-from sliplens.files import hold
+from sliplens.files import hold, parse_json
 from sliplens.images import decode_png, encode_png
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling, ReferenceChoice
@@ -26,7 +26,6 @@ from sliplens.recordings.store import (
     decode_pixels,
     encode_pixels,
     forces_path,
-    one_line,
     save_forces,
     write_trial,
 )
@@ -178,8 +177,9 @@ def _read_head(file: pa.NativeFile) -> tuple[JournalHeader, bytes | None] | None
     except pa.ArrowInvalid:
         return None
     file.seek(0)
-    values = msgspec.json.decode(metadata[_HEADER])
-    header = from_builtins(values, JournalHeader, where="the header of a journal", command="sliplens live")
+    where = "the header of a journal"
+    values = parse_json(metadata.get(_HEADER, b""), where=where, cure="move it away")
+    header = from_builtins(values, JournalHeader, where=where, command="sliplens live")
     return header, metadata.get(_REFERENCE)
 
 

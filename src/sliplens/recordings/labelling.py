@@ -8,6 +8,7 @@ from typing import TypeAlias
 import numpy as np
 
 from sliplens.errors import RecordingError
+from sliplens.friction import MOST_FRICTION
 
 AXES = ("x", "y", "z")
 
@@ -83,8 +84,10 @@ class FrictionEstimate:
     """Motion of the image at the onset beyond that before it, in standard deviations; None where not measured."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.mu < np.inf:
-            raise RecordingError(f"the coefficient of friction is {self.mu:.3g}; give a positive one")
+        if not 0 < self.mu <= MOST_FRICTION:
+            raise RecordingError(
+                f"the coefficient of friction is {self.mu:.3g}; give a positive one, no larger than {MOST_FRICTION:g}"
+            )
         if not 0 <= self.low <= self.mu <= self.high < np.inf:
             raise RecordingError(
                 f"the coefficient of friction {self.mu:.3g} lies outside its interval {self.low:.3g} to "

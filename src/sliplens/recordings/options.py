@@ -9,6 +9,12 @@ ReferenceMethod: TypeAlias = Literal["least contact energy", "first still"]
 REFERENCE_METHODS: tuple[str, ...] = get_args(ReferenceMethod)
 
 
+Budget: TypeAlias = Literal["frames", "pixels", "samples", "span"]
+LIMITS: dict[Budget, int] = {"frames": 1_000_000, "pixels": 2**25, "samples": 20_000_000, "span": 86_400}
+"""Most frames, pixels of a frame, samples of forces and seconds of a recording, unless they are told to be many: those
+of nine hours of video, of an 8K camera, of five hours at 1 kHz, and of a day."""
+
+
 def spoken(names: Iterable[str]) -> str:
     """Fields of options as the command line writes them."""
     return ", ".join(f"--{name.replace('_', '-')}" for name in names)
@@ -54,9 +60,16 @@ class ReadOptions:
     margin_unit: Literal["fraction", "percent"] | None = None
     """Unit of the safety margins in a list of the thesis; told by their size if not given."""
 
+    allow_large: tuple[Budget, ...] = ()
+    """Limits that do not hold, where a recording really is so large: frames, pixels, samples or span."""
+
     def given(self) -> tuple[str, ...]:
-        """Names of the options that were said."""
-        return tuple(field.name for field in fields(self) if getattr(self, field.name) not in (None, False))
+        """Names of the options that were said, of those that a reader must understand."""
+        return tuple(
+            field.name
+            for field in fields(self)
+            if field.name != "allow_large" and getattr(self, field.name) not in (None, False)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import UInt8
 
-from sliplens.errors import ImageError, InputError
+from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.images import list_images, read_image
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import DATASET_FILE, Dataset, load_dataset
@@ -16,7 +16,7 @@ from sliplens.recordings.formats import open_captures, recognise
 from sliplens.recordings.formats.images import frame_size, read_frame
 from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
-from sliplens.recordings.options import ReadOptions, spoken
+from sliplens.recordings.options import LIMITS, Budget, ReadOptions, spoken
 from sliplens.recordings.sensor import SensorProfile, load_profile
 
 Frames: TypeAlias = UInt8[np.ndarray, "frames height width 3"]
@@ -100,6 +100,8 @@ def open_source(
         replace(_with_reference(one, reference, reference_frame), opened=_words(source))
         for one in _open(source, format, options, whole=whole)
     ]
+    for one in opened if isinstance(source, Path) else ():
+        _require_usual(one, options.allow_large)
     if profile is not None:
         opened = [profile.prepare(one) for one in opened]
     return tuple(_chosen(opened, [one.name for one in opened], trial, source))
@@ -111,6 +113,31 @@ def _open(source: Path | Frames, format: str | None, options: ReadOptions, *, wh
     if not whole and set(options.given()) <= {"frame_rate"} and (format or recognise(source)) == "images":
         return [_images(source, options.frame_rate)]
     return open_captures(source, format=format, options=options)
+
+
+def _require_usual(capture: Capture, allowed: Sequence[Budget]) -> None:
+    """Refuse a recording that is larger than any usual one, before anything of its size is made."""
+    height, width = capture.frame_size
+    clocks = [time for time in (capture.time_s, capture.forces and capture.forces.time_s) if time is not None]
+    sizes: dict[Budget, tuple[float, str]] = {
+        "frames": (len(capture), f"{len(capture):,} frames"),
+        "pixels": (height * width, f"frames of {height} x {width} pixels"),
+        "samples": (samples := len(capture.forces.time_s) if capture.forces else 0, f"{samples:,} samples of forces"),
+        "span": max(((float(time[-1] - time[0]), _span(time)) for time in clocks), default=(0.0, "")),
+    }
+    for name, (size, told) in sizes.items():
+        if size > LIMITS[name] and name not in allowed:
+            raise RecordingError(
+                f"{capture.source} has {told}, more than the {LIMITS[name]:,} that are usual; cut or mend it, or say "
+                f"--allow-large {name} if it is right"
+            )
+
+
+def _span(time_s: np.ndarray) -> str:
+    """Length of a series of times, and its longest gap, in words."""
+    at = int(np.argmax(np.diff(time_s))) if len(time_s) > 1 else 0
+    gap = f", {time_s[at + 1] - time_s[at]:.6g} s of them after stamp {at}" if len(time_s) > 1 else ""
+    return f"times over {time_s[-1] - time_s[0]:.6g} s{gap}"
 
 
 def _chosen(trials: Sequence[Any], names: list[str], trial: str | None, source: Path | Frames) -> Sequence[Any]:

@@ -1,15 +1,17 @@
 """One trial on disk: a Parquet file, a row a frame, with its header and reference frame beside the rows."""
 
 import os
+import re
 import tempfile
 from array import array
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from hashlib import sha256
 from itertools import islice
+from math import prod
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeAlias, TypeVar
@@ -20,10 +22,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float, UInt8
 
-from sliplens.codec import from_builtins, to_builtins
+from sliplens.codec import from_builtins, open_parquet, read_parquet, telling_parquet, to_builtins
 from sliplens.errors import RecordingError
-from sliplens.files import hash_json
-from sliplens.images import decode_png, encode_png
+from sliplens.files import hash_json, parse_json
+from sliplens.images import MOST_PIXELS, decode_png, encode_png
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.trial import OPTIONAL_LABELS, SIGNALS, ContactState, GroundTruth, Labels, Recording, TrialFacts
@@ -37,24 +39,9 @@ CODEC = "rows+zstd"
 """Coding of the images, named in the metadata of a trial."""
 ROW_GROUP = 64
 """Frames that are written, and can be read, together."""
-DAMAGED_PARQUET = (pa.ArrowException, OSError, ValueError, LookupError)
-"""Errors that Arrow raises of a damaged file: names, too, may be no text."""
-
-
-def one_line(error: Exception) -> str:
-    """Text of an error, without the line breaks and stacks of Arrow."""
-    return " ".join(str(error).split())[:200]
-
-
-@contextmanager
-def reading(path: Path, *, wrong: str = "is not a readable Parquet file") -> Iterator[None]:
-    """Tell of a file of a data set that is missing or damaged, whatever is read of it inside."""
-    try:
-        yield
-    except FileNotFoundError:
-        raise RecordingError(f"{path} does not exist; make the data set again") from None
-    except DAMAGED_PARQUET as error:
-        raise RecordingError(f"{path} {wrong} ({one_line(error)}); make the data set again") from None
+_AGAIN = "make the data set again"
+reading = partial(telling_parquet, cure=_AGAIN, error=RecordingError)
+"""Tells of a file of a data set that is missing or damaged, whatever is read of it inside."""
 
 
 def encode_pixels(pixels: Pixels) -> bytes:
@@ -152,7 +139,23 @@ class TrialHeader(TrialFacts):
     labelling: Labelling | None = None
     truth: TruthHeader | None = None
 
+    def __post_init__(self) -> None:
+        require_stored(self)
 
+
+def require_stored(trial: TrialFacts) -> None:
+    """Check what a file says of a stored trial: its name names a file here, its frames are some a camera gives.
+
+    It is a `ValueError`, for the sentence of who reads the file.
+    """
+    if not _NAME.fullmatch(trial.trial):
+        raise ValueError(f"a trial is named with letters, digits, dots, dashes and underscores, not {trial.trial!r}")
+    frames, height, width = (getattr(trial, name) for name in ("frames", "height", "width"))
+    if frames < 0 or min(height, width) <= 0 or height * width > MOST_PIXELS:
+        raise ValueError(f"no trial has {frames} frames of {height} x {width} pixels")
+
+
+_NAME = re.compile(r"\w(?:[\w.-]*\w)?", re.ASCII)
 _HEADER, _FIRST_REFERENCE = b"sliplens", b"first_reference"
 
 
@@ -171,29 +174,34 @@ def read_first_reference(path: Path) -> Frame | None:
     return None if image is None else decode_png(image, where=f"the first reference frame of {path}")
 
 
+_KINDS = {
+    **dict.fromkeys((*SIGNALS, "safety_margin_sigma", "force_time_s"), "numbers"),
+    **{"image": "bytes", "contact_state": "texts", "valid": "true and false", "reason": "texts"},
+}
+"""What the columns of a trial hold; `OPTIONAL_LABELS` need not be there."""
+
+
 def _open(path: Path) -> tuple[pq.ParquetFile, TrialHeader]:
-    with reading(path):
-        file = pq.ParquetFile(path, memory_map=True)
+    needed = {name: kind for name, kind in _KINDS.items() if name not in OPTIONAL_LABELS}
+    file = open_parquet(path, needed, cure=_AGAIN, error=RecordingError)
     metadata: dict[bytes, bytes] = file.schema_arrow.metadata or {}
     missing = [key.decode() for key in (_HEADER, b"reference") if key not in metadata]
     if missing:
-        raise RecordingError(f"{path} lacks {', '.join(missing)} in its metadata; make the data set again")
-    missing = {"image", "contact_state", *SIGNALS} - set(file.schema_arrow.names)
-    if missing:
-        raise RecordingError(f"{path} lacks {', '.join(sorted(missing))}; make the data set again")
-    codec = metadata.get(b"codec", b"png").decode()
-    if codec != CODEC:
-        raise RecordingError(f"{path} keeps its images as {codec}, {CODEC} is needed; make the data set again")
-    try:
-        values = msgspec.json.decode(metadata[_HEADER])
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise RecordingError(f"the header of {path} is no JSON ({error}); make the data set again") from None
-    header = from_builtins(values, TrialHeader, where=f"the header of {path}", command="sliplens import")
+        raise RecordingError(f"{path} lacks {', '.join(missing)} in its metadata; {_AGAIN}")
+    codec = metadata.get(b"codec", b"png")
+    if codec != CODEC.encode():
+        raise RecordingError(f"{path} keeps its images as {str(codec[:40])[2:-1]}, {CODEC} is needed; {_AGAIN}")
+    where = f"the header of {path}"
+    values = parse_json(metadata[_HEADER], where=where, cure=_AGAIN)
+    header = from_builtins(values, TrialHeader, where=where, command="sliplens import")
     return file, replace(header, frames=file.metadata.num_rows)
 
 
 _TRUTH_SIGNALS = ("static_friction", "contact_radius_m", "stick_radius_m")
-_TRUTH_COLUMNS = {*_TRUTH_SIGNALS, "marker_px", "contact_map"}
+_TRUTH_KINDS = {
+    **dict.fromkeys(_TRUTH_SIGNALS, "numbers"),
+    **{"marker_px": "lists of numbers", "contact_map": "bytes"},
+}
 
 
 def save_recording(recording: Recording, path: Path) -> None:
@@ -252,14 +260,17 @@ def write_trial(
     part = path.with_name(path.name + ".part")
     written = 0
     # the images, nearly all of the file, neither compress further nor repeat
-    with pq.ParquetWriter(part, schema, compression="none", use_dictionary=False) as writer:
-        for chunk in images:
-            rows = table.slice(written, len(chunk)).combine_chunks()
-            numbers = pa.array(np.arange(written, written + len(chunk)))
-            arrays = [numbers, *(column.combine_chunks() for column in rows.columns), _in_place(chunk)]
-            writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema))
-            written += len(chunk)
-    part.replace(path)
+    try:
+        with pq.ParquetWriter(part, schema, compression="none", use_dictionary=False) as writer:
+            for chunk in images:
+                rows = table.slice(written, len(chunk)).combine_chunks()
+                numbers = pa.array(np.arange(written, written + len(chunk)))
+                arrays = [numbers, *(column.combine_chunks() for column in rows.columns), _in_place(chunk)]
+                writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema))
+                written += len(chunk)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _in_place(images: list[bytes]) -> pa.ChunkedArray:
@@ -280,20 +291,33 @@ def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Re
     """
     truth = truth and pixels
     file, header = _open(path)
-    without = (set() if pixels else {"image"}) | (set() if truth else _TRUTH_COLUMNS)
-    with reading(path), file:
-        table = file.read(columns=[name for name in file.schema_arrow.names if name not in without])
-    reference = decode_png(table.schema.metadata[b"reference"], where=f"the reference frame of {path}")
-    if table.num_rows == 0:
+    with file:
+        there, metadata = file.schema_arrow.names, file.schema_arrow.metadata
+    wanted = {name: kind for name, kind in _KINDS.items() if name in there and (pixels or name != "image")}
+    wanted |= _TRUTH_KINDS if truth and header.truth else {}
+    size, frames = (header.height, header.width, 3), header.frames
+    reference = decode_png(metadata[b"reference"], where=f"the reference frame of {path}")
+    if reference.shape != size:
+        raise RecordingError(f"{path} has a reference frame of another size than it says; {_AGAIN}")
+    if frames == 0:
         raise RecordingError(f"trial {header.trial} has no frames; leave it out or record it again")
-    size = reference.shape
-    labels: dict[str, Any] = {}
-    with reading(path, wrong="holds labels that no trial has"):
-        labels |= {name: table.column(name).to_numpy() for name in OPTIONAL_LABELS if name in table.column_names}
-        if "reason" in labels:
-            labels["reason"] = tuple(str(reason) for reason in labels["reason"])
-        labels |= {name: table.column(name).to_numpy().astype(np.float64) for name in SIGNALS}
-        labels["contact_state"] = tuple(map(ContactState, table.column("contact_state").to_pylist()))
+    if pixels and frames * prod(size) > _MOST_BYTES:
+        raise RecordingError(
+            f"{path} claims {frames:,} frames of {size[0]} x {size[1]} pixels, which no memory holds; {_AGAIN}"
+        )
+    table = read_parquet(path, wanted, cure=_AGAIN, error=RecordingError)
+    labels: dict[str, Any] = {
+        name: table.column(name).to_pylist()
+        if kind == "texts"
+        else table.column(name).to_numpy().astype(np.float64 if kind == "numbers" else np.bool_)
+        for name, kind in wanted.items()
+        if name in _KINDS and name != "image"
+    }
+    if strange := set(labels["contact_state"]) - set(ContactState):
+        raise RecordingError(f"{path} holds the contact state {min(strange)[:40]!r}, which is none; {_AGAIN}")
+    labels["contact_state"] = tuple(map(ContactState, labels["contact_state"]))
+    if "reason" in labels:
+        labels["reason"] = tuple(labels["reason"])
     return Recording(
         **_facts(header),
         **labels,
@@ -301,9 +325,12 @@ def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Re
         reference=reference,
         frames=_decode(table.column("image"), size=size, where=f"of {path}")
         if pixels
-        else np.broadcast_to(reference, (table.num_rows, *size)),
+        else np.broadcast_to(reference, (frames, *size)),
         truth=_read_truth(table, header.truth, size[:2], path) if truth and header.truth else None,
     )
+
+
+_MOST_BYTES = 2**35  # of the pixels of a trial that is read at once
 
 
 def _facts(trial: TrialFacts) -> dict[str, Any]:
@@ -350,16 +377,16 @@ def hash_frames(path: Path) -> str:
 
 
 def _read_truth(table: pa.Table, header: TruthHeader, size: tuple[int, ...], path: Path) -> GroundTruth:
-    missing = _TRUTH_COLUMNS - set(table.column_names)
-    if missing:
-        raise RecordingError(f"{path} lacks {', '.join(sorted(missing))} of its truth; make the data set again")
+    rest = len(header.marker_rest_px)
+    if (held := table.schema.field("marker_px").type.list_size) != 2 * rest:
+        raise RecordingError(f"{path} has {held} numbers a frame for {rest} markers, 2 each are needed; {_AGAIN}")
     # a trial is read as one chunk or many, as Arrow likes
     flat = table.column("marker_px").combine_chunks().flatten()
     return GroundTruth(
         recipe=header.recipe,
         displacement=header.displacement,
         marker_rest_px=np.array(header.marker_rest_px, dtype=np.float32).reshape(-1, 2),
-        marker_px=flat.to_numpy().astype(np.float32).reshape(table.num_rows, -1, 2),
+        marker_px=flat.to_numpy().astype(np.float32).reshape(table.num_rows, rest, 2),
         contact_map=_decode(table.column("contact_map"), size=size, where=f"(contact map) of {path}"),
         **{name: table.column(name).to_numpy().astype(np.float64) for name in _TRUTH_SIGNALS},
     )
@@ -397,9 +424,8 @@ def save_forces(forces: Forces, path: Path) -> None:
 
 def load_forces(path: Path) -> Forces:
     """Read samples written by `save_forces`."""
-    with reading(path, wrong="does not hold samples of forces"):
-        table = pq.read_table(path)
-        samples = table.select(["time_s", *_AXES]).cast(pa.schema({name: pa.float64() for name in ("time_s", *_AXES)}))
-        source = (table.schema.metadata or {}).get(b"source", b"the force sensor").decode()
-    time_s, *force_n = (column.to_numpy() for column in samples.columns)
+    columns: dict[str, str] = dict.fromkeys(("time_s", *_AXES), "numbers")
+    table = read_parquet(path, columns, cure=_AGAIN, error=RecordingError)
+    source = (table.schema.metadata or {}).get(b"source", b"the force sensor").decode(errors="replace")
+    time_s, *force_n = (table.column(name).to_numpy().astype(np.float64) for name in columns)
     return Forces(time_s=time_s, force_n=np.stack(force_n, axis=-1), source=source)

@@ -82,12 +82,18 @@ class Labels:
 
     def __post_init__(self) -> None:
         self._require_one_each(len(self.safety_margin), f"there are {len(self.safety_margin)} safety margins but")
+        self._require_possible("")
 
     def _require_one_each(self, count: int, begin: str, *more: str) -> None:
         for name in (*LABEL_SIGNALS, "contact_state", *OPTIONAL_LABELS, *more):
             values = getattr(self, name)
             if values is not None and len(values) != count:
                 raise RecordingError(f"{begin} {len(values)} values of {name}; give one value a frame")
+
+    def _require_possible(self, where: str) -> None:
+        for name in LABEL_BOUNDS:
+            if (values := getattr(self, name)) is not None:
+                require_possible(values, name=name, where=where)
 
     @property
     def labelled(self) -> Bool[np.ndarray, " frames"]:
@@ -204,25 +210,39 @@ class Recording(TrialFacts, Labels):
         self._require_one_each(count, begin, "time_s")
         if self.truth is not None and len(self.truth.marker_px) != count:
             raise RecordingError(f"{begin} the truth of {len(self.truth.marker_px)}; give the truth of every frame")
+        if not np.isfinite(self.time_s).all():
+            at = int(np.argmin(np.isfinite(self.time_s)))
+            raise RecordingError(f"trial {self.trial}: the time of frame {at} is {self.time_s[at]}; mend its stamp")
         if not np.all(np.diff(self.time_s) > 0):
             at = int(np.argmax(~(np.diff(self.time_s) > 0))) + 1
             raise RecordingError(
                 f"trial {self.trial}: time does not rise at frame {at} ({self.time_s[at - 1]:.6g} s, then "
                 f"{self.time_s[at]:.6g} s); sort the frames or mend their stamps"
             )
-        for name in ("safety_margin", "stick_ratio"):
-            require_unit_interval(getattr(self, name), name=name, trial=self.trial)
+        self._require_possible(self.trial)
 
     def __len__(self) -> int:
         return len(self.frames)
 
 
-def require_unit_interval(values: Float[np.ndarray, " frames"], *, name: str, trial: str) -> None:
-    """Check that labels lie in [0, 1]; NaN (no label) passes."""
-    outside = (values < 0) | (values > 1)
+MOST_FORCE_N = 1e4
+"""No fingertip survives more; a larger number is in another unit."""
+_FORCES = (-MOST_FORCE_N, MOST_FORCE_N, "give it in newtons")
+_FRACTION = (0.0, 1.0, "give it as a fraction, not in percent")
+LABEL_BOUNDS = {
+    **dict.fromkeys(("normal_force_n", "tangential_force_n"), _FORCES),
+    # after the slip it is F_t / F_n, which is large where hardly anything presses
+    "friction_coefficient": (-MOST_FORCE_N, MOST_FORCE_N, "make the labels again"),
+    **dict.fromkeys(("safety_margin", "stick_ratio"), _FRACTION),
+    "safety_margin_sigma": (0.0, MOST_FORCE_N, "make the labels again"),
+}
+"""Between which numbers a label can lie at all, and the cure where it does not."""
+
+
+def require_possible(values: Float[np.ndarray, " frames"], *, name: str, where: str) -> None:
+    """Check that labels lie where they can at all; NaN (no label) passes."""
+    low, high, cure = LABEL_BOUNDS[name]
+    outside = (values < low) | (values > high)
     if outside.any():
-        at = int(np.argmax(outside))
-        raise RecordingError(
-            f"trial {trial}: {name} of frame {at} is {values[at]:.4g}, outside [0, 1]; "
-            "give it as a fraction, not in percent"
-        )
+        at, of = int(np.argmax(outside)), f"trial {where}: " if where else ""
+        raise RecordingError(f"{of}{name} of frame {at} is {values[at]:.4g}, outside [{low:g}, {high:g}]; {cure}")

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float32, Float64, Shaped, UInt8
 
 from sliplens.arrays import require_saliency
-from sliplens.codec import Columns, load_result
+from sliplens.codec import Columns, load_record, load_result
 from sliplens.errors import InputError
-from sliplens.files import RUN_FILE, read_json, require_folder
+from sliplens.files import RUN_FILE, Provenance, require_folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +102,7 @@ def load_explained(folder: Path) -> Explained:
         If a map is not finite.
     """
     require_folder(folder, what="the explanations")
-    if read_json(folder / RUN_FILE).get("stage") != "explain":
+    if load_record(folder / RUN_FILE, Provenance, command="sliplens explain").stage != "explain":
         raise InputError(f"{folder} holds no explanations; make them with sliplens explain")
     explained = load_result(folder, Explained, command="sliplens explain")
     for kind, maps in (("map", explained.relevance), ("saliency", explained.saliency)):

@@ -82,7 +82,7 @@ def read_recipe(folder: Path) -> SimulationRecipe:
             "pulls": None if pulls is None else Pulls(**_tuples(pulls)),
         }
         return SimulationRecipe(**(_tuples(stored) | records))
-    except (InputError, KeyError, TypeError, AttributeError):
+    except (InputError, KeyError, TypeError, AttributeError, ValueError, ArithmeticError):
         raise InputError(
             f"{path} does not tell the recipe of the simulated trials; give the recipe, or a data set that "
             "sliplens simulate made"

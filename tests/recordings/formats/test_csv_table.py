@@ -182,7 +182,7 @@ def test_what_is_no_text_is_refused(tmp_path: Path, rng: np.random.Generator):
         read_force_table(path)
     with pytest.raises(RecordingError, match="does not exist; check the path"):
         read_force_table(tmp_path / "nothing.csv")
-    with pytest.raises(RecordingError, match="cannot be read"):
+    with pytest.raises(RecordingError, match="is a folder, not a file"):
         read_force_table(tmp_path)
 
 

@@ -378,7 +378,7 @@ def test_tables_that_contradict_the_metadata_are_refused(dataset):
     with pytest.raises(RecordingError, match="lists episode 1 twice"):
         read_lerobot(dataset)
     write_episodes(dataset, starts, **{f"videos/{CAMERA}/from_timestamp": [0.0, None, 0.0]})
-    with pytest.raises(RecordingError, match=r"has rows without videos/.*/from_timestamp; finish writing the data set"):
+    with pytest.raises(RecordingError, match=r"has gaps in the column 'videos/.*/from_timestamp'; copy the data set"):
         read_lerobot(dataset)
     write_episodes(dataset, starts, **{"data/file_index": ["0", "0", "1"]})
     with pytest.raises(RecordingError, match="has no whole numbers in data/file_index"):
@@ -392,7 +392,7 @@ def test_tables_that_contradict_the_metadata_are_refused(dataset):
 def test_missing_and_damaged_tables_are_refused(dataset):
     data = dataset / "data" / "chunk-000" / "file-001.parquet"
     pq.write_table(pq.read_table(data).drop_columns([FORCE]), data)
-    with pytest.raises(RecordingError, match=rf"file-001\.parquet lacks {FORCE}"):
+    with pytest.raises(RecordingError, match=rf"file-001\.parquet lacks the column '{FORCE}'"):
         read_lerobot(dataset)
     data.write_bytes(data.read_bytes()[:-9])
     with pytest.raises(RecordingError, match=r"file-001\.parquet is not a readable Parquet file"):

@@ -166,11 +166,8 @@ def test_missing_or_damaged_samples_are_refused(exported):
     pq.write_table(table.slice(0, 20), path)
     with pytest.raises(RecordingError, match=r"forces-000000\.parquet has 20 samples of first, 50 were exported"):
         read_lerobot(exported)
-    pq.write_table(table.replace_schema_metadata({"source": b"\xff"}), path)
-    with pytest.raises(RecordingError, match=r"forces-000000\.parquet does not hold samples of forces"):
-        read_lerobot(exported)
     path.write_bytes(path.read_bytes()[:-9])
-    with pytest.raises(RecordingError, match=r"forces-000000\.parquet does not hold samples of forces"):
+    with pytest.raises(RecordingError, match=r"forces-000000\.parquet is not a readable Parquet file"):
         read_lerobot(exported)
     path.unlink()
     with pytest.raises(RecordingError, match=r"forces-000000\.parquet does not exist"):
@@ -188,7 +185,7 @@ def test_missing_or_damaged_samples_are_refused(exported):
         ("observation.contact_state", [5] * 2 * FRAMES, "contact_state of .* leads beyond the 5 values"),
         ("observation.contact_state", [-1] * 2 * FRAMES, "contact_state of .* leads beyond the 5 values"),
         ("observation.invalid_reason", [1.0] * 2 * FRAMES, "invalid_reason of .* does not hold whole numbers"),
-        ("observation.invalid_reason", [None] * 2 * FRAMES, "has rows without observation.invalid_reason"),
+        ("observation.invalid_reason", [None] * 2 * FRAMES, "has gaps in the column 'observation.invalid_reason'"),
         ("observation.force", [[1.0, 2.0]] * 2 * FRAMES, "force of .* does not hold 3 numbers a frame"),
     ],
 )

@@ -18,7 +18,7 @@ from readers import read_rosbag
 from sliplens.codec import to_builtins
 from sliplens.errors import InputError, RecordingError
 from sliplens.recordings.capture import Capture, Forces
-from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_info, trial_path, write_dataset_table
+from sliplens.recordings.dataset import Dataset, load_dataset, trial_info, trial_path, write_dataset_table
 from sliplens.recordings.exporting import export_mcap
 from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.importing import import_trial
@@ -541,9 +541,10 @@ def test_times_beyond_the_stamps_of_ros_are_refused_and_nothing_is_left(tmp_path
 def test_a_trial_that_cannot_name_a_file_is_refused(data, tmp_path):
     folder = tmp_path / "out"
     folder.mkdir()
-    row = TrialInfo(**{**vars(data.trials[0]), "trial": "../full"})
-    with pytest.raises(RecordingError, match=r"trial '\.\./full' cannot name a file; name it with letters"):
-        write_mcap(data, folder, trials=[row])
+    text = (data.folder / "dataset.json").read_text()
+    (folder / "dataset.json").write_text(text.replace(f'"{data.trials[0].trial}"', '"../full"'))
+    with pytest.raises(InputError, match=r"a trial is named with letters, digits, .*, not '\.\./full' at trials"):
+        load_dataset(folder)
 
 
 @pytest.mark.parametrize("module", ["mcap", "rosbags"])

@@ -2,7 +2,6 @@
 
 import io
 import re
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -12,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from sliplens.errors import ImageError, RecordingError, SliplensError
-from sliplens.images import list_images, read_image
+from sliplens.errors import ImageError, RecordingError
+from sliplens.images import list_images, open_image, read_image, require_image, telling_damage
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.formats.tables import (
     UNITS,
@@ -32,26 +31,14 @@ from sliplens.recordings.formats.tables import (
 )
 from sliplens.recordings.options import ReadOptions
 
-_DAMAGED = (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning)
-
 
 @contextmanager
-def telling_damage(words: str, cure: str, *, kind: type[SliplensError] = RecordingError) -> Iterator[None]:
-    """Tell in these words what Pillow raises of an image inside that is damaged, or expands too far."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise kind(f"{error.filename} does not exist; check the path") from None
-    except _DAMAGED as error:
-        raise kind(f"{words} ({error}); {cure}") from None
-
-
-def open_encoded(data: Any, *, where: str) -> Image.Image:
+def open_encoded(data: Any, *, where: str) -> Iterator[Image.Image]:
     """Header of a PNG or JPEG in memory, whatever it is called: the bytes say what they are."""
-    image = Image.open(io.BytesIO(data), formats=("JPEG", "PNG"))
-    if image.mode not in {"RGB", "L"}:
-        raise RecordingError(f"{where} has pixels of mode {image.mode}; record it as 8-bit RGB or grey")
-    return image
+    with open_image(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
+        if image.mode not in {"RGB", "L"}:
+            raise RecordingError(f"{where} has pixels of mode {image.mode}; record it as 8-bit RGB or grey")
+        yield image
 
 
 def rgb_pixels(image: Image.Image) -> Frame:
@@ -62,9 +49,8 @@ def rgb_pixels(image: Image.Image) -> Frame:
 
 def frame_size(path: Path) -> tuple[int, int]:
     """Height and width of an image, in pixels, read from its header."""
-    with _telling_of(path), warnings.catch_warnings(), Image.open(path) as image:
-        # Pillow warns of a size that would fill the memory, and goes on
-        warnings.simplefilter("error", Image.DecompressionBombWarning)
+    require_image(path)
+    with _telling_of(path), open_image(path) as image:
         pages = getattr(image, "n_frames", 1)
         if pages > 1:
             raise ImageError(f"{path} holds {pages} images; save one image a file")
@@ -73,14 +59,15 @@ def frame_size(path: Path) -> tuple[int, int]:
 
 def read_frame(path: Path, *, size: tuple[int, int]) -> Frame:
     """Read an image as a frame."""
-    with _telling_of(path), Image.open(path) as image:
+    require_image(path)
+    with _telling_of(path), open_image(path) as image:
         if image.mode != "L" or image.size != size[::-1]:
             return read_image(path, size=size)  # says what is wrong, too
         return rgb_pixels(image)
 
 
 def _telling_of(path: Path) -> AbstractContextManager[None]:
-    return telling_damage(f"{path} cannot be read as an image", "copy or export it again", kind=ImageError)
+    return telling_damage(f"{path} cannot be read as an image", "copy or export it again")
 
 
 def common_size(paths: tuple[Path, ...]) -> tuple[int, int]:

@@ -1,6 +1,5 @@
 """LeRobot v3 data sets of a tactile camera and a force sensor."""
 
-import json
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -14,20 +13,23 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 from av.container import InputContainer
 from av.video.stream import VideoStream
 from jaxtyping import Float
 
-from sliplens.errors import RecordingError
+from sliplens.codec import open_parquet, read_parquet, telling_parquet
+from sliplens.errors import InputError, RecordingError
+from sliplens.files import read_json
+from sliplens.images import telling_damage
 from sliplens.recordings.capture import Capture, Forces, Frame
-from sliplens.recordings.formats.images import open_encoded, rgb_pixels, telling_damage
+from sliplens.recordings.formats.images import open_encoded, rgb_pixels
 from sliplens.recordings.formats.stored import ExportedTrial
 from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.formats.video import open_video, require_size
 from sliplens.recordings.options import ReadOptions
-from sliplens.recordings.store import DAMAGED_PARQUET, load_forces, one_line
+from sliplens.recordings.store import load_forces
 
+_COPY = "copy the data set again"
 _NO_VIDEO = "copy the data set again, with its videos"
 _VERSION = re.compile(r"v3\.\d+")
 _FIELD = re.compile(r"\{(video_key|chunk_index|file_index)(?::0?([1-9])d)?\}")
@@ -73,11 +75,9 @@ def read_layout(folder: Path) -> Layout:
     """Read `meta/info.json`."""
     path = folder / "meta" / "info.json"
     try:
-        info = json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
-        raise RecordingError(f"{path} does not exist; name the folder of a LeRobot data set") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise RecordingError(f"{path} is not valid JSON ({error}); copy it again") from None
+        info = read_json(path, missing="name the folder of a LeRobot data set", damaged="copy it again")
+    except InputError as error:
+        raise RecordingError(str(error)) from None
     version = info.get("codebase_version") if isinstance(info, dict) else None
     if version is None:
         raise RecordingError(f"{path} has no codebase_version; name the folder of a LeRobot data set")
@@ -128,22 +128,7 @@ def read_episodes(layout: Layout, *, camera_key: str) -> list[Episode]:
 
 def read_columns(path: Path, columns: list[str]) -> pa.Table:
     """Columns of a Parquet file, with no value missing."""
-    try:
-        names = pq.read_schema(path).names
-        missing = [name for name in columns if name not in names]
-        if missing:
-            raise RecordingError(
-                f"{path} lacks {', '.join(missing)}; it is no file of a LeRobot v3 data set, or damaged"
-            )
-        table = pq.read_table(path, columns=columns)
-    except FileNotFoundError:
-        raise RecordingError(f"{path} does not exist; copy the data set again") from None
-    except DAMAGED_PARQUET as error:
-        raise RecordingError(f"{path} is not a readable Parquet file ({one_line(error)}); copy it again") from None
-    for name in columns:
-        if table.column(name).null_count:
-            raise RecordingError(f"{path} has rows without {name}; finish writing the data set, or copy it again")
-    return table
+    return read_parquet(path, dict.fromkeys(columns, "values"), cure=_COPY, error=RecordingError)
 
 
 def _expand(layout: Layout, template: str, values: dict[str, Any]) -> Path:
@@ -264,14 +249,15 @@ def image_frames(episode: Episode, key: str) -> tuple[tuple[int, int], Callable[
 
 def _stored_images(path: Path, key: str, episode: int, *, frame_size: tuple[int, int] | None) -> Iterator[Frame]:
     index = 0
-    try:
-        file = pq.ParquetFile(path)
+    told: dict[str, Any] = {"cure": _COPY, "error": RecordingError}
+    columns = {"episode_index": "whole numbers", key: "values"}
+    with open_parquet(path, columns, **told) as file, telling_parquet(path, **told):
         # without this, each episode would cost all that share its file
         import pyarrow.dataset as ds  # noqa: PLC0415 (takes a second, and other formats are read without)
 
         (fragment,) = ds.dataset(path).get_fragments()
         groups = [group.id for group in fragment.subset(pc.field("episode_index") == episode).row_groups]
-        for batch in file.iter_batches(batch_size=16, row_groups=groups, columns=["episode_index", key]):
+        for batch in file.iter_batches(batch_size=16, row_groups=groups, columns=list(columns)):
             own = batch.column("episode_index").to_numpy() == episode
             for cell in batch.filter(pa.array(own)).column(key).to_pylist():
                 where = f"frame {index} of {key}, episode {episode} of {path},"
@@ -286,14 +272,13 @@ def _stored_images(path: Path, key: str, episode: int, *, frame_size: tuple[int,
                     )
                 yield pixels
                 index += 1
-    except DAMAGED_PARQUET as error:
-        raise RecordingError(f"{path} is not a readable Parquet file ({one_line(error)}); copy it again") from None
 
 
 def decode_image(data: bytes, *, where: str) -> Frame:
     """Pixels of a PNG or JPEG."""
     words = f"{where} cannot be read as PNG or JPEG"
-    with telling_damage(words, "copy the data set again"), open_encoded(data, where=where) as image:
+    told = telling_damage(words, "copy the data set again", kind=RecordingError)
+    with told, open_encoded(data, where=where) as image:
         return rgb_pixels(image)
 
 

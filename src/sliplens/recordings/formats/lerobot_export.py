@@ -38,7 +38,6 @@ from sliplens.recordings.formats.stored import (
     exported_labels,
     read_stored_trial,
 )
-from sliplens.recordings.formats.tables import require_trial_name
 from sliplens.recordings.store import save_forces
 
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
@@ -315,7 +314,6 @@ def _require_one_kind(trials: Sequence[TrialInfo]) -> tuple[int, int]:
         raise RecordingError("there is no trial to export; name at least one")
     first = trials[0]
     for info in trials:
-        require_trial_name(info.trial)
         if (info.height, info.width) != (first.height, first.width):
             raise RecordingError(
                 f"trial {info.trial} has frames of {info.height} x {info.width} pixels, trial {first.trial} of "

@@ -17,7 +17,6 @@ from sliplens.progress import OnProgress
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import Dataset, TrialInfo
 from sliplens.recordings.formats.stored import ExportedTrial, encode_batches, exported_labels, read_stored_trial
-from sliplens.recordings.formats.tables import require_trial_name
 from sliplens.recordings.trial import LABEL_SIGNALS
 
 if TYPE_CHECKING:
@@ -94,7 +93,6 @@ def write_mcap(
     chosen = data.trials if trials is None else tuple(trials)
     written, total = 0, sum(info.frames for info in chosen)
     for info in chosen:
-        require_trial_name(info.trial)
         with (folder / f"{info.trial}.mcap").open("wb") as stream:
             bag = _Bag(stream)
             for _ in _write_trial(bag, read_stored_trial(data, info)):

@@ -21,8 +21,9 @@ from PIL import Image
 
 from sliplens.errors import RecordingError, SliplensError
 from sliplens.extras import require_packages
+from sliplens.images import telling_damage
 from sliplens.recordings.capture import Capture, Forces, Frame
-from sliplens.recordings.formats.images import open_encoded, rgb_pixels, telling_damage
+from sliplens.recordings.formats.images import open_encoded, rgb_pixels
 from sliplens.recordings.formats.mcap import (
     IMAGE,
     LABELS,
@@ -74,7 +75,7 @@ def image_size(message: Any, *, where: str) -> tuple[int, int]:
 def image_pixels(message: Any, *, where: str) -> Frame:
     """Pixels of an image as RGB; grey is repeated in all three channels."""
     if message.__msgtype__ == COMPRESSED:
-        told = telling_damage(f"{where} is damaged", "cut the bag before it")
+        told = telling_damage(f"{where} is damaged", "cut the bag before it", kind=RecordingError)
         with _open_compressed(message, where=where) as image, told:
             return rgb_pixels(image)
     height, width = image_size(message, where=where)
@@ -87,12 +88,14 @@ def image_pixels(message: Any, *, where: str) -> Frame:
     return np.array(pixels[..., ::-1] if message.encoding == "bgr8" else pixels, order="C")
 
 
-def _open_compressed(message: Any, *, where: str) -> Image.Image:
-    """Image with its header read; Pillow refuses one that would expand beyond its limit (a decompression bomb)."""
+@contextmanager
+def _open_compressed(message: Any, *, where: str) -> Iterator[Image.Image]:
+    """Image with its header read; one that would expand too far (a decompression bomb) is refused."""
     # `format` is free text, and drivers differ in it
     words = f"{where}, of format {message.format[:40]!r}, cannot be read as JPEG or PNG"
-    with telling_damage(words, "record it again, or as one of these"):
-        return open_encoded(message.data, where=where)
+    told = telling_damage(words, "record it again, or as one of these", kind=RecordingError)
+    with told, open_encoded(message.data, where=where) as image:
+        yield image
 
 
 MOST_BYTES = 256 * 2**20

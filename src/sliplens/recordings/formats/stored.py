@@ -14,13 +14,14 @@ from jaxtyping import Float
 
 from sliplens.codec import from_builtins, to_builtins
 from sliplens.errors import InputError, RecordingError
+from sliplens.files import parse_json
 from sliplens.images import encode_png
 from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_path
 from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.store import forces_path, load_forces, load_recording, stream_frames
-from sliplens.recordings.trial import LABEL_SIGNALS, ContactState, Labels, Recording, TrialFacts, require_unit_interval
+from sliplens.recordings.trial import LABEL_SIGNALS, ContactState, Labels, Recording, TrialFacts
 
 STATES = {str(state): state for state in ContactState}
 """Contact states by their words."""
@@ -139,9 +140,9 @@ class ExportedTrial:
         if len(text) > _LONGEST:
             raise RecordingError(f"{where} has {len(text)} characters, no description does; export the trial again")
         try:
-            values = msgspec.json.decode(text)
-        except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
-            raise RecordingError(f"{where} is no JSON ({error}); export the trial again") from None
+            values = parse_json(text, where=where, cure="export the trial again")
+        except InputError as error:
+            raise RecordingError(str(error)) from None
         if not isinstance(values, dict) or values.get("format") != FORMAT:
             raise RecordingError(f"{where} does not describe a {FORMAT}; export the trial again")
         if values.get("version") != VERSION:
@@ -167,8 +168,6 @@ class ExportedTrial:
         time_s = numbers.pop("time_s")
         if not np.isfinite(time_s).all():
             raise RecordingError(f"{source} has a time that is not a number; export the trial again")
-        for name in ("safety_margin", "stick_ratio"):
-            require_unit_interval(numbers[name], name=name, trial=source)
         unknown = set(states) - set(STATES)
         if unknown:
             raise RecordingError(

@@ -13,15 +13,18 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from sliplens.errors import RecordingError
+from sliplens.errors import InputError, RecordingError
+from sliplens.files import require_file
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labels.axes import typical_step
 from sliplens.recordings.options import ReadOptions
+from sliplens.recordings.trial import MOST_FORCE_N
 
 _SEPARATORS = ("\t", ";", ",")  # a comma may be a decimal one where another separator is there
 _LACKING = ("", "nan", "na", "n/a", "null")  # fields of a sample that dropped out
 _COMMENTS = ("#", "%")
 _PROBED_BYTES = 65536
+_LONGEST_LINE = 100_000  # characters; a file without line breaks would be held whole
 _OLD = "cp1252"
 _CONTROLS = frozenset(range(32)) - frozenset(b"\t\n\r\f\x1a\x1b")
 
@@ -159,10 +162,11 @@ def guessed_encodings(*paths: Path) -> tuple[str, ...]:
 
 def _encoding(path: Path) -> str:
     try:
+        require_file(path)
         with path.open("rb") as stream:
             start = stream.read(_PROBED_BYTES)
-    except FileNotFoundError:
-        raise RecordingError(f"{path} does not exist; check the path") from None
+    except InputError as error:
+        raise RecordingError(str(error)) from None
     except OSError as error:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); name a text file") from None
     if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -179,7 +183,11 @@ def _encoding(path: Path) -> str:
 def _lines(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
     try:
         with path.open(encoding=encoding) as stream:
-            for number, text in enumerate(stream, start=1):
+            for number, text in enumerate(iter(lambda: stream.readline(_LONGEST_LINE), ""), start=1):
+                if len(text) == _LONGEST_LINE:
+                    raise RecordingError(
+                        f"{path}, line {number} is longer than {_LONGEST_LINE:,} characters; export the table as CSV"
+                    )
                 if text.strip():
                     yield number, text.rstrip("\r\n")
     except UnicodeError:
@@ -361,9 +369,6 @@ def require_trial_name(trial: str) -> None:
         )
 
 
-_MOST_FORCE_N = 1e4  # no fingertip survives more; a larger number is in another unit
-
-
 def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[str, ...]]:
     """Read times and forces from a text table with a header, and notes of what was declared or guessed.
 
@@ -379,7 +384,7 @@ def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[st
     unit, how = _time_unit(table, time_name, options.time_unit, time)
     scales, units = _force_scales(table, names, options.force_unit)
     forces = values[:, 1:] * scales
-    large = np.any(np.abs(forces) > _MOST_FORCE_N, axis=1)
+    large = np.any(np.abs(forces) > MOST_FORCE_N, axis=1)
     if large.any():
         at = int(np.argmax(large))
         raise RecordingError(

@@ -13,7 +13,7 @@ from sliplens.recordings.capture import Capture
 from sliplens.recordings.formats.images import common_size, read_frame
 from sliplens.recordings.formats.tables import evenly_spaced, guessed_encodings, text_lines, trial_name
 from sliplens.recordings.options import ReadOptions
-from sliplens.recordings.trial import labels_of_margins, require_unit_interval
+from sliplens.recordings.trial import labels_of_margins, require_possible
 
 
 def read_lines(path: Path) -> list[tuple[int, str]]:
@@ -179,7 +179,7 @@ def _read_margins(path: Path, *, unit: str | None) -> tuple[Float[np.ndarray, " 
     if unit is None:
         percent |= bool(np.nanmax(margins) > 2)  # no margin of a fraction comes near it, percents all do
     margins = margins / 100 if percent else margins
-    require_unit_interval(margins, name="safety_margin", trial=path.name)
+    require_possible(margins, name="safety_margin", where=path.name)
     return margins, (f"{path.name}: safety margins were read as {'percent' if percent else 'fractions'} ({how}).",)
 
 

@@ -17,6 +17,7 @@ from av.video.stream import VideoStream
 from jaxtyping import Float, Float32, Int64
 
 from sliplens.errors import RecordingError
+from sliplens.images import MOST_PIXELS
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.formats.tables import evenly_spaced, place_on_clock, trial_name
 from sliplens.recordings.options import ReadOptions
@@ -77,7 +78,6 @@ def _block_means(frame: Frame) -> Float32[np.ndarray, "rows columns 3"]:
     return (sums / (height * width)).astype(np.float32)
 
 
-_MOST_PIXELS = 100_000_000  # a larger frame is a damaged header, and would ask for gigabytes
 # FFmpeg also plays text files and play lists, and would follow these to other files and hosts
 _OPTIONS = {
     "protocol_whitelist": "file",
@@ -162,7 +162,7 @@ def open_video(path: Path, *, missing: str = "name a video file") -> Iterator[tu
 def require_size(path: Path, video: VideoStream) -> tuple[int, int]:
     """Height and width of the frames as the header claims them, where they can be true."""
     size = video.codec_context.height, video.codec_context.width
-    if min(size) <= 0 or size[0] * size[1] > _MOST_PIXELS:
+    if min(size) <= 0 or size[0] * size[1] > MOST_PIXELS:
         raise RecordingError(
             f"{path} claims frames of {size[1]} x {size[0]} pixels; the file is damaged, copy or export it again"
         )

@@ -67,6 +67,20 @@ def half_window(time_s: Samples, at_s: Times, *, window_s: float, until_s: float
     return np.clip(np.minimum(room, np.abs(at_s - until_s)), 0, window_s / 2)
 
 
+_MOST_WINDOWS = 4_000_000
+
+
+def middles(time_s: Samples, start_s: float, end_s: float, *, width_s: float) -> Times:
+    """Middles of windows one after another from a start, before an end.
+
+    Where a gap would make them too many, only those that hold a sample: an array is as long as there are samples.
+    """
+    if (end_s - start_s) / width_s <= _MOST_WINDOWS:
+        return np.arange(start_s + width_s / 2, end_s, width_s)
+    found = start_s + (np.unique(np.floor((time_s - start_s) / width_s)) + 0.5) * width_s
+    return found[found < end_s]
+
+
 def noise_sigma(values: Columns) -> Float[np.ndarray, "*axes"]:
     """Standard deviation of the noise of each column, from second differences: what changes slowly leaves no trace.
 
@@ -211,7 +225,7 @@ def _find_touch(forces: Forces, *, tare_n: Vector | None) -> float:
     first = forces.force_n[time <= start + _FIRST_S]
     rest = np.median(first, axis=0) if tare_n is None else np.array(tare_n)
     # means taken one after the other tell their noise, whatever its memory
-    apart = np.arange(start + _WINDOW_S / 2, time[-1], _WINDOW_S)
+    apart = middles(time, start, float(time[-1]), width_s=_WINDOW_S)
     sigma = float(np.linalg.norm(noise_sigma(mean_force(time, forces.force_n, apart, window_s=_WINDOW_S))))
     # the rest itself is known from a few windows only
     sigma *= np.sqrt(1 + 1.5 * _WINDOW_S / _FIRST_S)
@@ -270,8 +284,9 @@ class ContactForces:
     def noise_of_means_n(self, window_s: float) -> NormalTangential:
         """Standard deviation of the noise of means over a window; white or not, it is taken from means."""
         time = self.time_s
-        middles = np.arange(time[0] + window_s / 2, time[-1] - window_s / 2, window_s) if window_s > 0 else time
-        means = mean_force(time, self.recorded.force_n, middles, window_s=window_s)
+        ends = float(time[0]), float(time[-1] - window_s / 2)
+        apart = middles(time, *ends, width_s=window_s) if window_s > 0 else time
+        means = mean_force(time, self.recorded.force_n, apart, window_s=window_s)
         # too few means tell no spread: the samples then have to
         return self._split(noise_sigma(means)) if len(means) >= _FEW_MEANS else self.noise_n
 

@@ -225,7 +225,7 @@ def _find_falls(forces: ContactForces, *, window_s: float, contact_threshold_n: 
     sigma = np.where(pressed, np.hypot(sigma_n, ratio * noise.normal) / safe, 0)
     highest = float(ratio[tangential > 3 * sigma_n].max(initial=0))
     # the least that it has fallen to within the time of a slip
-    count = max(1, round(_DROP_S / step))
+    count = min(max(1, round(_DROP_S / step)), len(time))
     padded = np.concatenate((np.where(pressed, ratio, np.inf), np.full(count, np.inf)))
     least = np.lib.stride_tricks.sliding_window_view(padded, count + 1).min(axis=1)
     fall = ratio - least

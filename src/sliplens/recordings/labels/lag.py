@@ -45,6 +45,7 @@ def measure_motion(softened: Iterable[Soft]) -> Float[np.ndarray, " frames"]:
 
 Intervals: TypeAlias = Float[np.ndarray, " intervals"]
 _STEPS_A_FRAME = 16  # lags tried in the time of a frame; between them the peak is a parabola's
+_LEAST_LAG_S = 5e-4  # a tenth of what a lag is known to: of a fast camera the lags would be too many
 _BLOCKS = 24  # stretches of a trial that are drawn anew: long enough to hold a slip whole, many enough to draw from
 _LEAST_INTERVALS = 2 * _BLOCKS
 _LEAST_CORRELATION = 0.3
@@ -86,7 +87,7 @@ def estimate_lag(
     if intervals < _LEAST_INTERVALS:
         doubt = f"{intervals + 1} frames are too few to tell a lag from, {_LEAST_INTERVALS + 1} are needed"
         return Lag(lag_s=0.0, sigma_s=0.0, doubt=doubt)
-    step = typical_step(frame_time_s) / _STEPS_A_FRAME
+    step = max(typical_step(frame_time_s) / _STEPS_A_FRAME, _LEAST_LAG_S)
     reach = int(np.ceil(longest_s / step))
     lags = np.arange(-reach, reach + 1) * step
     changes = np.stack([force_changes(frame_time_s - lag, forces) for lag in lags])
