@@ -9,14 +9,13 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
 import pytest
-import torch
 from dots import draw_dots, make_grid
 from hypothesis import settings
+from small import make_recording, save_untrained
 
 from sliplens.images import absolute_difference, write_png
-from sliplens.models import Manifest, build_model, save_checkpoint
 from sliplens.models.calibration import Calibration, Traction
-from sliplens.recordings import ContactState, Dataset, Recording, load_dataset
+from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SimulationRecipe, plan_trials, simulate_trial
@@ -25,8 +24,6 @@ from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SimulationRecipe, plan_tr
 settings.register_profile("sliplens", derandomize=True, deadline=None)
 settings.load_profile("sliplens")
 
-FRAME_SIZE = 48
-IMAGE_SIZE = 32
 MOST_WORKERS = 8  # each imports the package and makes its own fixtures: more gain little
 
 
@@ -62,35 +59,6 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(20261121)
 
 
-def make_recording(trial: str, *, condition: str = "dry", day: int = 1, frames: int = 12, seed: int = 0) -> Recording:
-    """A square that wanders over a noisy background as the safety margin falls: enough for a network to learn."""
-    rng = np.random.default_rng(seed)
-    margin = np.linspace(1, 0, frames)
-    margin[0] = np.nan  # the first frame has no contact
-    reference = rng.integers(0, 20, (FRAME_SIZE, FRAME_SIZE, 3), dtype=np.uint8)
-    images = np.repeat(reference[None], frames, axis=0)
-    for index in range(1, frames):
-        row = 4 + round(24 * (1 - margin[index]))
-        images[index, row : row + 12, 16:32] += 120
-    state = [ContactState.NO_CONTACT] + [ContactState.INCIPIENT_SLIP] * (frames - 1)
-    force = np.full(frames, 1.0)
-    return Recording(
-        trial=trial,
-        sensor="test-sensor",
-        day=day,
-        condition=condition,
-        reference=reference,
-        frames=images,
-        time_s=np.arange(frames) / 30,
-        normal_force_n=force,
-        tangential_force_n=np.nan_to_num(0.5 * (1 - margin)),
-        friction_coefficient=0.5 * force,
-        safety_margin=margin,
-        stick_ratio=np.clip(margin ** (2 / 3), 0, 1),
-        contact_state=tuple(state),
-    )
-
-
 @pytest.fixture
 def recording() -> Recording:
     return make_recording("trial")
@@ -123,36 +91,6 @@ def fine_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
         table.append(trial_info(path, split="test"))
     write_dataset_table(folder, table)
     return load_dataset(folder)
-
-
-def save_untrained(
-    folder: Path,
-    *,
-    kind: str = "difference",
-    seed: int = 0,
-    frame_size: int = FRAME_SIZE,
-    image_size: int = IMAGE_SIZE,
-    traction: Traction | None = None,
-) -> Path:
-    """A checkpoint with random weights: enough to test everything around a network."""
-    head = "point" if traction is None else "margin-and-ratio"
-    folder.mkdir(parents=True, exist_ok=True)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        model = build_model(head=head)
-    manifest = Manifest(
-        backbone="shufflenet_v2_x1_0",
-        input=kind,
-        image_size=image_size,
-        frame_size=(frame_size, frame_size),
-        sensor="test-sensor",
-        data_hash="none",
-        head=head,
-        calibration=None if traction is None else traction.calibration,
-        traction=traction,
-    )
-    save_checkpoint(folder, model.eval(), manifest)
-    return folder
 
 
 @pytest.fixture(scope="session")

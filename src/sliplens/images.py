@@ -3,7 +3,7 @@
 import io
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -54,7 +54,7 @@ def require_image(path: Path) -> None:
 
 @contextmanager
 def open_image(
-    source: Path | io.BytesIO, *, formats: Sequence[str] = ("PNG", "TIFF", "JPEG", "BMP")
+    source: Path | io.BytesIO, *, formats: tuple[str, ...] = ("PNG", "TIFF", "JPEG", "BMP")
 ) -> Iterator[Image.Image]:
     """Open an image, none of its pixels read; a `ValueError` where it claims more than any camera has."""
     with warnings.catch_warnings():

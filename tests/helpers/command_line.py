@@ -11,10 +11,10 @@ def run(*words: object) -> int:
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    """Run a command that must fail with exit code 2 and one line; gives the line."""
+    """Run a command that must fail with exit code 2 and one line besides notes; gives the line."""
     assert run(*words) == 2
     captured = capsys.readouterr()
     assert "Traceback" not in captured.err + captured.out
-    lines = captured.err.strip().splitlines()
+    lines = [line for line in captured.err.strip().splitlines() if not line.lstrip().startswith("note: ")]
     assert len(lines) == 1
     return lines[0]

@@ -395,7 +395,7 @@ def damages() -> Iterator[Any]:
         "deep": lambda text: text[:-1] + ', "x": ' + "[" * 100_000,
     }
     for name, change in texts.items():
-        yield pytest.param(edit_text(change), r"/tactile/trial of .* is no JSON \(.*\); export", id=name)
+        yield pytest.param(edit_text(change), r"/tactile/trial of .* is not valid JSON \(.*\); export", id=name)
     yield pytest.param(
         edit_text(lambda text: text + " " * 2**24), r"has \d+ characters, no description does; export", id="endless"
     )
@@ -426,7 +426,7 @@ def damages() -> Iterator[Any]:
         "/tactile/wrench_times": "has 200 times of wrenches, /tactile/trial promises 1200",
     }.items():
         yield pytest.param(drop(topic, 0), said, id=f"one less of {topic}")
-    yield pytest.param(edit_table(frames=10**30), "has 40 frames, .* promises 1000000000000000000000", id="many frames")
+    yield pytest.param(edit_table(frames=10**18), "has 40 frames, .* promises 1000000000000000000", id="many frames")
     yield pytest.param(
         replace_bytes(LABELS, b"full slip", b"fool slip"),
         r"full of .* has the contact state 'fool slip', none of no contact, contact",
