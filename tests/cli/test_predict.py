@@ -3,11 +3,13 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 import tyro
+from own_recording import write_video
 from pyarrow.csv import read_csv
 
 from sliplens import __version__
@@ -17,6 +19,7 @@ from sliplens.cli.train import Train
 from sliplens.errors import InputError, SliplensError
 from sliplens.files import hash_file, hash_json, read_json
 from sliplens.recordings import Dataset
+from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 
 def run(*words: object) -> None:
@@ -47,6 +50,23 @@ def test_a_data_set_is_predicted(
     }
     assert "24 frames, by eager" in capsys.readouterr().out
     assert [path.name for path in output.parent.iterdir()] == ["a.parquet"]
+
+
+def test_a_video_alone_is_read_by_a_network_and_beside_a_frame_that_are_named(
+    small_dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    trial = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=20))
+    write_video(trial, tmp_path / "cup.mkv")
+    (tmp_path / "tip.toml").write_text('name = "tip"\nnetwork = "chromatouch-raw"\n')
+    run(tmp_path / "cup.mkv", "--engine", "eager")
+    alone = " ".join(capsys.readouterr().err.split())
+    assert "no network was named, so chromatouch-difference reads it, which comes with sliplens" in alone
+    assert "its first frame was taken for the untouched sensor" in alone
+    run(tmp_path / "cup.mkv", "--engine", "eager", "--sensor", tmp_path / "tip.toml")
+    known = " ".join(capsys.readouterr().err.split())
+    assert "so chromatouch-raw reads it, which the profile tip names" in known
+    assert "reads frames of tip" in known
+    assert "untouched" not in known
 
 
 def test_engines_agree_on_a_folder_of_images(difference_run: Path, difference_folder: Path, tmp_path: Path, capsys):

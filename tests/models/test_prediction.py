@@ -164,6 +164,11 @@ def test_what_the_images_were_taken_for_is_noted(trained: Run, wet: Recording, t
     frames = write_frames(tmp_path / "frames", wet.frames)
     assert "taken for difference images" in predict_source(trained, frames).notes[0]
     assert not predict_source(trained, frames, reference_frame=0).notes
+    video = write_video(tmp_path / "touch.mkv", wet.frames)
+    assumed, named = predict_source(trained, video), predict_source(trained, video, reference_frame=0)
+    assert "its first frame was taken for the untouched sensor" in assumed.notes[-1]
+    assert assumed.notes[:-1] == named.notes
+    assert assumed.frame()["prediction"] == named.frame()["prediction"]
 
 
 def refused(source: Path, trained: Run, kind: type[Exception], message: str, **options: object) -> None:
@@ -174,7 +179,6 @@ def refused(source: Path, trained: Run, kind: type[Exception], message: str, **o
 def test_what_is_missing_or_too_much_is_told(trained: Run, small_dataset: Dataset, wet: Recording, tmp_path: Path):
     video, image = write_video(tmp_path / "touch.mkv", wet.frames), tmp_path / "untouched.png"
     write_png(image, wet.reference)
-    refused(video, trained, InputError, "with --reference IMAGE, or a frame of it with --reference-frame N")
     refused(video, trained, InputError, "named twice", reference=image, reference_frame=0)
     refused(video, trained, InputError, "no splits; leave out --split", split="test", reference=image)
     refused(video, trained, ImageError, "gone.png does not exist", reference=tmp_path / "gone.png")

@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from sliplens.recordings.options import ReadOptions
 
 Result = TypeVar("Result")
-_NETWORK = "Folder of a trained network, or the name of one that comes with sliplens."
-Network = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="RUN", help=_NETWORK)]
+NETWORK_HELP = "Folder of a trained network, or the name of one that comes with sliplens."
+Network = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="RUN", help=NETWORK_HELP)]
 Data = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA", help="Data set to read.")]
 Output = Annotated[Path, tyro.conf.arg(aliases=("-o",))]
-_SOURCE = "Data set, folder of images, video, ROS 2 bag, or whatever `sliplens import` reads."
-Source = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE", help=_SOURCE)]
+SOURCE_HELP = "Data set, folder of images, video, ROS 2 bag, or whatever `sliplens import` reads."
+Source = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE", help=SOURCE_HELP)]
 TableFile = Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="FILE.parquet", help="File to write.")]
 _FRICTION = "Coefficient of friction of the object, where it is known: 0.62, or a range such as 0.5..0.8."
 Friction = Annotated[str | None, tyro.conf.arg(metavar="MU|LOW..HIGH", help=_FRICTION)]

@@ -96,6 +96,8 @@ class Live:
         named["sensor"] = self.sensor if is_profile(self.sensor) else None
         with ExitStack() as stack:
             reader = stack.enter_context(closing(LiveReader(self.source, self.network or shipped, **named)))
+            if reader.doubt is not None:
+                _tell(reader.doubt)
             reader.send_to(*self.sink)
             if self.record is not None:
                 reader.record(self.record, facts=self._facts())

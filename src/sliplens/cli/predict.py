@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from sliplens.cli.command import Device, Friction, Network, Source, SourceCommand
+from sliplens.cli.command import NETWORK_HELP, SOURCE_HELP, Device, Friction, SourceCommand
 from sliplens.cli.console import print_table, say, wrote
 from sliplens.errors import InputError
 from sliplens.files import require_new_file
@@ -30,8 +30,16 @@ class Predict(SourceCommand):
     lowest point. Images of a folder are taken for difference images if no reference is named.
     """
 
-    model: Network
-    source: Source
+    model: Annotated[
+        Path | None,
+        tyro.conf.Positional,
+        tyro.conf.arg(
+            name="run",
+            metavar="[RUN]",
+            help=f"{NETWORK_HELP} If left out, the one that the sensor's profile names, else chromatouch-difference.",
+        ),
+    ]
+    source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE", help=SOURCE_HELP)] = None
     output: Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="FILE.csv")] = None
     """Table to write, by its ending .parquet, .csv or .json: trial, frame, time, margin, interval, and label and forces
     where they are known. Memory does not grow with the recording."""
@@ -45,6 +53,11 @@ class Predict(SourceCommand):
     batch_size: int = 8
     """Frames predicted together; on a CPU more are slower, as they no longer fit its cache."""
     device: Device = "cpu"
+
+    def __post_init__(self) -> None:
+        if self.source is None:  # one word alone is what to read
+            object.__setattr__(self, "source", self.model)
+            object.__setattr__(self, "model", None)
 
     def check(self) -> None:
         """Refuse what is wrong at first sight."""
@@ -65,7 +78,9 @@ class Predict(SourceCommand):
         """Predict, show and write."""
         from sliplens.models.predictions import predict
 
-        named = {"run": self.model, "options": self.options, "onnx_file": self.onnx, "out": self.output}
+        assert self.source is not None  # see above
+        run, source = (self.source, None) if self.model is None else (self.model, self.source)
+        named = {"run": run, "source": source, "options": self.options, "onnx_file": self.onnx, "out": self.output}
         predictions = self.call(predict, **named)
         _show(predictions)
         if self.friction is not None:
@@ -73,7 +88,8 @@ class Predict(SourceCommand):
         if self.plot is not None:
             from sliplens.plots.margins import draw_margins
 
-            shown = draw_margins(predictions.frame(), self.plot, title=f"{self.source.name}, read by {self.model.name}")
+            read_by = "" if self.model is None else f", read by {self.model.name}"
+            shown = draw_margins(predictions.frame(), self.plot, title=f"{self.source.name}{read_by}")
             wrote(self.plot, f"margin over time of {shown} trial{'s' if shown > 1 else ''}")
         if self.output is not None:
             wrote(self.output, f"{predictions.frames:,} frames, by {predictions.engine}")

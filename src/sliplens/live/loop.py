@@ -127,6 +127,8 @@ class LiveReader:
         if network is None and profile is not None:
             network = profile.network
         self.network = load(network, device=device) if isinstance(network, Path | str) else network
+        self.doubt = None if self.network is None or profile is None else self.network.doubt(profile.name)
+        """That the sensor is another than the network's; None where it is not, or nobody names it."""
         options = options or SourceOptions()
         if self.network is not None and profile is None:
             options = replace(options, fit_size=self.network.manifest.frame_size)

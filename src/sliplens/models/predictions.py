@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
@@ -19,10 +19,11 @@ from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.models.checkpoint import Estimate, Run, load, sensor_kind
 from sliplens.models.engines import Engine, make_engine
 from sliplens.progress import OnProgress, note, stage
-from sliplens.recordings import Dataset
+from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.capture import Capture
+from sliplens.recordings.dataset import DATASET_FILE
 from sliplens.recordings.options import ReadOptions
-from sliplens.recordings.sensor import SensorProfile
+from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import Frame, Frames, open_source
 
 LEVEL = 0.9
@@ -161,12 +162,13 @@ def predict(
     ----------
     run
         Network, its folder, or the name of one that comes with sliplens. It may be left out: `predict("cup.mp4")` reads
-        the source with `chromatouch-difference`.
+        the source with the network that its sensor's profile names, else with `chromatouch-difference`.
     source
         Data set, folder of images, video, bag, uint8 RGB frames (frames, height, width, 3), or what `open_source` gave.
         Images without a reference are taken for difference images, compared before.
     reference, reference_frame
-        The sensor untouched: image, or number of the frame that shows it.
+        The sensor untouched: image, or number of the frame that shows it. Where nobody tells it of a recording, its
+        first frame is taken for it, and a note says so.
     split, format, options, sensor
         As `open_source` takes them.
     friction
@@ -186,7 +188,7 @@ def predict(
     Raises
     ------
     InputError
-        If something named is missing or does not fit, or frames that need a reference have none.
+        If something named is missing or does not fit, or frames in memory that need a reference have none.
     ImageError
         If frames are of another size than those of the network's sensor.
     RecordingError
@@ -211,7 +213,9 @@ def predict(
     if source is None:
         if isinstance(run, Run):
             raise InputError("name what to read: a data set, a folder of images, a video, or frames")
-        run, source = _SHIPPED, run
+        source = run
+        run, named_by = _find_network(source, sensor)
+        note(on_progress, f"no network was named, so {run} reads it, {named_by}")
     if not isinstance(run, Run | Path | str):
         raise InputError(f"{type(run).__name__} is no network; give a network, its folder or its name first")
     trained = run if isinstance(run, Run) else load(run, device=device)
@@ -229,6 +233,7 @@ def predict(
                 options=options,
                 sensor=sensor,
             )
+    source = [_assume_reference(trained, one) for one in source]
     notes = tuple(dict.fromkeys(words for one in source for words in (*one.notes, *_require_comparable(trained, one))))
     if known is not None:
         notes = (*notes, f"The coefficient of friction is taken for {known}.")
@@ -251,6 +256,33 @@ def predict(
     return Predictions(frames=total, engine=ready.name, path=path, rows=rows, schema=path and schema, notes=notes)
 
 
+def _find_network(source: object, sensor: SensorProfile | Path | str | None) -> tuple[str, str]:
+    """Network for a source where none is named, and who names it."""
+    profile = None if sensor is None else load_profile(sensor)
+    if profile is None and isinstance(source, Path | str) and (Path(source) / DATASET_FILE).is_file():
+        source = load_dataset(source)
+    if profile is None and isinstance(source, Dataset):
+        profile = source.profile(source.trials[0].sensor)
+    if profile is not None and profile.network is not None:
+        return profile.network, f"which the profile {profile.name} names"
+    return _SHIPPED, "which comes with sliplens"
+
+
+def _assume_reference(trained: Run, trial: Capture) -> Capture:
+    """Take the first frame of a recording for the untouched sensor, where a network needs it and nobody tells it."""
+    if trial.read_reference is not None or not _is_recorded(trial) or trained.encoding.name == "raw":
+        return trial
+    words = (
+        f"{trial.name}: its first frame was taken for the untouched sensor; if that touches, name another with "
+        "--reference-frame N, or an image with --reference"
+    )
+    return replace(trial, reference_index=0, notes=(*trial.notes, words))
+
+
+def _is_recorded(trial: Capture) -> bool:
+    return trial.files is None and trial.time_s is not None  # nobody compares frames before they are recorded
+
+
 def _require_comparable(trained: Run, trial: Capture) -> Iterator[str]:
     """Refuse a trial that the network cannot read; gives what is assumed of one that it can."""
     trained.require_frame_size(trial.frame_size)
@@ -258,12 +290,11 @@ def _require_comparable(trained: Run, trial: Capture) -> Iterator[str]:
     doubt = trained.doubt(trial.sensor)
     if doubt is not None:
         yield doubt + _compare_markers(trained, trial)
-    recorded = trial.files is None and trial.time_s is not None  # nobody compares frames before they are recorded
-    if trial.read_reference is None and not recorded:
+    if trial.read_reference is None and not _is_recorded(trial):
         trained.require_kind(next(trial.read_frames()), what=trial.files[0] if trial.files else "the first frame")
     if trial.read_reference is not None or encoding.name == "raw":
         return
-    if recorded or not encoding.empty_is_black:
+    if not encoding.empty_is_black:
         raise InputError(
             f"a network on {encoding.name} images compares the frames of {trial.name} with the untouched sensor; "
             "name its image with --reference IMAGE, or a frame of it with --reference-frame N"

@@ -45,6 +45,8 @@ class ForceAxes:
     tare_found: Found
     drift_n_s: Vector = (0.0, 0.0, 0.0)
     """Rate at which the reading of the untouched sensor drifts; 0 where it cannot be told from none."""
+    drift_sigma_n_s: Vector = (0.0, 0.0, 0.0)
+    """Standard uncertainty of that rate."""
     notes: tuple[str, ...] = ()
     """Doubts, a sentence each."""
 

@@ -83,6 +83,9 @@ class LabelSettings:
     widens the uncertainty."""
     tare: tuple[float, float, float] | None = None
     """What the untouched force sensor reads (x y z), in newtons; found if not given."""
+    drift_rate: float | None = None
+    """Standard deviation of the rate at which the force sensor's zero may drift, in N/s; 0 for one that does not. What
+    the untouched sensor leaves open if not given."""
     lag_ms: float | None = None
     """Milliseconds by which the camera's clock is late, if you know them; the forces are then shifted by them."""
     apply_lag: bool = False

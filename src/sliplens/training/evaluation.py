@@ -18,7 +18,7 @@ from sliplens.markers.detect import get_kind
 from sliplens.markers.estimators import ESTIMATORS, get_estimator
 from sliplens.models import Run
 from sliplens.models.checkpoint import load, tell_each
-from sliplens.progress import OnProgress, stage, wrote
+from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset
 from sliplens.results.evaluation import Evaluation, Predictions, RegressionScores, Reliability
@@ -81,6 +81,9 @@ def evaluate(
     trials = data.select(split=split)
     for trial in trials:
         run.require_frame_size((trial.height, trial.width))
+    for words in dict.fromkeys(run.doubt(trial.sensor) for trial in trials):
+        if words is not None:
+            note(on_progress, words)
     plan = _plan_baselines(baselines, data, trials, count=baseline_trials, markers=markers) if baselines else None
     if out is None:
         with scratch_folder() as folder:

@@ -191,6 +191,11 @@ def estimate_friction(
     (normal,), (tangential,) = forces.tare_sigma_n(np.array([fit.time_s]))
     tare = np.hypot(tangential, fit.level * normal)
     low, high = np.quantile(fit.levels + rng.normal(0, float(tare / forces.normal_n[near].mean()), draws), _BAND)
+    if low <= 0:
+        raise RecordingError(
+            f"the slip at {fit.time_s:.2f} s tells a friction of {fit.level:.2g} with a 68 % interval from {low:.2g} "
+            f"to {high:.2g}, which is none; give the coefficient of friction by hand"
+        )
     early, late = np.quantile(fit.times_s, _BAND)
     return FrictionEstimate(
         mu=fit.level,

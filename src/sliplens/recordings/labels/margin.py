@@ -310,7 +310,7 @@ def _label_screened(
 ) -> FoundLabels:
     forces = screened.forces
     given = {"normal": settings.normal_axis, "sign": settings.normal_sign, "tare_n": settings.tare}
-    axes = infer_axes(forces, **given, touch_s=settings.contact_s)
+    axes = infer_axes(forces, **given, touch_s=settings.contact_s, drift_n_s=settings.drift_rate)
     contact = apply_axes(forces, axes)
     if not np.ptp(contact.tangential_n, axis=0).any():
         # a sensor that measures it has noise, a simulated pull changes
