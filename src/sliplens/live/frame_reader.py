@@ -2,16 +2,19 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from threading import Event
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
+from torch import Tensor
 
 from sliplens.errors import ImageError, InputError
 from sliplens.friction import FrictionLike, SlipLearner, as_friction
 from sliplens.live.contract import LiveSource
+from sliplens.live.health import HealthMonitor
 from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading
 from sliplens.markers import TrackedFrame, Tracker
 from sliplens.models.checkpoint import Run
@@ -92,8 +95,21 @@ class LowPass:
         return values
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Answers:
+    """What the network said of a frame."""
+
+    parts: tuple[Tensor, ...]
+    """As `Answers` gives them."""
+    encode_ms: float
+    network_ms: float
+
+
 class FrameReader:
     """Reads frames one after another, each against the untouched sensor; `read` is called in one thread.
+
+    The network runs beside the checks of the same frame, in a thread of its own, for as long as the frame before it had
+    a margin: what the checks then withhold was read in vain.
 
     Parameters are those of `LiveReader`; `on_reference` is called with each image of the untouched sensor.
     """
@@ -127,6 +143,8 @@ class FrameReader:
         self._slip: SlipWatch | None = None
         self._tracker: Tracker | None = None
         self._taker: _ReferenceTaker | None = None
+        self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
+        self._has_margin = False
         self._last: LiveFrame | None = None
         self._dropped = 0
 
@@ -142,6 +160,10 @@ class FrameReader:
                 f"{_in_pixels(self._size)}; name an image of this camera with --reference, or leave it out"
             )
         self._set_reference(reference)
+
+    def close(self) -> None:
+        """Read nothing more."""
+        self._beside.shutdown(wait=False, cancel_futures=True)
 
     def missing(self, why: str) -> Reading:
         """Reading where no frame came."""
@@ -177,6 +199,7 @@ class FrameReader:
         if self.reference is None:
             still = "the picture must be still for a moment: leave the sensor untouched"
             return self._withhold(begin, frame, f"there is no reference frame yet; {still}")
+        answers = self._beside.submit(self._ask, frame) if self._has_margin else None
         begun = time.perf_counter()
         followed = markers = None
         if self._tracker is not None and self._slip is not None:
@@ -196,23 +219,32 @@ class FrameReader:
             self._friction.update(frame.time_s, slipping_s=slipping_s, touches=touches)
         if self.network is None or withheld is not None:
             return self._withhold(reading, frame, withheld)
-        return self._estimate(reading, frame)
+        self._has_margin = True
+        answers = answers or self._beside.submit(self._ask, frame)
+        return self._estimate(reading, frame, answers.result())
 
     def _withhold(self, reading: Reading, frame: LiveFrame, why: str | None) -> Reading:
         self._smooth.forget()
+        self._has_margin = False
         latency = replace(reading.latency, decode_ms=frame.decode_ms, total_ms=_since_ms(frame.captured_s))
         return replace(reading, withheld=why, latency=latency)
 
-    def _estimate(self, reading: Reading, frame: LiveFrame) -> Reading:
+    def _ask(self, frame: LiveFrame) -> _Answers:
+        """Have the network read a frame."""
         assert self.network is not None
         assert self.engine is not None
         assert self.reference is not None
         begun = time.perf_counter()
         inputs = self.network.encode(frame.image[None], self.reference)
         encoded = time.perf_counter()
-        friction = None if self._friction is None else self._friction.friction
-        estimate = self.engine.estimate(self.network, inputs, friction=friction)
+        [parts] = self.engine.answers([inputs])
         done = time.perf_counter()
+        return _Answers(parts=parts, encode_ms=1e3 * (encoded - begun), network_ms=1e3 * (done - encoded))
+
+    def _estimate(self, reading: Reading, frame: LiveFrame, answers: _Answers) -> Reading:
+        assert self.network is not None
+        friction = None if self._friction is None else self._friction.friction
+        estimate = self.network.to_estimate(*answers.parts, friction=friction)
         ratio = None if estimate.ratio is None else float(estimate.ratio.mean[0])
         if self._friction is not None and ratio is not None and estimate.ratio is not None:
             self._friction.note(ratio, sigma=float(estimate.ratio.sigma[0]), time_s=frame.time_s)
@@ -233,8 +265,8 @@ class FrameReader:
             lag_s=self._smooth.time_constant_s,
             latency=replace(
                 reading.latency,
-                encode_ms=1e3 * (encoded - begun),
-                network_ms=1e3 * (done - encoded),
+                encode_ms=answers.encode_ms,
+                network_ms=answers.network_ms,
                 total_ms=_since_ms(frame.captured_s),
             ),
         )
@@ -251,6 +283,8 @@ class FrameReader:
         self._on_reference(image)
         self.reference = image
         self._health = None if self._make_health is None else self._make_health(image, self.network)
+        if isinstance(self._health, HealthMonitor):
+            self._health.beside = self._beside
         self._begin_anew()
 
     def _begin_anew(self) -> None:

@@ -189,6 +189,7 @@ class LiveReader:
         if self._threads:
             raise InputError("a reader reads once; make another one of the same source")
         with ExitStack() as stack:
+            stack.callback(self._reader.close)
             stack.callback(self._end_outputs)
             stack.enter_context(self.source)
             if self._forces is not None:
