@@ -11,6 +11,7 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 from jaxtyping import Float
+from threadpoolctl import threadpool_limits
 
 from sliplens.errors import InputError, RecordingError, SourceError
 from sliplens.friction import FrictionLike
@@ -45,7 +46,8 @@ class LiveReader:
     """Readings of a running sensor; a context manager that captures and reads while it is entered.
 
     One thread captures and one reads, with a place for the newest frame only between them: a network that is slower
-    than the camera drops frames, counts them, and never lags behind.
+    than the camera drops frames, counts them, and never lags behind. While it is entered, NumPy's matrices are worked on
+    by one thread, in the whole process.
 
     Parameters
     ----------
@@ -189,6 +191,9 @@ class LiveReader:
         if self._threads:
             raise InputError("a reader reads once; make another one of the same source")
         with ExitStack() as stack:
+            # its threads spin while they wait for each other: a matrix of markers then takes ten times as long on cores
+            # that something else uses too, and the network runs beside it
+            stack.enter_context(threadpool_limits(1, user_api="blas"))
             stack.callback(self._reader.close)
             stack.callback(self._end_outputs)
             stack.enter_context(self.source)
