@@ -8,8 +8,8 @@
 headless Chromium beside it draws the page (`--page browser`); `p99_ms_with_maps` is the same while the page shows maps,
 twice a second. `drops` are frames that were never read, `memory_growth_mb` how much more memory the process holds at
 the end than after the first 10 seconds (or a tenth of a shorter run). `of_it_ms` says where the time of the slowest
-hundredth went, on average, checks and network side by side: `waiting` is what neither took, `gc_ms` the longest pause of
-Python's garbage collector.
+hundredth went, on average, checks and network side by side: `waiting` is what neither took, `gc_ms` the longest pause
+of Python's garbage collector.
 """
 
 import argparse

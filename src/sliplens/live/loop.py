@@ -46,8 +46,8 @@ class LiveReader:
     """Readings of a running sensor; a context manager that captures and reads while it is entered.
 
     One thread captures and one reads, with a place for the newest frame only between them: a network that is slower
-    than the camera drops frames, counts them, and never lags behind. While it is entered, NumPy's matrices are worked on
-    by one thread, in the whole process.
+    than the camera drops frames, counts them, and never lags behind. While it is entered, NumPy's matrices have one
+    thread, in the whole process.
 
     Parameters
     ----------
