@@ -138,7 +138,10 @@ def list_images(folder: Path) -> list[Path]:
         If the folder is missing, or holds no image.
     """
     require_folder(folder, what="the image folder")
-    found = [path for path in folder.iterdir() if is_image(path)]
+    found = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+    for path in found:
+        # without a frame that is a dead link, all that follow would be taken for earlier ones
+        require_image(path)
     if not found:
         raise InputError(f"{folder} holds no image (looked for {', '.join(sorted(IMAGE_SUFFIXES))}); check the path")
     return sorted(found, key=lambda path: natural_key(path.name))

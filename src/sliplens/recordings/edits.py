@@ -56,7 +56,7 @@ def read_edits(folder: Path) -> tuple[Edit, ...]:
         If a line of the file is damaged.
     """
     path = folder / EDITS_FILE
-    if not path.exists():
+    if not path.exists() and not path.is_symlink():
         return ()
     require_file(path, most=MOST_TEXT)
     edits = []

@@ -74,7 +74,9 @@ def load_results(workspace: Path) -> Results:
         If the folder is missing or holds no result, or a file in it is malformed.
     """
     require_folder(workspace, what="the workspace")
-    folders = sorted(path.parent for path in workspace.glob(f"*/{RUN_FILE}") if not path.parent.name.startswith("."))
+    inside = sorted(path for path in workspace.iterdir() if path.is_dir() and not path.name.startswith("."))
+    # a link that leads nowhere is no folder without a result
+    folders = [path for path in inside if (path / RUN_FILE).exists() or (path / RUN_FILE).is_symlink()]
     runs = {folder: load_record(folder / RUN_FILE, Provenance, command="sliplens") for folder in folders}
     # last finished last, so that it replaces the earlier ones
     runs = dict(sorted(runs.items(), key=lambda item: item[1].finished))

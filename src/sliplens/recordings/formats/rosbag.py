@@ -21,6 +21,7 @@ from PIL import Image
 
 from sliplens.errors import RecordingError, SliplensError
 from sliplens.extras import require_packages
+from sliplens.files import require_file
 from sliplens.images import telling_damage
 from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.formats.images import open_encoded, rgb_pixels
@@ -249,8 +250,10 @@ def open_bag(path: Path) -> Iterator["Reader"]:
     """Open a bag to read it, as `bag_topics` and `bag_messages` do; they tell of its errors."""
     require_packages("rosbags", extra="ros", purpose="a ROS 2 bag")
     _require_bag(path)
-    for file in path.glob("*.db3") if path.is_dir() else [path]:
-        _require_whole_pages(file)
+    for file in [file for file in path.iterdir() if file.suffix in _STORAGE] if path.is_dir() else [path]:
+        require_file(file)
+        if file.suffix == ".db3":
+            _require_whole_pages(file)
     try:
         with bounded_reader()(path) as bag:
             yield bag

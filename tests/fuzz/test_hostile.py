@@ -1,0 +1,197 @@
+"""A slice of the hostile inputs of every format (`make fuzz` runs them all), and what was once let in."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hostile import FORMATS, IMPOSSIBLE, Input, claim_size, inputs, outcome
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sliplens.codec import COLUMN_KINDS, from_builtins, open_parquet
+from sliplens.errors import ImageError, InputError, RecordingError, SliplensError
+from sliplens.files import parse_json, require_file
+from sliplens.friction import MOST_FRICTION, Friction
+from sliplens.images import read_image, write_png
+from sliplens.progress import visible
+from sliplens.recordings.capture import Forces
+from sliplens.recordings.labelling import FrictionEstimate
+from sliplens.recordings.labels.axes import middles
+from sliplens.recordings.options import LIMITS, ReadOptions
+from sliplens.recordings.sensor import SensorProfile
+from sliplens.recordings.source import open_source
+
+SLOW = {"network", "weights", "forces", "manifest", "arrays", "tables", "stages"}
+"""Formats whose readings take long; of these a few inputs are enough here."""
+
+KNOWN = {("tables", "infinity"), ("tables", "1e56"), ("tables", "-1e9")}
+"""Let in though wrong: of a number in a result only a hash could tell that no stage wrote it."""
+
+
+def some() -> list[Input]:
+    drawn = [one for one in inputs(600, seed=3) if one.seed == 3]
+    quick = [one for one in drawn if one.format not in SLOW][:24]
+    return quick + [one for name in sorted(SLOW) for one in [one for one in drawn if one.format == name][:1]]
+
+
+@pytest.fixture(scope="session")
+def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("originals")
+
+
+@pytest.mark.parametrize("one", some(), ids=lambda one: f"{one.format}-{one.change}")
+def test_a_hostile_input_is_refused_in_a_sentence_or_read_as_it_is(one: Input, originals: Path, tmp_path: Path):
+    kind, said = outcome(one, originals, tmp_path / "input")
+    assert kind in {"refused", "same", "accepted"} or (one.format, one.change) in KNOWN, said
+
+
+def test_every_change_of_every_format_comes_before_any_comes_again():
+    pairs = sum(len(kind.changes) for kind in FORMATS.values())
+    drawn = list(inputs(pairs + 1, seed=5))
+    assert len({(one.format, one.change) for one in drawn}) == pairs
+    assert drawn[-1].seed == 6
+    assert {change for kind in FORMATS.values() for change in kind.changes} >= IMPOSSIBLE
+
+
+JSON_VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=40)
+@given(JSON_VALUES)
+def test_json_is_a_record_or_a_sentence(value: object):
+    text = json.dumps(value)
+    try:
+        estimate = from_builtins(
+            parse_json(text, where="a file", cure="mend it"), FrictionEstimate, where="a file", command="sliplens label"
+        )
+    except SliplensError as error:
+        told = str(error)
+        assert told.startswith(("a file ", "a file:"))
+        assert "\n" not in told
+    else:
+        assert 0 < estimate.low <= estimate.mu <= estimate.high
+
+
+@given(st.binary(max_size=60))
+def test_bytes_are_json_or_a_sentence(data: bytes):
+    try:
+        expected = json.loads(data.decode(), parse_constant=float)
+    except (ValueError, RecursionError):
+        expected = None
+    try:
+        assert parse_json(data, where="a file", cure="mend it") == expected
+    except InputError as error:
+        told = str(error)
+        assert told.startswith("a file")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[" * 65 + "]" * 65, "nests more than 64 deep"),
+        ("[" * 100_000, "is not valid JSON"),
+        ("9" * 5000, "is not valid JSON|64 bits"),
+        (f'{{"a": [{2**64}]}}', "64 bits"),
+        ("NaN", "is not valid JSON"),
+        ("1e999", "is not valid JSON"),
+    ],
+)
+def test_json_that_nothing_of_ours_holds_is_refused(text: str, said: str):
+    with pytest.raises(InputError, match=said):
+        parse_json(text, where="a file", cure="mend it")
+    assert parse_json("[" * 63 + "]" * 63, where="a file", cure="mend it")
+    assert parse_json(str(2**64 - 1), where="a file", cure="mend it") == 2**64 - 1
+
+
+def test_whatever_is_no_file_is_not_opened(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "loop").symlink_to("loop")
+    for name in ("pipe", ".", "loop", "nothing", "x" * 300, "a\0b"):
+        with pytest.raises(InputError, match="; name another"):
+            require_file(tmp_path / name, missing="name another")
+    (tmp_path / "file").write_bytes(b"123")
+    assert require_file(tmp_path / "file") == 3
+    with pytest.raises(InputError, match="has 3 bytes, and no such file has more than 2"):
+        require_file(tmp_path / "file", most=2)
+
+
+def test_a_kind_of_column_is_what_its_words_say():
+    kinds = {"numbers": pa.float32(), "whole numbers": pa.int8(), "texts": pa.string(), "bytes": pa.binary()}
+    for words, kind in kinds.items():
+        fitting = {name for name, fits in COLUMN_KINDS.items() if fits(kind)} - {"values"}
+        assert fitting == {words} | ({"numbers"} if words == "whole numbers" else set())
+
+
+def test_a_small_table_that_claims_to_be_large_is_not_read(tmp_path: Path):
+    once = pa.DictionaryArray.from_arrays(np.zeros(50_000, dtype=np.int32), ["x" * 100_000])
+    pq.write_table(pa.table({"x": once}), tmp_path / "x.parquet", compression="zstd", store_schema=False)
+    assert (tmp_path / "x.parquet").stat().st_size < 10_000
+    with pytest.raises(InputError, match=r"claims 50,000 rows"):
+        open_parquet(tmp_path / "x.parquet", {"x": "texts"}, cure="mend it")
+
+
+def test_no_picture_is_opened_that_no_camera_takes(tmp_path: Path):
+    write_png(tmp_path / "x.png", np.zeros((4, 4, 3), dtype=np.uint8))
+    claim_size(tmp_path / "x.png", (10_001, 10_000))
+    with pytest.raises(ImageError, match="10001 x 10000 pixels are more than any camera has"):
+        read_image(tmp_path / "x.png")
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_a_recording_beyond_a_limit_is_told_and_let_in_by_name(name: str, tmp_path: Path, monkeypatch):
+    (tmp_path / "cup").mkdir()
+    for index in range(3):
+        write_png(tmp_path / "cup" / f"{index}.png", np.zeros((4, 5, 3), dtype=np.uint8))
+    lines = [f"{0.5 * row},0,0,{row}" for row in range(4)]
+    (tmp_path / "forces.csv").write_text("\n".join(["time_s,fx,fy,fz", *lines]))
+    options = {"frame_rate": 1.0, "forces": tmp_path / "forces.csv"}
+    least = {"frames": 3, "pixels": 20, "samples": 4, "span": 2}[name]
+    monkeypatch.setitem(LIMITS, name, least)
+    assert open_source(tmp_path / "cup", options=ReadOptions(**options))
+    monkeypatch.setitem(LIMITS, name, least - 1)
+    with pytest.raises(RecordingError, match=rf"more than the {least - 1} that are usual.*--allow-large {name}"):
+        open_source(tmp_path / "cup", options=ReadOptions(**options))
+    assert open_source(tmp_path / "cup", options=ReadOptions(**options, allow_large=(name,)))
+
+
+def test_windows_over_a_gap_are_as_many_as_samples_fill():
+    time = np.concatenate([np.arange(0, 1, 0.01), 1e9 + np.arange(0, 1, 0.01)])
+    assert len(middles(time, 0.0, time[-1], width_s=0.03)) < 80
+    assert np.array_equal(middles(time[:100], 0.0, 1.0, width_s=0.03), np.arange(0.015, 1.0, 0.03))
+
+
+def test_friction_of_nothing_that_slides_is_refused():
+    for value in (1e56, MOST_FRICTION * 1.01, 0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(InputError, match="coefficient of friction"):
+            Friction(value)
+        with pytest.raises(RecordingError, match="coefficient of friction"):
+            FrictionEstimate(mu=value, low=value, high=value)
+    assert Friction(MOST_FRICTION).mean == pytest.approx(MOST_FRICTION)
+
+
+def test_a_time_that_is_no_number_is_refused():
+    for time in ([0.0, np.inf], [0.0, np.nan]):
+        with pytest.raises(RecordingError, match=r"sample 1 is (inf|nan), no number"):
+            Forces(time_s=np.array(time), force_n=np.zeros((2, 3)), source="forces.csv")
+
+
+@given(st.text(max_size=30))
+def test_a_terminal_obeys_nothing_of_a_file(text: str):
+    shown = visible(text)
+    assert not {one for one in shown if ord(one) < 32 or 127 <= ord(one) < 160} - {"\t", "\n"}
+    assert visible(shown) == shown
+    if text.isprintable():
+        assert shown == text
+
+
+def test_a_profile_may_name_no_file_elsewhere():
+    with pytest.raises(ValueError, match="name has letters"):
+        SensorProfile(name="../tip")
