@@ -240,8 +240,8 @@ def test_what_is_told_of_friction_shapes_the_margin_and_a_slip_narrows_it(
     )
     readings = source.all_readings(reader)
     estimates = [network.estimate(network.encode(frame[None], trial.reference)) for frame in trial.frames[10:14]]
-    ratios = [one.ratio for one in estimates]
-    assert all(one is not None for one in ratios)
+    ratios = [one.ratio for one in estimates if one.ratio is not None]
+    assert len(ratios) == 4
     assert [reading.ratio for reading in readings] == pytest.approx([float(one.mean[0]) for one in ratios], abs=1e-4)
     # the slip that the fourth frame tells began 0.06 s before it, after the second
     learnt = told.update(float(ratios[1].mean[0]), float(ratios[1].sigma[0]))
