@@ -2,14 +2,13 @@
 
 from collections import deque
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from sliplens.errors import InputError
 from sliplens.live.reading import MarkerReading, SlipState
-from sliplens.markers.estimators import FieldTrial, affine_parts, displacement_entropy, rigid_residual, stick_area
+from sliplens.markers.estimators import FieldTrial, affine_parts, stick_area
 
 Field = Float[np.ndarray, "markers 2"]
 
@@ -17,10 +16,10 @@ _FEWEST = 6
 """Markers of the contact without which no motion of it can be told."""
 _LEAST_NOISE_PX = 0.02
 """Of compressed video, whose frames repeat, the noise cannot be seen."""
-_ENTROPY_NOISE_PX = 0.1
-"""Noise of a marker for which the bins of `displacement_entropy` are wide enough."""
 _REPRESSED = 1 / 0.75
 _LET_GO = 0.3
+_BENT_SHARE = 0.1
+"""Of what the pattern lets expect; skin that springs back is more rigid than it was sheared."""
 _RAYLEIGH_95 = 2.45
 """95 % of the lengths of two-dimensional normal noise are below so many standard deviations."""
 
@@ -38,12 +37,12 @@ class SlipLimits:
     """Frames that this takes at least."""
     window_s: float = 0.1
     """Longest time over which a motion is looked at, in seconds."""
+    pattern_s: float = 0.4
+    """Time over which the pattern of the shear is averaged, in seconds."""
     recoil: float = 4.0
-    """Motion of the contact's middle against its shear."""
-    evidence: float = 3.0
-    """Dong's rigid residual, and the entropy of the motion, over what is usual."""
-    moving_share: float = 0.9
-    """Share of markers below which the contact no longer moves as one."""
+    """Motion of the skin against that pattern."""
+    evidence: float = 0.5
+    """The same, of what no rigid motion explains (Dong's residual)."""
     hold_s: float = 0.25
     """Time for which a slip that was seen is told, in seconds."""
 
@@ -55,14 +54,12 @@ class SlipLimits:
 
 @dataclass(frozen=True, kw_only=True)
 class _Usual:
-    """What the still sensor showed."""
+    """What the still sensor showed, in pixels."""
 
     noise_px: float
     """Standard deviation of a coordinate of a marker."""
-    residual_px: float
-    residual_sigma: float
-    entropy: float
-    entropy_sigma: float
+    together_px: float
+    """The same, were all their motion that of the markers as a whole: more than `noise_px` where a camera trembles."""
 
     @property
     def step_px(self) -> float:
@@ -74,10 +71,12 @@ class SlipDetector:
     """Says of each frame whether the contact slips as a whole, from the motion of its markers.
 
     When a contact slips, friction falls from its static to its kinetic value and the stretched skin springs back
-    against the pull, middle first, within some hundredths of a second. So a slip is told where the middle of the
-    contact moves back against its shear while it is pressed as before, and where two of three say that the skin does
-    not move as one: Dong's residual from a rigid motion, Sui's share of markers that move with the middle, and the
-    entropy of the motion. Each is compared with what the sensor showed in its first still moments.
+    against the pull within some hundredths of a second. So a slip is told where the markers move back along the pattern
+    in which they were sheared before, while the contact is pressed as before, and where what is left of that motion
+    besides the best rigid one still follows the pattern: a camera that moves takes all markers along. The pattern is
+    the mean shear of the last moments; projected on it, dozens of markers of a tenth of a pixel's noise tell a recoil
+    of a few hundredths. Old and new frames are told apart where they differ most, in units of what the sensor showed in
+    its first still moments.
 
     What it cannot tell: a contact that slides on evenly looks as one that holds, and one whose friction does not fall
     has no recoil; after a slip it says "cannot tell" until the shear grows again. A load that is taken away as fast as
@@ -98,9 +97,7 @@ class SlipDetector:
     References
     ----------
     Dong, Ma, Donlon and Rodriguez, *Maintaining Grasps within Slipping Bounds by Monitoring Incipient Slip*, ICRA 2019.
-    Sui et al., *Incipient Slip Detection Method for Soft Objects with Vision-Based Tactile Sensor*, Measurement 2022.
-    Hu et al., *Learning to Detect Slip through Tactile Estimation of the Contact Force Field and its Entropy*,
-    arXiv:2303.00935.
+    Page, *Continuous Inspection Schemes*, Biometrika 41 (1954), for a change told where it is most likely.
 
     Examples
     --------
@@ -119,7 +116,6 @@ class SlipDetector:
         self._reach_px = float(np.linalg.norm(rest_px - rest_px.mean(axis=0), axis=1).mean())
         self._still: list[tuple[float, Field]] = []
         self._usual: _Usual | None = None
-        self._before: deque[tuple[float, Field]] = deque()
         self._end_contact()
 
     def update(self, positions_px: Field, time_s: float, /) -> MarkerReading:
@@ -132,9 +128,6 @@ class SlipDetector:
             self._end_contact()
             return MarkerReading(state=SlipState.CANNOT_TELL)
         reading = self._read(moved, time_s, self._usual)
-        self._before.append((time_s, moved))
-        while time_s - self._before[0][0] > self.limits.window_s:
-            self._before.popleft()
         return reading
 
     def _read(self, moved: Field, time_s: float, usual: _Usual) -> MarkerReading:
@@ -146,10 +139,10 @@ class SlipDetector:
             self._set_hold(moved, spread, time_s)
         assert self._hold is not None
         trial = self._trial(self._hold, moved - self._hold)
-        shear = self._shear(moved)
-        length = float(np.linalg.norm(shear))
+        length = float(np.linalg.norm(self._shear(moved)))
         share = stick_area(trial, tolerance_px=usual.step_px)[1, 0]
-        began_s = self._find_recoil(moved, spread, usual)
+        self._remember(moved - self._hold, spread, time_s)
+        began_s = self._find_recoil(usual)
         if began_s is not None:
             self._slip_s = began_s if self._slip_s is None else self._slip_s
             self._seen_s, self._least_px = time_s, length
@@ -178,24 +171,13 @@ class SlipDetector:
         limits = self.limits
         if time_s - self._still[0][0] < limits.still_s or len(self._still) < limits.still_frames:
             return
-        fields = np.stack([field for _, field in self._still])
+        steps = np.diff(np.stack([field for _, field in self._still]), axis=0)
         # of differences, and their median: creep and a touch that begins count little
-        step_px = np.nanmedian(np.abs(np.diff(fields, axis=0)))
-        noise_px = max(float(step_px) / 0.6745 / np.sqrt(2), _LEAST_NOISE_PX)
-        steps = [
-            (rigid_residual(trial)[1, 1], self._entropy(trial, noise_px))
-            for trial in (self._trial(0 * a, b - a) for a, b in pairwise(fields))
-        ]
-        middle = np.nanmedian(steps, axis=0)
-        sigma = np.nanmedian(np.abs(np.array(steps) - middle), axis=0) / 0.6745
-        # so few frames tell the spread to a fifth at best, and none of video that repeats
-        self._usual = _Usual(
-            noise_px=noise_px,
-            residual_px=float(middle[0]),
-            residual_sigma=float(max(sigma[0], 0.1 * noise_px)),
-            entropy=float(middle[1]),
-            entropy_sigma=float(max(sigma[1], 0.05)),
+        single, together = (
+            max(float(np.nanmedian(np.abs(part))) / 0.6745 / np.sqrt(2), _LEAST_NOISE_PX)
+            for part in (steps, np.nanmean(steps, axis=1) * np.sqrt(np.isfinite(moved[:, 0]).sum()))
         )
+        self._usual = _Usual(noise_px=single, together_px=max(single, together))
         self._still = []
 
     def _touches(self, moved: Field, spread: float, usual: _Usual) -> bool:
@@ -214,6 +196,8 @@ class SlipDetector:
 
     def _set_hold(self, moved: Field, spread: float, time_s: float) -> None:
         self._hold, self._pressed, self._hold_s = moved, spread, time_s
+        self._pattern = None
+        self._window.clear()
         trial = self._trial(moved, 0 * moved)
         self._inner = trial.inner & np.isfinite(moved[:, 0])
         if self._inner.sum() < 2:
@@ -223,17 +207,15 @@ class SlipDetector:
         self._hold: Field | None = None
         self._inner: Bool[np.ndarray, " markers"] = np.ones(len(self._rest), dtype=bool)
         self._pressed = self._hold_s = self._seen_s = 0.0
+        self._window: deque[tuple[float, float, Field]] = deque()
+        """Time, spread and motion since the press of the last frames."""
+        self._pattern: Field | None = None
         self._slip_s: float | None = None
         self._least_px = np.inf
 
     def _trial(self, pressed: Field, since: Field) -> FieldTrial:
         """Two frames for the estimators: the pressed contact, and some motion since."""
         return FieldTrial(rest_px=self._rest, displacement_px=np.stack([pressed, pressed + since]), hold=0)
-
-    def _entropy(self, trial: FieldTrial, noise_px: float) -> float:
-        scale = _ENTROPY_NOISE_PX / noise_px
-        scaled = FieldTrial(rest_px=self._rest, displacement_px=scale * trial.displacement_px, hold=0)
-        return float(displacement_entropy(scaled)[1, 0])
 
     def _middle_noise_px(self, usual: _Usual) -> float:
         """Noise of a difference of two means over the contact's middle."""
@@ -245,33 +227,55 @@ class SlipDetector:
         known = np.isfinite(since[:, 0])
         return since[known].mean(axis=0) if known.any() else np.full(2, np.nan)
 
-    def _find_recoil(self, moved: Field, spread: float, usual: _Usual) -> float | None:
-        """Time at which the middle began to spring back; None where it did not, or where that tells no slip."""
-        assert self._hold is not None
-        least_px = self.limits.recoil * self._middle_noise_px(usual)
-        now, best_px, start = self._shear(moved), least_px, None
-        for time_s, field in self._before:
-            if time_s < self._hold_s:
-                continue
-            then = self._shear(field)
-            length = float(np.linalg.norm(then))
-            back_px = float((then - now) @ then) / length if length > least_px else 0.0
-            if back_px > best_px:
-                best_px, start = back_px, (time_s, field)
-        if start is None:
+    def _remember(self, sheared: Field, spread: float, time_s: float) -> None:
+        """Take a frame into the window; those that leave it make the pattern."""
+        self._window.append((time_s, spread, sheared))
+        while time_s - self._window[0][0] > self.limits.window_s:
+            left_s, _, field = self._window.popleft()
+            if self._pattern is None:
+                self._pattern = field
+            # a marker that was not seen keeps what it had
+            share = -np.expm1(-(self._window[0][0] - left_s) / self.limits.pattern_s)
+            step = share * (field - self._pattern)
+            self._pattern = np.where(np.isfinite(self._pattern), self._pattern + np.nan_to_num(step), field)
+
+    def _find_recoil(self, usual: _Usual) -> float | None:
+        """Time at which the skin began to spring back; None where it did not, or where that tells no slip."""
+        if self._pattern is None or len(self._window) < 2:
             return None
-        began_s, field = start
-        pressed_px = abs(spread - affine_parts(self._rest, field[None])[0, 2]) / 2 * self._reach_px
-        if not pressed_px < best_px:
+        fields = np.stack([field for *_, field in self._window])
+        known = np.isfinite(fields[..., 0]).all(axis=0) & np.isfinite(self._pattern[:, 0])
+        pattern = self._pattern[known]
+        length = float(np.linalg.norm(pattern))
+        if known.sum() < _FEWEST or length < 2 * self.limits.recoil * usual.together_px:
+            return None  # of so little shear the pattern is noise
+        pattern = pattern.ravel() / length
+        rigid = _rigid_motions(self._rest[known])
+        bent = pattern - rigid.T @ (rigid @ pattern)
+        left = max(float(np.linalg.norm(bent)), 1e-9)
+        directions = np.stack([pattern, bent / left], axis=1)
+        heights = fields[:, known].reshape(len(fields), -1) @ directions
+        old = np.arange(1, len(fields))[:, None]
+        total = np.cumsum(heights, axis=0)
+        drop_px = total[:-1] / old - (total[-1] - total[:-1]) / (len(fields) - old)
+        ratio = drop_px / np.sqrt(1 / old + 1 / (len(fields) - old)) / [usual.together_px, usual.noise_px]
+        cut = int(ratio[:, 0].argmax())
+        whole, bending = ratio[cut].tolist()
+        # a large motion must show more than noise that happens to bend
+        if whole < self.limits.recoil or bending < max(self.limits.evidence, _BENT_SHARE * left * whole):
+            return None
+        spreads = np.array([spread for _, spread, _ in self._window])
+        pressed = abs(float(spreads[: cut + 1].mean() - spreads[cut + 1 :].mean()))
+        if pressed / 2 * self._reach_px > drop_px[cut, 0] / np.sqrt(known.sum()):
             return None  # let go, or pressed further
-        trial = self._trial(self._hold, moved - field)
-        residual = float(rigid_residual(trial)[1, 1])
-        votes = (
-            residual > usual.residual_px + self.limits.evidence * usual.residual_sigma,
-            float(stick_area(trial, tolerance_px=usual.step_px)[1, 0]) < self.limits.moving_share,
-            self._entropy(trial, usual.noise_px) > usual.entropy + self.limits.evidence * usual.entropy_sigma,
-        )
-        return began_s if sum(votes) >= 2 else None
+        return self._window[cut][0]
+
+
+def _rigid_motions(places_px: Field) -> Float[np.ndarray, "3 coordinates"]:
+    """Two shifts and a turn of some markers, as unit vectors that are orthogonal to each other."""
+    arm = places_px - places_px.mean(axis=0)
+    motions = [np.full_like(arm, [1.0, 0.0]), np.full_like(arm, [0.0, 1.0]), np.stack([-arm[:, 1], arm[:, 0]], axis=1)]
+    return np.stack([motion.ravel() / max(float(np.linalg.norm(motion)), 1e-9) for motion in motions])
 
 
 __all__ = ["SlipDetector", "SlipLimits"]
