@@ -2,11 +2,19 @@
 
 Each frame in contact of unseen days and sensors is read as it is, and with each fault in each strength; faults of
 camera and light are there since before the touch. A margin is off
-where it errs by more than 0.2; without contact there is none, so any answer counts as off. `auroc` ranks all these
-frames by how far their worst check is from its limit; `withheld_healthy` is the share of the frames without a fault
-whose margin is withheld. With --choose the quantiles of healthy values on validation trials are printed, from which
-the limits were chosen; with --fit a folder's network gets its novelty from such trials. Choice, fit and test share no
-day and no sensor.
+where it errs by more than 0.2; without contact there is none, so any answer counts as off.
+
+`auroc` ranks all these frames by `margin_risk`, in which all checks and the network's own spread are one number, and
+`auroc_worst` by how far their worst check is from its limit. Two numbers say what can be reached. `auroc_told` is that
+of somebody who is told each fault and its strength, and ranks by how often it put the margins of the other trials off:
+a fault that leaves half of the margins right cannot be ranked better, however well it is seen. And a frame that is off
+without any fault is no matter of health: `auroc_caused` leaves out the frames that are off without the fault too.
+`seen_by_health` and `seen_by_network` are AUROCs of each fault against frames without one, by the worst check and by
+`Estimate.known` alone. `withheld_healthy` is the share of the frames without a fault whose margin is withheld.
+
+With --choose, on other days and sensors, the quantiles of healthy values are printed, from which the limits were
+chosen, and the numbers of `margin_risk`; with --fit networks get their novelty, from simulated trials or those they
+were trained on. Choice, fit and test share no day and no sensor.
 """
 
 import argparse
@@ -18,19 +26,21 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.optimize import minimize
 
 from sliplens.codec import load_record, save_record
-from sliplens.live import HealthMonitor, LiveFrame
-from sliplens.live.health import severity
+from sliplens.live import Check, HealthMonitor, LiveFrame
+from sliplens.live.health import OFF, margin_risk, severity
 from sliplens.markers import Tracker
 from sliplens.models import Run, load
 from sliplens.models.checkpoint import MANIFEST_FILE, Manifest
 from sliplens.models.novelty import fit_novelty
+from sliplens.recordings.dataset import load_dataset
 from sliplens.simulation import TrialPlan, make_recipe, plan_trials
 from sliplens.simulation.filming import Film
 from sliplens.simulation.trials import prepare_trial
+from sliplens.training.metrics import auroc, risk_coverage
 
-OFF = 0.2
 Fault = Callable[[np.ndarray, float, np.random.Generator], np.ndarray]
 
 
@@ -38,13 +48,32 @@ Fault = Callable[[np.ndarray, float, np.random.Generator], np.ndarray]
 class Case:
     """One frame, and what was said of it."""
 
+    trial: int
     fault: str
     strength: float
     error: float
     """Of the margin, infinite without contact."""
-    severity: float
-    failed: tuple[str, ...]
-    """Checks that were not fine."""
+    healthy_error: float
+    """Of the same frame without the fault; infinite where there is none."""
+    checks: tuple[Check, ...]
+    beyond: float
+    """What the network gives for an error above 0.2."""
+    known: float
+
+    @property
+    def failed(self) -> tuple[str, ...]:
+        """Checks that were not fine."""
+        return tuple(check.name for check in self.checks if not check.ok)
+
+    @property
+    def worst(self) -> float:
+        """How far the worst check is from its limit."""
+        return max(map(severity, self.checks))
+
+    @property
+    def name(self) -> str:
+        """Fault with its strength."""
+        return f"{self.fault} {self.strength:g}".removesuffix(" 0")
 
 
 def defocus(image: np.ndarray, sigma_px: float, rng: np.random.Generator) -> np.ndarray:
@@ -93,9 +122,9 @@ def plan_some(series: str, trials: int, *, sensor: str | None = None) -> list[Tr
 
 
 def touching(margins: np.ndarray, count: int) -> np.ndarray:
-    """Some frames in contact, evenly spread."""
+    """Some frames in contact, evenly spread: the middles of as many parts."""
     frames = np.flatnonzero(np.isfinite(margins))
-    return frames[np.linspace(0, len(frames) - 1, count).round().astype(int)]
+    return frames[((np.arange(count) + 0.5) / count * len(frames)).astype(int)]
 
 
 def draw(film: Film, frame: int) -> np.ndarray:
@@ -113,8 +142,8 @@ def hide_markers(film: Film, share: float, rng: np.random.Generator) -> Film:
 class Judge:
     """Reads frames of one trial, and asks for their health."""
 
-    def __init__(self, run: Run, reference: np.ndarray) -> None:
-        self._run, self._reference = run, reference
+    def __init__(self, run: Run, reference: np.ndarray, *, trial: int) -> None:
+        self._run, self._reference, self._trial = run, reference, trial
 
     def say(
         self,
@@ -125,7 +154,8 @@ class Judge:
         strength: float = 0.0,
         held_s: float = 0.0,
         before: np.ndarray | None = None,
-    ) -> tuple[Case, dict[str, float]]:
+        healthy_error: float = np.inf,
+    ) -> Case:
         """Read one frame; `held_s`: time for which it has been the same; `before`: the untouched sensor as it was seen
         last.
         """
@@ -139,72 +169,97 @@ class Judge:
             checks = monitor.check(
                 LiveFrame(image=pixels, number=0, time_s=time_s, captured_s=0.0), tracker.update(pixels)
             )
-        said = float(np.clip(self._run.predict(self._run.encode(pixels[None], self._reference))[0], 0, 1))
-        error = abs(said - margin) if np.isfinite(margin) else np.inf
-        failed = tuple(check.name for check in checks if not check.ok)
-        case = Case(fault=fault, strength=strength, error=error, severity=severity(checks), failed=failed)
-        return case, {check.name: check.value for check in checks}
+        estimate = self._run.estimate(self._run.encode(pixels[None], self._reference))
+        error = abs(float(np.clip(estimate.margin[0], 0, 1)) - margin) if np.isfinite(margin) else np.inf
+        return Case(
+            trial=self._trial, fault=fault, strength=strength, error=error, checks=checks,
+            healthy_error=error if fault == "none" else healthy_error,
+            beyond=float(estimate.beyond(OFF)[0]), known=1.0 if estimate.known is None else float(estimate.known[0]),
+        )  # fmt: skip
 
 
-def judge_trial(run: Run, plan: TrialPlan, *, frames: int, other: TrialPlan, healthy: bool) -> Iterator[tuple]:
-    """All cases of one trial; those without a fault alone if `healthy`."""
+def judge_trial(run: Run, plan: TrialPlan, *, trial: int, frames: int, other: TrialPlan) -> Iterator[Case]:
+    """All cases of one trial."""
     rng = np.random.default_rng(plan.seed)
     loading, film = prepare_trial(plan)
-    judge, margins = Judge(run, film.draw_reference().numpy()), loading.safety_margin
+    judge, margins = Judge(run, film.draw_reference().numpy(), trial=trial), loading.safety_margin
     # the reference's own noise would be shared
     untouched = draw(film, 0)
-    chosen = touching(margins, frames)
+    chosen, healthy = touching(margins, frames), {}
     for at in chosen:
         image, margin = draw(film, at), float(margins[at])
-        yield judge.say(image, margin)
-        if healthy:
-            continue
+        as_it_is = judge.say(image, margin)
+        healthy[at] = as_it_is.error
+        yield as_it_is
         for fault, (make, strengths) in FAULTS.items():
             for strength in strengths:
                 seed = int(rng.integers(2**32))
                 there, free = (make(one, strength, np.random.default_rng(seed)) for one in (image, untouched))
-                yield judge.say(there, margin, fault=fault, strength=strength, before=free)
+                yield judge.say(
+                    there, margin, fault=fault, strength=strength, before=free, healthy_error=as_it_is.error
+                )
         for share in (0.1, 0.2, 0.4):
             hidden = draw(hide_markers(film, share, rng), at)
-            yield judge.say(hidden, margin, fault="markers hidden", strength=share)
-    if healthy:
-        return
+            yield judge.say(hidden, margin, fault="markers hidden", strength=share, healthy_error=as_it_is.error)
     for later in (1, 2):  # the picture stays that of an earlier frame, for longer and longer
         for old, now in zip(chosen[:-later], chosen[later:], strict=True):
             held_s = float(loading.time_s[now] - loading.time_s[old])
-            yield judge.say(draw(film, old), float(margins[now]), fault="stale", strength=float(later), held_s=held_s)
+            yield judge.say(
+                draw(film, old), float(margins[now]), fault="stale", strength=float(later), held_s=held_s,
+                healthy_error=healthy[now],
+            )  # fmt: skip
     for at in np.flatnonzero(~np.isfinite(margins))[:2]:
-        yield judge.say(draw(film, at), np.nan, fault="no contact")
+        yield judge.say(draw(film, at), np.nan, fault="no contact", healthy_error=0.0)
     loading, film = prepare_trial(other)
-    judge = Judge(run, film.draw_reference().numpy())
+    judge = Judge(run, film.draw_reference().numpy(), trial=trial)
     for at in touching(loading.safety_margin, frames):
-        yield judge.say(draw(film, at), float(loading.safety_margin[at]), fault="another sensor")
+        yield judge.say(draw(film, at), float(loading.safety_margin[at]), fault="another sensor", healthy_error=0.0)
 
 
-def auroc(scores: np.ndarray, positive: np.ndarray) -> float:
-    """Chance that what is off ranks above what is not, ties counted half."""
-    above = scores[positive][:, None] - scores[~positive][None]
-    return float(np.mean((above > 0) + 0.5 * (above == 0)))
+def off_elsewhere(cases: list[Case], off: np.ndarray) -> np.ndarray:
+    """How often each case's fault and strength put the margins of the other trials off."""
+    names, trials = np.array([case.name for case in cases]), np.array([case.trial for case in cases])
+    shares = np.zeros(len(cases))
+    for name in set(names):
+        for trial in set(trials):
+            others = off[(names == name) & (trials != trial)]
+            shares[(names == name) & (trials == trial)] = others.mean() if len(others) else off.mean()
+    return shares
 
 
 def summarise(cases: list[Case]) -> dict[str, object]:
     """Ranking, withheld frames, by fault and strength, and the error of what is told as more is withheld."""
-    scores, off = np.array([case.severity for case in cases]), np.array([case.error > OFF for case in cases])
+    errors, off = np.array([case.error for case in cases]), np.array([case.error > OFF for case in cases])
+    risk = np.array([margin_risk(case.checks, case.beyond) for case in cases])
+    worst, known = np.array([case.worst for case in cases]), np.array([case.known for case in cases])
+    told = off_elsewhere(cases, off)
+    caused = off & np.array([case.healthy_error <= OFF for case in cases])
     by_fault: dict[str, list[Case]] = defaultdict(list)
     for case in cases:
-        by_fault[f"{case.fault} {case.strength:g}".removesuffix(" 0")].append(case)
-    touched = np.array([np.isfinite(case.error) for case in cases])
-    errors, order = np.array([case.error for case in cases]), np.argsort(scores)
-    order = order[touched[order]]
-    shares = (0.0, 0.2, 0.4, 0.6, 0.8)
-    healthy = by_fault["none"]
+        by_fault[case.name].append(case)
+    kinds = np.array([case.fault for case in cases])
+    healthy, faults = kinds == "none", sorted(set(kinds) - {"none"})
+    touched = np.isfinite(errors)
+    kept = risk_coverage(errors[touched], {"risk": -risk[touched]})
+    bands = np.digitize(risk, np.linspace(0, 1, 6)[1:-1])
     return {
-        "auroc": auroc(scores, off),
-        "withheld_healthy": float(np.mean([bool(case.failed) for case in healthy])),
-        "healthy_off": float(np.mean([case.error > OFF for case in healthy])),
+        "auroc": auroc(risk[off], risk[~off]),
+        "auroc_worst": auroc(worst[off], worst[~off]),
+        "auroc_told": auroc(told[off], told[~off]),
+        "auroc_caused": auroc(risk[caused], risk[~off]),
+        "seen_by_health": {name: auroc(worst[kinds == name], worst[healthy]) for name in faults}
+        | {"all": auroc(worst[~healthy], worst[healthy])},
+        "seen_by_network": {name: auroc(-known[kinds == name], -known[healthy]) for name in faults}
+        | {"all": auroc(-known[~healthy], -known[healthy])},
+        "off_by_risk": {
+            f"{band / 5:g} to {(band + 1) / 5:g}": (int((bands == band).sum()), float(off[bands == band].mean()))
+            for band in sorted(set(bands.tolist()))
+        },
+        "withheld_healthy": float(np.mean([bool(case.failed) for case in by_fault["none"]])),
+        "healthy_off": float(off[healthy].mean()),
         "off_told": float(np.mean([bool(case.failed) for case, wrong in zip(cases, off, strict=True) if wrong])),
         "mean_error_by_share_withheld": {
-            f"{share:g}": float(errors[order[: round(len(order) * (1 - share))]].mean()) for share in shares
+            f"{1 - share:g}": kept.error_at("risk", share) for share in (1.0, 0.8, 0.6, 0.4, 0.2)
         },
         "by_fault": {
             name: {
@@ -216,20 +271,62 @@ def summarise(cases: list[Case]) -> dict[str, object]:
             for name, some in by_fault.items()
         },
         "frames": len(cases),
+    }  # fmt: skip
+
+
+def choose(cases: list[Case]) -> dict[str, object]:
+    """Quantiles of healthy values, and the numbers of `margin_risk` that make what happened most likely."""
+    healthy = [{check.name: check.value for check in case.checks} for case in cases if case.fault == "none"]
+    found: dict[str, object] = {
+        name: np.quantile([values[name] for values in healthy], (0.5, 0.9, 0.99, 0.997, 1.0)).round(4).tolist()
+        for name in healthy[0]
     }
+    names = [name for name in healthy[0] if name not in {"late", "drops"}]
+    off = np.array([case.error > OFF for case in cases])
+
+    def unpack(numbers: np.ndarray) -> tuple[dict[str, tuple[float, float]], tuple[float, float]]:
+        most, growth = 1 / (1 + np.exp(-numbers[: len(names)])), np.exp(numbers[len(names) : -2])
+        harm = {name: (float(a), float(b)) for name, a, b in zip(names, most, growth, strict=True)}
+        return harm, (float(numbers[-2]), float(np.exp(numbers[-1])))
+
+    def loss(numbers: np.ndarray) -> float:
+        harm, spread = unpack(numbers)
+        risk = np.array([margin_risk(case.checks, case.beyond, harm=harm, spread=spread) for case in cases])
+        risk = np.clip(risk, 1e-4, 1 - 1e-4)
+        # a little towards nothing known: some checks hardly ever failed
+        return -float(np.mean(np.where(off, np.log(risk), np.log(1 - risk)))) + 1e-3 * float(np.mean(numbers**2))
+
+    begin = np.concatenate([np.zeros(len(names)), np.full(len(names), -1.0), np.zeros(2)])
+    harm, spread = unpack(minimize(loss, begin, method="L-BFGS-B").x)
+    found["harm"] = {name: (round(a, 2), round(b, 2)) for name, (a, b) in harm.items()}
+    found["spread"] = [round(value, 2) for value in spread]
+    return found
 
 
-def fit(folder: Path, *, trials: int) -> None:
-    """Fit the novelty of a network on simulated trials of half the days, its limit on those of the others."""
-    run = load(folder)
-    inputs = []
-    for plan in plan_some("health-fit", trials):
-        loading, film = prepare_trial(plan)
-        images = np.stack([draw(film, at) for at in touching(loading.safety_margin, 8)])
-        inputs.append(run.encode(images, film.draw_reference().numpy()))
-    half = len(inputs) // 2
-    manifest = load_record(folder / MANIFEST_FILE, Manifest, command="sliplens train")
-    save_record(replace(manifest, novelty=fit_novelty(run.model, inputs[:half], inputs[half:])), folder / MANIFEST_FILE)
+def fit(folders: list[Path], *, trials: int, data: Path | None) -> None:
+    """Fit the novelty of networks on simulated trials of half the days, what is usual on those of the others.
+
+    `data`: their own training and validation trials instead.
+    """
+    parts: list[list[tuple[np.ndarray, np.ndarray]]]
+    if data is None:
+        drawn = []
+        for plan in plan_some("health-fit", trials):
+            loading, film = prepare_trial(plan)
+            images = np.stack([draw(film, at) for at in touching(loading.safety_margin, 8)])
+            drawn.append((images, film.draw_reference().numpy()))
+        parts = [drawn[: len(drawn) // 2], drawn[len(drawn) // 2 :]]
+    else:
+        dataset, parts = load_dataset(data), []
+        for split in ("train", "validation"):
+            offered = dataset.select(split=split)  # of all days
+            kept = [dataset.load(trial) for trial in offered[:: max(1, len(offered) // trials)]]
+            parts.append([(one.frames[touching(one.safety_margin, 24)], one.reference) for one in kept])
+    for folder in folders:
+        run = load(folder)
+        train, validation = ([run.encode(images, untouched) for images, untouched in part] for part in parts)
+        manifest = load_record(folder / MANIFEST_FILE, Manifest, command="sliplens train")
+        save_record(replace(manifest, novelty=fit_novelty(run.model, train, validation)), folder / MANIFEST_FILE)
 
 
 def main() -> None:
@@ -238,32 +335,28 @@ def main() -> None:
     parser.add_argument("--network", default="chromatouch-difference", help="name or folder of a network")
     parser.add_argument("--trials", type=int, default=8, help="one a day")
     parser.add_argument("--frames", type=int, default=5, help="of each trial")
-    parser.add_argument("--choose", action="store_true", help="print quantiles of healthy values, on other trials")
-    parser.add_argument("--fit", type=Path, help="folder of a network that gets its novelty")
+    parser.add_argument(
+        "--choose", action="store_true", help="print what limits and risk are chosen from"
+    )
+    parser.add_argument("--fit", type=Path, nargs="+", help="folders of networks that get their novelty")
+    parser.add_argument("--data", type=Path, help="for --fit: data set that they were trained on")
     parser.add_argument("--threads", type=int, default=2, help="of torch")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     if options.fit is not None:
-        fit(options.fit, trials=options.trials)
+        fit(options.fit, trials=options.trials, data=options.data)
         return
     run = load(options.network)
     series = "health-choose" if options.choose else "health-test"
     plans = plan_some(series, options.trials)
     others = plan_some(series, options.trials, sensor="flat-gel")
-    said = [
-        one
-        for plan, other in zip(plans, others, strict=True)
-        for one in judge_trial(run, plan, frames=options.frames, other=other, healthy=options.choose)
+    cases = [
+        case
+        for trial, (plan, other) in enumerate(zip(plans, others, strict=True))
+        for case in judge_trial(run, plan, trial=trial, frames=options.frames, other=other)
     ]
-    if options.choose:
-        names = said[0][1]
-        shown = (0.5, 0.9, 0.99, 0.997, 1.0)
-        found: dict[str, object] = {
-            name: np.quantile([values[name] for _, values in said], shown).round(4).tolist() for name in names
-        }
-    else:
-        found = summarise([case for case, _ in said])
+    found = choose(cases) if options.choose else summarise(cases)
     if options.json:
         print(json.dumps(found))
         return

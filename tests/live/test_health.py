@@ -10,7 +10,7 @@ import pytest
 import sliplens as sl
 from sliplens.errors import InputError
 from sliplens.live import Check, HealthLimits, HealthMonitor, LiveFrame
-from sliplens.live.health import severity
+from sliplens.live.health import margin_risk, severity
 from sliplens.markers import Tracker
 from sliplens.models.novelty import Novelty
 from sliplens.recordings import Dataset, Recording
@@ -52,7 +52,7 @@ def blurred(picture: np.ndarray) -> np.ndarray:
 def test_a_healthy_frame_passes_every_check(monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator):
     checks = monitor.check(shot(untouched, rng))
     assert failed(checks) == set()
-    assert severity(checks) < 1
+    assert max(map(severity, checks)) < 1
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.8, 1.3])
@@ -115,7 +115,7 @@ def test_without_a_touch_there_is_nothing_to_tell(
     bare = np.clip(untouched + rng.normal(0, 2, untouched.shape), 0, 255).astype(np.uint8)
     checks = monitor.check(LiveFrame(image=bare, number=0, time_s=0.0, captured_s=0.0))
     assert failed(checks) == {"touch"}
-    assert severity(checks) > 1
+    assert max(map(severity, checks)) > 1
 
 
 def test_markers_that_are_hidden_are_counted(trials: dict[str, Recording]):
@@ -140,7 +140,7 @@ def test_a_network_says_what_is_unlike_its_training(difference_run: Path, small_
     here = LiveFrame(image=recording.frames[0], number=0, time_s=0.0, captured_s=0.0)
     novelty = Novelty(
         layer="conv1", mean=(0.5,) * 24, scale=(1.0,) * 24, directions=((1.0,) + (0.0,) * 23,), variances=(1.0,),
-        rest=1.0, limit=1e-9, frames=40,
+        rest=1.0, limit=1e-9, spread_limit=None, strangeness=tuple(np.linspace(0.1, 1, 10)), frames=40,
     )  # fmt: skip
     strange = replace(run, manifest=replace(run.manifest, novelty=novelty))
     checks = {check.name: check for check in HealthMonitor(recording.reference, strange).check(here)}
@@ -152,3 +152,28 @@ def test_a_network_says_what_is_unlike_its_training(difference_run: Path, small_
 def test_limits_that_cannot_be_are_told():
     with pytest.raises(InputError, match="the health limit focus must be positive, got -1"):
         HealthLimits(focus=-1.0)
+
+
+def check_of(name: str, value: float, *, limit: float = 1.0) -> Check:
+    return Check(name=name, value=value, limit=limit, ok=value <= limit, sentence="")
+
+
+def test_risk_is_that_of_causes_which_each_suffice():
+    harm, sure = {"camera": (0.6, 1.0), "light": (0.5, 1.0)}, (0.0, 1.0)
+    quiet = margin_risk((), 0.3, harm=harm, spread=sure)
+    assert quiet == pytest.approx(0.3, abs=0.01)  # the network alone, as it says itself
+    camera, light = check_of("camera", 9.0), check_of("light", 9.0)
+    # far beyond its limit each puts the margin off with its own chance, and both miss it together
+    assert margin_risk((camera,), 0.0, harm=harm, spread=sure) == pytest.approx(0.6, abs=0.01)
+    both = margin_risk((camera, light), 0.3, harm=harm, spread=sure)
+    assert both == pytest.approx(1 - 0.7 * 0.4 * 0.5, abs=0.01)
+
+
+def test_risk_grows_with_every_fault_and_with_the_spread(
+    untouched: np.ndarray, monitor: HealthMonitor, rng: np.random.Generator
+):
+    risks = [
+        margin_risk(monitor.check(shot(np.clip(factor * untouched, 0, 255), rng)), beyond)
+        for factor, beyond in ((1.0, 0.05), (0.5, 0.05), (0.5, 0.5))
+    ]
+    assert 0 < risks[0] < risks[1] < risks[2] < 1

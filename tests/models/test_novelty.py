@@ -1,10 +1,14 @@
 """Novelty: the distance of Mahalanobis, in features of an early layer."""
 
+import threading
+
 import numpy as np
+import pytest
 import torch
+from torch import nn
 
 from sliplens.models import build_model
-from sliplens.models.novelty import find_layer, fit_novelty, read_features
+from sliplens.models.novelty import Novelty, find_layer, fit_novelty, read_features, watch_features
 
 
 def test_the_layer_answers_with_an_eighth_of_the_side_whatever_the_backbone():
@@ -37,3 +41,49 @@ def test_with_all_directions_the_distance_is_that_of_mahalanobis(rng: np.random.
 
 def test_too_few_frames_tell_nothing():
     assert fit_novelty(build_model("shufflenet_v2_x0_5").eval(), [torch.zeros(8, 3, 32, 32)], []) is None
+
+
+@pytest.fixture(scope="module")
+def sure() -> tuple[nn.Module, Novelty]:
+    """A network with a distribution as its answer, and what frames of noise are to it."""
+    images = torch.from_numpy(np.random.default_rng(0).uniform(0, 1, (160, 3, 32, 32))).float()
+    torch.manual_seed(0)
+    model = build_model("shufflenet_v2_x0_5", head="histogram").eval()
+    novelty = fit_novelty(model, images[:80].split(20), images[80:].split(20))
+    assert novelty is not None
+    return model, novelty
+
+
+def test_frames_like_those_of_the_validation_are_known_evenly_and_others_less_the_farther(
+    sure: tuple[nn.Module, Novelty],
+):
+    model, novelty = sure
+    again = torch.from_numpy(np.random.default_rng(1).uniform(0, 1, (200, 3, 32, 32))).float()
+    known = novelty.known(read_features(model, novelty.layer, again), None)
+    # of 80 and of 200 frames each share is known to some hundredths
+    for share in (0.2, 0.5, 0.8):
+        assert np.mean(known < share) == pytest.approx(share, abs=0.15)
+    darker = [
+        float(novelty.known(read_features(model, novelty.layer, again[:1] * part), None)[0]) for part in (0.8, 0.4, 0.1)
+    ]
+    assert 0.5 > darker[0] > darker[1] > darker[2] > 0
+
+
+def test_an_answer_that_is_spread_wide_makes_a_frame_strange_by_itself(sure: tuple[nn.Module, Novelty]):
+    model, novelty = sure
+    features = read_features(model, novelty.layer, torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(1)))
+    assert novelty.spread_limit is not None
+    narrow, wide = (novelty.known(features, np.array([ratio * novelty.spread_limit]))[0] for ratio in (0.1, 3.0))
+    assert wide < 0.005 < narrow
+
+
+def test_passes_of_another_thread_are_not_watched():
+    model = build_model("shufflenet_v2_x0_5").eval()
+    images = torch.zeros(1, 3, 32, 32)
+    with watch_features(model, "conv1") as seen, torch.no_grad():
+        other = threading.Thread(target=model, args=(images,))
+        other.start()
+        other.join()
+        assert not seen
+        model(images)
+    assert len(seen) == 1

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sliplens.training.metrics import auroc, coverage, lead_times
+from sliplens.training.metrics import auroc, coverage, lead_times, risk_coverage
 
 SCORES = arrays(np.float64, st.integers(1, 12), elements=st.integers(0, 5).map(float))
 
@@ -82,3 +82,20 @@ def test_the_order_of_the_frames_does_not_matter(rng: np.random.Generator):
     assert lead_times(name, time, labels, predictions) == lead_times(
         name, time[order], labels[order], predictions[order]
     )
+
+
+def test_withholding_by_the_errors_themselves_is_best_and_by_chance_gains_nothing(rng: np.random.Generator):
+    errors = rng.exponential(0.1, 2000)
+    found = risk_coverage(
+        errors, {"known": rng.uniform(size=2000), "spread": -errors + rng.normal(0, 0.05, 2000), "none": None}
+    )
+    assert set(found.error) == {"known", "spread", "perfect"}
+    assert {values[0] for values in found.error.values()} == {pytest.approx(errors.mean())}
+    best = np.array(found.error["perfect"])
+    assert np.all(np.diff(best) <= 0)
+    for values in found.error.values():
+        assert np.all(np.array(values) >= best - 1e-12)
+    # of an exponential with mean m, what lies below its quantile q has the mean m (1 + (1 - q) ln(1 - q) / q)
+    assert found.error_at("perfect", 0.8) == pytest.approx(0.1 * (1 + 0.2 * np.log(0.2) / 0.8), rel=0.1)
+    assert found.error_at("known", 0.5) == pytest.approx(errors.mean(), rel=0.1)
+    assert str(found).startswith(f"mean error {100 * errors.mean():.1f} points; of a fifth less, ")

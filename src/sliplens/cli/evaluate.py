@@ -71,6 +71,8 @@ def _print_scores(evaluation: "Evaluation") -> None:
         say(f"F_t / F_n is read with R2 {', '.join(told)}")
     if evaluation.wet_auroc is not None:
         say(f"wet is told from dry by the network's own uncertainty: AUROC {evaluation.wet_auroc:.2f}")
+    if evaluation.risk is not None:
+        say(str(evaluation.risk))
 
 
 def _row(condition: str, evaluation: "Evaluation") -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from sliplens.errors import ImageError, InputError
 from sliplens.friction import FrictionLike, SlipLearner, as_friction
 from sliplens.live.contract import LiveSource
-from sliplens.live.health import HealthMonitor
+from sliplens.live.health import OFF, HealthMonitor, margin_risk
 from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading
 from sliplens.markers import TrackedFrame, Tracker
 from sliplens.models.checkpoint import Run
@@ -261,6 +261,7 @@ class FrameReader:
             high=high,
             ratio=ratio,
             friction=None if friction is None else str(friction),
+            risk=margin_risk(reading.health, float(estimate.beyond(OFF)[0])) if reading.health else None,
             contact_state=state,
             lag_s=self._smooth.time_constant_s,
             latency=replace(

@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 
@@ -148,52 +148,38 @@ class HealthMonitor:
         if self._before is None or not np.array_equal(pixels, self._before):
             self._before, self._changed_s = pixels.copy(), frame.time_s
         value = max(0.0, frame.time_s - self._changed_s)
-        return _judge(
-            "repeated", value, self.limits.repeated_s,
-            f"the picture has not changed by a single pixel for {value:.2g} s; start the camera again",
-            f"the picture changed {value:.2g} s ago",
-        )  # fmt: skip
+        told = f"the picture has not changed by a single pixel for {value:.2g} s"
+        return _judge("repeated", value, self.limits.repeated_s, told, "start the camera again")
 
     def _check_late(self, frame: LiveFrame) -> Check:
         value = max(0.0, time.monotonic() - frame.captured_s) if frame.captured_s > 0 else 0.0
-        return _judge(
-            "late", value, self.limits.late_s,
-            f"the frame is {value:.2g} s old; close what else uses the processor, or lower --rate",
-            f"the frame is {value:.2g} s old",
-        )  # fmt: skip
+        cure = "close what else uses the processor, or lower --rate"
+        return _judge("late", value, self.limits.late_s, f"the frame is {value:.2g} s old", cure)
 
     def _check_drops(self, frame: LiveFrame) -> Check:
         self._numbers.append((frame.time_s, frame.number))
         while frame.time_s - self._numbers[0][0] > _DROPS_OVER_S or frame.number < self._numbers[0][1]:
             self._numbers.popleft()
         span = self._numbers[-1][1] - self._numbers[0][1]
-        value = 1 - (len(self._numbers) - 1) / span if span > 0 else 0.0
-        return _judge(
-            "drops", value, self.limits.drops,
-            f"{value:.0%} of the frames of the last second were lost; lower --rate or --size, or use another port",
-            f"{value:.0%} of the frames of the last second were lost",
-        )  # fmt: skip
+        value = max(0.0, 1 - (len(self._numbers) - 1) / span) if span > 0 else 0.0
+        told = f"{value:.0%} of the frames of the last second were lost"
+        return _judge("drops", value, self.limits.drops, told, "lower --rate or --size, or use another port")
 
     def _check_saturation(self, image: Frame) -> Check:
         value = max(0.0, _saturated(image) - self._lost)
-        return _judge(
-            "saturation", value, self.limits.saturation,
-            f"{value:.0%} of the picture have turned black or white; mend the exposure or the lamps",
-            f"{value:.0%} of the picture have turned black or white",
-        )  # fmt: skip
+        told = f"{value:.0%} of the picture have turned black or white"
+        return _judge("saturation", value, self.limits.saturation, told, "mend the exposure or the lamps")
 
     def _check_exposure(self, gain: float) -> Check:
         told = f"the picture is {2**gain:.2g} times as bright as the reference"
         cure = "fix exposure and gain of the camera, or take a new reference"
-        return _judge("exposure", abs(gain), self.limits.exposure, f"{told}; {cure}", told)
+        return _judge("exposure", abs(gain), self.limits.exposure, told, cure)
 
     def _check_focus(self, grey: Plane, gain: float) -> Check:
         left = _sharpness(grey) / 2**gain / max(self._sharp, 1e-3)
         told = f"edges are {left:.0%} as sharp as in the reference"
-        return _judge(
-            "focus", max(0.0, 1 - left), self.limits.focus,
-            f"{told}; clean or focus the lens, and take a new reference", told,
-        )  # fmt: skip
+        cure = "clean or focus the lens, and take a new reference"
+        return _judge("focus", max(0.0, 1 - left), self.limits.focus, told, cure)
 
     def _check_light(self, ratio: np.ndarray, known: np.ndarray) -> Check:
         rows, columns = (np.array_split(np.arange(side), _TILES) for side in ratio.shape[:2])
@@ -207,12 +193,8 @@ class HealthMonitor:
                     values = tile[..., channel][seen[..., channel]]
                     # the median: markers that moved are few
                     worst = max(worst, abs(float(np.median(values)))) if len(values) > 3 else worst
-        return _judge(
-            "light", worst, self.limits.light,
-            f"one side of the picture is {2**worst:.2g} times brighter or darker than in the reference; look after the "
-            "lamps, or take a new reference",
-            f"the light falls as in the reference, to a factor of {2**worst:.2g}",
-        )  # fmt: skip
+        told = f"one side of the picture is {2**worst:.2g} times brighter or darker than in the reference"
+        return _judge("light", worst, self.limits.light, told, "look after the lamps, or take a new reference")
 
     def _check_camera(self, grey: Plane, gain: float) -> Check:
         level = np.float32(2**-gain)
@@ -225,10 +207,8 @@ class HealthMonitor:
             self._moved_px = min(length, _REACH_PX)
         value = self._moved_px
         told = f"the border of the picture moved by {value:.1f} px since the reference"
-        return _judge(
-            "camera", value, self.limits.camera_px,
-            f"{told}: the camera or the skin has shifted; fasten it, and take a new reference", told,
-        )  # fmt: skip
+        cure = "the camera or the skin has shifted; fasten it, and take a new reference"
+        return _judge("camera", value, self.limits.camera_px, told, cure)
 
     def _check_markers(self, markers: TrackedFrame) -> Check:
         status = markers.status
@@ -238,10 +218,8 @@ class HealthMonitor:
             absent = np.isin(status, (MarkerStatus.MISSING, MarkerStatus.BROKEN))
             value = float(absent.sum() / max(1, (absent | (status == MarkerStatus.FOLLOWED)).sum()))
             told = f"{value:.0%} of the markers are not seen where they should be"
-        return _judge(
-            "markers", value, self.limits.markers,
-            f"{told}; clean the skin and the lens, let go, and take a new reference", told,
-        )  # fmt: skip
+        cure = "clean the skin and the lens, let go, and take a new reference"
+        return _judge("markers", value, self.limits.markers, told, cure)
 
     def _check_touch(self, soft: np.ndarray, gain: float) -> Check:
         value = float(np.quantile(np.abs(soft * 2**-gain - self._soft).max(axis=-1), 0.98))
@@ -267,25 +245,67 @@ class HealthMonitor:
         assert novelty is not None
         inputs = run.encode(frame.image[None], self._reference)
         value = float(novelty.distance(read_features(run.model, novelty.layer, inputs))[0])
-        told = f"to the network the picture is {value / novelty.limit:.2g} times as strange as any it was tested on"
-        check = _judge(
-            "novelty", value, novelty.limit,
-            f"{told}; use the sensor that it was trained on, or train it on this one",
-            f"the picture is like those that the network was trained on (distance {value:.2g})",
-        )  # fmt: skip
-        return check
+        told = f"to the network the picture is {value / novelty.limit:.2g} times as strange as what it was tested on"
+        cure = "use the sensor that it was trained on, or train it on this one"
+        return _judge("novelty", value, novelty.limit, told, cure)
 
 
-def severity(checks: Iterable[Check]) -> float:
-    """How far the worst check is from its limit, as a ratio: above 1 something is wrong."""
-    ratios = (check.limit / max(check.value, 1e-6) if check.name == "touch" else check.value / check.limit
-              for check in checks)  # fmt: skip
-    return max(ratios, default=0.0)
+def severity(check: Check) -> float:
+    """How far a check is from its limit, as a ratio: above 1 something is wrong."""
+    return check.limit / max(check.value, 1e-6) if check.name == "touch" else check.value / check.limit
 
 
-def _judge(name: str, value: float, limit: float, wrong: str, fine: str) -> Check:
+OFF = 0.2
+"""Error from which on a margin is off."""
+_HARM: dict[str, tuple[float, float]] = {
+    "repeated": (0.77, 1.0), "saturation": (0.22, 0.06), "exposure": (0.34, 0.10), "focus": (0.29, 0.09),
+    "light": (0.29, 0.50), "camera": (0.65, 0.61), "markers": (0.20, 0.75), "touch": (0.56, 0.61),
+    "novelty": (0.34, 0.18),
+}  # fmt: skip
+"""Chance that a fault puts the margin off however strong it is, and its growth with severity, by check."""
+_SPREAD = 0.15, 0.61
+"""Offset and slope of the logit of what the network itself gives for an error above `OFF`."""
+
+
+def margin_risk(
+    checks: Iterable[Check],
+    beyond: float,
+    *,
+    harm: Mapping[str, tuple[float, float]] | None = None,
+    spread: tuple[float, float] = _SPREAD,
+) -> float:
+    """Chance that the margin of a frame is off by more than 0.2: all checks and the network's spread in one number.
+
+    Each fault, and the network's own doubt, is taken for a cause that puts the margin off by itself (a noisy or):
+    1 - P = (1 - P_network) * product of (1 - a (1 - exp(-(b s)^2))) over the checks, s their severity. The numbers a
+    and b, and the offset and slope of P_network's logit, are those of greatest likelihood on simulated frames with
+    faults of graded strength, read by `chromatouch-difference` (`benchmarks/health.py --choose`); on frames of other
+    days and sensors such a chance came true as often as it says.
+
+    Parameters
+    ----------
+    checks
+        Health of the frame.
+    beyond
+        What the network gives for an error above 0.2, as `Estimate.beyond` tells it.
+    harm, spread
+        Other numbers, while they are fitted.
+
+    References
+    ----------
+    Pearl, *Probabilistic Reasoning in Intelligent Systems* (1988), section 4.3.2, for the noisy or.
+    """
+    harm = _HARM if harm is None else harm
+    right = 1 / (1 + np.exp(spread[0] + spread[1] * np.log((beyond + 0.01) / (1.01 - beyond))))
+    for check in checks:
+        most, growth = harm.get(check.name, (0.0, 0.0))
+        right *= 1 - most * -np.expm1(-((growth * severity(check)) ** 2))
+    return float(1 - right)
+
+
+def _judge(name: str, value: float, limit: float, told: str, cure: str) -> Check:
     ok = value <= limit
-    return Check(name=name, value=value, limit=limit, ok=ok, sentence=fine if ok else wrong)
+    return Check(name=name, value=value, limit=limit, ok=ok, sentence=told if ok else f"{told}; {cure}")
 
 
 def _shrink(plane: Num[np.ndarray, "height width"], factor: int) -> Float32[np.ndarray, "rows columns"]:
@@ -359,4 +379,4 @@ class _Border:
         return found
 
 
-__all__ = ["HealthLimits", "HealthMonitor", "severity"]
+__all__ = ["OFF", "HealthLimits", "HealthMonitor", "margin_risk", "severity"]

@@ -106,6 +106,9 @@ class Reading:
     """Traction ratio F_t / F_n, of a network that tells it."""
     friction: str | None = None
     """Coefficient of friction that the margin was read with, in words; None where none was told."""
+    risk: float | None = None
+    """Chance that the margin is off by more than 0.2, from all of health and the network's own spread
+    (`margin_risk`); None without a margin."""
     lag_s: float = 0.0
     """Delay of margin and interval by smoothing; 0 without."""
     contact_state: ContactState = ContactState.UNKNOWN

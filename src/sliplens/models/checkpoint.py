@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from math import erfc, sqrt
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from sliplens.images import MOST_PIXELS
 from sliplens.models.backbones import Answers, bin_edges, build_model, ratio_edges
 from sliplens.models.calibration import Calibration, Traction, raw_interval, spread
 from sliplens.models.encodings import Encoding, get_encoding
-from sliplens.models.novelty import Novelty
+from sliplens.models.novelty import Novelty, watch_features
 from sliplens.models.told import told_probabilities
 from sliplens.results.training import Training
 
@@ -198,7 +199,18 @@ class Run:
 
         `friction`: what is known of the coefficient of friction, as `predict` takes it.
         """
-        return self.to_estimate(*self.answers(inputs.split(batch_size)), friction=friction)
+        return self.estimate_batches(inputs.split(batch_size), friction=friction)
+
+    def estimate_batches(self, batches: Iterable[Tensor], *, friction: FrictionLike | None = None) -> "Estimate":
+        """Safety margins as `estimate` tells them, of batches of encoded frames."""
+        novelty = self.manifest.novelty
+        if novelty is None:
+            return self.to_estimate(*self.answers(batches), friction=friction)
+        with watch_features(self.model, novelty.layer) as features:
+            answers = self.answers(batches)
+        sigma = self.to_estimate(*answers).sigma  # before friction narrows it
+        known = novelty.known(np.concatenate(features), sigma)
+        return replace(self.to_estimate(*answers, friction=friction), known=known)
 
     def to_estimate(
         self,
@@ -282,6 +294,13 @@ class Estimate:
     """Second answer, F_t / F_n; None for a network without it."""
     friction: Friction | None = None
     """What was told of the friction; None where nothing was."""
+    known: Float[np.ndarray, " frames"] | None = None
+    """How far the network knows such frames, from 0 to 1: the share of its validation frames that were as strange or
+    stranger, in its features or in the spread of its answer (`Novelty.known`). None of a network that does not tell,
+    and of engines, which answer without their features.
+
+    An unknown friction is nothing strange: a network that was trained on frictions from 0.15 to 1.2 takes wet for one
+    more of them, and no value of this warns of it."""
 
     @property
     def sigma(self) -> Float[np.ndarray, " frames"] | None:
@@ -289,6 +308,19 @@ class Estimate:
         if self.probabilities is None or self.edges is None:
             return None
         return spread(self.margin, self.probabilities, self.edges)
+
+    def beyond(self, error: float) -> Float[np.ndarray, " frames"]:
+        """What the network gives for an error above a number of margin units, from 0 to 1; not calibrated.
+
+        One that answers with one number gives every frame that of a normal distribution with its validation error.
+        """
+        if self.probabilities is None or self.edges is None:
+            mse = self.calibration.mse if self.calibration else 0.0
+            return np.full(len(self.margin), erfc(error / sqrt(2 * mse)) if mse > 0 else 0.0)
+        # bins beyond 0 and 1 mean the ends
+        centres = np.clip((self.edges[1:] + self.edges[:-1]) / 2, 0, 1)
+        far = np.abs(centres - np.clip(self.margin, 0, 1)[:, None]) > error
+        return (self.probabilities * far).sum(axis=1)
 
     def interval(self, level: float) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]] | None:
         """Margins between which each label lies with a level of confidence, within [0, 1]; None if not calibrated."""

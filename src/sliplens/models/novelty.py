@@ -1,7 +1,9 @@
-"""Distance of an input from what a network was trained on, in the network's own features."""
+"""How far a network knows its input: the distance of its features from the training's, and the spread of its answer."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -9,12 +11,15 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sliplens.errors import ModelError
+from sliplens.models.backbones import Answers, bin_edges
+from sliplens.models.calibration import spread
 
 _STRIDE = 8
 """Of the features: early enough to cost a third of a pass, and to see light, focus and print."""
 _MOST_DIRECTIONS = 12
 _LEAST_FRAMES = 40
-_HEALTHY_SHARE = 0.995
+_SHARES = (1.0, 0.8, 0.5, 0.3, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005)
+"""Of the validation frames, for each of which the strangeness is kept that only so many reach."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +46,11 @@ class Novelty:
     """Variance along every other direction, a ratio to that of the feature."""
     limit: float
     """Distance, a ratio to the usual one, that all but 0.5 % of the validation frames stay below."""
+    spread_limit: float | None
+    """The same of the standard deviation of the answer, in margin units; None of a network that answers with one
+    number."""
+    strangeness: tuple[float, ...]
+    """What 100, 80, 50, 30, 20, 10, 5, 2, 1 and 0.5 % of the validation frames reach of `measure_strangeness`."""
     frames: int
     """Validation frames."""
 
@@ -60,9 +70,57 @@ class Novelty:
         squared = (along**2 / np.array(self.variances)).sum(axis=1) + left / self.rest
         return np.sqrt(squared / features.shape[1])
 
+    def measure_strangeness(
+        self, features: Float[np.ndarray, "frames features"], sigma: Float[np.ndarray, " frames"] | None
+    ) -> Float[np.ndarray, " frames"]:
+        """The larger of distance and spread, each over its limit."""
+        distance = self.distance(features) / self.limit
+        if sigma is None or self.spread_limit is None:
+            return distance
+        return np.maximum(distance, sigma / self.spread_limit)
+
+    def known(
+        self, features: Float[np.ndarray, "frames features"], sigma: Float[np.ndarray, " frames"] | None
+    ) -> Float[np.ndarray, " frames"]:
+        """Share of the validation frames that were as strange or stranger, from 0 to 1.
+
+        Frames like those of the validation are below a share p with probability p, as p values are. Beyond the
+        strangest half percent the logarithm goes on as steeply as before it: what is farther off is known less.
+
+        `sigma`: standard deviation of each answer, in margin units; None where it is one number.
+        """
+        levels, shares = np.array(self.strangeness), np.log(_SHARES)
+        strange = self.measure_strangeness(features, sigma)
+        slope = (shares[-1] - shares[-4]) / max(levels[-1] - levels[-4], 1e-6)
+        beyond = shares[-1] + slope * np.maximum(strange - levels[-1], 0)
+        return np.exp(np.where(strange > levels[-1], beyond, np.interp(strange, levels, shares)))
+
 
 class _Enough(Exception):  # noqa: N818 (no error: it ends a pass early)
     """The layer that was waited for has answered."""
+
+
+@contextmanager
+def watch_features(
+    model: nn.Module, layer: str, then: Callable[[], None] = lambda: None
+) -> Iterator[list[Float[np.ndarray, "batch features"]]]:
+    """Keep the mean over the image of each channel of a layer, batch by batch, while the model is run by this thread.
+
+    `then` is called after each batch.
+    """
+    kept: list[np.ndarray] = []
+    own = threading.get_ident()
+
+    def keep(_: nn.Module, __: object, output: Tensor) -> None:
+        if threading.get_ident() == own:  # a running sensor's network is explained by another thread meanwhile
+            kept.append(output.detach().mean(dim=(2, 3)).double().cpu().numpy())
+            then()
+
+    handle = model.get_submodule(layer).register_forward_hook(keep)
+    try:
+        yield kept
+    finally:
+        handle.remove()
 
 
 @torch.no_grad()
@@ -70,20 +128,13 @@ def read_features(
     model: nn.Module, layer: str, images: Float[Tensor, "batch colours height width"]
 ) -> Float[np.ndarray, "batch features"]:
     """Mean over the image of each channel of a layer; what comes after it is not run."""
-    kept: list[Tensor] = []
 
-    def keep(_: nn.Module, __: object, output: Tensor) -> None:
-        kept.append(output.mean(dim=(2, 3)))
+    def stop() -> None:
         raise _Enough
 
-    handle = model.get_submodule(layer).register_forward_hook(keep)
-    try:
+    with watch_features(model, layer, stop) as kept, suppress(_Enough):
         model(images.to(next(model.parameters()).device))
-    except _Enough:
-        pass
-    finally:
-        handle.remove()
-    return kept[0].double().cpu().numpy()
+    return kept[0]
 
 
 @torch.no_grad()
@@ -108,18 +159,18 @@ def find_layer(model: nn.Module, images: Float[Tensor, "batch colours height wid
 
 
 def fit_novelty(model: nn.Module, train: Iterable[Tensor], validation: Iterable[Tensor]) -> Novelty | None:
-    """Fit the features of training frames; the limit is from validation frames, of other trials.
+    """Fit the features of training frames; what is usual is told by validation frames, of other trials.
 
     `model` is in evaluation mode; `train`, `validation`: batches of encoded frames, (batch, 3, size, size). None where
     the network has no layer to look at, or there are too few frames.
     """
-    batches = list(train)
+    batches, others = list(train), list(validation)
     layer = find_layer(model, batches[0][:1]) if batches else None
     if layer is None:
         return None
     features, held = (
         np.concatenate([read_features(model, layer, batch) for batch in part] or [np.zeros((0, 1))])
-        for part in (batches, validation)
+        for part in (batches, others)
     )
     if min(len(features), len(held)) < _LEAST_FRAMES:
         return None
@@ -139,10 +190,30 @@ def fit_novelty(model: nn.Module, train: Iterable[Tensor], validation: Iterable[
         variances=_rounded(variances[:kept]),
         rest=float(variances[kept:].sum() / max(1, unit.shape[1] - kept)) + 1e-6,
         limit=np.inf,
+        spread_limit=None,
+        strangeness=(),
         frames=len(held),
     )
-    limit = float(np.quantile(begun.distance(held), _HEALTHY_SHARE))
-    return Novelty(**{**vars(begun), "limit": limit})
+    sigma = _spread(model, others)
+    usual = 1 - _SHARES[-1]
+    limited = replace(
+        begun,
+        limit=float(np.quantile(begun.distance(held), usual)),
+        spread_limit=None if sigma is None else float(np.quantile(sigma, usual)),
+    )
+    reached = np.quantile(limited.measure_strangeness(held, sigma), 1 - np.array(_SHARES))
+    return replace(limited, strangeness=_rounded(reached))
+
+
+@torch.no_grad()
+def _spread(model: nn.Module, batches: Iterable[Tensor]) -> Float[np.ndarray, " frames"] | None:
+    """Standard deviation of the answers, in margin units; None for a network that answers with one number."""
+    edges, device = bin_edges(model), next(model.parameters()).device
+    if edges is None:
+        return None
+    answers = [Answers(model)(batch.to(device)) for batch in batches]
+    margins, probabilities = (torch.cat([answer[at] for answer in answers]).double().cpu().numpy() for at in (0, 1))
+    return spread(margins, probabilities, edges)
 
 
 def _rounded(values: np.ndarray) -> tuple[float, ...]:

@@ -29,7 +29,15 @@ from sliplens.plots.style import (
     methods_in_order,
     short_input_name,
 )
-from sliplens.results.evaluation import BaselineScores, BinScore, Evaluation, Predictions, RegressionScores, Reliability
+from sliplens.results.evaluation import (
+    BaselineScores,
+    BinScore,
+    Evaluation,
+    Predictions,
+    RegressionScores,
+    Reliability,
+    RiskCoverage,
+)
 from sliplens.results.faithfulness import DeletionCurve
 from sliplens.results.training import Training
 
@@ -135,8 +143,8 @@ def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
     """Save a page of six charts as .png, .pdf or .svg, or of eight where there are baselines.
 
     Answers against labels; mean squared error in ten bins of the margin (thesis, Fig. 7); bias of each trial; how often
-    intervals hold; uncertainty by condition; the trial of median error over time. Below, R2 and mean absolute error of
-    the network beside those of model-based estimators, where there are any.
+    intervals hold; the error as frames are withheld; the trial of median error over time. Below, R2 and mean absolute
+    error of the network beside those of model-based estimators, where there are any.
     """
     require_picture_path(path, example="evaluation.png")
     conditions = conditions_in_order(evaluation.conditions)
@@ -154,7 +162,7 @@ def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
         charts[1].legend(fontsize=8)
         _plot_trials(predictions, conditions, ax=charts[2])
         _plot_coverage(evaluation.reliability, conditions, ax=charts[3])
-        _plot_uncertainty(predictions, conditions, evaluation.wet_auroc, ax=charts[4])
+        _plot_risk(evaluation.risk, ax=charts[4])
         _plot_typical(predictions, evaluation.trials, ax=charts[5])
         if estimators:
             _plot_readers(figure, {"network": evaluation, **estimators}, conditions, top=_HEIGHT + 0.25)
@@ -200,18 +208,19 @@ def _plot_coverage(reliability: Mapping[str, Reliability], conditions: list[str]
     ax.legend(fontsize=8, loc="upper left")
 
 
-def _plot_uncertainty(predictions: Predictions, conditions: list[str], auroc: float | None, *, ax: Axes) -> None:
-    title = "Uncertainty" if auroc is None else f"Wet told from dry: AUROC {auroc:.2f}"
-    ax.set(xlabel="Standard deviation of the answer (points of Γ)", ylabel="Share of the frames (%)", title=title)
-    if not np.isfinite(predictions.sigma).any():
-        write_over(ax, "one number, and no distribution")
+def _plot_risk(risk: RiskCoverage | None, *, ax: Axes) -> None:
+    ax.set(xlabel="Withheld (% of the frames)", ylabel="Mean error of the others (points of Γ)", xlim=(0, 96))
+    ax.set_title("Saying “I do not know”")
+    if risk is None:
+        write_over(ax, "not measured")
         return
-    sigma = 100 * predictions.sigma
-    edges = np.linspace(0, max(1.0, float(np.quantile(sigma, 0.995))), 30).tolist()
-    for name in conditions:
-        shown = sigma[predictions.condition == name]
-        weights = np.full(len(shown), 100 / len(shown))
-        ax.hist(shown, bins=edges, weights=weights, color=CONDITION_COLOURS.get(name, GREEN), alpha=0.6, label=name)
+    colours = {"known": BLUE, "spread": PURPLE, "perfect": GREY}
+    words = {"known": "least known first", "spread": "widest first", "perfect": "worst first (nobody knows)"}
+    for name, errors in risk.error.items():
+        line = "--" if name == "perfect" else "-"
+        shares = 100 * (1 - np.array(risk.covered))
+        ax.plot(shares, 100 * np.array(errors), color=colours[name], linestyle=line, label=words[name])
+    ax.set_ylim(bottom=0)
     ax.legend(fontsize=8)
 
 

@@ -83,6 +83,27 @@ class Predictions(Columns):
 
 
 @dataclass(frozen=True, kw_only=True)
+class RiskCoverage:
+    """Error of what is answered against the share that is: what a network gains by saying "I do not know"."""
+
+    covered: tuple[float, ...]
+    """Shares of the frames that are answered, from 1 down."""
+    error: dict[str, tuple[float, ...]]
+    """Mean absolute error at each share, in margin units, by what is withheld first: `known`, what is least like the
+    training (`Estimate.known`); `spread`, the widest answers; `perfect`, the largest errors, which nobody knows."""
+
+    def error_at(self, reason: str, share: float) -> float:
+        """Mean absolute error while a share of the frames is answered, in margin units."""
+        return self.error[reason][self.covered.index(share)]
+
+    def __str__(self) -> str:
+        """What withholding a fifth of the frames gains, in one sentence."""
+        words = {"known": "the least known", "spread": "the widest", "perfect": "the worst, if one knew them,"}
+        parts = [f"{100 * self.error_at(name, 0.8):.1f} without {words[name]}" for name in self.error]
+        return f"mean error {100 * self.error_at('perfect', 1.0):.1f} points; of a fifth less, {', '.join(parts)}"
+
+
+@dataclass(frozen=True, kw_only=True)
 class BaselineScores:
     """How well one estimator reads the margin, by condition."""
 
@@ -150,6 +171,8 @@ class Evaluation:
     ratio_r2: dict[str, float | None] = field(default_factory=dict)
     """R2 of the traction ratio F_t / F_n by condition; empty for a network that answers with the margin alone, None
     where the ratio does not vary or no force is known."""
+    risk: RiskCoverage | None = None
+    """Error as more and more frames are withheld; None in a result without it."""
     baselines: Baselines | None = None
     """Scores of estimators that read the markers of the same frames; None where none were asked for."""
     baseline_predictions: BaselinePredictions | None = None

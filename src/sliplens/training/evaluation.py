@@ -24,7 +24,7 @@ from sliplens.recordings.dataset import load_dataset
 from sliplens.results.evaluation import Evaluation, Predictions, RegressionScores, Reliability
 from sliplens.training.baselines import BaselinePlan, choose_training, evaluate_baselines, marker_kind
 from sliplens.training.data import FrameSet, load_frames
-from sliplens.training.metrics import auroc, coverage, find_lead_times, score_predictions
+from sliplens.training.metrics import auroc, coverage, find_lead_times, risk_coverage, score_predictions
 
 EACH = "each"
 """What `friction` may be where every trial is told its own."""
@@ -187,8 +187,9 @@ def evaluate_frames(
     count = len(frames)
     if not count:
         raise RecordingError("there is no labelled frame to evaluate; check the split and the condition")
-    answers = run.answers(frames.batches(batch_size, on_progress))
-    estimate = run.to_estimate(*answers, friction=None if friction == EACH else friction)
+    estimate = run.estimate_batches(
+        frames.batches(batch_size, on_progress), friction=None if friction == EACH else friction
+    )
     if friction == EACH:
         if not np.isfinite(frames.friction).all():
             raise RecordingError("not every trial has a coefficient of friction to tell; name one, or leave it out")
@@ -244,6 +245,10 @@ def evaluate_frames(
         wet_auroc=None if sigma is None or wet is None or dry is None else auroc(sigma[wet], sigma[dry]),
         lead_times={name: find_lead_times(predictions.where(rows)) for name, rows in conditions.items()},
         predictions=predictions,
+        risk=risk_coverage(
+            np.abs(predictions.prediction - predictions.safety_margin),
+            {"known": estimate.known, "spread": None if sigma is None else -sigma},
+        ),
         friction="that of each trial, told exactly" if friction == EACH else str(estimate.friction or ""),
         ratio_r2={} if estimate.ratio is None else _ratio_r2(estimate.ratio.mean, frames),
     )

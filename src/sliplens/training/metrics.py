@@ -1,12 +1,12 @@
 """Errors, coverage and warnings of predictions against labels."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
 from sliplens.errors import RecordingError
-from sliplens.results.evaluation import BinScore, LeadTimes, Predictions, RegressionScores
+from sliplens.results.evaluation import BinScore, LeadTimes, Predictions, RegressionScores, RiskCoverage
 
 
 def coverage(
@@ -28,6 +28,38 @@ def auroc(positive: Float[np.ndarray, " _"], negative: Float[np.ndarray, " _"]) 
     below = np.searchsorted(ordered, positive, side="left")
     not_above = np.searchsorted(ordered, positive, side="right")
     return float((below + not_above).mean() / 2 / len(negative))
+
+
+_COVERED = tuple(round(1 - step / 20, 2) for step in range(20))
+
+
+def risk_coverage(
+    errors: Float[np.ndarray, " frames"], trust: Mapping[str, Float[np.ndarray, " frames"] | None]
+) -> RiskCoverage:
+    """Mean absolute error of the frames that are answered, as more and more of the least trusted are withheld.
+
+    Parameters
+    ----------
+    errors
+        Absolute error of each frame, in margin units.
+    trust
+        Reasons to withhold, by name: a number a frame, the lower the sooner it is withheld; None for one that the
+        network does not tell. `perfect`, by the errors themselves, is always told.
+
+    References
+    ----------
+    El-Yaniv and Wiener, *On the Foundations of Noise-free Selective Classification*, JMLR 2010.
+    """
+    told = {name: values for name, values in trust.items() if values is not None} | {"perfect": -errors}
+    kept = [max(1, round(share * len(errors))) for share in _COVERED]
+    means = {
+        # stable: frames that are trusted alike are withheld in their order
+        name: np.cumsum(errors[np.argsort(-values, kind="stable")]) / np.arange(1, len(errors) + 1)
+        for name, values in told.items()
+    }
+    return RiskCoverage(
+        covered=_COVERED, error={name: tuple(float(mean[count - 1]) for count in kept) for name, mean in means.items()}
+    )
 
 
 THRESHOLD = 0.2
