@@ -26,7 +26,7 @@ _RAYLEIGH_95 = 2.45
 
 @dataclass(frozen=True, kw_only=True)
 class SlipLimits:
-    """From when on a motion counts, in standard deviations of what the sensor showed while it was still.
+    """From when on a motion counts; `recoil` and `evidence` in standard deviations of what the still sensor showed.
 
     The defaults were chosen on simulated trials of other seeds than `benchmarks/slip.py` tests on.
     """
@@ -43,6 +43,8 @@ class SlipLimits:
     """Motion of the skin against that pattern."""
     evidence: float = 0.5
     """The same, of what no rigid motion explains (Dong's residual)."""
+    fall: float = 0.045
+    """Least share of the shear that is lost within the window: a pull that is let go slowly is no slip."""
     hold_s: float = 0.25
     """Time for which a slip that was seen is told, in seconds."""
 
@@ -262,7 +264,9 @@ class SlipDetector:
         cut = int(ratio[:, 0].argmax())
         whole, bending = ratio[cut].tolist()
         # a large motion must show more than noise that happens to bend
-        if whole < self.limits.recoil or bending < max(self.limits.evidence, _BENT_SHARE * left * whole):
+        if drop_px[cut, 0] < self.limits.fall * length or whole < self.limits.recoil:
+            return None
+        if bending < max(self.limits.evidence, _BENT_SHARE * left * whole):
             return None
         spreads = np.array([spread for _, spread, _ in self._window])
         pressed = abs(float(spreads[: cut + 1].mean() - spreads[cut + 1 :].mean()))
