@@ -335,9 +335,7 @@ def main() -> None:
     parser.add_argument("--network", default="chromatouch-difference", help="name or folder of a network")
     parser.add_argument("--trials", type=int, default=8, help="one a day")
     parser.add_argument("--frames", type=int, default=5, help="of each trial")
-    parser.add_argument(
-        "--choose", action="store_true", help="print what limits and risk are chosen from"
-    )
+    parser.add_argument("--choose", action="store_true", help="print what limits and risk are chosen from")
     parser.add_argument("--fit", type=Path, nargs="+", help="folders of networks that get their novelty")
     parser.add_argument("--data", type=Path, help="for --fit: data set that they were trained on")
     parser.add_argument("--threads", type=int, default=2, help="of torch")

@@ -252,18 +252,19 @@ class HealthMonitor:
 
 def severity(check: Check) -> float:
     """How far a check is from its limit, as a ratio: above 1 something is wrong."""
-    return check.limit / max(check.value, 1e-6) if check.name == "touch" else check.value / check.limit
+    over, under = (check.limit, check.value) if check.name == "touch" else (check.value, check.limit)
+    return over / max(under, 1e-6)
 
 
 OFF = 0.2
 """Error from which on a margin is off."""
 _HARM: dict[str, tuple[float, float]] = {
-    "repeated": (0.77, 1.0), "saturation": (0.22, 0.06), "exposure": (0.34, 0.10), "focus": (0.29, 0.09),
-    "light": (0.29, 0.50), "camera": (0.65, 0.61), "markers": (0.20, 0.75), "touch": (0.56, 0.61),
-    "novelty": (0.34, 0.18),
+    "repeated": (0.98, 0.12), "saturation": (0.25, 0.08), "exposure": (0.43, 0.23), "focus": (0.29, 0.07),
+    "light": (0.17, 0.64), "camera": (0.62, 0.75), "markers": (0.33, 2.22), "touch": (0.97, 1.30),
+    "novelty": (0.41, 0.41),
 }  # fmt: skip
 """Chance that a fault puts the margin off however strong it is, and its growth with severity, by check."""
-_SPREAD = 0.15, 0.61
+_SPREAD = -0.59, 0.58
 """Offset and slope of the logit of what the network itself gives for an error above `OFF`."""
 
 
@@ -287,7 +288,7 @@ def margin_risk(
     checks
         Health of the frame.
     beyond
-        What the network gives for an error above 0.2, as `Estimate.beyond` tells it.
+        What the network gives for an error above 0.2, from 0 to 1, as `Estimate.beyond` tells it.
     harm, spread
         Other numbers, while they are fitted.
 

@@ -14,6 +14,8 @@ Field = Float[np.ndarray, "markers 2"]
 
 _FEWEST = 6
 """Markers of the contact without which no motion of it can be told."""
+_FEWEST_FRAMES = 3
+"""Of the window, however slow the camera is."""
 _LEAST_NOISE_PX = 0.02
 """Of compressed video, whose frames repeat, the noise cannot be seen."""
 _REPRESSED = 1 / 0.75
@@ -232,7 +234,7 @@ class SlipDetector:
     def _remember(self, sheared: Field, spread: float, time_s: float) -> None:
         """Take a frame into the window; those that leave it make the pattern."""
         self._window.append((time_s, spread, sheared))
-        while time_s - self._window[0][0] > self.limits.window_s:
+        while len(self._window) > _FEWEST_FRAMES and time_s - self._window[0][0] > self.limits.window_s:
             left_s, _, field = self._window.popleft()
             if self._pattern is None:
                 self._pattern = field
