@@ -15,7 +15,7 @@ from sliplens.results.evaluation import Evaluation, Predictions, Reliability
 from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
 from sliplens.results.faithfulness import DeletionScores, DeletionTable, MethodScore
 from sliplens.results.training import LearningCurve, Training
-from sliplens.training.metrics import find_lead_times, score_predictions
+from sliplens.training.metrics import find_lead_times, risk_coverage, score_predictions
 
 METHODS = ("grad-cam", "integrated-gradients", "poly-cam")
 MARGINS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
@@ -111,6 +111,9 @@ def made_up_evaluation(predictions: Predictions, *, name: str = "difference", su
         wet_auroc=0.97 if sure else None,
         lead_times={one: find_lead_times(rows) for one, rows in by_condition.items()},
         predictions=predictions,
+        risk=risk_coverage(
+            np.abs(predictions.prediction - predictions.safety_margin), {"spread": -predictions.sigma if sure else None}
+        ),
     )
 
 

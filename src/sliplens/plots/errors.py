@@ -209,7 +209,7 @@ def _plot_coverage(reliability: Mapping[str, Reliability], conditions: list[str]
 
 
 def _plot_risk(risk: RiskCoverage | None, *, ax: Axes) -> None:
-    ax.set(xlabel="Withheld (% of the frames)", ylabel="Mean error of the others (points of Γ)", xlim=(0, 96))
+    ax.set(xlabel="Withheld (% of the frames)", ylabel="MAE of the rest (points of Γ)", xlim=(0, 96))
     ax.set_title("Saying “I do not know”")
     if risk is None:
         write_over(ax, "not measured")

@@ -98,9 +98,11 @@ class RiskCoverage:
 
     def __str__(self) -> str:
         """What withholding a fifth of the frames gains, in one sentence."""
-        words = {"known": "the least known", "spread": "the widest", "perfect": "the worst, if one knew them,"}
-        parts = [f"{100 * self.error_at(name, 0.8):.1f} without {words[name]}" for name in self.error]
-        return f"mean error {100 * self.error_at('perfect', 1.0):.1f} points; of a fifth less, {', '.join(parts)}"
+        words = {"known": "the least known", "spread": "the widest", "perfect": "the worst, which nobody knows"}
+        parts = ", ".join(f"{100 * self.error_at(name, 0.8):.1f} ({words[name]})" for name in self.error)
+        return (
+            f"mean error {100 * self.error_at('perfect', 1.0):.1f} points; with a fifth of the frames withheld {parts}"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
