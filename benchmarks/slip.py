@@ -3,8 +3,9 @@
 Each trial is pressed, held and pulled until it slips; its frames are drawn at 60 a second, their markers followed, and
 given to `SlipDetector` as a running sensor would. The onset is the first frame without margin. A slip that is told
 within half a second of it is found, later it is missed; one that is told before it is a false alarm. Seeds below 100
-were looked at while thresholds were chosen, and those from 100 on once before; the benchmark takes others. With --positions the markers' true places with
-0.1 px of noise stand in for drawing and following, which takes a hundredth of the time.
+were looked at while thresholds were chosen, and those from 100 on once before; the benchmark takes others. With
+--positions the markers' true places with 0.1 px of noise stand in for drawing and following, which takes a hundredth of
+the time.
 
 With --clips, real GelSight Mini clips of lifts: only whether a slip was told at all is known of each.
 """
