@@ -10,19 +10,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.images import decode_png
 from sliplens.plots import viewer as viewer_process
-from sliplens.plots.viewer import open_viewer, write_rrd
+from sliplens.plots.viewer import Beside, open_viewer, view_capture, view_explained, view_stored, write_rrd
 from sliplens.recordings import ContactState, Dataset, Recording, load_dataset
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.importing import import_trial
 from sliplens.recordings.labels import LabelSettings
+from sliplens.recordings.source import open_source
 from sliplens.recordings.store import forces_path, read_header, save_recording
 from sliplens.recordings.trial import SIGNALS
+from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 rerun = pytest.importorskip("rerun")
@@ -97,7 +100,9 @@ def written(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     data = stored(folder / "data", trial)
     told = []
     write_rrd(
-        data, data.trials[0], folder / "new" / "a.rrd", on_progress=lambda done, total: told.append((done, total))
+        view_stored(data, data.trials[0]),
+        folder / "new" / "a.rrd",
+        on_progress=lambda done, total: told.append((done, total)),
     )
     assert told == [(8, FRAMES), (16, FRAMES), (FRAMES, FRAMES)]
     assert [path.name for path in (folder / "new").iterdir()] == ["a.rrd"]
@@ -228,7 +233,7 @@ def test_a_trial_without_truth_keeps_its_gaps(trial: Recording, tmp_path: Path):
         contact_state=states,
     )
     data = stored(tmp_path / "data", bare)
-    write_rrd(data, data.trials[0], tmp_path / "a.rrd")
+    write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd")
     found = read_rrd(tmp_path / "a.rrd")
     np.testing.assert_array_equal(numbers(found, "margin/gamma"), 100 * margin)
     np.testing.assert_array_equal(numbers(found, "force/normal"), normal)
@@ -255,10 +260,103 @@ def test_a_trial_where_nothing_is_known_can_be_looked_at(trial: Recording, tmp_p
         **dict.fromkeys(SIGNALS[1:], nothing),
     )
     data = stored(tmp_path / "data", bare)
-    write_rrd(data, data.trials[0], tmp_path / "a.rrd")
+    write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd")
     found = read_rrd(tmp_path / "a.rrd")
     assert np.isnan(numbers(found, "margin/gamma")).all()
     assert not pictures(found, "difference").any()
+
+
+def test_what_networks_and_trackers_say_stands_on_the_clock_of_the_frames(trial: Recording, tmp_path: Path):
+    data, frames = stored(tmp_path / "data", trial), np.arange(0, FRAMES, 2)
+    rng = np.random.default_rng(3)
+    margin = rng.uniform(0, 1, len(frames))
+    own = {"trial": [trial.trial] * len(frames), "frame": frames, "prediction": margin, "low_90": margin - 0.1}
+    # another trial in the same table, and a network that tells no upper end
+    others = {**own, "trial": ["other"] * len(frames), "prediction": margin + 1}
+    table = pa.concat_tables([pa.table(others), pa.table(own)]).append_column(
+        "high_90", pa.array([None] * (2 * len(frames)), pa.float64())
+    )
+    pq.write_table(table, tmp_path / "margins.parquet")
+    positions = trial.truth.marker_px[:, :3].copy() if trial.truth is not None else np.empty((0, 3, 2))
+    positions[5, 1] = np.nan
+    flat = positions.reshape(-1, 2)
+    place = {"frame": np.repeat(np.arange(FRAMES), 3), "marker": np.tile(np.arange(3), FRAMES)}
+    tracks = pa.table({"trial": [trial.trial] * len(flat), **place, "x_px": flat[:, 0], "y_px": flat[:, 1]})
+    pq.write_table(tracks, tmp_path / "tracks.parquet")
+    maps = explained_of(trial, [3, 4, 9])
+    beside = Beside(predictions=tmp_path / "margins.parquet", maps=maps, tracks=tmp_path / "tracks.parquet")
+    write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd", beside=beside)
+    found = read_rrd(tmp_path / "a.rrd")
+    read = rows(found, "margin/read", "Scalars:scalars")
+    np.testing.assert_array_equal(read.frame, frames)
+    np.testing.assert_allclose(numbers(found, "margin/read"), 100 * margin)
+    np.testing.assert_allclose(numbers(found, "margin/read/low"), 100 * (margin - 0.1))
+    assert "margin/read/high" not in found
+    np.testing.assert_array_equal(read.time_ns, np.round(1e9 * trial.time_s[frames]).astype(np.int64))
+    followed = rows(found, "camera/followed", "Points2D:positions").values
+    moving = [points for points in followed if points is not None]
+    assert [len(points) for points in moving][5] == 2
+    np.testing.assert_allclose(moving[4], positions[4] + 0.5, atol=1e-3)
+    shown = rows(found, "map/poly-cam", "EncodedImage:blob")
+    assert shown.frame is not None
+    assert [at for at, blob in zip(shown.frame.tolist(), shown.values, strict=True) if blob is not None] == [3, 4, 9]
+    cleared = rows(found, "map/poly-cam", "Clear:is_recursive")
+    assert cleared.frame is not None
+    assert [at for at, one in zip(cleared.frame.tolist(), cleared.values, strict=True) if one is not None] == [5, 10]
+
+
+def test_what_is_of_another_trial_is_refused(trial: Recording, tmp_path: Path):
+    data = stored(tmp_path / "data", trial)
+    nothing = {"trial": ["other"], "frame": [0], "prediction": [0.5], "low_90": [0.1], "high_90": [0.9]}
+    pq.write_table(pa.table(nothing), tmp_path / "margins.parquet")
+    for beside, words in (
+        (Beside(predictions=tmp_path / "margins.parquet"), f"has no frame of {trial.trial}; it has other"),
+        (Beside(maps=explained_of(replace(trial, trial="other"), [3])), "of no frame of"),
+        (Beside(tracks=tmp_path / "margins.parquet"), "lacks the column"),
+    ):
+        with pytest.raises(InputError, match=words):
+            write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd", beside=beside)
+    assert not (tmp_path / "a.rrd").exists()
+
+
+def test_frames_of_any_source_and_explained_ones_are_viewed_alike(trial: Recording, tmp_path: Path):
+    (capture,) = open_source(trial.frames, reference=trial.reference)
+    write_rrd(view_capture(capture), tmp_path / "a.rrd")
+    found = read_rrd(tmp_path / "a.rrd")
+    np.testing.assert_array_equal(pictures(found, "camera/frame"), trial.frames)
+    np.testing.assert_array_equal(pictures(found, "reference"), trial.reference[None])
+    maps = explained_of(trial, [3, 9])
+    write_rrd(view_explained(maps), tmp_path / "b.rrd", beside=Beside(maps=maps))
+    found = read_rrd(tmp_path / "b.rrd")
+    np.testing.assert_array_equal(pictures(found, "camera/frame"), maps.pictures)
+    np.testing.assert_allclose(numbers(found, "margin/gamma"), 100 * trial.safety_margin[[3, 9]])
+
+
+def explained_of(trial: Recording, frames: list[int]) -> Explained:
+    """Maps of some frames of a trial, drawn by chance."""
+    relevance = np.random.default_rng(1).normal(0, 1, (len(frames), 224, 224)).astype(np.float32)
+    labels = [float(margin) if np.isfinite(margin) else None for margin in trial.safety_margin[frames]]
+    return Explained(
+        input="difference",
+        source="simulated",
+        weights_sha256="",
+        frames=tuple(
+            ExplainedFrame(
+                id=f"{trial.trial}-f{at:04d}",
+                trial=trial.trial,
+                condition=trial.condition,
+                safety_margin=label,
+                prediction=0.5,
+                reference_prediction=1.0,
+            )
+            for at, label in zip(frames, labels, strict=True)
+        ),
+        methods={"poly-cam": MethodNotes(seconds_per_frame=0.1, warnings=())},
+        images=trial.frames[frames].transpose(0, 3, 1, 2),
+        pictures=trial.frames[frames],
+        relevance={"poly-cam": relevance},
+        saliency={"poly-cam": np.abs(relevance) / np.abs(relevance).max()},
+    )
 
 
 @pytest.mark.parametrize("applied", [True, False])
@@ -291,7 +389,7 @@ def test_samples_of_the_force_sensor_stand_on_the_clock_of_the_camera(
     )
     write_dataset_table(tmp_path, [trial_info(path, split="test")])
     data = load_dataset(tmp_path)
-    write_rrd(data, data.trials[0], tmp_path / "a.rrd")
+    write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd")
     labelling, found = read_header(path).labelling, read_rrd(tmp_path / "a.rrd")
     assert labelling is not None
     assert labelling.basis is not None
@@ -315,7 +413,7 @@ def test_samples_of_the_force_sensor_stand_on_the_clock_of_the_camera(
 @pytest.mark.parametrize("name", ["a.mp4", "a"])
 def test_another_suffix_is_refused(small_dataset: Dataset, tmp_path: Path, name: str):
     with pytest.raises(InputError, match=r"does not end in \.rrd; name a file of the Rerun viewer, such as trial\.rrd"):
-        write_rrd(small_dataset, small_dataset.trials[0], tmp_path / name)
+        write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / name)
     assert not list(tmp_path.iterdir())
 
 
@@ -324,8 +422,8 @@ def test_a_damaged_trial_leaves_no_file(trial: Recording, tmp_path: Path):
     path = trial_path(data.folder, trial.trial)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(RecordingError, match="is not a readable Parquet file"):
-        write_rrd(data, data.trials[0], tmp_path / "out" / "a.rrd")
-    assert not list((tmp_path / "out").iterdir())
+        write_rrd(view_stored(data, data.trials[0]), tmp_path / "out" / "a.rrd")
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_interruption_leaves_no_file(small_dataset: Dataset, tmp_path: Path):
@@ -333,14 +431,14 @@ def test_an_interruption_leaves_no_file(small_dataset: Dataset, tmp_path: Path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_rrd(small_dataset, small_dataset.trials[0], tmp_path / "a.rrd", on_progress=interrupt)
+        write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / "a.rrd", on_progress=interrupt)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_cannot_be_made_is_told(small_dataset: Dataset, tmp_path: Path):
     (tmp_path / "taken").write_text("a file")
     with pytest.raises(InputError, match=r"cannot write .*a\.rrd .*; choose another file"):
-        write_rrd(small_dataset, small_dataset.trials[0], tmp_path / "taken" / "a.rrd")
+        write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / "taken" / "a.rrd")
 
 
 def test_without_rerun_its_installation_is_told(
@@ -349,13 +447,13 @@ def test_without_rerun_its_installation_is_told(
     monkeypatch.setitem(sys.modules, "rerun", None)
     wanted = r'the viewer needs Rerun, which is not installed; install with `pip install "sliplens\[view\]"'
     with pytest.raises(InputError, match=wanted):
-        write_rrd(small_dataset, small_dataset.trials[0], tmp_path / "a.rrd")
+        write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / "a.rrd")
 
 
 def test_rerun_that_is_too_old_is_told(monkeypatch: pytest.MonkeyPatch, small_dataset: Dataset, tmp_path: Path):
     monkeypatch.delattr(rerun, "StateChange")
     with pytest.raises(InputError, match=r"too old .*; upgrade it with `pip install"):
-        write_rrd(small_dataset, small_dataset.trials[0], tmp_path / "a.rrd")
+        write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / "a.rrd")
 
 
 def test_rerun_switched_off_writes_no_empty_file(
@@ -363,7 +461,7 @@ def test_rerun_switched_off_writes_no_empty_file(
 ):
     monkeypatch.setenv("RERUN", "off")
     with pytest.raises(InputError, match="the environment variable RERUN switches Rerun off; unset it"):
-        write_rrd(small_dataset, small_dataset.trials[0], tmp_path / "a.rrd")
+        write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / "a.rrd")
     assert not list(tmp_path.iterdir())
 
 
@@ -377,7 +475,7 @@ def test_an_open_viewer_is_given_what_a_file_is(
     monkeypatch.setattr(rerun.RecordingStream, "connect_grpc", connect)
     monkeypatch.setattr("sliplens.plots.viewer.start_viewer", lambda: "rerun+http://127.0.0.1:1/proxy")
     data = stored(tmp_path / "data", trial)
-    open_viewer(data, data.trials[0])
+    open_viewer(view_stored(data, data.trials[0]))
     sent = read_rrd(tmp_path / "sent.rrd")
     assert set(sent) == set(simulated)
     np.testing.assert_array_equal(pictures(sent, "camera/frame"), trial.frames)
@@ -390,7 +488,7 @@ def test_no_viewer_opens_for_a_trial_that_is_not_there(
     data = stored(tmp_path / "data", trial)
     trial_path(data.folder, trial.trial).unlink()
     with pytest.raises(RecordingError, match="does not exist; make the data set again"):
-        open_viewer(data, data.trials[0])
+        open_viewer(view_stored(data, data.trials[0]))
 
 
 class Begun(NamedTuple):

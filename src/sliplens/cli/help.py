@@ -27,7 +27,7 @@ EXAMPLES = {
     "label": "sliplens label runs/mine/data --page",
     "split": "sliplens split runs/mine/data --preset trials --dry-run",
     "check": "sliplens check runs/mine/data",
-    "view": "sliplens view runs/mine/data --trial cup",
+    "view": "sliplens view runs/mine/data --trial cup --predictions margins.parquet --maps runs/mine/explain",
     "track": "sliplens track cup.mp4 --reference untouched.png -o markers.parquet",
     "train": "sliplens train runs/mine/data -o runs/mine/train --start-from chromatouch-difference --epochs 5",
     "evaluate": "sliplens evaluate runs/mine/train runs/mine/data -o runs/mine/evaluate",

@@ -2,47 +2,100 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from sliplens.cli.command import Command, Data
+from sliplens.cli.command import SOURCE_HELP, SourceCommand
 from sliplens.cli.console import Terminal, say, wrote
+from sliplens.errors import InputError
 from sliplens.files import require_new_file
+
+if TYPE_CHECKING:
+    from sliplens.plots.viewer import Viewed
+
+_SOURCE = f"{SOURCE_HELP} Or a table of `sliplens predict`, which names its source, or a folder of `sliplens explain`."
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(Command):
-    """Look at a trial in the Rerun viewer: frames, differences, forces and labels on one clock.
+class View(SourceCommand):
+    """Look at a trial in the Rerun viewer: frames, differences, forces, labels, predictions, maps on one clock.
 
     Needs the extra `view`: pip install "sliplens[view]". The viewer opens on this machine and listens to it alone; with
     --output a file is written instead, to be opened with `rerun FILE.rrd` wherever Rerun is installed.
     """
 
-    data: Data
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE", help=_SOURCE)]
     trial: str | None = None
-    """Name of the trial; the first of the data set if not given."""
+    """Name of the trial; the first if not given."""
+    predictions: Annotated[Path | None, tyro.conf.arg(metavar="FILE.parquet")] = None
+    """Margins with their intervals, as `sliplens predict` or `sliplens evaluate` wrote them."""
+    maps: Path | None = None
+    """Folder of maps that `sliplens explain` wrote."""
+    tracks: Annotated[Path | None, tyro.conf.arg(metavar="FILE.parquet")] = None
+    """Markers that `sliplens track` followed."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="FILE.rrd")] = None
     """File to write instead of opening the viewer."""
 
     def run(self) -> None:
         """Open the viewer, or write its file."""
-        from sliplens.plots.viewer import open_viewer, require_rerun, require_rrd_path, write_rrd
-        from sliplens.recordings import load_dataset
+        from sliplens.plots.viewer import Beside, open_viewer, require_rerun, require_rrd_path, write_rrd
+        from sliplens.results.explanation import is_explained, load_explained
 
         require_rerun()
         if self.output is not None:
             require_rrd_path(self.output)
             require_new_file(self.output, overwrite=self.overwrite)
-        data = load_dataset(self.data)
-        info = data.trials[0] if self.trial is None else data.find(self.trial)
-        with Terminal().stage(f"Reading {info.trial}") as bar:
+        table, maps = self.predictions, self.maps
+        if self.source.suffix == ".parquet":
+            table = self.source
+        elif is_explained(self.source):
+            maps = self.source
+        explained = None if maps is None else load_explained(maps)
+        viewed = self._open()
+        with Terminal().stage(f"Reading {viewed.trial.trial}") as bar:
+            beside = Beside(predictions=table, maps=explained, tracks=self.tracks)
             if self.output is None:
-                open_viewer(data, info, on_progress=bar)
+                open_viewer(viewed, beside=beside, on_progress=bar)
             else:
-                write_rrd(data, info, self.output, on_progress=bar)
+                write_rrd(viewed, self.output, beside=beside, on_progress=bar)
+        told = f"{viewed.trial.trial}, {len(viewed.trial):,} frames"
         if self.output is None:
-            say(f"{info.trial} is in the Rerun viewer, {info.frames:,} frames")
+            say(f"{told}, are in the Rerun viewer")
             say("the viewer tells its makers that it is used, not what is seen; `rerun analytics disable` ends that")
         else:
-            wrote(self.output, f"{info.trial}, {info.frames:,} frames; open it with `rerun {self.output}`")
+            wrote(self.output, f"{told}; open it with `rerun {self.output}`")
+
+    def _open(self) -> "Viewed":
+        """Trial of whatever was named."""
+        from sliplens.plots.viewer import view_capture, view_explained, view_stored
+        from sliplens.recordings import load_dataset
+        from sliplens.recordings.dataset import DATASET_FILE
+        from sliplens.recordings.source import open_source
+        from sliplens.results.explanation import is_explained, load_explained
+
+        source, trial = self.source, self.trial
+        if is_explained(source):
+            return view_explained(load_explained(source))
+        if source.suffix == ".parquet":
+            source, first = self._source_of(source)
+            trial = trial or first
+        if (source / DATASET_FILE).is_file():
+            data = load_dataset(source)
+            infos = data.select(split=self.split)
+            return view_stored(data, infos[0] if trial is None else data.find(trial))
+        return view_capture(self.call(open_source, source=source, trial=trial, whole=False)[0])
+
+    def _source_of(self, table: Path) -> tuple[Path, str | None]:
+        """What a table of predictions was read from, and its first trial."""
+        from sliplens.codec import open_parquet
+
+        with open_parquet(table, {"trial": "texts"}, cure="name a table that sliplens predict wrote") as file:
+            named = (file.schema_arrow.metadata or {}).get(b"sliplens.source", b"").decode()
+            trials = next(file.iter_batches(1, columns=["trial"]), None)
+        if not Path(named).exists() or not named:
+            raise InputError(
+                f"{table} was read from {named or 'a source that it does not tell'}, which is not there; name the "
+                f"source first, and the table with --predictions {table}"
+            )
+        return Path(named), None if trials is None else trials["trial"][0].as_py()

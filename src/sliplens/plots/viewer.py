@@ -1,4 +1,4 @@
-"""A trial in the Rerun viewer: frames, differences, forces and labels on one clock, streamed from its file."""
+"""A trial in the Rerun viewer: frames, differences, forces, labels and what networks say of it, on one clock."""
 
 import os
 import re
@@ -8,8 +8,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from types import ModuleType
@@ -17,38 +19,110 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from jaxtyping import Float, Int, UInt8
 from matplotlib.colors import to_rgba
 
+from sliplens.codec import open_parquet
 from sliplens.errors import InputError
 from sliplens.extras import require_packages
 from sliplens.images import absolute_difference, encode_png
 from sliplens.plots.audit import Fact, audit_facts, end_of_ratio, force_ratio
 from sliplens.plots.contact_sheet import STATE_COLOURS, TIMES, brighten, brightening
 from sliplens.plots.layout import written_whole
-from sliplens.plots.style import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
+from sliplens.plots.saliency import full_colour, overlay_relevance
+from sliplens.plots.style import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, method_name
 from sliplens.progress import OnProgress
-from sliplens.recordings import Dataset, Recording, TrialInfo
-from sliplens.recordings.capture import Forces
+from sliplens.recordings import Dataset, Recording, TrialFacts, TrialInfo
+from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.dataset import trial_path
 from sliplens.recordings.labelling import LabelBasis
+from sliplens.recordings.source import open_source
 from sliplens.recordings.store import (
     TruthHeader,
     decode_pixels,
     forces_path,
     load_forces,
     load_recording,
-    read_frames,
     read_header,
     reading,
     stream_frames,
 )
-from sliplens.recordings.trial import OUTSIDE, SLIPS, STICKS
+from sliplens.recordings.trial import OUTSIDE, SLIPS, STICKS, Labels, labels_of_margins
+from sliplens.results.explanation import Explained
 
 if TYPE_CHECKING:
     from rerun import RecordingStream, TimeColumn
     from rerun.blueprint import Blueprint, TimeSeriesView
+
+
+@dataclass(frozen=True, kw_only=True)
+class Viewed:
+    """A trial as the viewer reads it, a few frames in memory at a time."""
+
+    trial: Recording
+    """Times and labels; without pixels."""
+    read_frames: Callable[[], Iterator[Frame]]
+    pick: Callable[[Sequence[int]], Iterable[Frame]]
+    """Gives frames of rising numbers."""
+    split: str = ""
+    forces: Forces | None = None
+    path: Path | None = None
+    """File of a stored trial, which may hold the truth."""
+    files: tuple[str, ...] = ()
+    """Names of the images of a folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Beside:
+    """What networks and trackers say of trials, to be shown beside their frames."""
+
+    predictions: Path | None = None
+    """Table that `sliplens predict` or `sliplens evaluate` wrote (Parquet)."""
+    maps: Explained | None = None
+    tracks: Path | None = None
+    """Table that `sliplens track` wrote."""
+
+
+def view_stored(data: Dataset, info: TrialInfo) -> Viewed:
+    """Trial of a data set for the viewer."""
+    path = trial_path(data.folder, info.trial)
+    return Viewed(
+        trial=load_recording(path, pixels=False),
+        read_frames=partial(stream_frames, path),
+        pick=lambda places: stream_frames(path, set(places)),
+        split=info.split,
+        forces=load_forces(forces_path(data.folder, info.trial)) if info.forces_sha256 else None,
+        path=path,
+    )
+
+
+def view_capture(capture: Capture) -> Viewed:
+    """Recording of any source for the viewer; without an untouched sensor its first frame stands for it."""
+    count, labels = len(capture), capture.labels or labels_of_margins(np.full(len(capture), np.nan))
+    reference = next(capture.read_frames()) if capture.read_reference is None else capture.read_reference()
+    time_s = np.arange(count) / capture.frame_rate_hz if capture.time_s is None else capture.time_s
+    facts = {one.name: getattr(capture, one.name) for one in fields(TrialFacts)}
+    known = {one.name: getattr(labels, one.name) for one in fields(Labels)}
+    frames = np.broadcast_to(reference, (count, *reference.shape))
+    return Viewed(
+        trial=Recording(**facts, **known, time_s=time_s, reference=reference, frames=frames),
+        read_frames=capture.read_frames,
+        pick=lambda places: (frame for at, frame in enumerate(capture.read_frames()) if at in set(places)),
+        forces=capture.forces,
+        files=capture.files or (),
+    )
+
+
+def view_explained(explained: Explained) -> Viewed:
+    """Frames that were explained, one after another, as their network saw them."""
+    (capture,) = open_source(explained.pictures)
+    first = explained.frames[0]
+    capture = replace(capture, trial=first.trial, condition=first.condition, day=first.day)
+    labels = [np.nan if one.safety_margin is None else one.safety_margin for one in explained.frames]
+    known = replace(capture, labels=labels_of_margins(np.array(labels)))
+    return replace(view_capture(known), files=tuple(f"{one.id}.png" for one in explained.frames))
 
 
 _LOOPBACK = "127.0.0.1"
@@ -129,13 +203,24 @@ LINES = {
     "margin/band/high": ("Γ + \N{GREEK SMALL LETTER SIGMA} (%)", PURPLE),
     "margin/band/low": ("Γ \N{MINUS SIGN} \N{GREEK SMALL LETTER SIGMA} (%)", PURPLE),
     "margin/stick_ratio": ("stick ratio (%)", ORANGE),
+    "margin/read": ("Γ as read (%)", VERMILLION),
+    "margin/read/high": ("upper end of its 90 % interval (%)", YELLOW),
+    "margin/read/low": ("lower end of its 90 % interval (%)", YELLOW),
 }
 """Entity, name and colour of each number of a frame."""
 SAMPLE_LINES = {"x (N), as recorded": VERMILLION, "y (N), as recorded": GREEN, "z (N), as recorded": BLUE}
 """The same of each axis of the force sensor."""
 
 
-def lay_out(*, size: tuple[int, int], factor: float, highest_ratio: float, truth: bool, sensor: bool) -> "Blueprint":
+def lay_out(
+    *,
+    size: tuple[int, int],
+    factor: float,
+    highest_ratio: float,
+    truth: bool,
+    sensor: bool,
+    methods: Sequence[str] = (),
+) -> "Blueprint":
     """Lay out a trial: what is seen at first sight, before anything is moved."""
     rrb = require_rerun().blueprint
     height, width = size
@@ -155,10 +240,15 @@ def lay_out(*, size: tuple[int, int], factor: float, highest_ratio: float, truth
         _chart("ratio", "F_t / F_n in contact, beside friction", "RightBottom", (0.0, highest_ratio)),
         *([_chart("sensor", "force sensor, as recorded (N)", "RightBottom")] if sensor else []),
     ]
+    # a map is as large as the network's image, whatever the camera's
+    maps = [
+        rrb.Spatial2DView(origin=f"map/{method}", name=f"map by {method_name(method)}, at its frame")
+        for method in methods
+    ]
     about = rrb.TextDocumentView(origin="about", name="about this trial")
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(camera, difference),
+            rrb.Vertical(camera, difference, *([rrb.Tabs(*maps)] if maps else [])),
             rrb.Vertical(states, *charts, row_shares=[0.6, *(1 for _ in charts)]),
             rrb.Vertical(about, reference, row_shares=[2, 1]),
             column_shares=[2, 3, 1.4],
@@ -181,19 +271,20 @@ def _chart(origin: str, name: str, legend: str, span: tuple[float, float] | None
 _MARKS = re.compile(r"([\\`*_{}\[\]<>#|~])")
 
 
-def describe_trial(trial: Recording, info: TrialInfo, truth: TruthHeader | None) -> str:
+def describe_trial(trial: Recording, truth: TruthHeader | None, *, split: str = "") -> str:
     """Tell in Markdown what a trial is, and what its labels rest on."""
     span = float(trial.time_s[-1] - trial.time_s[0])
+    height, width = trial.reference.shape[:2]
     told = {
-        "sensor": info.sensor,
-        "object": info.object,
-        "condition": info.condition,
-        "day": str(info.day),
-        "split": info.split,
-        "frames": f"{info.frames:,} of {info.width} × {info.height} pixels in {span:.2f} s",  # noqa: RUF001 (times is meant)
+        "sensor": trial.sensor,
+        "object": trial.object,
+        "condition": trial.condition,
+        "day": str(trial.day),
+        "split": split,
+        "frames": f"{len(trial):,} of {width} × {height} pixels in {span:.2f} s",  # noqa: RUF001 (times is meant)
     }
     about = [f"- {name}: {_plain(value)}" for name, value in told.items() if value]
-    lines = [f"# {_plain(info.trial)}", *about, "", "## What its labels rest on"]
+    lines = [f"# {_plain(trial.trial)}", *about, "", "## What its labels rest on"]
     for fact in _facts(trial, truth):
         lines.append(f"\n**{'▲ ' if fact.doubtful else ''}{_plain(fact.head)}**\n")
         lines += [f"- {_plain(words)}" for words in fact.words if words]
@@ -235,7 +326,6 @@ def rgba(colour: str) -> list[int]:
 
 def log_numbers(stream: "RecordingStream", trial: Recording, static_friction: Float[np.ndarray, " _"] | None) -> None:
     """Log forces, their ratio where something touches, and labels: a line each."""
-    rerun = require_rerun()
     normal = trial.normal_force_n
     margin, sigma = 100 * trial.safety_margin, trial.safety_margin_sigma
     lines = {
@@ -252,12 +342,77 @@ def log_numbers(stream: "RecordingStream", trial: Recording, static_friction: Fl
         lines["ratio/static_friction"] = static_friction
     if sigma is not None:
         lines |= {"margin/band/high": margin + 100 * sigma, "margin/band/low": margin - 100 * sigma}
-    times = clock(trial.time_s, np.arange(len(trial)))
+    _log_lines(stream, lines, clock(trial.time_s, np.arange(len(trial))))
+
+
+def _log_lines(stream: "RecordingStream", lines: dict[str, Float[np.ndarray, " _"]], times: "list[TimeColumn]") -> None:
+    rerun = require_rerun()
     for entity, values in lines.items():
         name, colour = LINES[entity]
-        width = 1.0 if "band" in entity else 2.0
+        width = 1.0 if entity.endswith(("high", "low")) else 2.0
         stream.log(entity, rerun.SeriesLines(names=name, colors=[rgba(colour)], widths=width), static=True)
         stream.send_columns(entity, times, rerun.Scalars.columns(scalars=values))
+
+
+_PREDICTED = {"trial": "texts", "frame": "whole numbers", "prediction": "numbers", "low_90": "numbers"}
+_TRACKED = {"trial": "texts", "frame": "whole numbers", "x_px": "numbers", "y_px": "numbers", "marker": "whole numbers"}
+
+
+def _rows_of(trial: Recording, path: Path, kinds: dict[str, str], *, command: str) -> tuple[pa.Table, np.ndarray]:
+    """Rows of a table that are of a trial, in the order of its frames, and the frames' numbers."""
+    with open_parquet(path, kinds, cure=f"name a table that {command} wrote") as file:
+        table = file.read()
+    names = table["trial"].unique().to_pylist()
+    rows = table.filter(pc.field("trial") == trial.trial).sort_by("frame")
+    frames = rows["frame"].to_numpy().astype(np.int64)
+    if not len(frames):
+        raise InputError(f"{path} has no frame of {trial.trial}; it has {', '.join(map(str, names[:3]))}")
+    if frames[0] < 0 or frames[-1] >= len(trial):
+        raise InputError(f"{path} has frame {frames[-1]} of {trial.trial}, which has {len(trial)}; predict it anew")
+    return rows, frames
+
+
+def log_predictions(stream: "RecordingStream", trial: Recording, path: Path) -> None:
+    """Log the margins that a network read, with the ends of their 90 % intervals where it tells any."""
+    rows, frames = _rows_of(trial, path, _PREDICTED, command="sliplens predict")
+    columns = {"margin/read": "prediction", "margin/read/high": "high_90", "margin/read/low": "low_90"}
+    lines = {entity: 100 * rows[name].to_numpy().astype(np.float64) for entity, name in columns.items()}
+    known = {entity: values for entity, values in lines.items() if np.isfinite(values).any()}
+    _log_lines(stream, known, clock(trial.time_s[frames], frames))
+
+
+def log_tracks(stream: "RecordingStream", trial: Recording, path: Path) -> None:
+    """Log where markers were followed to, over the camera frames."""
+    rerun = require_rerun()
+    rows, frames = _rows_of(trial, path, _TRACKED, command="sliplens track")
+    places, starts = np.unique(frames, return_index=True)
+    points = np.stack([rows[name].to_numpy().astype(np.float32) for name in ("x_px", "y_px")], axis=-1) + _HALF_PX
+    seen = np.isfinite(points).all(axis=1)
+    counts = np.add.reduceat(seen.astype(np.int64), starts)
+    dots = rerun.Points2D.from_fields(colors=[rgba(GREEN)], radii=[rerun.Radius.ui_points(2.5)])
+    stream.log("camera/followed", dots, static=True)
+    columns = rerun.Points2D.columns(positions=points[seen]).partition(counts)
+    stream.send_columns("camera/followed", clock(trial.time_s[places], places), columns)
+
+
+def log_maps(stream: "RecordingStream", viewed: Viewed, maps: Explained) -> tuple[str, ...]:
+    """Log the maps of a trial's frames, each until the next frame, on one scale; gives their methods."""
+    rerun, trial = require_rerun(), viewed.trial
+    numbers = {Path(name).stem: at for at, name in enumerate(viewed.files)}
+    numbers |= {f"{trial.trial}-f{at:04d}": at for at in range(len(trial))}
+    found = {numbers[frame.id]: row for row, frame in enumerate(maps.frames) if frame.id in numbers}
+    if not found:
+        raise InputError(f"the maps are of no frame of {trial.trial}; they are of {maps.frames[0].id} and others")
+    for method in maps.methods:
+        scale = full_colour(maps.relevance[method])
+        for at, row in sorted(found.items()):
+            picture = overlay_relevance(maps.pictures[row], maps.relevance[method][row] / scale)
+            image = rerun.EncodedImage.columns(blob=[encode_png(picture)], media_type=[_PNG])
+            stream.send_columns(f"map/{method}", clock(trial.time_s[[at]], np.array([at])), image)
+            if at + 1 < len(trial) and at + 1 not in found:  # a map says nothing of the frames after its own
+                after = clock(trial.time_s[[at + 1]], np.array([at + 1]))
+                stream.send_columns(f"map/{method}", after, rerun.Clear.columns(is_recursive=[False]))
+    return tuple(maps.methods)
 
 
 def log_states(stream: "RecordingStream", trial: Recording) -> None:
@@ -295,14 +450,12 @@ _PNG = "image/png"
 _TOGETHER = 8  # frames that are sent together: a megabyte or so, as much as Rerun itself sends at once
 
 
-def log_frames(
-    stream: "RecordingStream", path: Path, trial: Recording, factor: float, on_progress: OnProgress | None
-) -> None:
+def log_frames(stream: "RecordingStream", viewed: Viewed, factor: float, on_progress: OnProgress | None) -> None:
     """Log camera frames and their bright differences from the reference, losslessly.
 
     As PNG: two thirds the size of raw pixels, in the file and in the viewer's memory, for some 5 ms a picture.
     """
-    rerun, frames, done = require_rerun(), stream_frames(path), 0
+    rerun, frames, trial, done = require_rerun(), viewed.read_frames(), viewed.trial, 0
 
     def encode(frame: UInt8[np.ndarray, "_ _ 3"]) -> tuple[bytes, bytes]:
         return encode_png(frame), encode_png(brighten(absolute_difference(frame, trial.reference), factor))
@@ -365,60 +518,69 @@ _APPLICATION = "sliplens"
 _SAMPLED = 32  # frames that are looked at for the brightness of all
 
 
-def write_rrd(data: Dataset, info: TrialInfo, path: Path, *, on_progress: OnProgress | None = None) -> None:
+def write_rrd(viewed: Viewed, path: Path, *, beside: Beside = Beside(), on_progress: OnProgress | None = None) -> None:
     """Write a trial as a file of the Rerun viewer; it appears when complete."""
     require_rrd_path(path)
     stream = _new_stream()
     with written_whole(path) as part:
         part.touch()  # Rerun would tell of a file that cannot be written in its own way
         stream.save(part)
-        _log_whole(stream, data, info, on_progress, otherwise=f"{path} could not be written; see what space is left")
+        _log_whole(
+            stream, viewed, beside, on_progress, otherwise=f"{path} could not be written; see what space is left"
+        )
 
 
-def open_viewer(data: Dataset, info: TrialInfo, *, on_progress: OnProgress | None = None) -> None:
+def open_viewer(viewed: Viewed, *, beside: Beside = Beside(), on_progress: OnProgress | None = None) -> None:
     """Open a trial in a Rerun viewer of its own, which stays when this process ends."""
     stream = _new_stream()
-    read_header(trial_path(data.folder, info.trial))  # no window for a trial that is not there
     stream.connect_grpc(start_viewer())
-    _log_whole(stream, data, info, on_progress, otherwise="the Rerun viewer was closed too early; leave it open")
+    _log_whole(stream, viewed, beside, on_progress, otherwise="the Rerun viewer was closed too early; leave it open")
 
 
 def log_trial(
-    stream: "RecordingStream", data: Dataset, info: TrialInfo, *, on_progress: OnProgress | None = None
+    stream: "RecordingStream", viewed: Viewed, beside: Beside, *, on_progress: OnProgress | None = None
 ) -> None:
-    """Log a trial and its layout to a Rerun stream, a few frames in memory at a time.
+    """Log a trial, what is beside it, and its layout to a Rerun stream, a few frames in memory at a time.
 
     Timelines are `time`, on the clock of the camera, and `frame`. What is not known is NaN: there a line breaks.
     """
     rerun = require_rerun()
-    path, samples = trial_path(data.folder, info.trial), forces_path(data.folder, info.trial)
-    trial, truth, sensor = load_recording(path, pixels=False), read_header(path).truth, bool(info.forces_sha256)
+    trial, path = viewed.trial, viewed.path
+    truth = None if path is None else read_header(path).truth
     basis = trial.labelling.basis if trial.labelling else None
     friction = _static_friction(path, trial, truth, basis)
-    some = read_frames(path, range(0, len(trial), -(-len(trial) // _SAMPLED)))
+    methods = () if beside.maps is None else log_maps(stream, viewed, beside.maps)
+    if beside.predictions is not None:
+        log_predictions(stream, trial, beside.predictions)
+    if beside.tracks is not None:
+        log_tracks(stream, trial, beside.tracks)
+    some = np.stack(list(viewed.pick(range(0, len(trial), -(-len(trial) // _SAMPLED)))))
     size, factor = trial.reference.shape[:2], brightening([absolute_difference(some, trial.reference)])
     frictions = trial.friction_coefficient if friction is None else friction
     highest = end_of_ratio(force_ratio(trial), float(np.max(frictions, where=np.isfinite(frictions), initial=0)))
-    stream.send_recording_name(info.trial)
+    sensor = viewed.forces is not None
+    stream.send_recording_name(trial.trial)
     stream.send_blueprint(
-        lay_out(size=size, factor=factor, highest_ratio=highest, truth=truth is not None, sensor=sensor)
+        lay_out(
+            size=size, factor=factor, highest_ratio=highest, truth=truth is not None, sensor=sensor, methods=methods
+        )
     )
-    about = describe_trial(trial, info, truth)
+    about = describe_trial(trial, truth, split=viewed.split)
     stream.log("about", rerun.TextDocument(about, media_type=rerun.MediaType.MARKDOWN), static=True)
     log_numbers(stream, trial, friction)
     log_states(stream, trial)
-    if sensor:
-        log_samples(stream, load_forces(samples), basis)
-    if truth is not None:
+    if viewed.forces is not None:
+        log_samples(stream, viewed.forces, basis)
+    if path is not None and truth is not None:
         log_truth(stream, path, trial, truth)
-    log_frames(stream, path, trial, factor, on_progress)
+    log_frames(stream, viewed, factor, on_progress)
 
 
 def _log_whole(
-    stream: "RecordingStream", data: Dataset, info: TrialInfo, on_progress: OnProgress | None, *, otherwise: str
+    stream: "RecordingStream", viewed: Viewed, beside: Beside, on_progress: OnProgress | None, *, otherwise: str
 ) -> None:
     try:
-        log_trial(stream, data, info, on_progress=on_progress)
+        log_trial(stream, viewed, beside, on_progress=on_progress)
         stream.flush()
     except RuntimeError as error:
         raise InputError(f"{otherwise} ({error})") from None
@@ -427,10 +589,10 @@ def _log_whole(
 
 
 def _static_friction(
-    path: Path, trial: Recording, truth: TruthHeader | None, basis: LabelBasis | None
+    path: Path | None, trial: Recording, truth: TruthHeader | None, basis: LabelBasis | None
 ) -> Float[np.ndarray, " frames"] | None:
     """mu_s of each frame: that of the simulator, or what was estimated; None where neither is told."""
-    if truth is None:
+    if truth is None or path is None:
         return None if basis is None else np.full(len(trial), basis.friction.mu)
     with reading(path):
         return pq.read_table(path, columns=["static_friction"])["static_friction"].to_numpy().astype(np.float64)

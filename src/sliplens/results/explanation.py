@@ -91,6 +91,12 @@ class Explained:
         )
 
 
+def is_explained(folder: Path) -> bool:
+    """Whether a folder is one that `sliplens explain` wrote."""
+    path = folder / RUN_FILE
+    return path.is_file() and load_record(path, Provenance, command="sliplens explain").stage == "explain"
+
+
 def load_explained(folder: Path) -> Explained:
     """Read a folder that `sliplens explain` wrote.
 
@@ -102,7 +108,7 @@ def load_explained(folder: Path) -> Explained:
         If a map is not finite.
     """
     require_folder(folder, what="the explanations")
-    if load_record(folder / RUN_FILE, Provenance, command="sliplens explain").stage != "explain":
+    if not is_explained(folder):
         raise InputError(f"{folder} holds no explanations; make them with sliplens explain")
     explained = load_result(folder, Explained, command="sliplens explain")
     for kind, maps in (("map", explained.relevance), ("saliency", explained.saliency)):
