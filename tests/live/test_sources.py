@@ -53,6 +53,12 @@ def test_a_repeated_trial_goes_on_counting(recording: Recording):
     np.testing.assert_array_equal(frames[13].image, recording.frames[1])
 
 
+def test_a_capture_of_fewer_frames_than_it_tells_ends_with_them(recording: Recording):
+    capture = open_source(recording.frames)[0]
+    short = replace(capture, read_frames=lambda: iter(recording.frames[:3]))
+    assert [frame.number for frame in ReplaySource(short, rate_hz=1000.0).frames()] == [0, 1, 2]
+
+
 def test_a_closed_source_ends_soon(recording: Recording):
     source = open_live(recording.frames, options=SourceOptions(rate_hz=0.1))
     frames = source.frames()

@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from sliplens.errors import ImageError, SliplensError
+from sliplens.errors import SliplensError
 from sliplens.explainers.explanation import CLOSE, Explanation
 from sliplens.explainers.occlusion import marker_regions, to_network_px
 from sliplens.explainers.table import explain
@@ -27,7 +27,6 @@ from sliplens.live.loop import LiveReader
 from sliplens.live.reading import LiveFrame, Reading
 from sliplens.live.recorder import RecordingState
 from sliplens.live.sinks import SinkState
-from sliplens.markers import Tracker
 from sliplens.models.checkpoint import Run
 from sliplens.plots.saliency import full_colour
 from sliplens.recordings.capture import Frame
@@ -36,7 +35,7 @@ CHART_S = 30.0
 """Time that the chart of the page spans, in seconds."""
 LIVE_METHOD = "grad-cam"
 """Explainer of the running picture, one of the cheapest; any other explains a frozen one."""
-_PICTURES_HZ, _ARROWS_HZ, _MAPS_HZ = 30.0, 10.0, 2.0
+_PICTURES_HZ, _MAPS_HZ = 30.0, 2.0
 _LONGEST_PX = 800
 _QUALITY = 85
 _UNANSWERED = 2  # messages under way to one viewer: one is drawn while the next one travels
@@ -200,9 +199,6 @@ class Feed:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._closed = Event()
         self._end_subscription: Callable[[], None] = lambda: None
-        self._followed_s = -np.inf
-        self._tracker: tuple[Frame, Tracker | None] | None = None
-        self._arrows: tuple[Arrow, ...] = ()
         self._before: Frame | None = None
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="explain")
         # explainers listen inside the network: not in the one that reads
@@ -306,39 +302,13 @@ class Feed:
     def _draw(self, reading: Reading, frame: LiveFrame) -> Picture:
         shown = Image.fromarray(frame.image)
         shown.thumbnail((_LONGEST_PX, _LONGEST_PX), reducing_gap=1.0)
-        reference = self.reader.reference
         return Picture(
             reading=reading,
             frame=frame,
-            reference=reference,
+            reference=self.reader.reference,
             jpeg=encode_jpeg(np.asarray(shown), _QUALITY),
-            arrows=self._follow(frame, reference) if any(viewer.shows_arrows for viewer in tuple(self.viewers)) else (),
+            arrows=_arrows(self.reader.markers_px),
         )
-
-    def _follow(self, frame: LiveFrame, reference: Frame | None) -> tuple[Arrow, ...]:
-        """Arrows of a frame, or of one just before."""
-        if reference is None or reference.shape != frame.image.shape:
-            return ()
-        if self._tracker is None or self._tracker[0] is not reference:
-            try:
-                self._tracker = reference, Tracker(reference)
-            except ImageError:
-                self._tracker = reference, None  # a sensor without markers
-            self._followed_s = -np.inf
-        _, tracker = self._tracker
-        if tracker is None:
-            return ()
-        if frame.captured_s - self._followed_s < 0.7 / _ARROWS_HZ:
-            return self._arrows
-        self._followed_s = frame.captured_s
-        rest = tracker.rest.centre_px
-        place = tracker.update(frame.image).position_px[: len(rest)]
-        self._arrows = tuple(
-            Arrow(start_px=(x, y), end_px=(to_x, to_y))
-            for x, y, to_x, to_y in np.column_stack([rest, place]).round(1).tolist()
-            if np.isfinite(to_x)
-        )
-        return self._arrows
 
     def _map_on(self) -> None:
         """Explain the newest picture at a few hertz, while somebody wants that."""
@@ -382,6 +352,17 @@ class Feed:
             ),
             cells=np.round(127 * (not alike) * np.clip(relevance / full, -1, 1)).astype(np.int8).tobytes(),
         )
+
+
+def _arrows(markers_px: tuple[np.ndarray, np.ndarray] | None) -> tuple[Arrow, ...]:
+    """Ways of the markers that are seen in the newest frame, or one just before."""
+    if markers_px is None:
+        return ()
+    return tuple(
+        Arrow(start_px=(x, y), end_px=(to_x, to_y))
+        for x, y, to_x, to_y in np.column_stack(markers_px).round(1).tolist()
+        if np.isfinite(to_x)
+    )
 
 
 def _marker_relevance(explanation: Explanation, picture: Picture) -> tuple[MarkerRelevance, ...]:

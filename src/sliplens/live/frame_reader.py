@@ -132,6 +132,8 @@ class FrameReader:
         """The sensor untouched, as the next frame is compared with it."""
         self.asked = Event()
         """Set to have a new reference taken as soon as the picture is still."""
+        self.markers_px: tuple[np.ndarray, np.ndarray] | None = None
+        """Places (x, y) of the markers at rest and in the newest frame, in pixels; None where they are not followed."""
         self._friction = None if friction is None else SlipLearner(as_friction(friction))
         if self._friction is not None:
             if network is None:
@@ -203,8 +205,9 @@ class FrameReader:
         begun = time.perf_counter()
         followed = markers = None
         if self._tracker is not None and self._slip is not None:
-            followed = self._tracker.update(frame.image)
-            markers = self._slip.update(followed.position_px[: len(self._tracker.rest)], frame.time_s)
+            followed, rest_px = self._tracker.update(frame.image), self._tracker.rest.centre_px
+            self.markers_px = rest_px, followed.position_px[: len(rest_px)]
+            markers = self._slip.update(self.markers_px[1], frame.time_s)
         health = () if self._health is None else self._health.check(frame, followed)
         latency = Latency(decode_ms=frame.decode_ms, checks_ms=1e3 * (time.perf_counter() - begun))
         withheld = next((check.sentence for check in health if not check.ok), None)
@@ -291,6 +294,7 @@ class FrameReader:
     def _begin_anew(self) -> None:
         """Forget what came before, where frames no longer follow each other."""
         self._smooth.forget()
+        self.markers_px = None
         if self._make_slip is not None and self.reference is not None:
             try:
                 self._tracker = Tracker(self.reference)

@@ -176,6 +176,13 @@ class LiveReader:
         return self._reader.engine
 
     @property
+    def markers_px(self) -> tuple[Float[np.ndarray, "markers 2"], Float[np.ndarray, "markers 2"]] | None:
+        """Places (x, y) of the markers at rest and in the newest frame, in pixels, NaN where one is not seen; None where
+        none are followed.
+        """
+        return self._reader.markers_px
+
+    @property
     def outputs(self) -> tuple[RecordingState | SinkState, ...]:
         """How far the recording is, the last one where none goes on, and each sink."""
         recorder = self._recorded

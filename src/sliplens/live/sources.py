@@ -73,7 +73,9 @@ class ReplaySource(LiveSource):
             forces_s = -np.inf
             for at, offset_s in enumerate(self._time_s.tolist()):
                 before = time.perf_counter()
-                image = next(images)
+                image = next(images, None)
+                if image is None:  # a video whose header promised more
+                    break
                 decode_ms = 1e3 * (time.perf_counter() - before)
                 time_s = begun_s + offset_s
                 if not pace.wait(time_s / self.speed):
