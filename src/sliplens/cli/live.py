@@ -131,11 +131,11 @@ class Live:
         for reading in reader.readings():
             if time.monotonic() - told_s >= 1:
                 told_s = time.monotonic()
+                for error in () if self.page else (sender.error for sender in reader.senders if sender.error):
+                    raise error
                 for trouble in set(reader.troubles) - told:
                     told.add(trouble)
                     _tell(trouble)
-                for error in () if self.page else (sender.error for sender in reader.senders if sender.error):
-                    raise error
                 if not self.sink:
                     say(str(reading))
 

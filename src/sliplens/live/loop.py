@@ -177,8 +177,9 @@ class LiveReader:
 
     @property
     def markers_px(self) -> tuple[Float[np.ndarray, "markers 2"], Float[np.ndarray, "markers 2"]] | None:
-        """Places (x, y) of the markers at rest and in the newest frame, in pixels, NaN where one is not seen; None where
-        none are followed.
+        """Places (x, y) of the markers at rest and in the newest frame, in pixels, NaN where one is not seen.
+
+        None where none are followed.
         """
         return self._reader.markers_px
 
