@@ -186,6 +186,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.quick:
         options.sensors, options.trials, options.seeds, options.image_size = ["dome"], [0, 1, 3], 1, 64
+        options.changes = '{"epochs": 3, "epoch_frames": 128}'
     options.cache.mkdir(parents=True, exist_ok=True)
     try:
         found = measure(options)

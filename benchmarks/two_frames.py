@@ -4,9 +4,9 @@ The network stays as it is: a small perceptron gets its answers and its uncertai
 taught the margin of the last of them, on trials from slippery to rough; it is tried on fresh days, dry (friction 0.5 to
 1.2) and wet (0.15 to 0.7). One frame alone goes through such a perceptron too: the difference is what the others add.
 
-All frames lie at fixed times: the speed of the pull is the same in all trials of the simulator, and a sequence tells
-the margin in part by how fast it falls. On a robot that grips at a speed of its own, expect less; docs/limit.md says
-how much.
+All frames lie at fixed times. With `--pulls steady` the speed of the pull is the same in all trials, and a sequence
+tells the margin in part by how fast it falls; with `varied` no pull is like another, and what is left is what a
+sequence tells of friction.
 """
 
 import argparse
@@ -29,6 +29,7 @@ from sliplens.errors import SliplensError
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
 from sliplens.simulation import PRESETS, SimulationRecipe, simulate_dataset
+from sliplens.simulation.plan import PULLS
 from sliplens.training import evaluate_frames
 from sliplens.training.data import load_frames
 from sliplens.training.metrics import regression_scores
@@ -106,6 +107,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--run", type=Path, default=Path("chromatouch-difference"), help="a trained network")
     parser.add_argument("--days", type=int, default=40, help="that teach, and as many that test")
+    parser.add_argument("--pulls", default="varied", choices=PULLS, help="how objects are pulled")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     try:
@@ -114,7 +116,14 @@ def main() -> None:
         sys.exit(f"{Path(__file__).name}: {error}")
     varied, days = PRESETS["varied"], options.days
     learned_from = replace(
-        varied, seed=101, frames_per_trial=40, days=days + 1, test_days=1, dry_trials=3 * (days + 1), wet_trials=0
+        varied,
+        seed=101,
+        frames_per_trial=40,
+        days=days + 1,
+        test_days=1,
+        dry_trials=3 * (days + 1),
+        wet_trials=0,
+        pulls=PULLS[options.pulls],
     )
     tried_on = replace(
         learned_from, seed=102, test_days=days, wet_trials=3 * days, nuisances=PRESETS["thesis"].nuisances

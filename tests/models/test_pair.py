@@ -76,9 +76,7 @@ def test_it_does_without_no_reference(raw_run: Path, recording: Recording):
 
 
 def test_from_training_to_an_explanation(small_dataset: Dataset, raw_run: Path, tmp_path: Path):
-    run = sl.train(
-        small_dataset, input="pair", start_from=raw_run, image_size=32, epochs=1, batch_size=11, head="point"
-    )
+    run = sl.train(small_dataset, input="pair", start_from=raw_run, image_size=32, epochs=1, batch_size=11)
     save_checkpoint(tmp_path, run.model, run.manifest)
     again = load_checkpoint(tmp_path)
     assert (again.manifest.input, again.encoding.colours) == ("pair", 6)

@@ -28,7 +28,7 @@ class Train(Command):
     |T_n - T_0| as strong as it is. pair: T_n and T_0 side by side."""
     start_from: Path | None = None
     """Network whose weights to start from, a run or one that comes with sliplens: to teach it your own sensor, or to go
-    on at another image size. Its input, backbone and head must be those asked for."""
+    on at another image size. It keeps its input, backbone and head."""
     condition: str | None = None
     """Train and validate on the trials of one condition alone, such as dry."""
     backbone: str | None = None

@@ -51,9 +51,15 @@ from sliplens.training.loggers import open_logger
 from sliplens.training.module import Clock, DivergedError, Regressor
 from sliplens.training.trainer import make_trainer, run_trainer, share_of_batch
 
-_ENOUGH_TRIALS, _FEW_TRIALS = 30, 300
+_ENOUGH_TRIALS, _FEW_TRIALS = 10, 300
 """Labelled trials after which adapting gains little more, and below which it beats a network that begins with nothing;
 of `benchmarks/adapt.py`."""
+_KIND = {
+    "all": ("backbone", "head"),
+    "weights": ("backbone", "head", "image_size"),
+    "ratio": ("backbone", "image_size"),
+}
+"""What a network to start from keeps, by what is learnt."""
 _NOVELTY_FRAMES = 2000
 """Frames from which the place of healthy inputs in the features is told, at most."""
 
@@ -90,7 +96,7 @@ def train(
         Row of `RECIPES`.
     start_from
         Network whose weights to start from, its folder, or the name of one that comes with sliplens: to teach it
-        another sensor, or to go on at another image size.
+        another sensor, or to go on at another image size. It keeps its input, backbone and head.
     condition
         Train and validate on the trials of one condition alone, such as dry.
     accelerator, devices, num_nodes
@@ -184,14 +190,13 @@ def train(
 
 
 def _configure(recipe: str, changes: dict[str, Any], start: Run | None) -> TrainConfig:
-    """Recipe with changes; a network that is taught something more stays of its kind."""
+    """Recipe with changes; a network to start from stays of its kind where nothing else is asked for."""
     config = replace(get_recipe(recipe), **changes)
-    if config.learns == "all":
-        return config
     if start is None:
-        raise InputError(f"the recipe {recipe} teaches a network that is there; name it with --start-from")
-    kind = ("backbone", "image_size", *(("head",) if config.learns == "weights" else ()))
-    return replace(config, **{name: getattr(start.manifest, name) for name in kind} | changes)
+        if config.learns != "all":
+            raise InputError(f"the recipe {recipe} teaches a network that is there; name it with --start-from")
+        return config
+    return replace(config, **{name: getattr(start.manifest, name) for name in _KIND[config.learns]} | changes)
 
 
 def _choose_trials(data: Dataset, condition: str | None) -> tuple[tuple[TrialInfo, ...], tuple[TrialInfo, ...]]:
@@ -213,10 +218,10 @@ def _advise(
     """Say how many trials to record, where there are few."""
     count = len(train) + len(validation)
     if config.learns == "weights":
-        enough = f"record {_ENOUGH_TRIALS}" if count < _ENOUGH_TRIALS else "more add little"
+        enough = f"record {_ENOUGH_TRIALS}" if count < _ENOUGH_TRIALS else "that is enough"
         yield (
-            f"{count} labelled trials, {len(validation)} of them held out: on sensors that were simulated to try this, "
-            f"{_ENOUGH_TRIALS} reached what it gives, so {enough}, on several days and to the slip"
+            f"{count} labelled trials, {len(validation)} of them held out; on simulated sensors {_ENOUGH_TRIALS} did "
+            f"as well as 30, so {enough}: on several days, to the slip, and on slippery objects if it is to hold those"
         )
     elif start is None and count < _FEW_TRIALS:
         yield (
