@@ -53,6 +53,7 @@ NOISE_LEVELS = 1.5
 """Mean absolute difference between key frames, in grey levels, up to which they are still."""
 _STILL_KEYS = 3
 _CONTACT_PX = 1.0
+_SOON = 5  # frames
 _RIDGE = 1.0
 _DRAWS = 2000
 _CUT = 60
@@ -181,6 +182,20 @@ def alive_at_end(clip: Clip) -> tuple[float, float]:
     last = int(touched[-1]) if len(touched) else len(far) - 1
     followed, seen = clip.status[last] == MarkerStatus.FOLLOWED, clip.status[last] != MarkerStatus.OUTSIDE
     return float(followed.sum() / max(1, seen.sum())), float(followed.mean())
+
+
+def recovered_share(clips: list[Clip]) -> float | None:
+    """Share of the times that all dots of a clip were lost after which nearly all in view were soon followed again."""
+    back = []
+    for clip in clips:
+        lost = np.all(clip.status == MarkerStatus.LOST, axis=1)
+        for at in np.flatnonzero(lost[:-1] & ~lost[1:]):
+            soon = clip.status[at + 1 : at + 1 + _SOON]
+            followed, seen = soon == MarkerStatus.FOLLOWED, soon != MarkerStatus.OUTSIDE
+            back.append(bool(np.any(followed.sum(axis=1) >= 0.9 * seen.sum(axis=1))))
+        if lost[-1]:
+            back.append(False)
+    return float(np.mean(back)) if back else None
 
 
 def find_still(clip: Clip) -> list[np.ndarray]:
@@ -624,7 +639,11 @@ def main() -> None:
         "objects": len({clip.grasped for clip in clips}),
         "frames": sum(len(clip) for clip in clips),
         "tracks_alive": float(alive[:, 0].mean()),
-        "tracks_alive_worst_clip": float(alive[:, 0].min()),
+        "worst_clip_alive": float(alive[:, 0].min()),
+        "clips_below_90_percent_alive": [
+            clip.name for clip, share in zip(clips, alive[:, 0], strict=True) if share < 0.9
+        ],
+        "recovered": recovered_share(clips),
         "clips_with_95_percent_alive": float(np.mean(alive[:, 0] >= 0.95)),
         "tracks_alive_of_all": float(alive[:, 1].mean()),
         "followed_in_view": float(np.mean(status[status != MarkerStatus.OUTSIDE] == MarkerStatus.FOLLOWED)),

@@ -7,14 +7,20 @@ pyramidal one from frame to frame. Both are left out where they are not installe
 A track is right if it is followed in the last frame and, whenever it says it was followed, lies within a pixel of its
 own marker; markers that leave the frame in between are not counted. Damage begins in mid-trial: of every ten markers
 one is painted over or smeared, and the tracks of the others are counted.
+
+Recovery is measured on drawn clips of a GelSight Mini's 7 x 9 dots that are lost for a while: a heavy object pushed in
+from the border, a knock, two seconds of darkness. A marker that shows again counts as recovered if within 5 frames it
+is followed under its old name, within a pixel; `visible_followed` are marker frames, `worst_clip_alive` is the least
+share of the visible markers that a clip ends with.
 """
 
 import argparse
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # must be set before torch is imported
@@ -129,6 +135,120 @@ def _sum_up(found: dict[str, list[Quality]]) -> dict[str, float]:
     }
 
 
+_PITCH_PX, _GEL = 34.0, (240, 320)
+_SOON = 5  # frames
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """One frame to be drawn."""
+
+    places_px: np.ndarray
+    shown: np.ndarray
+    light: float = 1.0
+    object_px: tuple[float, float, float] | None = None
+    """Centre and radius of what hides the gel."""
+
+
+def press_from_border(rest: np.ndarray, *, reach_px: float, radius_px: float, frames: int) -> Iterator[Drawn]:
+    """Push an object in from the left within some frames, hold it, draw it back: it hides dots and moves the others."""
+    way = np.linspace(0, 1, frames)
+    for depth in np.concatenate([np.zeros(3), way, np.ones(10), way[::-1], np.zeros(8)]):
+        x, y = reach_px * depth - radius_px, 110.0
+        apart = rest - (x, y)
+        distance = np.linalg.norm(apart, axis=1, keepdims=True)
+        push = 0.5 * _PITCH_PX * depth * np.exp(-np.maximum(distance - radius_px, 0) / 60)
+        places = rest + apart / distance * push
+        shown = np.linalg.norm(places - (x, y), axis=1) > radius_px + 4
+        yield Drawn(places_px=places, shown=shown, object_px=(x, y, radius_px))
+
+
+def knock(rest: np.ndarray, *, pitches: float) -> Iterator[Drawn]:
+    """Throw the whole pattern aside; it swings back, and is too blurred to be seen while it is fast."""
+    before = 0.0
+    for share in (0, 0, 0, 0.5, 1, 0.7, 0.2, -0.3, -0.5, -0.3, 0, 0.2, 0.1, 0.05, *[0] * 8):
+        shown = np.full(len(rest), abs(share - before) * pitches < 0.35)
+        before = share
+        yield Drawn(places_px=rest + pitches * share * _PITCH_PX * np.array([1.0, 0.3]), shown=shown)
+
+
+def darken(rest: np.ndarray, *, pitches: float) -> Iterator[Drawn]:
+    """Put the lamps out for two seconds; meanwhile the skin is pressed apart in its middle, and drawn aside."""
+    apart = rest - (160, 120)
+    distance = np.linalg.norm(apart, axis=1, keepdims=True)
+    dented = apart / np.maximum(distance, 1) * 0.35 * np.exp(-(((distance - 50) / 35) ** 2))
+    moved = rest + _PITCH_PX * (dented + np.array([pitches, -0.4 * pitches]))
+    for number in range(75):
+        dark = 3 <= number < 63
+        places = rest if number < 3 else moved
+        yield Drawn(places_px=places, shown=np.full(len(rest), not dark), light=0.02 if dark else 1.0)
+
+
+CLIPS = {
+    "border_half": partial(press_from_border, reach_px=170, radius_px=200, frames=4),
+    "border_two_thirds": partial(press_from_border, reach_px=215, radius_px=250, frames=12),
+    "border_deep": partial(press_from_border, reach_px=130, radius_px=200, frames=3),
+    "knock": partial(knock, pitches=1.4),
+    "hard_knock": partial(knock, pitches=2.2),
+    "darkness": partial(darken, pitches=0.0),
+    "darkness_drawn": partial(darken, pitches=0.3),
+}
+
+
+def draw_gel(drawn: Drawn, *, rng: np.random.Generator) -> np.ndarray:
+    """Dark dots on a lit gel."""
+    rows, columns = np.mgrid[: _GEL[0], : _GEL[1]]
+    share = np.zeros(_GEL)
+    for x, y in drawn.places_px[drawn.shown]:
+        near = np.s_[max(0, int(y) - 12) : max(0, int(y) + 13), max(0, int(x) - 12) : max(0, int(x) + 13)]
+        if share[near].size:
+            distance = np.clip((np.hypot(columns[near] - x, rows[near] - y) - 5) / 0.8, -40, 40)
+            share[near] = np.maximum(share[near], 1 / (1 + np.exp(distance)))
+    image = np.array([180.0, 170, 160]) - share[..., None] * np.array([140.0, 135, 130])
+    if drawn.object_px is not None:
+        x, y, radius = drawn.object_px
+        inside = np.hypot(columns - x, rows - y) < radius
+        image[inside] = np.array([70.0, 75, 80]) + 30 * np.sin(columns[inside] / 5)[:, None]
+    noisy = drawn.light * image + rng.normal(0, 2, image.shape)
+    return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+
+
+def measure_recovery(*, jitter_px: float, seed: int) -> dict[str, float]:
+    """Follow the dots of drawn clips that are lost for a while; `jitter_px` are the irregularities of the print."""
+    back, seen, ends, wrong = [], [], {}, 0
+    for name, clip in CLIPS.items():
+        rng = np.random.default_rng(seed)
+        across, down = np.meshgrid(np.arange(-2, 12) * _PITCH_PX + 4, np.arange(-2, 10) * _PITCH_PX + 8)
+        rest = np.stack([across.ravel(), down.ravel()], axis=-1)
+        rest = rest + rng.normal(0, jitter_px, rest.shape)
+        drawn = list(clip(rest))
+        reference = draw_gel(Drawn(places_px=rest, shown=np.ones(len(rest), dtype=bool)), rng=rng)
+        tracks = track_markers([draw_gel(one, rng=rng) for one in drawn], reference, "gelsight-mini")
+        kept = tracks.from_reference
+        own = np.linalg.norm(tracks.rest_px[kept][:, None] - rest[None], axis=-1).argmin(axis=1)
+        places = np.stack([one.places_px[own] for one in drawn])
+        inside = np.all((places > _EDGE_PX) & (places < np.array(_GEL[::-1]) - 1 - _EDGE_PX), axis=-1)
+        visible = np.stack([one.shown[own] for one in drawn]) & inside
+        right = tracks.followed[:, kept] & (np.linalg.norm(tracks.position_px[:, kept] - places, axis=-1) < RIGHT_PX)
+        wrong += int((tracks.followed[:, kept] & ~right & visible).sum())
+        shows = visible[1:] & ~visible[:-1]
+        back += [
+            right[at + 1 : at + 1 + _SOON, marker].any()
+            for at, marker in np.argwhere(shows)
+            if visible[at + 1 : at + 1 + _SOON, marker].all() and at + _SOON < len(drawn)
+        ]
+        seen.append(right[visible].mean())
+        ends[name] = float(right[-1][visible[-1]].mean())
+    return {
+        "recovered": float(np.mean(back)),
+        "shown_again": len(back),
+        "visible_followed": float(np.mean(seen)),
+        "worst_clip_visible_followed": float(min(seen)),
+        "worst_clip_alive": min(ends.values()),
+        "recovery_wrong_marker_frames": wrong,
+    }
+
+
 def draw_sequence(*, frames: int, rng: np.random.Generator) -> np.ndarray:
     """Frames of 640 x 480 pixels with 100 markers that are pressed apart and drawn down."""
     across, down = np.meshgrid(np.arange(10) * 60.0 + 50, np.arange(10) * 44.0 + 42)
@@ -216,6 +336,7 @@ def main() -> None:
     parser.add_argument("--speed-frames", type=int, default=40)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--threads", type=int, default=2, help="of OpenCV")
+    parser.add_argument("--jitter", type=float, default=0.6, help="of the dots of the clips that are lost, px")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
@@ -224,6 +345,7 @@ def main() -> None:
     found = {
         **measure_speed(sequence, repeats=options.repeats),
         **measure_quality(trials=options.trials, frames=options.frames, seed=options.seed),
+        **measure_recovery(jitter_px=options.jitter, seed=options.seed),
     }
     if options.json:
         print(json.dumps(found))

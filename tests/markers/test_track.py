@@ -107,6 +107,54 @@ def test_a_frame_full_of_light_loses_all_and_the_next_finds_all_again(dots, grid
     assert tracks.followed[1].all()
 
 
+def shows_again(tracks, truth, shown):
+    """Markers that show again are followed within five frames under their own names, and none is ever wrong."""
+    own = truth_of(tracks, truth[0])
+    places, shown = truth[:, own], shown[:, own]
+    never_wrong(tracks, places)
+    inside = np.all((places > 9) & (places < np.array([190, 150])), axis=-1)
+    again = shown[1:] & ~shown[:-1]
+    assert again.any()
+    for at, marker in np.argwhere(again):
+        assert tracks.followed[at + 1 : at + 6, marker].any() or not inside[at + 1 : at + 6, marker].all()
+
+
+@pytest.mark.parametrize("reach_px", [60, 110])
+def test_what_stands_plainly_is_followed_beside_a_heavy_object_from_the_border(reach_px, dots, grid, rng):
+    rest = grid(columns=9, rows=7, pitch=22.0, at=(14.0, 14.0), jitter=0.5, rng=rng)
+    frames, truth, shown = [], [], []
+    for depth in [0, 0.3, 0.7, 1, 1, 1, 0.5, 0, 0, 0, 0, 0]:
+        edge = depth * reach_px  # of what lies on the gel, from the left
+        places = rest + np.array([9.0, 0]) * depth * np.exp(-np.maximum(rest[:, :1] - edge, 0) / 40)
+        seen = places[:, 0] > edge + 6
+        frame = dots(places[seen], noise=1.0, rng=rng)
+        frame[:, : int(edge)] = (70, 75, 80)
+        frames, truth, shown = [*frames, frame], [*truth, places], [*shown, seen]
+    tracks = track_markers(frames, frames[0], "gelsight-mini")
+    truth, shown = np.array(truth), np.array(shown)
+    shows_again(tracks, truth, shown)
+    own = truth_of(tracks, rest)
+    inside = np.all((truth[:, own] > 9) & (truth[:, own] < np.array([190, 150])), axis=-1)
+    assert tracks.followed[:, tracks.from_reference][shown[:, own] & inside].mean() > 0.95
+
+
+@pytest.mark.parametrize("pitches", [0.3, 1.6])
+def test_after_a_knock_and_after_two_seconds_of_darkness_every_marker_has_its_name(pitches, dots, grid, rng):
+    rest = grid(columns=9, rows=7, pitch=22.0, at=(14.0, 14.0), jitter=0.5, rng=rng)
+    dark = 60 if pitches < 1 else 1  # a knock is blurred for a moment, and swings back
+    after = [pitches, 0.4 * pitches, 0, 0, 0, 0] if pitches > 1 else [pitches] * 6
+    truth = np.array([rest, *[rest] * dark, *[rest + np.array([22.0, 6.6]) * share for share in after]])
+    night = [np.clip(rng.normal(4, 1.0, (160, 200, 3)), 0, 255).astype(np.uint8) for _ in range(min(dark, 3))]
+    lit = [dots(places, noise=1.0, rng=rng) for places in (rest, *truth[dark + 1 :])]
+    tracks = track_markers(
+        [lit[0], *(night[step % len(night)] for step in range(dark)), *lit[1:]], lit[0], "gelsight-mini"
+    )
+    shown = np.ones(truth.shape[:2], dtype=bool)
+    shown[1 : 1 + dark] = False
+    assert np.all(tracks.status[1 : 1 + dark] == MarkerStatus.LOST)
+    shows_again(tracks, truth, shown)
+
+
 def test_what_cannot_be_followed_is_refused_in_one_sentence(dots, grid):
     reference = dots(grid())
     with pytest.raises(ImageError, match="frame of 100 x 120 pixels against a reference of 160 x 200"):

@@ -59,6 +59,8 @@ def predict_from_neighbours(neighbours: Neighbours, displacement_px: Places, kno
 
 GATE = 0.45
 """Pitches, within which a marker may be taken for the one predicted: less than half, so that no other is nearer."""
+_CLEAN_PX = 0.3  # of unlike steps: what jumps as a whole does not bend
+_BENT_SHARE = 0.1  # of what a marker moves apart from most, by which bent skin may differ from a plane
 _VOTES = 6  # shifts that are looked at
 _FURTHEST = 5.0  # pitches
 
@@ -73,6 +75,8 @@ class Pairing:
     """Share of the markers expected in view that have a spot."""
     spread_px: float
     """Unlikeness of the steps where they are most alike: a touch bends some skin, a wrong match spoils all."""
+    alike: int
+    """Markers that step as their neighbours do, to the noise of a centre: hardly any of a wrong match."""
     step_px: Places
     """Step of each from where it was; NaN without a spot."""
 
@@ -98,7 +102,10 @@ def pair(
     error = np.linalg.norm(step - told, axis=1)
     astray = error > GATE * neighbours.pitch_px
     spot, step = np.where(astray, -1, spot), np.where(astray[:, None], np.nan, step)
-    error = error[np.isfinite(error) & ~astray]
+    kept = np.isfinite(error) & ~astray
+    error, told = error[kept], told[kept]
+    bend = np.linalg.norm(told - np.median(told, axis=0), axis=1) if len(told) else error
+    alike = int((error < _CLEAN_PX + _BENT_SHARE * bend).sum())
     bent = float(np.quantile(error, 0.25)) if len(error) else np.inf
     expected = np.all((predicted_px >= 0) & (predicted_px <= np.array([size[1] - 1, size[0] - 1])), axis=1)
     seen = expected & (spot >= 0)
@@ -106,6 +113,7 @@ def pair(
         spot=spot,
         support=float(seen.sum() / max(1, expected.sum())),
         spread_px=min(bent, _from_commonest(step[np.all(np.isfinite(step), axis=1)])),
+        alike=alike,
         step_px=step,
     )
 
@@ -163,8 +171,10 @@ _LEAST_SUPPORT = 0.6
 _CALM_SUPPORT = 0.85  # of the usual one
 _RIVAL_SUPPORT, _RIVAL_SPREAD = 0.85, 1.6  # of the best: whoever comes so near cannot be ruled out
 _LEAST_SHARE = 0.3  # of all markers
-_CLEAN_PX = 0.3  # of spread: what jumps as a whole does not bend
 _SMALL_STEP, _SMALL_SUPPORT = 0.25, 0.8
+_FEW = 6  # markers that move alike: fewer may by chance
+_STANDING_SHARE, _MOVING_SHARE = 0.25, 0.5  # of those with a spot, where it stands as it did and where it jumped
+_MOST_SHARE = 0.7  # of all markers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,8 +200,8 @@ def link(
     A small and smooth step is taken as it is. Otherwise all shifts that bring many markers onto spots are tried: on a
     regular grid a step of 0.6 pitches looks like one of 0.4 the other way. The right one keeps the small irregularities
     of the print, so that neighbours move alike. A step of less than a quarter pitch is believed unless another does
-    clearly better; of larger ones, and where the pattern was lost in the frame before, the best is believed only where
-    no other does nearly as well.
+    clearly better, and so is a pattern that after a loss stands as it did, or as at rest, though most of it may be
+    hidden. Of larger steps the best is believed only where no other does nearly as well.
     """
     step = _pair(origins[0], np.zeros(2), found_px, neighbours=neighbours, size=size)
     moved = np.linalg.norm(step.step_px, axis=1) / neighbours.pitch_px
@@ -202,19 +212,43 @@ def link(
     smooth = step.spread_px <= max(_CALM_SPREAD * spread, _LEAST_SPREAD_PX)
     if way <= _CALM_STEP and smooth and step.support >= _CALM_SUPPORT * usual.support:
         return step
-    rivals: list[Pairing] = []
-    for origin in origins:
-        for shift in (np.zeros(2), *likely_shifts(origin, found_px, pitch_px=pitch)):
-            pairing = _pair(origin, shift, found_px, neighbours=neighbours, size=size)
-            if pairing.support >= _LEAST_SUPPORT and pairing.paired.sum() >= _LEAST_SHARE * len(origin):
-                rivals.append(pairing)
-    small = way < _SMALL_STEP and step.support >= _SMALL_SUPPORT
-    if small and not any(_beats(other, step) for other in rivals):
-        return step
+    stands = [step, *(_pair(origin, np.zeros(2), found_px, neighbours=neighbours, size=size) for origin in origins[1:])]
+    jumps = [
+        _pair(origin, shift, found_px, neighbours=neighbours, size=size)
+        for origin in origins
+        for shift in likely_shifts(origin, found_px, pitch_px=pitch)
+    ]
+    tried = [*stands, *jumps]
+    rivals = [
+        one for one in tried if one.support >= _LEAST_SUPPORT and one.paired.sum() >= _LEAST_SHARE * len(origins[0])
+    ]
+    # first what hardly moved since it was seen, or stands as at rest again, however many are hidden or torn along
+    for one in stands:
+        moved = np.linalg.norm(one.step_px[one.paired], axis=1) / neighbours.pitch_px[one.paired]
+        small = len(moved) > 0 and np.median(moved) < _SMALL_STEP
+        known = one.support >= _SMALL_SUPPORT or _stands_out(one, tried, share=_STANDING_SHARE, rivals=1.0)
+        if small and known and not any(_beats(other, one) for other in rivals):
+            return one
+    # of what is half hidden a part may fit elsewhere by chance
+    most = _MOST_SHARE * len(origins[0])
+    rivals = [
+        one for one in rivals if one.paired.sum() >= most or _stands_out(one, tried, share=_MOVING_SHARE, rivals=0.5)
+    ]
     if not rivals:
         return None
     best = max(rivals, key=lambda one: one.paired.sum() * one.support / (one.spread_px + 0.1))
     return None if any(_rules_out(other, best) for other in rivals) else best
+
+
+def _stands_out(one: Pairing, tried: list[Pairing], *, share: float, rivals: float) -> bool:
+    """Whether a share of the markers moves as their neighbours do, and in no other match more than so many of them."""
+    fewest, most = max(_FEW, share * one.paired.sum()), rivals * one.alike
+    return bool(one.alike >= fewest) and all(other.alike <= most for other in tried if _differs(other, one))
+
+
+def _differs(other: Pairing, one: Pairing) -> bool:
+    both = other.paired & one.paired
+    return bool(not both.any() or np.mean(other.spot[both] != one.spot[both]) > 0.5)
 
 
 def _beats(other: Pairing, small: Pairing) -> bool:
@@ -230,10 +264,8 @@ def _beats(other: Pairing, small: Pairing) -> bool:
 
 def _rules_out(other: Pairing, best: Pairing) -> bool:
     """Whether another pairing does nearly as well as the best, so that neither can be believed."""
-    both = other.paired & best.paired
-    different = not both.any() or np.mean(other.spot[both] != best.spot[both]) > 0.5
     strong = other.paired.sum() >= _RIVAL_SUPPORT * best.paired.sum()
-    return bool(different and strong and other.spread_px < _RIVAL_SPREAD * best.spread_px + 0.02)
+    return bool(_differs(other, best) and strong and other.spread_px < _RIVAL_SPREAD * best.spread_px + 0.02)
 
 
 def _pair(
