@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 from sliplens._version import __version__
 
 if TYPE_CHECKING:
+    from sliplens.doctor import examine_installation
     from sliplens.errors import SliplensError
     from sliplens.explainers.table import explain
     from sliplens.faithfulness.scoring import score
@@ -39,6 +40,7 @@ _MODULES = {
     "compare_datasets": "sliplens.simulation.sharing",
     "diagnose": "sliplens.study.diagnose",
     "evaluate": "sliplens.training.evaluation",
+    "examine_installation": "sliplens.doctor",
     "explain": "sliplens.explainers.table",
     "export_lerobot": "sliplens.recordings.exporting",
     "export_mcap": "sliplens.recordings.exporting",
@@ -69,6 +71,7 @@ __all__ = [
     "compare_datasets",
     "diagnose",
     "evaluate",
+    "examine_installation",
     "explain",
     "export_lerobot",
     "export_mcap",

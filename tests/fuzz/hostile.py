@@ -37,12 +37,13 @@ from sliplens.recordings.edits import keep_edit, make_edit
 from sliplens.recordings.exporting import export_lerobot, export_mcap
 from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.importing import relabel_trial
+from sliplens.recordings.labelling import Reason
 from sliplens.recordings.options import LabelSettings, ReadOptions
 from sliplens.recordings.sensor import load_profile
 from sliplens.recordings.source import open_source
 from sliplens.recordings.splits import assign_splits, read_splits
 from sliplens.recordings.store import forces_path, save_forces, save_recording
-from sliplens.recordings.trial import TrialFacts
+from sliplens.recordings.trial import Labels, TrialFacts
 from sliplens.report.results import load_results
 
 Rng = np.random.Generator
@@ -157,8 +158,10 @@ def spoil_json(text: bytes, rng: Rng, how: str) -> bytes:
     if how == "dropped":
         del inside[key]
     elif how == "added":
-        inside |= {"new": 1} if isinstance(inside, dict) else {}
-        inside.append(inside[0]) if isinstance(inside, list) else None
+        if isinstance(inside, dict):
+            inside["new"] = 1
+        else:
+            inside.append(inside[0])
     elif how == "larger":
         inside[key] = inside[key] * 10**40 if isinstance(inside[key], int | float) else [inside[key]]
     else:
@@ -197,6 +200,12 @@ def _numbers(table: pa.Table, name: str, rng: Rng) -> np.ndarray:
     return table.column(name).to_numpy().astype(np.float64).copy()
 
 
+def _texts(table: pa.Table, name: str, rng: Rng) -> pa.Table:
+    others = [one for one in table.column_names if not pa.types.is_string(table.schema.field(one).type)]
+    name = name if name in others else str(rng.choice(np.array(others, dtype=object)))
+    return _set(table, name, pa.array(["x"] * len(table)))
+
+
 def _moved(value: float) -> Callable[[pa.Table, str, Rng], pa.Table]:
     def change(table: pa.Table, name: str, rng: Rng) -> pa.Table:
         names = [one for one in table.column_names if pa.types.is_floating(table.schema.field(one).type)]
@@ -218,7 +227,7 @@ def _far(table: pa.Table, _: str, rng: Rng) -> pa.Table:
 
 COLUMNS: dict[str, Change] = {
     "column dropped": _columns(lambda table, name, _: table.drop_columns([name])),
-    "column of texts": _columns(lambda table, name, _: _set(table, name, pa.array(["x"] * len(table)))),
+    "column of texts": _columns(_texts),
     "column of whole numbers": _columns(lambda table, name, _: _set(table, name, pa.array([1] * len(table)))),
     "column of lists": _columns(lambda table, name, _: _set(table, name, pa.array([[1.0, 2.0]] * len(table)))),
     "column of nothing": _columns(lambda table, name, _: _set(table, name, pa.nulls(len(table)))),
@@ -302,12 +311,16 @@ class _FoundError(Exception):
     """A finding of `sliplens check`, which is a sentence as an error is."""
 
 
+def _require_no_fault(labels: Labels) -> None:
+    """Take what labels tell of wrong samples for the sentence that it is; what was marked by hand is none."""
+    basis = labels.labelling and labels.labelling.basis
+    if faults := [one for one in basis.faults if one.kind != Reason.MARKED] if basis else []:
+        raise _FoundError(f"{faults[0].kind} at {faults[0].start_s} s")
+
+
 def _labels(folder: Path) -> object:
     labels = relabel_trial(load_dataset(folder), "trial-0", labelling=LabelSettings(mu=0.6))
-    assert labels.labelling is not None
-    assert labels.labelling.basis is not None
-    if flags := labels.labelling.basis.flags:
-        raise _FoundError(flags[0])
+    _require_no_fault(labels)
     return labels.safety_margin
 
 
@@ -337,7 +350,10 @@ def _import(folder: Path, source: str = "cup", **options: Any) -> object:
     )
     if data.left_out:
         raise _FoundError(data.left_out[0].why)
-    return [(one.trial, data.read_labels(one).safety_margin) for one in data.trials]
+    labels = [data.read_labels(one) for one in data.trials]
+    for one in labels:
+        _require_no_fault(one)
+    return [one.safety_margin for one in labels]
 
 
 def _lines(change: Callable[[list[str], int, Rng], Any]) -> Change:

@@ -14,6 +14,7 @@ from sliplens.cli.command import in_options, option_names
 from sliplens.cli.console import fail
 from sliplens.cli.demo import Demo
 from sliplens.cli.diagnose import Diagnose
+from sliplens.cli.doctor import Doctor
 from sliplens.cli.evaluate import Evaluate
 from sliplens.cli.explain import Explain
 from sliplens.cli.export import Export
@@ -37,7 +38,7 @@ from sliplens.recordings.options import LabelSettings, ReadOptions
 
 _Recordings = Sensor | Simulate | Import | Label | Split | Check | View | Track
 _Networks = Train | Evaluate | Predict | Export
-Command = Demo | Live | _Recordings | _Networks | Explain | Score | Diagnose | Study | Grip | Report | Help
+Command = Demo | Live | _Recordings | _Networks | Explain | Score | Diagnose | Study | Grip | Report | Doctor | Help
 
 _DESCRIPTION = """sliplens tells how close a soft robotic fingertip is to losing its grip, from the images of the camera
 inside it, and shows why the network says so. Start with `sliplens demo runs/demo`; `sliplens help` tells which commands

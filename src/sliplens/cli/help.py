@@ -39,6 +39,7 @@ EXAMPLES = {
     "study": "sliplens study runs/mine/data --difference runs/mine/train --raw none -o runs/mine/study",
     "grip": "sliplens grip -o runs/grip --object egg",
     "report": "sliplens report runs/mine",
+    "doctor": "sliplens doctor",
     "help": "sliplens help teach",
 }
 """One line for each command that can be typed as it stands, once the files are there."""

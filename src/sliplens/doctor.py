@@ -1,0 +1,195 @@
+"""What is installed here and whether it works: versions, networks, engines, extras, cameras, reference data."""
+
+import os
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module, metadata
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from sliplens.errors import InputError, SliplensError
+from sliplens.files import machine, scratch_folder, shipped_names, versions
+from sliplens.images import list_images, read_image
+from sliplens.live.camera import list_cameras
+from sliplens.models.checkpoint import Run, load
+from sliplens.models.engines import ENGINES, prepare
+from sliplens.models.onnx import TOLERANCE
+from sliplens.progress import OnProgress
+from sliplens.recordings.store import load_recording, save_recording
+from sliplens.simulation import make_recipe, plan_trials, simulate_trial
+
+_BUILDERS = frozenset({"dev", "docs"})
+"""Extras of those who work on sliplens itself."""
+_SLOW = "compiled"
+"""Engine that takes minutes to be made ready."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Item:
+    """One thing that was tried."""
+
+    name: str
+    works: bool | None
+    """None where it is not there, and nothing needs it."""
+    told: str
+    """What was found, or what is wrong and its cure."""
+
+
+def examine_installation(*, reference: Path | None = None, on_progress: OnProgress | None = None) -> tuple[Item, ...]:
+    """Try each part of this installation once; whatever fails is told, none of it stops the others.
+
+    Parameters
+    ----------
+    reference
+        Folder of the real recordings; that of the environment variable SLIPLENS_REFERENCE, else `../shared/reference`,
+        if None.
+
+    Returns
+    -------
+    tuple[Item, ...]
+        Versions, the data store, each network, engine, extra and camera, and each set of reference data.
+    """
+    tried: list[tuple[str, Callable[[], str | None]]] = [("versions", _versions), ("data store", _store)]
+    tried += [("graphics card", _graphics_card)]
+    tried += [(f"network {name}", partial(_network, name)) for name in shipped_names()]
+    tried += [(f"engine {name}", partial(_engine, name)) for name in ENGINES]
+    tried += [(f"extra {name}", partial(_extra, name, needs)) for name, needs in _extras().items()]
+    tried += [("cameras", _cameras)]
+    folder = reference or Path(os.environ.get("SLIPLENS_REFERENCE", "../shared/reference"))
+    there = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+    tried += [(f"reference {path.name}", partial(_reference, path)) for path in there]
+    tried += [] if there else [("reference data", partial(_absent, f"not at {folder}; set SLIPLENS_REFERENCE"))]
+    items = []
+    for number, (name, attempt) in enumerate(tried, start=1):
+        items.append(_tried(name, attempt))
+        if on_progress is not None:
+            on_progress(number, len(tried))
+    return tuple(items)
+
+
+class _AbsentError(SliplensError):
+    """Something that is not there, and need not be."""
+
+
+def _absent(what: str) -> str:
+    raise _AbsentError(what)
+
+
+def _tried(name: str, attempt: Callable[[], str | None]) -> Item:
+    try:
+        return Item(name=name, works=True, told=attempt() or "")
+    except _AbsentError as error:
+        return Item(name=name, works=None, told=str(error))
+    # another package may raise anything, and the others are to be tried as well
+    except Exception as error:
+        said = str(error) if isinstance(error, SliplensError) else f"{type(error).__name__}: {error}"
+        return Item(name=name, works=False, told=" ".join(said.split())[:300])
+
+
+def _versions() -> str:
+    here = machine()
+    packages = ", ".join(f"{name} {version}" for name, version in versions().items())
+    return f"{packages}; {here.system} {here.processor}, {here.cores} cores"
+
+
+def _store() -> str:
+    """Write a simulated trial and read it back."""
+    (planned, *_) = plan_trials(make_recipe("small", frames_per_trial=20))
+    trial = simulate_trial(planned)
+    with scratch_folder() as folder:
+        save_recording(trial, folder / "trial.parquet")
+        size, back = (folder / "trial.parquet").stat().st_size, load_recording(folder / "trial.parquet")
+    if not np.array_equal(back.frames, trial.frames):
+        raise InputError("frames come back from disk as others; install the pinned versions of pyarrow and numpy")
+    return f"{len(trial)} frames came back to the bit from {size:,} bytes"
+
+
+def _graphics_card() -> str:
+    if not torch.cuda.is_available():
+        return _absent("none that torch can use; the CPU does all")
+    sums = torch.ones(64, 64, device="cuda").sum().item()
+    return f"{torch.cuda.get_device_name()} counts {sums:.0f}"
+
+
+def _inputs(trained: Run) -> torch.Tensor:
+    """Encoded images that any network reads."""
+    size = trained.manifest.image_size
+    return torch.rand((2, 3, size, size), generator=torch.Generator().manual_seed(0))
+
+
+def _network(name: str) -> str:
+    trained = load(name)
+    began = time.perf_counter()
+    answers = trained.predict(_inputs(trained))
+    milliseconds = 500 * (time.perf_counter() - began)
+    if not torch.isfinite(answers).all():
+        raise InputError(f"{name} answers with no number; install sliplens again")
+    return f"{trained.manifest.backbone}, {milliseconds:.0f} ms a frame"
+
+
+def _engine(name: str) -> str:
+    if name == _SLOW:
+        return _absent("takes minutes to be made ready, and is not tried here")
+    trained = load(shipped_names()[0])
+    inputs = _inputs(trained)
+    expected = trained.predict(inputs)
+    if said := ENGINES[name].obstacle(inputs.device):
+        return _absent(said)
+    engine = prepare(trained.model, inputs, expected, passes=1, engine=name)
+    off = max(float((part - whole).abs().max()) for part, whole in zip(engine.run([inputs]), [expected], strict=True))
+    if off > TOLERANCE:
+        raise InputError(f"its answers differ by {off:.2g}, {TOLERANCE:g} is allowed; leave out --engine {name}")
+    return f"agrees with the network to {off:.1g}"
+
+
+def _extras() -> dict[str, list[str]]:
+    """Packages of each extra for users, as they are installed."""
+    extras: dict[str, list[str]] = {}
+    for line in metadata.requires("sliplens") or ():
+        found = re.fullmatch(r"([\w.-]+).*;.*extra == ['\"]([\w-]+)['\"].*", line)
+        if found and found[2] not in _BUILDERS:
+            extras.setdefault(found[2], []).append(found[1])
+    return extras
+
+
+def _extra(name: str, needs: list[str]) -> str:
+    """Import every package of an extra."""
+    told, modules = [], metadata.packages_distributions()
+    for package in needs:
+        try:
+            told.append(f"{package} {metadata.version(package)}")
+        except metadata.PackageNotFoundError:
+            return _absent(f'{package} is not installed; install with `pip install "sliplens[{name}]"`')
+        own = [module for module, names in modules.items() if package in names and not module.startswith("_")]
+        for module in own[:1]:
+            import_module(module)
+    return ", ".join(told)
+
+
+def _cameras() -> str:
+    try:
+        found = list_cameras()
+    except InputError as error:
+        return _absent(str(error))
+    if not found:
+        return _absent("none is connected")
+    if not any(camera.modes for camera in found):
+        raise InputError(f"{found[0].path} {found[0].name}; close what holds it, or join the group video")
+    return ", ".join(f"{camera.path} {camera.name} ({len(camera.modes)} modes)" for camera in found)
+
+
+def _reference(folder: Path) -> str:
+    """Read one image of each folder of images below."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    inside = {path.parent for path in files if path.suffix == ".png"}
+    sizes = {read_image(list_images(one)[0]).shape[:2] for one in sorted(inside)}
+    read = ", ".join(f"images of {height} x {width} pixels" for height, width in sorted(sizes))
+    return "; ".join(filter(None, (f"{len(files)} files", read)))
+
+
+__all__ = ["Item", "examine_installation"]

@@ -1,0 +1,64 @@
+"""Each part of an installation is tried once; what fails is told and stops nothing."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import run
+
+from sliplens import doctor
+from sliplens.doctor import Item, examine_installation
+from sliplens.errors import InputError
+from sliplens.images import write_png
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No engine, network or extra, which take seconds."""
+    monkeypatch.setattr(doctor, "ENGINES", {})
+    monkeypatch.setattr(doctor, "shipped_names", list)
+    monkeypatch.setattr(doctor, "_extras", lambda: {"onnx": ["no-such-package"], "view": ["numpy"]})
+    monkeypatch.setattr(doctor, "list_cameras", tuple)
+
+
+def test_what_is_there_works_and_what_is_not_is_told_with_its_cure(few: None, tmp_path: Path):
+    (tmp_path / "chromatouch").mkdir()
+    write_png(tmp_path / "chromatouch" / "1.png", np.zeros((4, 6, 3), dtype=np.uint8))
+    counted = []
+    items = examine_installation(reference=tmp_path, on_progress=lambda done, total: counted.append((done, total)))
+    found = {item.name: item for item in items}
+    assert found["data store"].works
+    assert found["extra view"] == Item(name="extra view", works=True, told=f"numpy {np.__version__}")
+    assert found["extra onnx"].works is None
+    assert 'pip install "sliplens[onnx]"' in found["extra onnx"].told
+    assert found["reference chromatouch"].told == "1 files; images of 4 x 6 pixels"
+    assert found["cameras"].works is None
+    assert counted[-1] == (len(items), len(items))
+
+
+def test_what_fails_is_told_and_stops_nothing(few: None, tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.setattr(doctor, "list_cameras", lambda: 1 / 0)
+    monkeypatch.setenv("SLIPLENS_REFERENCE", str(tmp_path / "nothing"))
+    assert run("doctor") == 2
+    said = capsys.readouterr()
+    assert "cameras         ZeroDivisionError: division by zero" in said.out
+    assert "reference data  not at" in said.out
+    assert "cameras does not work" in said.err
+
+
+@pytest.mark.parametrize("name", ["eager", "folded"])
+def test_an_engine_agrees_with_the_network(name: str):
+    assert doctor._engine(name).startswith("agrees with the network")
+
+
+def test_a_network_that_answers_with_no_number_fails(monkeypatch: pytest.MonkeyPatch):
+    assert "ms a frame" in doctor._network("chromatouch-difference")
+    monkeypatch.setattr(doctor.Run, "predict", lambda _, inputs: inputs.sum(dim=(1, 2, 3)) * float("nan"))
+    with pytest.raises(InputError, match="answers with no number"):
+        doctor._network("chromatouch-difference")
+
+
+def test_extras_are_those_of_users():
+    extras = doctor._extras()
+    assert "rosbags" in extras["ros"]
+    assert not set(extras) & {"dev", "docs"}
