@@ -40,7 +40,9 @@ from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 SIZE = (480, 640)
 RATE_HZ = 60.0
 WARM_S = 2.0
-"""Time at the start that counts for nothing: caches fill and clocks rise."""
+"""Time at the start, once the page shows its first picture, that counts for nothing: caches fill and clocks rise."""
+OPENS_S = 120.0
+"""Time within which a browser opens the page, however busy the machine."""
 PARTS = ("waiting", "decode", "checks", "encode", "network")
 
 
@@ -118,25 +120,27 @@ def measure(frames: np.ndarray, untouched: np.ndarray, *, seconds: float, shown:
     network = replace(network, manifest=replace(network.manifest, frame_size=SIZE))
     source = ReplaySource(open_source(frames)[0], rate_hz=RATE_HZ, repeat=True)
     # made beforehand, so that what is kept here does not look like memory that grows
-    table = np.full((round(1.1 * RATE_HZ * (seconds + WARM_S)), 2 + len(PARTS)), -1.0)
-    kept, last = [0], [""]
+    table = np.full((round(1.1 * RATE_HZ * seconds) + 600, 2 + len(PARTS)), -1.0)
+    kept, last, begins_s = [0], [""], [np.inf]
     memory_mb = np.full(round(seconds) + 10, -1.0)
     dropped = [0, 0]
     settles_s = min(10.0, seconds / 10)
 
     def keep(reading: Reading, frame: LiveFrame | None) -> None:
-        if frame is None or reading.time_s < WARM_S:
+        if frame is None or reading.time_s < begins_s[0]:
             dropped[0] = reading.dropped
             return
         spent = reading.latency
         own_ms = (spent.decode_ms, spent.checks_ms, spent.encode_ms, spent.network_ms)
         # a replayed frame was decoded before it was due; network and checks are worked on at once
         waiting_ms = spent.total_ms - max(spent.checks_ms, spent.encode_ms + spent.network_ms)
+        if kept[0] == len(table):
+            return
         table[kept[0]] = (reading.margin is not None, spent.total_ms, waiting_ms, *own_ms)
         kept[0] += 1
         last[0] = str(reading.withheld)
         dropped[1] = reading.dropped
-        since_s = round(reading.time_s - WARM_S - settles_s)
+        since_s = round(reading.time_s - begins_s[0] - settles_s)
         if 0 <= since_s < len(memory_mb) and memory_mb[since_s] < 0:
             memory_mb[since_s] = resident_mb()
 
@@ -156,7 +160,11 @@ def measure(frames: np.ndarray, untouched: np.ndarray, *, seconds: float, shown:
                     viewer.shows_map = maps
                 pictures |= set() if page.feed.picture is None else {page.feed.picture.frame.number}
                 explained |= set() if page.feed.map is None else {page.feed.map.facts.number}
-            if reading.time_s >= seconds + WARM_S:
+            if np.isinf(begins_s[0]) and (page is None or page.feed.picture is not None):
+                begins_s[0] = reading.time_s + WARM_S
+            if np.isinf(begins_s[0]) and reading.time_s > OPENS_S:
+                raise SystemExit(f"no browser opened the page within {OPENS_S:g} s; look after Chromium")
+            if reading.time_s >= begins_s[0] + seconds:
                 break
         engine = reader.engine.name if reader.engine else ""
     rows = table[: kept[0]]
