@@ -12,12 +12,14 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 # as the command line does; must be set before torch is imported
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
 
+from sliplens.friction import GRASP_SPREAD, Friction
 from sliplens.grip import (
     CONDITIONS,
     OBJECTS,
@@ -42,8 +44,9 @@ CHOSEN = 64
 FORCES_N = (0.5, 0.8, 1.1, 1.4, 1.8, 2.2, 2.6, 3.0, 3.5, 4.0)
 CONTROLLERS = ("margin", "proportional", "assumed-friction", "reflex", "oracle")
 LATENCIES_S = (0.0, 0.025, 0.05, 0.075, 0.1, 0.15)
-SCALES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)
-TARGETS = (0.0, 0.1, 0.2, 0.3, 0.4)
+SCALES = (0.0, 0.5, 1.0, 1.5, 2.0)
+TARGETS = (0.05, 0.15, 0.25, 0.35, 0.45)
+TOLD = ("exactly", "within 10 %", "from one slip")
 _DRAWS = 400
 
 
@@ -75,14 +78,16 @@ def hold(
     *,
     latency_s: float = 0.02,
     error_scale: float = 1.0,
+    friction: list[Friction] | None = None,
 ) -> Outcome:
     """Run a controller over all episodes at once."""
     rng = np.random.default_rng(SEED)
-    eyes = TableEyes(READINGS, fingertips=scripts.fingertips, rng=rng, error_scale=error_scale)
-    plant = Plant(OBJECTS["cup"], episodes=len(scripts))
-    loop = GripLoop(
-        plant, eyes if controller != "fixed" else NoEyes(), make_controller(controller, settings), latency_s=latency_s
+    eyes = TableEyes(READINGS, fingertips=scripts.fingertips, rng=rng, error_scale=error_scale, friction=friction)
+    plant, hand = (
+        Plant(OBJECTS["cup"], episodes=len(scripts)),
+        make_controller(controller, settings, told=bool(friction)),
     )
+    loop = GripLoop(plant, eyes if controller != "fixed" else NoEyes(), hand, latency_s=latency_s)
     table = run_scripts(loop, scripts)
     return Outcome(
         dropped=table.dropped,
@@ -122,6 +127,18 @@ def compare(own: Outcome, fixed: Sequence[Outcome], rows: np.ndarray, rng: np.ra
         "median_slip_mm": round(1e3 * float(np.median(own.slip_m[rows])), 3),
         "under_20_s": round(float(own.under_20_s[rows].mean()), 3),
     }
+
+
+def tell(how: str, scripts: Scripts, rng: np.random.Generator) -> list[Friction]:
+    """What is told of the friction with which each episode begins."""
+    true = scripts.friction.tolist()
+    if how == "exactly":
+        return [Friction(one) for one in true]
+    if how == "within 10 %":
+        return [Friction.between(0.9 * one, 1.1 * one) for one in true]
+    # another grasp of the same object slipped, at a friction of its own that was read with an error
+    slipped = [one * (1 + GRASP_SPREAD * rng.standard_normal()) + 0.05 * rng.standard_normal() for one in true]
+    return [Friction.from_slips([max(ratio, 0.05)]) for ratio in slipped]
 
 
 def _number(value: float) -> float | None:
@@ -217,7 +234,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             told = {}
             for value in values:
                 settings = {name: value} if where.get("of") == "settings" else {}
-                given = {} if settings else {name: value}
+                given: dict[str, Any] = {} if settings else {name: value}
                 told[f"{value:g}"] = compare(hold("margin", settings, fewer, **given), beside, rows, rng)
             return told
 
@@ -225,6 +242,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         found["error_scale"] = swept("error_scale", SCALES)
         found["r2"] = {f"{scale:g}": round(accuracy(READINGS, scale, rng=rng), 3) for scale in SCALES}
         found["target"] = swept("target", TARGETS, of="settings")
+        groups = {"all": rows, **{name: labels[some] == name for name in conditions}}
+        found["friction_told"] = {}
+        for how in TOLD:
+            own = hold("margin", {}, fewer, friction=tell(how, fewer, rng))
+            found["friction_told"][how] = {name: compare(own, beside, one, rng) for name, one in groups.items()}
     if options.rendered:
         found["validation"] = validate(options.rendered, conditions)
     for name, value in found.items():

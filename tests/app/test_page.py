@@ -7,6 +7,7 @@ import sys
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,11 +35,10 @@ class Served:
     record_into: Path
 
 
-@pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """Page of a simulated fingertip that nobody presses yet."""
-    into = tmp_path_factory.mktemp("page") / "recorded"
-    command = [sys.executable, str(Path(__file__).with_name("served_page.py")), str(into)]
+@contextmanager
+def served(what: str, into: Path) -> Iterator[Served]:
+    """Serve the page of a simulated fingertip or gripper."""
+    command = [sys.executable, str(Path(__file__).with_name("served_page.py")), str(into), what]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
@@ -48,6 +48,13 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
             assert process.wait(timeout=60) == 0
         finally:
             process.kill()
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """Page of a simulated fingertip that nobody presses yet."""
+    with served("fingertip", tmp_path_factory.mktemp("page") / "recorded") as page:
+        yield page
 
 
 @pytest.fixture(scope="module")
@@ -167,3 +174,26 @@ def test_one_page_at_a_time_and_a_port_that_is_taken(page: Served):
 def test_others_need_a_token(host: str, own: bool):
     assert is_loopback(host) is own
     assert (LivePage(sl.LiveReader("simulated"), host=host).token is None) is own
+
+
+def test_a_gripper_answers_water_a_wet_skin_and_another_controller(browser, tmp_path: Path):
+    told = "document.querySelector('.sl-grip').textContent"
+    least = f"parseFloat({told}.match(/([\\d.]+) N would hold/)?.[1] ?? 0)"
+    with served("gripper", tmp_path / "recorded") as page:
+        context = browser.new_context(viewport={"width": 320, "height": 640})
+        context.set_default_timeout(60_000)
+        window = context.new_page()
+        window.goto(page.address)
+        window.wait_for_function(f"{least} > 0 && {told}.includes('margin: no margin is read')")
+        light = window.evaluate(least)
+        slide(window, "Pour water", "PageUp", f"{least} > {2 * light}")
+        window.get_by_label("held by").click()
+        window.get_by_role("option", name="oracle", exact=True).click()  # which lets nothing fall
+        window.wait_for_function(f"{told}.includes('oracle: ')")
+        heavy = window.evaluate(least)
+        window.get_by_role("switch", name="Wet").click()
+        window.wait_for_function(f"{least} > {1.8 * heavy}")  # half the friction
+        assert window.evaluate("document.documentElement.scrollWidth") <= 320
+        window.get_by_role("button", name="Grip again").click()
+        window.wait_for_function(f"{told}.includes('open') || {told}.includes('closing')")
+        context.close()

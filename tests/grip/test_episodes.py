@@ -87,7 +87,7 @@ def test_a_fixed_grip_drops_what_weighs_more_than_its_friction_holds_and_no_othe
 def test_the_table_reads_at_its_nodes_what_was_measured(table):
     tips, place = np.arange(5), (2, 1, 3)
     state = {"friction": np.full(5, FRICTIONS[2]), "margins": np.full(5, MARGINS[3])}
-    margin, low, high, shear = table.read(tips, np.full(5, FORCES_N[1]), **state)
+    margin, low, high, shear, *_ = table.read(tips, np.full(5, FORCES_N[1]), **state)
     for values, name in ((margin, "margin"), (low, "low"), (high, "high"), (shear, "shear_px")):
         assert values == pytest.approx(getattr(table, name)[(slice(5), *place)], abs=1e-6)
 
@@ -256,7 +256,7 @@ def told_table(table: ReadingTable) -> ReadingTable:
     """Readings of three quarters of F_t / F_n, as if a network told it."""
     friction, _, margins = np.meshgrid(FRICTIONS, FORCES_N, MARGINS, indexing="ij")
     ratio = np.broadcast_to(0.75 * friction * (1 - margins), table.margin.shape).astype(np.float32)
-    return replace(table, ratio={"mean": ratio, "sigma": np.full_like(ratio, 0.02)})
+    return replace(table, ratio={"mean": ratio, "sigma": np.full_like(ratio, 0.02)}, ratio_noise=0.0)
 
 
 def pulled(friction: float, ratio: float) -> Plant:

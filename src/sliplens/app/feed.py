@@ -17,6 +17,7 @@ import torch
 from PIL import Image
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from sliplens.app.gripper import GripSource, Held
 from sliplens.errors import SliplensError
 from sliplens.explainers.explanation import CLOSE, Explanation
 from sliplens.explainers.occlusion import marker_regions, to_network_px
@@ -55,6 +56,10 @@ class Point:
     high: float | None
     """Upper end of it, in margin units."""
     true_margin: float | None
+    force_n: float | None
+    """Grip force, of a simulated gripper alone."""
+    least_force_n: float | None
+    """Least grip force that holds, of the same."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,6 +138,8 @@ class Update:
     now_s: float
     """When it was made, as `time.monotonic` counts."""
     reading: Reading | None
+    held: Held | None
+    """What a simulated gripper does, and why."""
     points: tuple[Point, ...]
     """Readings since the message before."""
     rate_hz: float
@@ -187,6 +194,8 @@ class Feed:
         """Those who may, by the name under which they will ask for frames."""
         self.reading: Reading | None = None
         """Newest reading."""
+        self.held: Held | None = None
+        """What a simulated gripper did at it."""
         self.picture: Picture | None = None
         """Newest picture."""
         self.map: Map | None = None
@@ -256,13 +265,16 @@ class Feed:
         return await asyncio.get_running_loop().run_in_executor(self._pool, self._explain, picture, method)
 
     def _take(self, reading: Reading, frame: LiveFrame | None) -> None:
-        now_s = time.monotonic()
+        now_s, source = time.monotonic(), self.reader.source
+        self.held = held = source.held(reading.number) if isinstance(source, GripSource) else None
         point = Point(
             at_s=now_s,
             margin=reading.margin,
             low=reading.low,
             high=reading.high,
             true_margin=reading.true_margin,
+            force_n=None if held is None else held.force_n,
+            least_force_n=None if held is None else held.least_force_n,
         )
         with self._lock:
             self._points.append(point)
@@ -483,6 +495,7 @@ class Viewer:
             serial=self._serial,
             now_s=time.monotonic(),
             reading=feed.reading,
+            held=feed.held,
             points=points,
             rate_hz=feed.rate_hz,
             drawn_ms=self._drawn_ms,

@@ -41,6 +41,10 @@ export default {
       <section class="sl-controls" aria-label="controls"><slot></slot></section>
       <section class="sl-told-of" aria-label="the last seconds and health">
         <canvas class="sl-chart" ref="chart" role="img" aria-label="safety margin over the last seconds"></canvas>
+        <div v-show="grips">
+          <canvas class="sl-chart" ref="force" role="img" aria-label="grip force over the last seconds"></canvas>
+          <div class="sl-grip" role="status" ref="grip"></div>
+        </div>
         <div class="sl-recording" ref="recording" hidden></div>
         <div class="sl-recording" ref="troubles" role="alert"></div>
         <div class="sl-lamps" ref="lamps"></div>
@@ -55,6 +59,7 @@ export default {
     raises: String,
     methods: Object,
     network: Boolean,
+    grips: Boolean,
   },
   mounted() {
     // nothing of this is reactive: it changes with each frame, and is drawn by hand
@@ -151,7 +156,8 @@ export default {
     },
     draw() {
       this.drawPicture();
-      this.drawChart();
+      this.drawMargins();
+      if (this.grips) this.drawForces();
       if (!this.update) return;
       this.tellMargin();
       this.tellHealth();
@@ -212,8 +218,37 @@ export default {
         context.stroke();
       }
     },
-    drawChart() {
-      const canvas = this.$refs.chart;
+    drawMargins() {
+      this.drawChart(this.$refs.chart, {
+        most: 1,
+        ticks: [0, ...this.target, 1],
+        words: (margin) => `${Math.round(100 * margin)} %`,
+        zone: this.target,
+        band: ["low", "high"],
+        lines: [["true_margin", "--sl-faint", 1.5, [4, 4]], ["margin", "--sl-ink", 2, []]],
+        note: this.points.some((point) => point.true_margin !== null) ? "dashed: the true margin" : "",
+      });
+    },
+    drawForces() {
+      const most = Math.ceil(Math.max(2, ...this.points.map(({ force_n, least_force_n }) => Math.max(force_n, least_force_n))));
+      this.drawChart(this.$refs.force, {
+        most,
+        ticks: Array.from({ length: most + 1 }, (_, tick) => tick),
+        words: (force) => `${force} N`,
+        zone: null,
+        band: ["least_force_n", "force_n"],
+        lines: [["least_force_n", "--sl-faint", 1.5, [4, 4]], ["force_n", "--sl-ink", 2, []]],
+        note: "grip force; dashed: the least that holds",
+      });
+      const { held } = this.update ?? {};
+      if (!held) return;
+      const state = held.phase === "dropped" || held.phase === "crushed" ? "bad" : "";
+      this.$refs.grip.dataset.state = state;
+      const slid = held.slip_m > 5e-5 ? `, slid ${(1e3 * held.slip_m).toFixed(1)} mm` : "";
+      const force = `${held.force_n.toFixed(2)} N, ${held.least_force_n.toFixed(2)} N would hold`;
+      set(this.$refs.grip, `${state ? "▲" : "●"} ${held.phase}: ${force}${slid}. ${held.controller}: ${held.why || "waits"}`);
+    },
+    drawChart(canvas, { most, ticks, words, zone, band: [below, above], lines, note }) {
       const dpr = fit(canvas, null), style = getComputedStyle(canvas);
       const colour = (name) => style.getPropertyValue(name);
       const context = canvas.getContext("2d");
@@ -222,21 +257,23 @@ export default {
       context.clearRect(0, 0, canvas.clientWidth, canvas.clientHeight);
       const now = this.update?.now_s ?? 0;
       const x = (at) => right - ((now - at) / this.chartS) * (right - left);
-      const y = (margin) => bottom - margin * (bottom - top);
-      context.fillStyle = colour("--sl-zone");
-      context.fillRect(left, y(this.target[1]), right - left, y(this.target[0]) - y(this.target[1]));
+      const y = (value) => bottom - (value / most) * (bottom - top);
+      if (zone) {
+        context.fillStyle = colour("--sl-zone");
+        context.fillRect(left, y(zone[1]), right - left, y(zone[0]) - y(zone[1]));
+      }
       context.font = "11px system-ui, sans-serif";
       context.lineWidth = 1;
       context.strokeStyle = colour("--sl-line");
       context.fillStyle = colour("--sl-faint");
       context.textBaseline = "middle";
       context.textAlign = "right";
-      for (const margin of [0, ...this.target, 1]) {
+      for (const tick of ticks) {
         context.beginPath();
-        context.moveTo(left, y(margin));
-        context.lineTo(right, y(margin));
+        context.moveTo(left, y(tick));
+        context.lineTo(right, y(tick));
         context.stroke();
-        context.fillText(`${Math.round(100 * margin)} %`, left - 4, y(margin));
+        context.fillText(words(tick), left - 4, y(tick));
       }
       context.textBaseline = "top";
       for (const ago of [this.chartS, (2 / 3) * this.chartS, this.chartS / 3, 0]) {
@@ -247,17 +284,14 @@ export default {
       context.beginPath();
       context.rect(left, 0, right - left, bottom + 2);
       context.clip();
-      for (const run of runs(this.points, "low")) {
+      for (const run of runs(this.points, below)) {
         context.beginPath();
-        run.forEach(({ at_s, high }) => context.lineTo(x(at_s), y(high)));
-        run.reverse().forEach(({ at_s, low }) => context.lineTo(x(at_s), y(low)));
+        run.forEach((point) => context.lineTo(x(point.at_s), y(point[above])));
+        run.reverse().forEach((point) => context.lineTo(x(point.at_s), y(point[below])));
         context.fillStyle = colour("--sl-interval");
         context.fill();
       }
-      for (const [name, paint, width, dashes] of [
-        ["true_margin", "--sl-faint", 1.5, [4, 4]],
-        ["margin", "--sl-ink", 2, []],
-      ]) {
+      for (const [name, paint, width, dashes] of lines) {
         context.strokeStyle = colour(paint);
         context.lineWidth = width;
         context.lineJoin = "round";
@@ -270,11 +304,9 @@ export default {
       }
       context.restore();
       context.setLineDash([]);
-      if (this.points.some((point) => point.true_margin !== null)) {
-        context.fillStyle = colour("--sl-faint");
-        context.textAlign = "right";
-        context.fillText("dashed: the true margin", right, 4);
-      }
+      context.fillStyle = colour("--sl-faint");
+      context.textAlign = "right";
+      context.fillText(note, right, 4);
     },
     tellMargin() {
       const { reading, ended, waiting } = this.update;

@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nicegui import binding, run, ui
-from nicegui.events import GenericEventArguments, KeyEventArguments
+from nicegui.events import KeyEventArguments
 
 from sliplens.app.feed import CHART_S, LIVE_METHOD, Viewer
+from sliplens.app.gripper import GripSource
 from sliplens.errors import InputError, SliplensError
 from sliplens.explainers.table import EXPLAINERS
+from sliplens.grip.controllers import CONTROLLERS
 from sliplens.live.sources import SimulatedSource
 from sliplens.plots.saliency import LOWERS, RAISES
 from sliplens.plots.style import BLUE, METHOD_NAMES
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 TARGET = 0.2, 0.4
 """Margins that people keep when they hold something."""
 _MOST_PRESS_N, _MOST_PULL_N = 3.0, 2.4
+_MOST_WATER_KG, _MOST_GRIP_PULL_N = 0.06, 0.6
 
 
 class LiveView(ui.element, component="live_view.js"):
@@ -38,6 +41,7 @@ class LiveView(ui.element, component="live_view.js"):
             "raises": RAISES,
             "methods": METHOD_NAMES,
             "network": network is not None,
+            "grips": isinstance(page.reader.source, GripSource),
         })  # fmt: skip
 
 
@@ -131,6 +135,8 @@ def build_live(page: "LivePage") -> None:
     with LiveView(page, name):
         if isinstance(reader.source, SimulatedSource):
             _build_hand(page.hand, reader.source)
+        elif isinstance(reader.source, GripSource):
+            _build_gripper(reader.source)
         with ui.element("div").classes("sl-buttons"):
             ui.button("Reference (R)", on_click=_told(acts.take_reference)).tooltip(
                 "take a new image of the untouched sensor, as soon as the picture is still"
@@ -171,26 +177,60 @@ def _build_overlays(acts: _Acts, *, network: bool) -> None:
             ui.button("Explain (E)", on_click=_told(acts.explain)).tooltip("why, of this picture, by the method beside")
 
 
+def _add_slider(
+    label: str, shared: object, name: str, *, words: Callable[[float], str], most: float, act: Callable[[float], None]
+) -> None:
+    """Slider of an attribute that all viewers share, beside what it says."""
+    ui.label().bind_text_from(shared, name, words)
+    slider = ui.slider(min=0, max=most, step=most / 60).props(f'aria-label="{label}"').bind_value_from(shared, name)
+    slider.on("update:model-value", lambda event: act(float(event.args)), throttle=0.05)
+
+
 def _build_hand(hand: Hand, source: SimulatedSource) -> None:
     """Sliders that press and pull, which all viewers share."""
 
-    def press(event: GenericEventArguments) -> None:
-        hand.press_n = float(event.args)
-        source.load(normal_force_n=hand.press_n, tangential_force_n=hand.pull_n)
-
-    def pull(event: GenericEventArguments) -> None:
-        hand.pull_n = float(event.args)
+    def load(**forces_n: float) -> None:
+        for name, force_n in forces_n.items():
+            setattr(hand, name, force_n)
         source.load(normal_force_n=hand.press_n, tangential_force_n=hand.pull_n)
 
     with ui.element("div").classes("sl-hand"):
-        for word, field, most_n, act in (
-            ("Press", "press_n", _MOST_PRESS_N, press),
-            ("Pull", "pull_n", _MOST_PULL_N, pull),
-        ):
-            ui.label().bind_text_from(hand, field, lambda force_n, word=word: f"{word} {force_n:.2f} N")
-            slider = ui.slider(min=0, max=most_n, step=0.05).props(f'aria-label="{word} the fingertip, in newtons"')
-            slider.bind_value_from(hand, field)
-            slider.on("update:model-value", act, throttle=0.05)
+        for word, name, most_n in (("Press", "press_n", _MOST_PRESS_N), ("Pull", "pull_n", _MOST_PULL_N)):
+            _add_slider(
+                f"{word} the fingertip, in newtons",
+                hand,
+                name,
+                words=lambda force_n, word=word: f"{word} {force_n:.2f} N",
+                most=most_n,
+                act=lambda force_n, name=name: load(**{name: force_n}),
+            )
         ui.button("Grip by itself", on_click=source.let_go).tooltip(
             "touch, press, pull until it slips, let go, and again"
         )
+
+
+def _build_gripper(source: GripSource) -> None:
+    """What changes the object that the simulated gripper holds, and who holds it; all viewers share it."""
+    with ui.element("div").classes("sl-hand"):
+        _add_slider(
+            "Pour water in, in kilograms",
+            source,
+            "water_kg",
+            words=lambda water_kg: f"Water {1e3 * water_kg:.0f} g",
+            most=_MOST_WATER_KG,
+            act=lambda water_kg: source.act(water_kg=water_kg),
+        )
+        _add_slider(
+            "Pull at it, in newtons",
+            source,
+            "pull_n",
+            words=lambda pull_n: f"Pull {pull_n:.2f} N",
+            most=_MOST_GRIP_PULL_N,
+            act=lambda pull_n: source.act(pull_n=pull_n),
+        )
+    with ui.element("div").classes("sl-buttons"):
+        ui.switch("Wet", on_change=lambda event: source.act(wet=bool(event.value))).bind_value_from(source, "wet")
+        ui.select(
+            list(CONTROLLERS), label="held by", on_change=lambda event: source.act(controller=str(event.value))
+        ).props("dense outlined options-dense").bind_value_from(source, "controller")
+        ui.button("Grip again", on_click=source.grip_again).tooltip("put it down, open, grip and lift it anew")

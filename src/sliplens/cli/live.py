@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sliplens.live import LiveReader
     from sliplens.recordings import TrialFacts
 
-_SOURCE = "simulated, the number of a camera, the address of a stream, or a video, bag, data set or growing folder."
+_SOURCE = "simulated, grip, number of a camera, address of a stream, or a video, bag, data set or growing folder."
 
 
 def _tell(message: str) -> None:
@@ -34,7 +34,7 @@ class Live:
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE", help=_SOURCE)] = "simulated"
     network: str | None = None
-    """Folder or name of a trained network: chromatouch-difference for the simulated fingertip, none if not given."""
+    """Folder or name of a trained network: chromatouch-difference for what is simulated, none if not given."""
     reference: Path | None = None
     """Image of the untouched sensor; taken when the picture is still at first if not given."""
     friction: Friction = None
@@ -81,32 +81,38 @@ class Live:
 
     def run(self) -> None:
         """Read until the source ends."""
+        from sliplens.app.gripper import open_grip
         from sliplens.live import LiveReader
         from sliplens.live.contract import SourceOptions, parse_size
+        from sliplens.recordings import TrialFacts
         from sliplens.recordings.sensor import is_profile
 
         if self.list:
             self._list()
             return
-        shipped = "chromatouch-difference" if self.source in {"simulated", "simulated:chromatouch"} else None
+        grips = self.source.partition(":")[0] == "grip"
+        shipped = "chromatouch-difference" if grips or self.source in {"simulated", "simulated:chromatouch"} else None
         wishes = {name: getattr(self, name) for name in ("speed", "trial", "pixel_format")}
         options = SourceOptions(rate_hz=self.rate, size=parse_size(self.size), **wishes)
         names = ("reference", "engine", "device", "seconds", "forces", "friction")
         named = {name: getattr(self, name) for name in names} | {"smoothing_s": self.smoothing, "options": options}
         named["sensor"] = self.sensor if is_profile(self.sensor) else None
+        named |= {"source": open_grip(self.source, options), "options": None} if grips else {"source": self.source}
+        told = {name: getattr(self, name) for name in ("sensor", "object", "condition", "day")}
+        facts = TrialFacts(trial="live", **told)
         with ExitStack() as stack:
-            reader = stack.enter_context(closing(LiveReader(self.source, self.network or shipped, **named)))
+            reader = stack.enter_context(closing(LiveReader(network=self.network or shipped, **named)))
             if reader.doubt is not None:
                 _tell(reader.doubt)
             reader.send_to(*self.sink)
             if self.record is not None:
-                reader.record(self.record, facts=self._facts())
+                reader.record(self.record, facts=facts)
             stack.callback(lambda: [_tell(str(state)) for state in reader.outputs])
-            with suppress(KeyboardInterrupt), reader, self._shown(reader):  # the way to end it
+            with suppress(KeyboardInterrupt), reader, self._shown(reader, facts):  # the way to end it
                 self._watch(reader)
 
     @contextmanager
-    def _shown(self, reader: "LiveReader") -> Iterator[None]:
+    def _shown(self, reader: "LiveReader", facts: "TrialFacts") -> Iterator[None]:
         """Page of it, if it is wanted; alone it stays when the source has ended."""
         from sliplens.app import LivePage
 
@@ -114,17 +120,12 @@ class Live:
             yield
             return
         shown = {"host": self.host, "port": self.port, "record_into": self.record or Path("recorded")}
-        with LivePage(reader, facts=self._facts(), **shown) as page:
+        with LivePage(reader, facts=facts, **shown) as page:
             _tell(f"open {page.address}")
             yield
             if self.seconds is None and not self.sink:
                 _tell(f"{reader.source.name} has ended; the page stays until Ctrl-C")
                 Event().wait()
-
-    def _facts(self) -> "TrialFacts":
-        from sliplens.recordings import TrialFacts
-
-        return TrialFacts(trial="live", sensor=self.sensor, object=self.object, condition=self.condition, day=self.day)
 
     def _watch(self, reader: "LiveReader") -> None:
         told_s, told = -1.0, set[str]()
@@ -142,9 +143,8 @@ class Live:
     def _list(self) -> None:
         from sliplens.live import SOURCES, list_cameras
 
-        cameras = list_cameras()
-        rows = [(str(one.path), one.name, *mode.in_words()) for one in cameras for mode in one.modes]
+        rows = [(str(one.path), one.name, *mode.in_words()) for one in list_cameras() for mode in one.modes]
         columns = ("device", "name", "format", "size", "frames/s")
         print_table("Cameras", columns, rows) if rows else say("no camera is there that can be read")
-        for kind in SOURCES.values():
-            say(f"  {kind.words}")
+        for words in ("simulated gripper that holds (grip, or grip:egg)", *(kind.words for kind in SOURCES.values())):
+            say(f"  {words}")

@@ -4,9 +4,9 @@ from sliplens.grip.controllers import CONTROLLERS, Controller, Observation, make
 from sliplens.grip.episodes import run_episodes, run_scripts
 from sliplens.grip.fingertip import Fingertip
 from sliplens.grip.loop import Eyes, GripLoop, NoEyes, RenderedEyes, Sight, SlipWatch, TableEyes, Tick
-from sliplens.grip.plant import OBJECTS, GripperModel, HeldObject, Plant, PlantState, World, least_force
+from sliplens.grip.plant import OBJECTS, GripperModel, HeldObject, Plant, PlantState, World, least_force, pick_object
 from sliplens.grip.readings import ReadingTable, load_readings, measure_readings
-from sliplens.grip.scripts import CONDITIONS, Scripts, draw_scripts, pick_object
+from sliplens.grip.scripts import CONDITIONS, Scripts, draw_scripts
 
 __all__ = [
     "CONDITIONS",

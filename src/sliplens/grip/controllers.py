@@ -89,8 +89,8 @@ class MarginGrip(ABC):
     as the fingers began to slide, if that is more. After a slip nothing is loosened for a while.
     """
 
-    target: float = 0.2
-    """Margin Gamma* aimed at, as a share of the friction: 0.2 presses 25 % more than the least force that holds."""
+    target: float = 0.25
+    """Margin Gamma* aimed at, as a share of the friction: 0.25 presses a third more than the least force that holds."""
     caution: float = 0.0
     """Share of the way from the margin read to the lower end of its interval; with 1 a `zero` of 0.2 and a `target` of
     0.1 suit."""
@@ -116,7 +116,10 @@ class MarginGrip(ABC):
     """Time after a slip in which nothing is loosened."""
     blind_s: float = 0.15
     """Time without any reading after which the force goes to `safe_n`; until then it holds."""
-    safe_n: float = 3.5
+    safe_n: float = 2.5
+    """Force to go to then: no more, for beyond it the network sees frames that it does not know, and stays blind."""
+    acted: np.ndarray = field(init=False, repr=False, default_factory=lambda: np.ones(1))
+    """Margin acted on last in each episode, a share."""
     _zero: np.ndarray = field(init=False, default_factory=lambda: np.zeros(1))
     _last: np.ndarray = field(init=False, default_factory=lambda: np.zeros(1))
     _slipped_s: np.ndarray = field(init=False, default_factory=lambda: np.full(1, -np.inf))
@@ -144,7 +147,8 @@ class MarginGrip(ABC):
         self._slipped_s = np.where(slip, seen.time_s, self._slipped_s)
         self._zero = np.maximum(self._zero, np.where(slip, np.minimum(self._last, _HIGHEST_ZERO), self.zero))
         self._last = np.where(blind, self._last, margin)
-        wanted = self.law(seen.force_n, np.clip((margin - self._zero) / (1 - self._zero), -1, 1))
+        self.acted = np.clip((margin - self._zero) / (1 - self._zero), -1, 1)
+        wanted = self.law(seen.force_n, self.acted)
         wanted = np.where(blind, seen.command_n, wanted)
         wanted = np.where(np.abs(wanted - seen.command_n) < self.dead_band * seen.command_n, seen.command_n, wanted)
         calm = (seen.time_s - self._slipped_s < self.calm_s) | (seen.time_s < _SETTLED_S)
@@ -157,7 +161,7 @@ class MarginGrip(ABC):
         return np.maximum(told, self.start_n if seen.time_s < _SETTLED_S else self.least_n)
 
 
-_HIGHEST_ZERO = 0.7
+_HIGHEST_ZERO = 0.6
 """A slip at which more is read is taken for something else: a jolt that ended."""
 _DEAF_S = 0.15
 """Time after a slip in which another one is the same."""

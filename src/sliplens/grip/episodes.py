@@ -18,9 +18,9 @@ from sliplens.files import output_folder, to_builtins
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.grip.controllers import Controller, make_controller
 from sliplens.grip.loop import GripLoop, RenderedEyes, TableEyes, Tick
-from sliplens.grip.plant import PERIOD_S, Episodes, HeldObject, Plant, least_force
+from sliplens.grip.plant import PERIOD_S, Episodes, HeldObject, Plant, least_force, pick_object
 from sliplens.grip.readings import ReadingTable, load_readings, measure_readings, require_calibration
-from sliplens.grip.scripts import EPISODE_S, LIFT_S, Scripts, draw_scripts, hand_motion, pick_object
+from sliplens.grip.scripts import EPISODE_S, LIFT_S, Scripts, draw_scripts, hand_motion
 from sliplens.mechanics import stick_ratio
 from sliplens.models import Run, load
 from sliplens.plots.clip import write_clip

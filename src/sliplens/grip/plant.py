@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sliplens.errors import ContactError
+from sliplens.errors import ContactError, InputError
 from sliplens.mechanics import safety_margin
 
 GRAVITY_M_S2 = 9.81
@@ -45,6 +45,13 @@ OBJECTS = {
     "berries": HeldObject(mass_kg=(0.03, 0.12), stiffness_n_m=1_500.0, crush_n=3.5, grip_length_m=0.03),
 }
 """Objects by name."""
+
+
+def pick_object(name: str) -> HeldObject:
+    """Object of a name that a user gave."""
+    if name not in OBJECTS:
+        raise InputError(f"there is no object named {name!r}; choose one of {', '.join(OBJECTS)}")
+    return OBJECTS[name]
 
 
 @dataclass(frozen=True, kw_only=True)

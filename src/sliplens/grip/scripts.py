@@ -10,7 +10,7 @@ from jaxtyping import Float
 from sliplens.codec import Columns
 from sliplens.errors import InputError
 from sliplens.extras import Table
-from sliplens.grip.plant import GRAVITY_M_S2, OBJECTS, HeldObject, World
+from sliplens.grip.plant import GRAVITY_M_S2, HeldObject, World, pick_object
 
 EPISODE_S = 6.0
 """Length of an episode in seconds."""
@@ -200,10 +200,3 @@ def draw_scripts(
 
 
 _BOUNDS = {"mass_kg": 0, "friction": 0, "kinetic_ratio": 0, "patch_factor": 0, "drift": -1, "water_kg": -1e-9}
-
-
-def pick_object(name: str) -> HeldObject:
-    """Object of a name that a user gave."""
-    if name not in OBJECTS:
-        raise InputError(f"there is no object named {name!r}; choose one of {', '.join(OBJECTS)}")
-    return OBJECTS[name]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from threading import Event
 
 from sliplens.errors import InputError
-from sliplens.live.reading import LiveFrame
+from sliplens.live.reading import LiveFrame, Reading
 from sliplens.recordings.capture import Frame
 
 
@@ -91,6 +91,9 @@ class LiveSource(ABC):
     @abstractmethod
     def frames(self) -> Iterator[LiveFrame]:
         """Frames as they come; it ends when the source does, or soon after `close`."""
+
+    def hear(self, reading: Reading) -> None:  # noqa: B027 (most act on nothing)
+        """Take what was read of a frame: for a source that acts on it, as a gripper does."""
 
     def close(self) -> None:  # noqa: B027 (most have nothing to give back)
         """Stop giving frames, soon; may be called from another thread, and again."""

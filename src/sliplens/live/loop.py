@@ -405,6 +405,7 @@ class LiveReader:
                 place.close()
 
     def _tell(self, reading: Reading, frame: LiveFrame | None) -> None:
+        self.source.hear(reading)
         for place in tuple(self._listening):
             place.put(reading)
         for callback in tuple(self._subscribers):

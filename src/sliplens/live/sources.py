@@ -19,7 +19,7 @@ from sliplens.extras import Table
 from sliplens.images import is_image, list_images, natural_key
 from sliplens.live.camera import CameraSource
 from sliplens.live.contract import LiveSource, Pace, SourceKind, SourceOptions
-from sliplens.live.reading import LiveFrame
+from sliplens.live.reading import LiveFrame, Reading
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.formats import recognise
 from sliplens.recordings.formats.images import frame_size, read_frame
@@ -219,6 +219,10 @@ class ProfiledSource(LiveSource):
 
     def __exit__(self, *error: object) -> None:
         self._source.__exit__(*error)
+
+    def hear(self, reading: Reading) -> None:
+        """Hand on what was read."""
+        self._source.hear(reading)
 
     def close(self) -> None:
         """Stop giving frames, soon."""
