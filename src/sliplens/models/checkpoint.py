@@ -204,7 +204,7 @@ class Run:
     def estimate_batches(self, batches: Iterable[Tensor], *, friction: FrictionLike | None = None) -> "Estimate":
         """Safety margins as `estimate` tells them, of batches of encoded frames."""
         novelty = self.manifest.novelty
-        if novelty is None:
+        if novelty is None or not novelty.strangeness:
             return self.to_estimate(*self.answers(batches), friction=friction)
         with watch_features(self.model, novelty.layer) as features:
             answers = self.answers(batches)
@@ -372,7 +372,8 @@ def tell_each(
     for value in np.unique(friction):
         rows = friction == value
         ratio = replace(estimate.ratio, probabilities=estimate.ratio.probabilities[rows])
-        some = replace(estimate, margin=margin[rows], probabilities=probabilities[rows], ratio=ratio)
+        own = {"margin": estimate.margin[rows], "probabilities": estimate.probabilities[rows]}
+        some = replace(estimate, **own, ratio=ratio)
         told = some.told(Friction(float(value)), trained_friction=trained_friction)
         assert told.probabilities is not None
         margin[rows], probabilities[rows] = told.margin, told.probabilities

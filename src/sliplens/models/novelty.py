@@ -46,13 +46,14 @@ class Novelty:
     """Variance along every other direction, a ratio to that of the feature."""
     limit: float
     """Distance, a ratio to the usual one, that all but 0.5 % of the validation frames stay below."""
-    spread_limit: float | None
-    """The same of the standard deviation of the answer, in margin units; None of a network that answers with one
-    number."""
-    strangeness: tuple[float, ...]
-    """What 100, 80, 50, 30, 20, 10, 5, 2, 1 and 0.5 % of the validation frames reach of `measure_strangeness`."""
     frames: int
     """Validation frames."""
+    spread_limit: float | None = None
+    """What they stay below of the standard deviation of the answer, in margin units; None of a network that answers
+    with one number."""
+    strangeness: tuple[float, ...] = ()
+    """What 100, 80, 50, 30, 20, 10, 5, 2, 1 and 0.5 % of the validation frames reach of `measure_strangeness`; empty
+    where that was never measured (`benchmarks/health.py --fit`)."""
 
     def __post_init__(self) -> None:
         width = len(self.mean)
@@ -190,8 +191,6 @@ def fit_novelty(model: nn.Module, train: Iterable[Tensor], validation: Iterable[
         variances=_rounded(variances[:kept]),
         rest=float(variances[kept:].sum() / max(1, unit.shape[1] - kept)) + 1e-6,
         limit=np.inf,
-        spread_limit=None,
-        strangeness=(),
         frames=len(held),
     )
     sigma = _spread(model, others)
