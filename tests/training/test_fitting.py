@@ -155,7 +155,7 @@ def test_it_does_not_start_from_a_network_of_another_kind(
         require_same_kind(start, CONFIG, "raw")
 
 
-ADAPT = replace(get_recipe("adapt"), head="point", image_size=32, epochs=3, batch_size=11, epoch_frames=22, seed=3)
+ADAPT = replace(get_recipe("adapt"), head="point", image_size=32, epochs=1, batch_size=11, epoch_frames=22, seed=3)
 
 
 def test_adapting_moves_weights_and_leaves_the_statistics_of_the_normalisation(
@@ -163,7 +163,7 @@ def test_adapting_moves_weights_and_leaves_the_statistics_of_the_normalisation(
 ):
     start = load_checkpoint(trained_run)
     training = run(tmp_path / "run", frames, ADAPT, start=start)
-    assert training.epochs == 3
+    assert training.epochs == 1
     adapted, before = load_checkpoint(tmp_path / "run").model, start.model
     kept = dict(before.named_buffers())
     assert all(torch.equal(value, kept[name]) for name, value in adapted.named_buffers())
@@ -175,9 +175,9 @@ def test_it_stops_where_the_validation_gains_nothing(
     tmp_path: Path, frames: tuple[FrameSet, FrameSet], trained_run: Path
 ):
     # so low a rate gains nothing
-    still = replace(ADAPT, epochs=9, learning_rate=1e-30, patience=2)
+    still = replace(ADAPT, epochs=9, learning_rate=1e-30, patience=1)
     training = run(tmp_path / "run", frames, still, start=load_checkpoint(trained_run))
-    assert (training.stopped_by, training.epochs) == ("no gain", 3)
+    assert (training.stopped_by, training.epochs) == ("no gain", 2)
 
 
 RATIO = replace(get_recipe("ratio"), image_size=32, epochs=30, batch_size=11, seed=3)
