@@ -96,6 +96,8 @@ def test_a_recording_is_studied(fine_dataset: Dataset, difference_run: Path, tmp
         raw=None,
         methods=["grad-cam"],
         trials=1,
+        tests=("score",),
+        steps=4,
         random_orders=1,
         out=tmp_path / "study",
     )
