@@ -102,12 +102,20 @@ def test_a_profile_comes_back_from_its_text(tmp_path: Path):
 
 
 def test_every_shipped_profile_can_be_read():
-    assert set(shipped_profiles()) == {"chromatouch", "digit", "gelsight-mini", "tactip"}
+    assert set(shipped_profiles()) == {"chromatouch", "digit", "gelsight-mini", "gelsight-mini-camera", "tactip"}
     for name in shipped_profiles():
         profile = load_profile(name)
-        assert profile.name == name
+        assert profile.name == name.removesuffix("-camera")
         width, height = profile.camera_size_px or (224, 224)
         assert min(profile.output_size((height, width))) > 0
+
+
+def test_what_the_makers_software_hands_on_is_not_cropped_or_turned_twice():
+    frame = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    np.testing.assert_array_equal(load_profile("gelsight-mini").apply(frame), frame)
+    # the maker's software leaves a seventh out at each border; DIGIT's driver transposes, then turns upside down
+    assert load_profile("gelsight-mini-camera").crop_px == (469, 352, 3280 - 2 * 469, 2464 - 2 * 352)
+    np.testing.assert_array_equal(load_profile("digit").apply(frame), frame.transpose(1, 0, 2)[::-1])
 
 
 @pytest.mark.parametrize(

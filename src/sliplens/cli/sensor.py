@@ -38,8 +38,8 @@ class Sensor(Command):
         from sliplens.recordings.sensor import load_profile, shipped_profiles
 
         if self.task == "list":
-            shipped = [load_profile(name) for name in shipped_profiles()]
-            rows = [(one.name, one.markers or "none", str(one.camera_size_px or "any")) for one in shipped]
+            shipped = {name: load_profile(name) for name in shipped_profiles()}
+            rows = [(name, one.markers or "none", str(one.camera_size_px or "any")) for name, one in shipped.items()]
             print_table("Sensor profiles", ("name", "markers", "camera, width x height"), rows)
             return
         if self.source is None or self.output is None:
