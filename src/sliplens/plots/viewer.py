@@ -38,7 +38,6 @@ from sliplens.recordings import Dataset, Recording, TrialFacts, TrialInfo
 from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.dataset import trial_path
 from sliplens.recordings.labelling import LabelBasis
-from sliplens.recordings.source import open_source
 from sliplens.recordings.store import (
     TruthHeader,
     decode_pixels,
@@ -117,6 +116,8 @@ def view_capture(capture: Capture) -> Viewed:
 
 def view_explained(explained: Explained) -> Viewed:
     """Frames that were explained, one after another, as their network saw them."""
+    from sliplens.recordings.source import open_source  # noqa: PLC0415 (readers of video come with it)
+
     (capture,) = open_source(explained.pictures)
     first = explained.frames[0]
     capture = replace(capture, trial=first.trial, condition=first.condition, day=first.day)
