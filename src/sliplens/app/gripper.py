@@ -10,7 +10,7 @@ import numpy as np
 from sliplens.errors import InputError
 from sliplens.grip.controllers import Controller, MarginGrip, Observation, make_controller
 from sliplens.grip.fingertip import Fingertip
-from sliplens.grip.plant import PERIOD_S, Plant, PlantState, World, least_force, pick_object
+from sliplens.grip.plant import PERIOD_S, GripperModel, Plant, PlantState, World, least_force, pick_object
 from sliplens.grip.scripts import LIFT_S, hand_motion
 from sliplens.live.contract import LiveSource, Pace, SourceOptions
 from sliplens.live.reading import LiveFrame, Reading, SlipState
@@ -20,6 +20,9 @@ OPEN_S = 1.5
 """Time that the fingers stay open before they close, so that the sensor is seen untouched, and after a drop."""
 _STALE_S = 0.5
 """Age from which a reading says nothing of now."""
+_CEILING_N = 2.8
+"""Force that the gripper never passes: beyond, the network of the package sees frames that it does not know, its margin
+is withheld, and a grip that is never loosened blindly would stay there."""
 _MEMORY = 120
 _POURS_KG_S, _PULLS_N_S = 0.03, 2.0
 """How fast a person pours and pulls."""
@@ -99,7 +102,8 @@ class GripSource(LiveSource):
 
     def _begin(self, time_s: float) -> None:
         """Open the fingers, and close them anew after a moment."""
-        self._plant, self._grips_s = Plant(self._object), time_s + OPEN_S
+        self._plant = Plant(self._object, model=GripperModel(ceiling_n=_CEILING_N))
+        self._grips_s = time_s + OPEN_S
         self._told.clear()
         self._ended_s: float | None = None
         self._poured_kg = self._pulled_n = 0.0
@@ -235,9 +239,10 @@ class GripSource(LiveSource):
             slip=np.array([slip]),
             true_margin=np.nan_to_num(now.margin, nan=1.0),
         )
-        told = float(np.asarray(self._hand.command(seen))[0])
+        told = min(float(np.asarray(self._hand.command(seen))[0]), _CEILING_N)
         change = told - self._command
         does = "holds" if abs(change) < 1e-3 else "tightens" if change > 0 else "loosens"
+        does = "presses as hard as it may" if told == _CEILING_N else does
         if slip:
             self._why = "the markers told a slip: tightens at once"
         elif reading is None or reading.margin is None:
