@@ -15,6 +15,7 @@ from sliplens.recordings.formats.tables import trial_name
 _VIDEOS = frozenset({".mp4", ".m4v", ".mkv", ".mov", ".avi", ".webm", ".mpg", ".mpeg"})
 _TABLES = frozenset({".csv", ".tsv", ".txt"})
 _FORCE_WORDS = re.compile(r"[-_. ](forces?|wrench|ft)$", re.IGNORECASE)
+_LONGEST_NAME = 255  # characters, of a file or a folder
 _LONGEST = 100_000  # characters of a field; those of a manifest are paths and words
 
 
@@ -161,6 +162,9 @@ def _row(said: Mapping[str, str], path: Path, where: str) -> ManifestRow:
     if "video" not in said:
         raise RecordingError(f"{where}: no video is named; name the recording of the trial")
     folder, reference = path.parent, said.get("reference")
+    for name, text in said.items():
+        if max(map(len, re.split(r"[/\\]", text))) > _LONGEST_NAME:
+            raise RecordingError(f"{where}: {name} has {len(text):,} characters, which no name has; mend it")
     numbers: dict[str, float | int] = {}
     for name, kind in (("day", int), ("mu", float)):
         if name in said:
