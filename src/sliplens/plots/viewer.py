@@ -205,8 +205,8 @@ LINES = {
     "margin/band/low": ("Γ \N{MINUS SIGN} \N{GREEK SMALL LETTER SIGMA} (%)", PURPLE),
     "margin/stick_ratio": ("stick ratio (%)", ORANGE),
     "margin/read": ("Γ as read (%)", VERMILLION),
-    "margin/read/high": ("upper end of its 90 % interval (%)", YELLOW),
-    "margin/read/low": ("lower end of its 90 % interval (%)", YELLOW),
+    "margin/read/high": ("upper end of its 90 % interval (%)", VERMILLION),
+    "margin/read/low": ("lower end of its 90 % interval (%)", VERMILLION),
 }
 """Entity, name and colour of each number of a frame."""
 SAMPLE_LINES = {"x (N), as recorded": VERMILLION, "y (N), as recorded": GREEN, "z (N), as recorded": BLUE}
@@ -220,6 +220,7 @@ def lay_out(
     highest_ratio: float,
     truth: bool,
     sensor: bool,
+    forced: bool,
     methods: Sequence[str] = (),
 ) -> "Blueprint":
     """Lay out a trial: what is seen at first sight, before anything is moved."""
@@ -237,8 +238,12 @@ def lay_out(
     states = rrb.StateTimelineView(origin="state", name="contact state")
     charts = [
         _chart("margin", "safety margin Γ and stick ratio (%)", "LeftBottom", (-5.0, 105.0)),
-        _chart("force", "forces (N)", "RightBottom"),
-        _chart("ratio", "F_t / F_n in contact, beside friction", "RightBottom", (0.0, highest_ratio)),
+        *([_chart("force", "forces (N)", "RightBottom")] if forced else []),
+        *(
+            [_chart("ratio", "F_t / F_n in contact, beside friction", "RightBottom", (0.0, highest_ratio))]
+            if forced
+            else []
+        ),
         *([_chart("sensor", "force sensor, as recorded (N)", "RightBottom")] if sensor else []),
     ]
     # a map is as large as the network's image, whatever the camera's
@@ -559,11 +564,17 @@ def log_trial(
     size, factor = trial.reference.shape[:2], brightening([absolute_difference(some, trial.reference)])
     frictions = trial.friction_coefficient if friction is None else friction
     highest = end_of_ratio(force_ratio(trial), float(np.max(frictions, where=np.isfinite(frictions), initial=0)))
-    sensor = viewed.forces is not None
+    sensor, forced = viewed.forces is not None, bool(np.isfinite(trial.normal_force_n).any())
     stream.send_recording_name(trial.trial)
     stream.send_blueprint(
         lay_out(
-            size=size, factor=factor, highest_ratio=highest, truth=truth is not None, sensor=sensor, methods=methods
+            size=size,
+            factor=factor,
+            highest_ratio=highest,
+            truth=truth is not None,
+            sensor=sensor,
+            forced=forced,
+            methods=methods,
         )
     )
     about = describe_trial(trial, truth, split=viewed.split)
