@@ -66,6 +66,13 @@ def test_a_slip_that_the_markers_tell_is_answered_once(source: GripSource):
     assert after[-1].force_n == pytest.approx(1.5 * before, rel=0.1)
 
 
+def test_skin_that_springs_back_as_the_grip_is_loosened_is_no_slip(source: GripSource):
+    frames = source.frames()
+    run(source, frames, 2.8)  # lifted with 2 N, far more than it needs
+    course = run(source, frames, 1.0, slip=SlipState.SLIP)
+    assert np.all(np.diff([held.force_n for held in course]) < 0.05)
+
+
 def test_what_fell_is_gripped_anew(source: GripSource):
     frames = source.frames()
     source.act(controller="reflex", water_kg=0.05)

@@ -24,6 +24,8 @@ _CEILING_N = 2.8
 """Force that the gripper never passes: beyond, the network of the package sees frames that it does not know, its margin
 is withheld, and a grip that is never loosened blindly would stay there."""
 _MEMORY = 120
+_SPRINGS_BACK = 8
+"""Frames within which the markers tell of skin that springs back."""
 _POURS_KG_S, _PULLS_N_S = 0.03, 2.0
 """How fast a person pours and pulls."""
 _FAINTEST_N = 0.02
@@ -148,8 +150,11 @@ class GripSource(LiveSource):
             if self._told_friction != (reading.friction is not None):
                 self._told_friction = not self._told_friction
                 self._choose(self.controller)
+            # skin that springs back as the grip is loosened looks the same
+            earlier = self._told.get(reading.number - _SPRINGS_BACK, known)[0]
+            loosened = known[0].force_n[0] < 0.99 * earlier.force_n[0]
             slips = reading.slip is SlipState.SLIP and known[0].time_s > LIFT_S
-            self._slip |= slips and not self._slipping
+            self._slip |= bool(slips and not self._slipping and not loosened)
             self._reading, self._slipping = reading, slips
 
     def held(self, number: int) -> Held | None:
