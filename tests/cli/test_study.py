@@ -7,6 +7,7 @@ import pytest
 from command_line import refused, run
 
 from sliplens.recordings import Dataset
+from sliplens.study.run import run_study
 
 STAGES = ("evaluate", "explain", "score", "remedies", "faithfulness", "randomisation", "map-quality", "timing")
 
@@ -75,3 +76,21 @@ def test_mistakes_are_told_before_anything_is_made(
 ):
     assert sentence in refused(capsys, "study", fine_dataset.folder, "-o", tmp_path / "study", *more)
     assert not (tmp_path / "study").exists()
+
+
+def test_too_few_trials_are_told_before_a_network_is_loaded(
+    fine_dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    told: list[str] = []
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sliplens.study.run.note", lambda _, words: told.append(words))
+    monkeypatch.setattr("sliplens.study.run.load_network", stop)
+    with pytest.raises(KeyboardInterrupt):
+        run_study(fine_dataset, out=tmp_path / "study", trials=2)
+    assert told == [
+        "2 test trials of condition dry: fewer than 5 decide nothing, whatever the page then shows; --trials is 2"
+    ]
+    assert not list(tmp_path.iterdir())

@@ -43,6 +43,8 @@ class Section:
     intro: str | Callable[[Results], str]
     apart: bool = False
     """Whether they are no part of a study, which does not miss them."""
+    simulated: bool = False
+    """Whether a study has them of simulated data alone."""
     build: Callable[[Results, np.random.Generator], Iterable[Block | None]] = lambda *_: ()
     """Makes its blocks; None for one that is not there. Without any, the section is left out."""
     needs: Callable[[Results], Collection[str]] = lambda results: results.inputs
@@ -59,8 +61,9 @@ def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Secti
     sections, absent = [], []
     for section in SECTIONS:
         blocks = tuple(block for block in section.build(results, rng) if block is not None)
-        # a study that stopped was asked for all of its stages; single commands are asked for one by one
-        if not blocks and (section.apart or not results.study):
+        # a study that stopped was asked for all that its data can tell; single commands are asked for one by one
+        unasked = section.apart or not results.study or (section.simulated and results.study.source == "real")
+        if not blocks and unasked:
             continue
         if not blocks:
             absent.append(section.short_title)
@@ -313,6 +316,7 @@ SECTIONS: tuple[Section, ...] = (
         title="Real touch",
         short_title="Real touch",
         intro="Frames of a real sensor, shown to the same networks.",
+        apart=True,
         build=_real,
         # real frames may exist as difference images only, so one input is enough
     ),
@@ -333,6 +337,7 @@ SECTIONS: tuple[Section, ...] = (
     ),
     Section(
         id="truth",
+        simulated=True,
         of_sample=True,
         title="What the network should have looked at",
         short_title="Truth",

@@ -16,6 +16,7 @@ from sliplens.errors import InputError
 from sliplens.explainers import Explainer
 from sliplens.faithfulness.removal import Faithfulness
 from sliplens.files import hash_json, output_folder
+from sliplens.intervals import FEWEST_UNITS
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
 from sliplens.progress import OnProgress, note, stage, wrote
@@ -130,6 +131,11 @@ def run_study(
     if jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {jobs}")
     explainers = study_explainers(methods, budget=budget)
+    data = data if isinstance(data, Dataset) else load_dataset(data)
+    if (count := min(trials, len(data.select(split=split, condition=condition)))) < FEWEST_UNITS:
+        these = f"{count} {split} trial{'s' if count > 1 else ''} of condition {condition}"
+        cure = f"--trials is {trials}" if trials == count else "record more, or name another --split or --condition"
+        note(on_progress, f"{these}: fewer than {FEWEST_UNITS} decide nothing, whatever the page then shows; {cure}")
     given = {name: network for name, network in (("difference", difference), ("raw", raw)) if network is not None}
     if not given:
         raise InputError("a study needs a network; leave out --difference none or --raw none")
@@ -137,7 +143,7 @@ def run_study(
     scratch = None if out is not None else tempfile.TemporaryDirectory(prefix="sliplens-study-")
     stages = _Stages(
         folder=Path(out if scratch is None else scratch.name),  # pyright: ignore[reportArgumentType] (one is given)
-        data=data if isinstance(data, Dataset) else load_dataset(data),
+        data=data,
         networks=networks,
         explainers=explainers,
         tests=frozenset(tests),
