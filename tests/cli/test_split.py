@@ -136,5 +136,5 @@ def test_a_mistake_leaves_all_as_it_was(
 
 def test_what_is_not_there_is_told(folder: Path, rules: Path, capsys: pytest.CaptureFixture[str]):
     assert "does not exist" in refused(capsys, "split", folder / "nothing", "--rules", rules)
-    assert "cannot be read" in refused(capsys, "split", folder, "--rules", folder / "nothing.toml")
+    assert "does not exist" in refused(capsys, "split", folder, "--rules", folder / "nothing.toml")
     assert "deals by object" in refused(capsys, "split", folder, "--preset", "objects")

@@ -126,7 +126,7 @@ def train(
     data = data if isinstance(data, Dataset) else load_dataset(data)
     encoding, trials = get_encoding(input), _choose_trials(data, condition)
     _require_varied_labels(data, trials[0])
-    for sentence in _advise(config, *trials, start=start):
+    for sentence in _advise(config, *trials, start=start) if trainer.is_global_zero else ():  # one process speaks
         note(on_progress, sentence)
     # what shapes the result besides the recipe
     origin = {"input": encoding.name, "condition": condition, "data_hash": data.hash}
