@@ -25,7 +25,7 @@ _DOUBTFUL = 0.6  # a second axis that departs by this share of the first makes t
 # of a drift, of the untouched reading at the end or of its slope before the touch: a false one costs good labels
 _DRIFT_SIGMAS, _SLOPE_SIGMAS = 4.0, 3.0
 # of the standard uncertainty of a drift that only the moment before the touch tells: all of it would cost 40 % of the
-# labels of sound trials that are held to their end, 0.6 half of some, none leaves a third of those of drifting ones wrong
+# labels of sound trials that are held to their end, 0.6 a quarter, none leaves a third of those of drifting ones wrong
 _UNSEEN_SHARE = 0.3
 _UNSEEN_LOAD = 0.1  # of the load: a drift that may be larger by the end is told
 _DRIFT_SHARE = 0.01  # of the load: less is no matter
