@@ -121,7 +121,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
                 print(f"simulating {name}, seed {seed}", file=sys.stderr)
                 simulate_dataset(output.folder, recipe)
         data = sl.load_dataset(folder)
-        test: dict[int, FrameSet] = {}
+        test: dict[tuple[int, str], FrameSet] = {}
         for trials, start in product(options.trials, options.starts):
             if not trials and start == "scratch":
                 continue
@@ -134,17 +134,19 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
                 "recipe": recipe.hash,
                 "start": network.manifest.weights_sha256,
                 "training": get_recipe("adapt" if start == "adapted" else "default"),
+                "as_many": get_recipe("adapt"),
             }
             part = options.cache / f"{hash_json(shaped)}.json"
             if not part.is_file():
                 print(f"{name}, {start}, {trials} trials, seed {seed}", file=sys.stderr)
                 run = train(plan, data, network) if trials else network
                 size = run.manifest.image_size
-                test[size] = test.get(size) or load_frames(
+                seen = size, run.encoding.name
+                test[seen] = test.get(seen) or load_frames(
                     data, data.select(split="test"), encoding=run.encoding, image_size=size
                 )
                 minutes = 0.0 if run.training is None or not trials else run.training.minutes
-                write_json(part, {**r2(run, test[size]), "minutes": minutes})
+                write_json(part, {**r2(run, test[seen]), "minutes": minutes})
                 print(f"  {json.loads(part.read_text())}", file=sys.stderr)
             row = found.setdefault(name, {}).setdefault(start, {})
             row.setdefault(str(trials), []).append(json.loads(part.read_text()))
@@ -174,7 +176,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--start-from", default="chromatouch-difference", help="network to adapt")
     parser.add_argument("--sensors", nargs="+", default=list(SENSORS), choices=SENSORS)
-    parser.add_argument("--trials", nargs="+", type=int, default=[0, 1, 3, 10, 30, 100])
+    parser.add_argument("--trials", nargs="+", type=int, default=[0, 2, 3, 10, 30, 100])
     parser.add_argument("--starts", nargs="+", default=list(STARTS), choices=STARTS)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--image-size", type=int, help="that of the network if not given")
@@ -185,7 +187,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     if options.quick:
-        options.sensors, options.trials, options.seeds, options.image_size = ["dome"], [0, 1, 3], 1, 64
+        options.sensors, options.trials, options.seeds, options.image_size = ["dome"], [0, 2, 3], 1, 64
         options.changes = '{"epochs": 3, "epoch_frames": 128}'
     options.cache.mkdir(parents=True, exist_ok=True)
     try:

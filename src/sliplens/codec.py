@@ -253,12 +253,15 @@ def open_parquet(
         chunks = [group.column(at) for group in groups for at in range(group.num_columns)]
         expanded = sum(chunk.total_uncompressed_size for chunk in chunks)
         kinds = {name: schema.field(name).type for name in columns if names.count(name) == 1}
-        # what is written once and counted often grows as it is read
+        # what is written once and counted often grows as it is read; texts are bounded as they are read
+        whole = {name for name, kind in columns.items() if kind in {"bytes", "values"}}
         repeated = max(
             (
                 chunk.total_uncompressed_size * chunk.num_values
                 for chunk in chunks
-                if chunk.physical_type == "BYTE_ARRAY" and any("DICT" in one for one in chunk.encodings)
+                if chunk.path_in_schema in whole
+                and chunk.physical_type == "BYTE_ARRAY"
+                and any("DICT" in one for one in chunk.encodings)
             ),
             default=0,
         )

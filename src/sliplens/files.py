@@ -263,7 +263,8 @@ def output_folder(
     recipe = to_builtins(config)
     config_hash = hash_json({"stage": stage, "config": recipe, "sliplens": __version__})
     if (aside := _aside(target)).exists():  # whoever replaced it was killed, before or after the new one took its place
-        shutil.rmtree(aside) if target.exists() else aside.rename(target)
+        # nor is it there any more where another process is just clearing it away
+        shutil.rmtree(aside, ignore_errors=True) if target.exists() else aside.rename(target)
     empty = target.is_dir() and not any(target.iterdir())
     if target.exists() and not (target / run_file).is_file() and not (overwrite and empty):
         raise InputError(f"{target} exists and was not made by sliplens; choose another output folder")
@@ -324,8 +325,7 @@ def _take_place(partial: Path, target: Path) -> None:
     if target.exists():
         target.rename(aside)
     partial.rename(target)
-    if aside.exists():
-        shutil.rmtree(aside)
+    shutil.rmtree(aside, ignore_errors=True)
 
 
 def _aside(target: Path) -> Path:

@@ -48,7 +48,7 @@ def test_an_undo_takes_back_the_last_edit_of_its_own_trial():
     ("kind", "value"),
     [
         ("tare", (1.0, 2.0)), ("tare", 1.0), ("slip_s", (1.0, 2.0)), ("slip_s", float("nan")), ("normal_sign", 2.0),
-        ("reference_frame", 1.5), ("bad", None), ("bad", (1.0, 2.5)), ("undo", 1.0),
+        ("reference_frame", 1.5), ("mu", -1.0), ("mu", 50.0), ("bad", None), ("bad", (1.0, 2.5)), ("undo", 1.0),
     ],
 )  # fmt: skip
 def test_a_value_that_does_not_fit_is_refused(kind: str, value: float | tuple[float, ...] | None):

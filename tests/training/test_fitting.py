@@ -115,7 +115,7 @@ def test_fewer_frames_than_a_batch_are_refused(tmp_path: Path, frames: tuple[Fra
     ("change", "message"),
     [
         ({"epochs": 0}, "epochs must be positive, got 0"),
-        ({"image_size": 16}, "image_size must be at least 32 pixels, got 16"),
+        ({"image_size": 16}, "image_size must be 32 to 4096 pixels, got 16"),
         ({"batch_size": 1}, "batch_size must be at least 2"),
         ({"max_minutes": 0.0}, "max_minutes must be positive, got 0"),
     ],

@@ -18,7 +18,7 @@ from sliplens.recordings.edits import apply_edits, edits_in_force, keep_edit, lo
 from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.importing import relabel_trial
 from sliplens.recordings.labelling import Edit, EditKind, ForceAxes, FrictionEstimate
-from sliplens.recordings.labels import measure_motion
+from sliplens.recordings.labels import measure_motion, soften
 from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.store import read_frames
 from sliplens.recordings.trial import ContactState
@@ -143,7 +143,7 @@ class LabelPage(Page):
         try:
             with self._lock:
                 if trial not in self._motion:
-                    self._motion[trial] = measure_motion(stored.read_frames())
+                    self._motion[trial] = measure_motion(map(soften, stored.read_frames()))
             motion = self._motion[trial]
             labels = relabel_trial(self.data, trial, labelling=self.labelling, edits=edits, image_motion=motion)
         except SliplensError as error:

@@ -19,7 +19,7 @@ class Train(Command):
     output: Output
     """Folder to make: weights, manifest, learning curve."""
     recipe: str = "default"
-    """default: a distribution over the margin, AdamW. thesis: as the thesis trained, one output and Ranger21. ratio:
+    """default: a distribution over the margin, AdamW. thesis: as the thesis trained, one output and Ranger21.
     adapt: teaches the network of --start-from a sensor of your own, from some ten trials, in minutes. ratio: teaches it
     F_t / F_n, for where friction is told; its margins stay. The options below change it."""
     input: str | None = None

@@ -28,7 +28,7 @@ from sliplens.results.training import Training
 
 WEIGHTS_FILE = "model.safetensors"
 SCHEMA_VERSION = 1
-_LARGEST_INPUT = 4096  # pixels along a side, several times what any backbone was made for
+LARGEST_INPUT = 4096  # pixels along a side, several times what any backbone was made for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class Manifest:
 
     def __post_init__(self) -> None:
         height, width = self.frame_size
-        if not 1 <= self.image_size <= _LARGEST_INPUT or min(height, width) <= 0 or height * width > MOST_PIXELS:
+        if not 1 <= self.image_size <= LARGEST_INPUT or min(height, width) <= 0 or height * width > MOST_PIXELS:
             sizes = f"frames of {height} x {width} pixels at {self.image_size}"
             raise ValueError(f"no network reads {sizes}")
 
@@ -413,6 +413,8 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> Run:
     strange = [name for name in own if values[name].dtype != own[name].dtype or not values[name].isfinite().all()]
     if strange:
         raise CheckpointError(f"{weights} holds what is no number in {strange[0]}; train the network again")
+    if manifest.novelty is not None and manifest.novelty.layer not in dict(model.named_modules()):
+        raise CheckpointError(f"{folder / MANIFEST_FILE} names a layer that the network has not; copy the folder again")
     # channels last: depthwise convolutions run up to half as fast again on a CPU
     model = model.to(device, memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
     # the networks of the package come without their learning curve

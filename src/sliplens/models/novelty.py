@@ -61,6 +61,8 @@ class Novelty:
             raise ValueError("mean, scale and directions of features are of different lengths")
         if not min(*self.scale, *self.variances, self.rest, 1.0) > 0:
             raise ValueError("deviations and variances of features are positive")
+        if len(self.strangeness) not in {0, len(_SHARES)} or not self.limit > 0:
+            raise ValueError(f"strangeness has no or {len(_SHARES)} levels, and its limit is positive")
 
     def distance(self, features: Float[np.ndarray, "frames features"]) -> Float[np.ndarray, " frames"]:
         """Distance of features, as `read_features` gives them."""

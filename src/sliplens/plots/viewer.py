@@ -360,14 +360,16 @@ def _log_lines(stream: "RecordingStream", lines: dict[str, Float[np.ndarray, " _
         stream.send_columns(entity, times, rerun.Scalars.columns(scalars=values))
 
 
-_PREDICTED = {"trial": "texts", "frame": "whole numbers", "prediction": "numbers", "low_90": "numbers"}
+_PREDICTED = {
+    "trial": "texts", "frame": "whole numbers", "prediction": "numbers", "low_90": "numbers", "high_90": "numbers"
+}  # fmt: skip
 _TRACKED = {"trial": "texts", "frame": "whole numbers", "x_px": "numbers", "y_px": "numbers", "marker": "whole numbers"}
 
 
 def _rows_of(trial: Recording, path: Path, kinds: dict[str, str], *, command: str) -> tuple[pa.Table, np.ndarray]:
     """Rows of a table that are of a trial, in the order of its frames, and the frames' numbers."""
     with open_parquet(path, kinds, cure=f"name a table that {command} wrote") as file:
-        table = file.read()
+        table = file.read(columns=list(kinds))
     names = table["trial"].unique().to_pylist()
     rows = table.filter(pc.field("trial") == trial.trial).sort_by("frame")
     frames = rows["frame"].to_numpy().astype(np.int64)
@@ -404,8 +406,9 @@ def log_tracks(stream: "RecordingStream", trial: Recording, path: Path) -> None:
 def log_maps(stream: "RecordingStream", viewed: Viewed, maps: Explained) -> tuple[str, ...]:
     """Log the maps of a trial's frames, each until the next frame, on one scale; gives their methods."""
     rerun, trial = require_rerun(), viewed.trial
-    numbers = {Path(name).stem: at for at, name in enumerate(viewed.files)}
-    numbers |= {f"{trial.trial}-f{at:04d}": at for at in range(len(trial))}
+    numbers = {f"{trial.trial}-f{at:04d}": at for at in range(len(trial))}
+    # names that were given go before those that are made: of maps alone the files are the frames that were explained
+    numbers |= {Path(name).stem: at for at, name in enumerate(viewed.files)}
     found = {numbers[frame.id]: row for row, frame in enumerate(maps.frames) if frame.id in numbers}
     if not found:
         raise InputError(f"the maps are of no frame of {trial.trial}; they are of {maps.frames[0].id} and others")

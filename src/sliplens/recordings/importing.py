@@ -655,9 +655,16 @@ def _label(job: _Job, footage: _Footage, rng: np.random.Generator) -> tuple[Fram
         clip=capture.clip,
         basis=found.basis if found else None,
         edits=job.edits,
-        first_reference=capture.reference_choice if any(one.kind is EditKind.REFERENCE for one in job.edits) else None,
+        first_reference=_first_reference(capture, job.edits),
     )
     return image, replace(labels, labelling=labelling)
+
+
+def _first_reference(capture: Capture, edits: Sequence[Edit]) -> ReferenceChoice | None:
+    """What the first image of the untouched sensor was, where an edit named another: it is kept for who undoes that."""
+    if capture.reference is None or all(one.kind is not EditKind.REFERENCE for one in edits):
+        return None
+    return capture.reference_choice or ReferenceChoice(method="came with the recording")
 
 
 def _frames(capture: Capture) -> Iterator[Frame]:

@@ -270,7 +270,9 @@ class Edit:
         if not missing and (len(values) != wanted or isinstance(self.value, tuple) != (wanted > 1)):
             raise RecordingError(f"an edit of {self.kind} takes {wanted or 'no'} numbers, not {self.value}; mend it")
         whole = self.kind not in _WHOLE or all(float(one).is_integer() for one in values)
-        if not (np.isfinite(values).all() and whole) or (self.kind is EditKind.SIGN and not {*values} <= {1, -1}):
+        friction = self.kind is not EditKind.FRICTION or all(0 < one <= MOST_FRICTION for one in values)
+        sign = self.kind is not EditKind.SIGN or {*values} <= {1, -1}
+        if not (np.isfinite(values).all() and whole and friction and sign):
             raise RecordingError(f"an edit of {self.kind} cannot be {self.value}; mend it, or undo it")
 
     @property

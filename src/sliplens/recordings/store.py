@@ -155,7 +155,7 @@ def require_stored(trial: TrialFacts) -> None:
         raise ValueError(f"no trial has {frames} frames of {height} x {width} pixels")
 
 
-_NAME = re.compile(r"\w(?:[\w.-]*\w)?", re.ASCII)
+_NAME = re.compile(r"\w(?:[\w.-]*\w)?")
 _HEADER, _FIRST_REFERENCE = b"sliplens", b"first_reference"
 
 

@@ -293,6 +293,8 @@ def _noisiest(looks: MapQuality) -> Answer:
             if method.endswith(AS_RUN) and (value := getattr(found, measure)) is not None
         }
         own = values.pop(NOISY, None)
+        if measure != "total_variation" and (own is None or not values):
+            continue  # it decides nothing
         if own is None or not values:
             return _untested(subject, f"{name} of {method_name(NOISY)} and of another method are not both known")
         if measure == "total_variation":

@@ -7,6 +7,7 @@ from typing import Literal
 from sliplens.errors import InputError
 from sliplens.extras import Table
 from sliplens.models.backbones import DEFAULT_BACKBONE, head_outputs
+from sliplens.models.checkpoint import LARGEST_INPUT
 from sliplens.training.data import get_augmentation
 
 
@@ -48,8 +49,8 @@ class TrainConfig:
             value = getattr(self, name)
             if value is not None and not (isfinite(value) and value > 0):
                 raise InputError(f"{name} must be positive, got {value}")
-        if self.image_size < 32:
-            raise InputError(f"image_size must be at least 32 pixels, got {self.image_size}")
+        if not 32 <= self.image_size <= LARGEST_INPUT:
+            raise InputError(f"image_size must be 32 to {LARGEST_INPUT} pixels, got {self.image_size}")
         if self.batch_size < 2:
             raise InputError("batch_size must be at least 2, since batch normalisation needs more than one image")
         if self.max_minutes is not None and not self.max_minutes > 0:

@@ -51,9 +51,9 @@ from sliplens.training.loggers import open_logger
 from sliplens.training.module import Clock, DivergedError, Regressor
 from sliplens.training.trainer import make_trainer, run_trainer, share_of_batch
 
-_ENOUGH_TRIALS, _FEW_TRIALS = 10, 300
-"""Labelled trials after which adapting gains little more, and below which it beats a network that begins with nothing;
-of `benchmarks/adapt.py`."""
+_ENOUGH_TRIALS, _FEW_TRIALS = 10, 30
+"""Labelled trials after which adapting gains little more, and up to which it beat a network that begins with nothing,
+both on dry objects and as far as was measured; of `benchmarks/adapt.py`."""
 _KIND = {
     "all": ("backbone", "head"),
     "weights": ("backbone", "head", "image_size"),
@@ -220,8 +220,9 @@ def _advise(
     if config.learns == "weights":
         enough = f"record {_ENOUGH_TRIALS}" if count < _ENOUGH_TRIALS else "that is enough"
         yield (
-            f"{count} labelled trials, {len(validation)} of them held out; on simulated sensors {_ENOUGH_TRIALS} did "
-            f"as well as 30, so {enough}: on several days, to the slip, and on slippery objects if it is to hold those"
+            f"{count} labelled trials, {len(validation)} of them held out; on simulated sensors {_ENOUGH_TRIALS} "
+            f"read dry objects as well as 30, so {enough}: on several days, to the slip, and on slippery objects if it "
+            "is to hold those"
         )
     elif start is None and count < _FEW_TRIALS:
         yield (
@@ -408,9 +409,9 @@ def fit(
     )
     checkpoints = folder / "checkpoints"
     best = ModelCheckpoint(dirpath=checkpoints, filename="best", monitor="validation_mse", save_last=True)
-    # what the checkpoint does not hold is kept by Lightning's own state of it
+    # in this order: a checkpoint holds what the stopping has counted of the same epoch
     early = EarlyStopping("validation_mse", patience=config.patience) if config.patience else None
-    trainer.callbacks += [clock, best, *filter(None, [early])]  # pyright: ignore[reportAttributeAccessIssue]
+    trainer.callbacks += [clock, *filter(None, [early]), best]  # pyright: ignore[reportAttributeAccessIssue]
     trainer.loggers = [logger] if logger is not None and first else []
     trainer.log_every_n_steps = min(50, per_epoch)  # pyright: ignore[reportAttributeAccessIssue]
     loaders = make_loaders(train, validation, shuffle=shuffle, batch_size=share)
@@ -549,8 +550,10 @@ def require_same_kind(start: Run, config: TrainConfig, encoding: str) -> None:
     """Refuse to start from a network whose weights would mean something else."""
     for name, value in (("input", encoding), ("backbone", config.backbone), ("head", config.head)):
         kept = getattr(start.manifest, name)
-        # a second answer can be learnt beside the first, and the reference be seen beside the frame
-        grown = (value == "pair" and kept in REFERENCE_SIGNS) or (kept, value) == ("histogram", "margin-and-ratio")
+        # a second answer can be learnt beside the first, and the reference be seen beside the frame, but not both at
+        # once: the first answer would stay as it was for other images
+        paired = value == "pair" and kept in REFERENCE_SIGNS and config.learns != "ratio"
+        grown = paired or (kept, value) == ("histogram", "margin-and-ratio")
         if kept != value and not grown:
             raise ModelError(
                 f"the network to start from has the {name} {kept}, and {value} is to be trained; "

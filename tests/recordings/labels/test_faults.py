@@ -96,9 +96,7 @@ def test_labels_are_those_of_the_sound_samples(trial: Trial, fault: str, every: 
 @pytest.mark.parametrize("every", [1, 5])
 def test_a_sound_trial_has_no_fault_and_the_labels_it_had(trial: Trial, every: int):
     labels = label(trial, spoilt(trial, lambda _time, _force: None, every=every))
-    # from half a second of slow samples a drift of a tenth of the load cannot be told from none
-    assert len(labels.basis.flags) == (1 if every > 1 else 0)
-    assert all("may drift by" in flag for flag in labels.basis.flags)
+    assert not labels.basis.flags
 
 
 def test_a_slip_in_a_sample_is_no_step_for_the_image_sees_it(trial: Trial):
