@@ -27,7 +27,7 @@ REAL_METHODS = ("grad-cam", "poly-cam")
 """The quickest methods, for the real frames."""
 STRIP_METHOD = "poly-cam"
 """Method of the first picture: the one whose maps are quickest to read."""
-_BUDGET = 0.15
+_BUDGET = 0.1
 """Share of the channels that Poly-CAM measures at first."""
 _STUDY: dict[str, Any] = {
     "methods": METHODS,
@@ -35,7 +35,7 @@ _STUDY: dict[str, Any] = {
     "budget": _BUDGET,
     "tests": ("score", "faithfulness"),
     "settings": (Setting(fill="reference", unit="pixel"), Setting(fill="noisy-linear", unit="pixel")),
-    "random_orders": 4,
+    "random_orders": 3,
     "steps": STEPS,
 }
 """The study of a first look: too few trials to decide anything, as the page says, but there within minutes."""
