@@ -43,7 +43,8 @@ def in_a_child(one: Input, originals: Path) -> tuple[str, str]:
     if not child:
         try:
             size = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-            resource.setrlimit(resource.RLIMIT_AS, (size + 3 * MOST_BYTES,) * 2)
+            most = size + 3 * MOST_BYTES
+            resource.setrlimit(resource.RLIMIT_AS, (most, most))
             told = outcome(one, originals, folder / "input")
         except MemoryError:
             told = "memory", "more than was left"

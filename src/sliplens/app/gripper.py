@@ -147,7 +147,8 @@ class GripSource(LiveSource):
             known = self._told.get(reading.number)
             if known is None:
                 return
-            if self._told_friction != (reading.friction is not None):
+            # a reading that is withheld tells no friction either
+            if reading.margin is not None and self._told_friction != (reading.friction is not None):
                 self._told_friction = not self._told_friction
                 self._choose(self.controller)
             # skin that springs back as the grip is loosened looks the same
