@@ -262,9 +262,13 @@ def output_folder(
     """
     recipe = to_builtins(config)
     config_hash = hash_json({"stage": stage, "config": recipe, "sliplens": __version__})
-    if (aside := _aside(target)).exists():  # whoever replaced it was killed, before or after the new one took its place
-        # nor is it there any more where another process is just clearing it away
-        shutil.rmtree(aside, ignore_errors=True) if target.exists() else aside.rename(target)
+    aside = _aside(target)
+    if aside.exists():  # whoever replaced it was killed, before or after the new one took its place
+        with _held(partial_folder(target), target):  # or is about to put it there
+            if aside.exists():
+                shutil.rmtree(aside) if target.exists() else aside.rename(target)
+            with suppress(OSError):  # what was begun stays
+                partial_folder(target).rmdir()
     empty = target.is_dir() and not any(target.iterdir())
     if target.exists() and not (target / run_file).is_file() and not (overwrite and empty):
         raise InputError(f"{target} exists and was not made by sliplens; choose another output folder")

@@ -59,6 +59,14 @@ def test_it_is_careful_where_it_hears_nothing(source: GripSource):
     assert course[-1].why.startswith("no margin is read")
 
 
+def test_a_reading_that_stays_the_same_grows_old(source: GripSource):
+    frames = source.frames()
+    run(source, frames, 4.0)
+    course = run(source, frames, 20.0, tells=False)
+    assert course[-1].force_n == pytest.approx(MarginLaw.safe_n, rel=0.02)
+    assert course[-1].why.startswith("no margin is read")
+
+
 def test_a_slip_that_the_markers_tell_is_answered_once(source: GripSource):
     frames = source.frames()
     before = run(source, frames, 6.0)[-1].force_n

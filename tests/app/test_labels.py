@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 from sliplens.app import LabelPage
-from sliplens.errors import InputError
+from sliplens.errors import InputError, RecordingError
 from sliplens.images import decode_png
 from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.edits import EDITS_FILE, read_edits
+from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.importing import relabel_trial
 from sliplens.recordings.store import save_recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
@@ -116,3 +117,15 @@ def test_a_damaged_file_of_edits_is_told_before_a_browser_is_opened(tmp_path: Pa
     (tmp_path / EDITS_FILE).write_text("{\n")
     with pytest.raises(InputError, match="line 1 of"):
         LabelPage(Dataset(folder=tmp_path, trials=data.trials))
+
+
+def test_the_tare_of_a_span_is_the_mean_of_its_samples(data: Dataset, trial: Recording):
+    page, forces = LabelPage(data, by="bo"), read_stored_trial(data, data.find(trial.trial)).forces
+    assert forces is not None
+    begin_s, end_s = float(forces.time_s[3]), float(forces.time_s[17])
+    page.edit(trial.trial, "tare_span", (begin_s, end_s))
+    (tare,) = (edit for edit in page.look(trial.trial).edits if edit.kind == "tare")
+    assert tare.value == pytest.approx(tuple(forces.force_n[3:18].mean(axis=0)))
+    with pytest.raises(RecordingError, match="no force sample from"):
+        page.edit(trial.trial, "tare_span", (end_s + 1000, end_s + 1001))
+    page.edit(trial.trial, "undo")

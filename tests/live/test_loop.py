@@ -9,6 +9,7 @@ from threading import Semaphore
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import sliplens as sl
 from sliplens.errors import ImageError, InputError
@@ -292,3 +293,17 @@ def test_by_default_health_and_slip_are_watched_and_no_touch_has_no_margin(trial
     assert "nothing touches the sensor; press it on something" in str(readings[0].withheld)
     assert {reading.slip for reading in readings} == {SlipState.CANNOT_TELL}  # not yet still for long enough
     assert {"exposure", "focus", "camera", "markers"} <= {check.name for check in readings[0].health}
+
+
+def test_readers_that_end_in_any_order_give_numpy_its_threads_back(recording: Recording):
+    def threads() -> set[int]:
+        return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+
+    with threadpool_limits(2, user_api="blas"):
+        readers = [plain_reader(Burst(recording.frames[:2], [0, 1])) for _ in range(2)]
+        for reader in readers:
+            reader.__enter__()
+        readers[0].__exit__(None, None, None)
+        assert threads() == {1}
+        readers[1].__exit__(None, None, None)
+        assert threads() == {2}

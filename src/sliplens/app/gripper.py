@@ -230,9 +230,10 @@ class GripSource(LiveSource):
     def _answer(self, now: PlantState) -> float:
         """Grip force that the controller tells, in newtons."""
         reading, slip, self._slip = self._reading, self._slip, False
-        then = now if reading is None else self._told.get(reading.number, (now,))[0]
-        if now.time_s - then.time_s > _STALE_S:
-            reading = None
+        known = None if reading is None else self._told.get(reading.number)
+        if known is None or now.time_s - known[0].time_s > _STALE_S:
+            known = reading = None
+        then = now if known is None else known[0]
         margin = np.nan if reading is None or reading.margin is None else reading.margin
         low = margin if reading is None or reading.low is None else reading.low
         seen = Observation(

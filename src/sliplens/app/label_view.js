@@ -158,7 +158,7 @@ export default {
     },
     act(name) {
       if (!this.view || this.busy) return;
-      const at = this.frame, time = this.view.time_s[at] - this.view.shift_s;
+      const at = this.frame, time = this.forceTime(at);
       const [first, last] = this.span ?? [at, at];
       if (name === "reference") this.edit("reference_frame", at);
       else if (name === "contact") this.edit("contact_s", time);
@@ -167,14 +167,11 @@ export default {
       else if (name === "from") this.span = [at, Math.max(at, last)];
       else if (name === "to") this.span = [Math.min(first, at), at];
       else if (name === "undo") this.view.edits.length && this.edit("undo", null);
-      else if (this.span && name === "tare") this.tareFromSpan();
+      else if (this.span && name === "tare") this.edit("tare_span", this.span.map((one) => this.forceTime(one)));
       else if (this.span) this.edit(name, [first, last]);
     },
-    tareFromSpan() {
-      const { samples, time_s } = this.view, [first, last] = this.span.map((at) => time_s[at]);
-      const inside = samples.time_s.map((at) => first <= at && at <= last);
-      const means = samples.axes_n.map((axis) => mean(axis.filter((value, at) => inside[at] && value !== null)));
-      if (means.every((value) => value !== null)) this.edit("tare", means);
+    forceTime(frame) {
+      return this.view.time_s[frame] - this.view.shift_s; // on the clock of the forces
     },
     setTare() {
       if (this.tare.every((value) => typeof value === "number")) this.edit("tare", [...this.tare]);
@@ -373,7 +370,6 @@ export default {
 };
 
 const clamp = (value, least, most) => Math.max(least, Math.min(most, value));
-const mean = (values) => (values.length ? values.reduce((sum, value) => sum + value, 0) / values.length : null);
 
 function extent(curves) {
   let low = Infinity, high = -Infinity;

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sliplens.app.server import Page
-from sliplens.errors import SliplensError
+from sliplens.errors import RecordingError, SliplensError
 from sliplens.images import encode_png
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.dataset import Dataset, load_dataset, trial_path
@@ -130,9 +130,23 @@ class LabelPage(Page):
         return {info.trial: len(edits_in_force(edits, info.trial)) for info in self.data.trials}
 
     def edit(self, trial: str, kind: EditKind | str, value: float | Sequence[float] | None = None) -> None:
-        """Keep an edit; a `RecordingError` tells why it cannot be."""
+        """Keep an edit; a `RecordingError` tells why it cannot be.
+
+        `tare_span` makes the mean of the samples between two times, in seconds on the forces' clock, the tare.
+        """
+        if kind == "tare_span":
+            assert isinstance(value, Sequence)
+            kind, value = EditKind.TARE, self._mean_force(trial, *value)
         with self._lock:
             keep_edit(self.data, make_edit(trial, kind, value, by=self.by))
+
+    def _mean_force(self, trial: str, begin_s: float, end_s: float) -> tuple[float, ...]:
+        """Mean of the whole samples of a span: the page has but the extremes of a long recording."""
+        forces = read_stored_trial(self.data, self.data.find(trial)).forces
+        within = None if forces is None else forces.force_n[(begin_s <= forces.time_s) & (forces.time_s <= end_s)]
+        if within is None or not len(within := within[np.isfinite(within).all(axis=1)]):
+            raise RecordingError(f"there is no force sample from {begin_s:.2f} to {end_s:.2f} s; choose a longer span")
+        return tuple(within.mean(axis=0).tolist())
 
     def look(self, trial: str) -> TrialView:
         """Label a trial anew, in memory."""

@@ -4,6 +4,7 @@ import asyncio
 import errno
 import secrets
 import socket
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache, partial
@@ -37,7 +38,7 @@ _ICON = (
 _Page = TypeVar("_Page", bound="Page")
 
 
-class Page:
+class Page(ABC):
     """Page for browsers; a context manager that serves it while it is entered. One at a time runs in a process.
 
     `host` and `port` are those of `LivePage`.
@@ -79,15 +80,15 @@ class Page:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def _open(self, stack: ExitStack) -> None:
+    def _open(self, stack: ExitStack) -> None:  # noqa: B027 (most pages have nothing to open)
         """Make what it shows, and let the stack end it."""
 
-    def start(self, loop: asyncio.AbstractEventLoop) -> None:
+    def start(self, loop: asyncio.AbstractEventLoop) -> None:  # noqa: B027 (some show only when asked)
         """Begin to show; viewers are served in this loop."""
 
+    @abstractmethod
     def build(self) -> None:
         """Make the elements of one viewer, in the place where NiceGUI has called."""
-        raise NotImplementedError
 
     async def serve(self, name: str, socket: "WebSocket") -> None:
         """Serve the socket of a viewer; here is none."""

@@ -111,7 +111,7 @@ class FrameReader:
     The network runs beside the checks of the same frame, in a thread of its own, for as long as the frame before it had
     a margin: what the checks then withhold was read in vain.
 
-    Parameters are those of `LiveReader`; `on_reference` is called with each image of the untouched sensor.
+    Parameters are those of `LiveReader`.
     """
 
     def __init__(
@@ -123,7 +123,6 @@ class FrameReader:
         smoothing_s: float,
         health: Callable[[Frame, Run | None], HealthWatch] | None,
         slip: Callable[[Float[np.ndarray, "markers 2"]], SlipWatch] | None,
-        on_reference: Callable[[Frame], None],
     ) -> None:
         self.source, self.network = source, network
         self.engine: Engine | None = None
@@ -140,7 +139,7 @@ class FrameReader:
                 raise InputError("--friction makes a margin of what a network reads; name one with --network")
             network.require_ratio()
         self._smooth = LowPass(time_constant_s=smoothing_s)
-        self._make_health, self._make_slip, self._on_reference = health, slip, on_reference
+        self._make_health, self._make_slip = health, slip
         self._health: HealthWatch | None = None
         self._slip: SlipWatch | None = None
         self._tracker: Tracker | None = None
@@ -284,7 +283,6 @@ class FrameReader:
             self._set_reference(image)
 
     def _set_reference(self, image: Frame) -> None:
-        self._on_reference(image)
         self.reference = image
         self._health = None if self._make_health is None else self._make_health(image, self.network)
         if isinstance(self._health, HealthMonitor):

@@ -231,8 +231,10 @@ class HealthMonitor:
         return Check(name="touch", value=value, limit=self.limits.touch, ok=touches, sentence=sentence)
 
     def _check_novelty(self, frame: LiveFrame, run: Run) -> Check:
-        known = self._novelty
-        if known is None or not 0 <= frame.time_s - known[0] < _NOVELTY_EVERY_S:
+        age_s = np.inf if self._novelty is None else frame.time_s - self._novelty[0]
+        if not 0 <= age_s < 2 * _NOVELTY_EVERY_S:  # of too old a picture: this one is waited for
+            self._novelty = self._coming = None
+        if not 0 <= age_s < _NOVELTY_EVERY_S:
             if self.beside is None:
                 self._novelty = frame.time_s, self._read_novelty(frame, run)
             elif self._coming is None:

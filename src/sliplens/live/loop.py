@@ -2,11 +2,11 @@
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from inspect import signature
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 from typing import ParamSpec, TypeVar
 
 import numpy as np
@@ -40,6 +40,23 @@ Subscriber = Callable[[Reading, LiveFrame | None], None]
 _MOST_FRAMES = 10**6
 _RETRY_S = 1.0  # between two tries to open a source that was lost
 _PATIENCE_S = 3.0
+
+
+_BLAS_LOCK, _BLAS_LIMITS = Lock(), list[threadpool_limits]()
+
+
+@contextmanager
+def _one_blas_thread() -> Iterator[None]:
+    """Keep NumPy's matrices to one thread, in the whole process, until the last who wants that is done."""
+    with _BLAS_LOCK:
+        _BLAS_LIMITS.append(_BLAS_LIMITS[0] if _BLAS_LIMITS else threadpool_limits(1, user_api="blas"))
+    try:
+        yield
+    finally:
+        with _BLAS_LOCK:
+            limit = _BLAS_LIMITS.pop()
+            if not _BLAS_LIMITS:
+                limit.restore_original_limits()
 
 
 class LiveReader:
@@ -154,7 +171,6 @@ class LiveReader:
             smoothing_s=smoothing_s,
             health=health,
             slip=slip,
-            on_reference=self._begin_trial,
         )
         self._frames: Mailbox[LiveFrame] = Mailbox()
         self._listening: list[Mailbox[Reading]] = []
@@ -201,7 +217,7 @@ class LiveReader:
         with ExitStack() as stack:
             # its threads spin while they wait for each other: a matrix of markers then takes ten times as long on cores
             # that something else uses too, and the network runs beside it
-            stack.enter_context(threadpool_limits(1, user_api="blas"))
+            stack.enter_context(_one_blas_thread())
             stack.callback(self._reader.close)
             stack.callback(self._end_outputs)
             stack.enter_context(self.source)
@@ -308,7 +324,6 @@ class LiveReader:
             facts=facts,
             source=self.source.name,
             simulated=self.source.simulated,
-            reference=self.reference,
         )
         if self._profile is not None:
             keep_profile(Path(folder), self._profile)
@@ -318,10 +333,6 @@ class LiveReader:
         """End the recording; gives its data set, None where there is none, or no frame of it."""
         recorder, self.recorder = self.recorder, None
         return None if recorder is None else recorder.close()
-
-    def _begin_trial(self, reference: Frame) -> None:
-        if (recorder := self.recorder) is not None:  # another thread may end it at any time
-            recorder.set_reference(reference)
 
     def _end_outputs(self) -> None:
         for sender in self.senders:
@@ -370,7 +381,9 @@ class LiveReader:
     def _take(self, frame: LiveFrame) -> None:
         if self._forces is not None:
             frame = self._forces.attach(frame)
-        if (recorder := self.recorder) is not None and self.reference is not None:
+        # other threads may end the recording, or take a new reference, at any time
+        if (recorder := self.recorder) is not None and (reference := self.reference) is not None:
+            recorder.set_reference(reference)
             recorder.add(frame)
         self._frames.put(frame)
 

@@ -1,5 +1,6 @@
 """A data set on disk: one Parquet file a trial, frames without loss beside their labels."""
 
+import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
@@ -199,6 +200,7 @@ def finish_recording(folder: Path, lock: JournalLock | None = None) -> None:
         held.release()
     if not found:
         (folder / DATASET_FILE).unlink()
+        shutil.rmtree(folder / SENSORS_FOLDER, ignore_errors=True)
         with suppress(OSError):  # where something else is in it
             folder.rmdir()
 
