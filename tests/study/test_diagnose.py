@@ -31,6 +31,7 @@ from sliplens.study.diagnose import (
     say_slices,
     say_slope,
 )
+from sliplens.study.truth import reliability_of
 
 TRIALS, FRAMES = 40, 12
 
@@ -139,13 +140,22 @@ def test_kinds_of_explanations_are_recovered_whatever_their_size(rng):
 def test_contributions_are_held_against_those_of_the_best_reading():
     state = np.array([1, 1, 2, 0])
     values = np.array([0.3, -0.1, 0.4, 5.0])
-    same = hold_against(values, values, state)
+    sure = np.zeros(4)
+    same = hold_against(values, sure, values, state)
     assert same.agreement == pytest.approx(1)
     assert same.network_slipping == same.reading_slipping == pytest.approx(0.4 / 0.8)
     # signed: what works the other way round disagrees
-    assert hold_against(-values, values, state).agreement == pytest.approx(-1)
+    assert hold_against(-values, sure, values, state).agreement == pytest.approx(-1)
     # an answer that no marker moves ranks none
-    assert np.isnan(hold_against(0 * values, values, state).agreement)
+    assert np.isnan(hold_against(0 * values, sure, values, state).agreement)
+    assert same.reliability == 1
+
+
+def test_the_reliability_is_how_two_estimates_correlate(rng: np.random.Generator):
+    values, errors = rng.normal(size=4000), np.full(4000, 0.7)
+    first, second = (values + errors * rng.normal(size=4000) for _ in range(2))
+    # a correlation of 4000 pairs is sure to (1 - r^2) / sqrt(4000) = 0.009
+    assert reliability_of(first, errors) == pytest.approx(np.corrcoef(first, second)[0, 1], abs=0.03)
 
 
 def frictions(slope: float, best: float, *, trials: int = 12) -> FrictionTable:

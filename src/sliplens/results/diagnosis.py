@@ -56,6 +56,8 @@ class ExplainedErrors(ErrorTable):
 
     agreement: Float64[np.ndarray, " frames"]
     """Signed rank correlation, marker by marker, of the Shapley values for the answer and for the best reading."""
+    reliability: Float64[np.ndarray, " frames"]
+    """Correlation that another estimate of the Shapley values from as many scenes would have with these."""
     network_slipping: Float64[np.ndarray, " frames"]
     reading_slipping: Float64[np.ndarray, " frames"]
     """Share on slipping markers, of the sizes of these values on markers in contact."""

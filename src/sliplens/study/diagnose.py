@@ -31,7 +31,7 @@ from sliplens.results.evaluation import Predictions
 from sliplens.results.explanation import Explained
 from sliplens.simulation.intervention import film_with_friction, marker_readings, reading_slope
 from sliplens.study.explaining import explain_frames, frames_at, network_inputs
-from sliplens.study.truth import StagedFrame, find_places, rank_correlation, redrawing, stage_frames
+from sliplens.study.truth import StagedFrame, find_places, rank_correlation, redrawing, reliability_of, stage_frames
 from sliplens.training import evaluate
 
 Markers = Float64[np.ndarray, " markers"]
@@ -45,7 +45,7 @@ _KINDS, _EXAMPLES, _BLOCKS = 6, 2, 8
 """Kinds of explanations at most, examples of each, and blocks across a map that has no markers to compare."""
 _DISTINCT = 0.25
 """Silhouette below which Kaufman and Rousseeuw (*Finding Groups in Data*, 1990) find no structure."""
-_LOOKED = ("agreement", "network_slipping", "reading_slipping")
+_LOOKED = ("agreement", "reliability", "network_slipping", "reading_slipping")
 
 
 def diagnose(
@@ -301,16 +301,21 @@ class MarkerContributions:
 
     values: Markers
     agreement: float
+    reliability: float
     network_slipping: float
     reading_slipping: float
 
 
-def hold_against(values: Markers, reading: Markers, state: Int64[np.ndarray, " markers"]) -> MarkerContributions:
+def hold_against(
+    values: Markers, errors: Markers, reading: Markers, state: Int64[np.ndarray, " markers"]
+) -> MarkerContributions:
     """Hold contributions of markers that slip (1), stick (2) or touch nothing (0) against those to the best reading."""
     sizes, least = (np.abs(values), np.abs(reading)), np.finfo(float).tiny
     network, best = (float(size[state == 1].sum() / max(size[state > 0].sum(), least)) for size in sizes)
-    agreement = rank_correlation(values, reading)
-    return MarkerContributions(values=values, agreement=agreement, network_slipping=network, reading_slipping=best)
+    return MarkerContributions(
+        values=values, agreement=rank_correlation(values, reading), reliability=reliability_of(values, errors),
+        network_slipping=network, reading_slipping=best,
+    )  # fmt: skip
 
 
 def find_contributions(
@@ -331,10 +336,10 @@ def find_contributions(
             return np.concatenate([answer_whole(predict, redraw(index, back)) for back in some])
 
         # a run that goes on asks the same
-        values = shapley_values(worth, markers, pairs=pairs, rng=np.random.default_rng((seed, index))).values
+        shares = shapley_values(worth, markers, pairs=pairs, rng=np.random.default_rng((seed, index)))
         reading = marker_readings(frames[index].scene, frames[index].number)[1]
         state = find_places(frames[index], image_size=run.manifest.image_size).state
-        return hold_against(values, reading, state)
+        return hold_against(shares.values, shares.standard_errors, reading, state)
 
     indices = counted(range(len(frames)), on_progress)
     return [keep_part(parts and parts / f"{at:05d}", MarkerContributions, partial(find, at)) for at in indices]
@@ -472,10 +477,16 @@ def say_looked(table: ExplainedErrors, slices: Sequence[ErrorSlice], rng: np.ran
         f"In {_frames(own)} {name} the markers' parts in the answer rank as in the best reading, to a signed rank "
         f"correlation (Spearman's) of {_gap(_mean(own.agreement, own, rng, (-1.0, 1.0)))}; of the parts in contact, "
         f"{100 * own.network_slipping.mean():.0f} % of the answer's and {100 * own.reading_slipping.mean():.0f} % of "
-        "the best reading's are of slipping markers."
+        "the best reading's are of slipping markers." + _say_sampling(own)
         for name, own in known.items()
         if len(np.unique(own.trial)) >= FEWEST_UNITS
     ]
+
+
+def _say_sampling(table: ExplainedErrors) -> str:
+    reliability = float(table.reliability.mean())
+    told = f" Another estimate of the answer's from as many scenes would correlate with this one by {reliability:.2f}."
+    return told if np.isfinite(reliability) else ""
 
 
 def say_slope(slope: FrictionSlope) -> str:

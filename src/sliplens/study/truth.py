@@ -288,10 +288,10 @@ def _test_oracle(gains: Float[np.ndarray, "frames 3"], interval: _Interval) -> O
     return OracleTest(oracle=oracle, degraded=degraded, changed=changed, gap=interval(gains[:, 0] - gains[:, 1]))
 
 
-def _reliability(effects: FrameEffects) -> float:
+def reliability_of(values: Float64[np.ndarray, " markers"], errors: Float64[np.ndarray, " markers"]) -> float:
     """Part of the spread of a frame's Shapley values that is no sampling error; NaN where they do not vary."""
-    spread = float(effects.shapley.var(ddof=1)) if len(effects.shapley) > 1 else 0.0
-    return float("nan") if spread == 0 else max(0.0, 1 - float((effects.shapley_error**2).mean()) / spread)
+    spread = float(values.var(ddof=1)) if len(values) > 1 else 0.0
+    return float("nan") if spread == 0 else max(0.0, 1 - float((errors**2).mean()) / spread)
 
 
 def _sum_over_change(effects: Sequence[FrameEffects], change: Float[np.ndarray, " frames"], name: str) -> float | None:
@@ -382,7 +382,7 @@ def judge_by_truth(
         areas=_by_region(places, lambda _, region: float(region.mean())),
         methods=_judge(judged, places, along, explained.clusters, seed=seed),
         pairs=pairs,
-        reliability=interval((_reliability(one) for one in effects), limits=(0.0, 1.0)),
+        reliability=interval((reliability_of(one.shapley, one.shapley_error) for one in effects), limits=(0.0, 1.0)),
         sums={name: _sum_over_change(effects, change, name) for name in ("shapley", "network")},
         shapley_against_margin=alike(rank_correlation(one.shapley, one.margin) for one in effects),
         network_against_margin=alike(rank_correlation(one.network, one.margin) for one in effects),
