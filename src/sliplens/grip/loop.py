@@ -1,14 +1,14 @@
 """The loop of a grip: images are read, a controller answers, the gripper acts, and the object moves or holds."""
 
 import math
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, UInt8
+from threadpoolctl import ThreadpoolController
+from torch import Tensor
 
 from sliplens.errors import InputError
 from sliplens.friction import Friction, FrictionLike, SlipLearner, as_friction
@@ -131,7 +131,8 @@ def _fill(values: np.ndarray, count: int) -> np.ndarray:
 class RenderedEyes:
     """Two fingertips filmed and read by a network, markers followed: the loop closed through pixels, one episode.
 
-    Markers are followed in one finger an image, turn by turn; in between a finger keeps its last displacement.
+    While the network reads one finger's frame, its markers are followed and the other finger's frame is drawn: each of
+    the two by one thread, for threads that share their many short steps wait for each other.
     """
 
     def __init__(
@@ -145,10 +146,12 @@ class RenderedEyes:
     ) -> None:
         first = Fingertip(seed=seed)
         self.fingertips = (first, Fingertip(seed=seed + 1, day=first.day))
-        self._run, self._pool = run, ThreadPoolExecutor(2)
-        self._engine = make_engine(engine, run, frames=frames, batch_size=2) if isinstance(engine, str) else engine
+        self._run, self._threads = run, ThreadpoolController()
+        if isinstance(engine, str):
+            with self._threads.limit(limits=1):
+                engine = make_engine(engine, run, frames=frames, batch_size=1)
+        self._engine = engine
         self._trackers = [Tracker(tip.reference) for tip in self.fingertips]
-        self._shear, self._turn = np.zeros(2), 0
         self._learner = None if friction is None else SlipLearner(as_friction(friction))
         if self._learner is not None:
             run.require_ratio()
@@ -158,48 +161,45 @@ class RenderedEyes:
         """The two untouched sensors, T_0."""
         return np.stack([tip.reference for tip in self.fingertips])
 
-    def _follow(self, frame: UInt8[np.ndarray, "height width 3"]) -> float:
-        tracker = self._trackers[self._turn]
-        return float(mean_shear(tracker.rest.centre_px, tracker.update(frame).position_px[: len(tracker.rest)]))
-
     def look(self, state: PlantState, slipping_s: Episodes) -> Sight:
         """Film both fingertips and read them."""
-        margins, friction, shear = state.margin[0], state.holding_friction[0], state.shear_n[0]
+        frames: list[np.ndarray] = []
+        shear_px: list[float] = []
 
-        def draw(finger: int) -> np.ndarray:
-            return self.fingertips[finger].draw(
-                float(state.force_n[0]),
-                friction=float(friction[finger]),
-                margin=float(np.nan_to_num(margins[finger], nan=1.0)),
-                held_s=float(state.held_s[0]),
-                pulled_back=bool(shear[finger] < 0),
-            )
+        def inputs() -> Iterator[Tensor]:
+            for finger, (tip, tracker) in enumerate(zip(self.fingertips, self._trackers, strict=True)):
+                with self._threads.limit(limits=1):
+                    frame = tip.draw(
+                        float(state.force_n[0]),
+                        friction=float(state.holding_friction[0, finger]),
+                        margin=float(np.nan_to_num(state.margin[0, finger], nan=1.0)),
+                        held_s=float(state.held_s[0]),
+                        pulled_back=bool(state.shear_n[0, finger] < 0),
+                    )
+                    encoded = self._run.encode(frame[None], tip.reference)
+                yield encoded
+                with self._threads.limit(limits=1):
+                    place_px = tracker.update(frame).position_px[: len(tracker.rest)]
+                frames.append(frame)
+                shear_px.append(float(mean_shear(tracker.rest.centre_px, place_px)))
 
-        # a core each: drawing is mostly torch, which lets go of the interpreter
-        frames = np.stack(list(self._pool.map(draw, range(2))))
-        self._turn = 1 - self._turn
-        following = self._pool.submit(self._follow, frames[self._turn])
-        parts = [
-            self._run.encode(frame[None], tip.reference) for frame, tip in zip(frames, self.fingertips, strict=True)
-        ]
         known, learner = None, self._learner
         if learner is not None:
             since_s = float(slipping_s[0])
             learner.update(state.time_s, slipping_s=None if math.isnan(since_s) else since_s)
             known = learner.friction
-        estimate = self._engine.estimate(self._run, torch.cat(parts), friction=known)
+        estimate = self._engine.estimate(self._run, inputs(), friction=known)
         if learner is not None and estimate.ratio is not None:
             learner.note(
                 float(estimate.ratio.mean.mean()), sigma=float(estimate.ratio.sigma.mean()), time_s=state.time_s
             )
         low, high = estimate.interval(LEVEL) or (estimate.margin, estimate.margin)
-        self._shear[self._turn] = following.result()
         return Sight(
             margin=estimate.margin[None],
             low=low[None],
             high=high[None],
-            shear_px=self._shear[None].copy(),
-            frames=frames,
+            shear_px=np.array([shear_px]),
+            frames=np.stack(frames),
         )
 
 

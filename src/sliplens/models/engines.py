@@ -46,13 +46,19 @@ class Engine:
         return (margins for margins, *_ in self.answers(batches))
 
     def estimate(
-        self, trained: Run, inputs: Float[Tensor, "batch colours size size"], *, friction: FrictionLike | None = None
+        self,
+        trained: Run,
+        inputs: Float[Tensor, "batch colours size size"] | Iterable[Tensor],
+        *,
+        friction: FrictionLike | None = None,
     ) -> Estimate:
         """Safety margins of images that the network of the engine has encoded, with how sure it is.
 
-        `friction`: what is known of the coefficient of friction, as `predict` takes it.
+        `inputs`: all images, or batches of them, each of which may be made while the one before is read. `friction`:
+        what is known of the coefficient of friction, as `predict` takes it.
         """
-        answers = zip(*self.answers(inputs.split(self.batch_size)), strict=True)
+        batches = inputs.split(self.batch_size) if isinstance(inputs, Tensor) else inputs
+        answers = zip(*self.answers(batches), strict=True)
         return trained.to_estimate(*(torch.cat(parts) for parts in answers), friction=friction)
 
 
