@@ -23,12 +23,12 @@ from torch import Tensor
 
 from sliplens.errors import SliplensError
 from sliplens.explainers import PolyCam, capture, find_layers
-from sliplens.explainers.activations import find_published_layers
+from sliplens.explainers.cam import find_published_layers
 from sliplens.explainers.contract import frozen
-from sliplens.explainers.maps import combine
+from sliplens.explainers.explanation import combine
 from sliplens.explainers.occlusion import marker_regions, markers_in_recording
+from sliplens.faithfulness.controls import relevance_mass, relevance_rank
 from sliplens.faithfulness.fills import get_fill
-from sliplens.faithfulness.map_quality import relevance_mass, relevance_rank
 from sliplens.faithfulness.removal import Units, score_maps, tile_units
 from sliplens.files import machine, versions
 from sliplens.intervals import paired_difference

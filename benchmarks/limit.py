@@ -26,7 +26,7 @@ from torch import nn
 from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, PRESETS, TrialPlan, plan_trials
 from sliplens.simulation.geometry import Dome
-from sliplens.simulation.information import (
+from sliplens.simulation.intervention import (
     MARGIN,
     Sensitivity,
     marker_sensitivity,

@@ -27,8 +27,7 @@ from torch import Tensor
 from fairness import at_its_best, busy_process
 from sliplens.errors import SliplensError
 from sliplens.explainers import Explanation, PolyCam, capture, find_layers
-from sliplens.explainers.explanation import EXACT, effect_rounding
-from sliplens.explainers.maps import pearson_r, resize, to_masks, top_overlap
+from sliplens.explainers.explanation import EXACT, effect_rounding, pearson_r, resize, to_masks, top_overlap
 from sliplens.files import machine, versions
 from sliplens.models import Run
 from sliplens.models.checkpoint import load

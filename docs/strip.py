@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from sliplens.plots.strip import draw_strip
+from sliplens.plots.margins import draw_strip
 from sliplens.report.results import load_results
 
 if __name__ == "__main__":

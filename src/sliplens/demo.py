@@ -16,8 +16,7 @@ from sliplens.report import write_report
 from sliplens.results.explanation import Strip
 from sliplens.simulation.trials import simulate
 from sliplens.study import explain_source, explain_trial, run_study, score_explained
-from sliplens.study.curves import Setting
-from sliplens.study.scoring import STEPS
+from sliplens.study.scoring import STEPS, Setting
 from sliplens.training import evaluate, train
 
 INPUTS = ("difference", "raw")

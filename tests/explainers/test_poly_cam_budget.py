@@ -7,7 +7,7 @@ import torch
 
 from sliplens.errors import InputError
 from sliplens.explainers import Likeness, PolyCam
-from sliplens.explainers.maps import pearson_r, top_overlap
+from sliplens.explainers.explanation import pearson_r, top_overlap
 from sliplens.explainers.poly_cam_budget import GaussianProcess
 from sliplens.models import engines as passes
 

@@ -9,8 +9,8 @@ from torchvision import models
 
 from sliplens.errors import InputError, ModelError
 from sliplens.explainers import PolyCam, capture, get_explainer
-from sliplens.explainers.activations import find_published_layers
-from sliplens.explainers.maps import spread
+from sliplens.explainers.cam import find_published_layers
+from sliplens.explainers.explanation import spread
 
 PUBLISHED = [
     "conv1",

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sliplens.faithfulness.alarms import (
+from sliplens.faithfulness.removal import Faithfulness
+from sliplens.faithfulness.scoring import (
     controls_win,
     fill_decides,
     flat_maps,
@@ -13,7 +14,6 @@ from sliplens.faithfulness.alarms import (
     rankings_disagree,
     saturated,
 )
-from sliplens.faithfulness.removal import Faithfulness
 
 
 def score(gain: float, images: int = 4) -> Faithfulness:

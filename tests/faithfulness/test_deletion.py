@@ -12,7 +12,7 @@ from sliplens.faithfulness import (
     get_fill,
     random_order,
 )
-from sliplens.faithfulness.deletion import deletion_steps, saliency_orders
+from sliplens.faithfulness.scoring import deletion_steps, saliency_orders
 
 
 def mean_of_pixels(images: torch.Tensor) -> torch.Tensor:

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sliplens.errors import InputError, SaliencyError
-from sliplens.faithfulness.map_quality import relevance_mass, relevance_rank
+from sliplens.faithfulness.controls import relevance_mass, relevance_rank
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.faithfulness.map_quality import gini, resolution, stability, total_variation
+from sliplens.faithfulness.controls import gini, resolution, stability, total_variation
 
 
 def test_total_variation_has_its_closed_forms(rng: np.random.Generator):

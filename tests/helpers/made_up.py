@@ -11,10 +11,9 @@ from sliplens.codec import save_record, save_result
 from sliplens.files import Machine, Provenance
 from sliplens.recordings import TrialInfo
 from sliplens.recordings.dataset import write_dataset_table
-from sliplens.results.evaluation import Evaluation, Predictions, Reliability
+from sliplens.results.evaluation import Evaluation, LearningCurve, Predictions, Reliability, Training
 from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
 from sliplens.results.faithfulness import DeletionScores, DeletionTable, MethodScore
-from sliplens.results.training import LearningCurve, Training
 from sliplens.training.metrics import find_lead_times, risk_coverage, score_predictions
 
 METHODS = ("grad-cam", "integrated-gradients", "poly-cam")

@@ -7,7 +7,7 @@ from scipy import stats
 from sliplens.errors import InputError
 from sliplens.friction import Friction
 from sliplens.models import Run
-from sliplens.models.told import told_probabilities
+from sliplens.models.calibration import told_probabilities
 
 EDGES, RATIO_EDGES = np.linspace(-0.1, 1.1, 61), np.linspace(-0.1, 1.5, 81)
 MARGINS = np.clip((EDGES[1:] + EDGES[:-1]) / 2, 0, 1)

@@ -17,7 +17,7 @@ from matplotlib.text import Text
 from sliplens.errors import InputError
 from sliplens.plots.audit import choose_along, draw_audit
 from sliplens.plots.contact_sheet import STATE_COLOURS
-from sliplens.plots.layout import save_page
+from sliplens.plots.style import save_page
 from sliplens.recordings import ContactState, Recording
 from sliplens.recordings.labelling import (
     ForceAxes,

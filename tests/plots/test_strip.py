@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sliplens.plots.strip import draw_strip
+from sliplens.plots.margins import draw_strip
 from sliplens.results.explanation import Strip, StripReadings
 
 

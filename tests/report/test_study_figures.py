@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 import sliplens as sl
 from sliplens.errors import InputError
-from sliplens.faithfulness.deletion import deletion_order
+from sliplens.faithfulness.scoring import deletion_order
 from sliplens.report import load_results
 from sliplens.report.pictures import plate_removal, plate_truth
 from sliplens.report.plates import (

@@ -8,15 +8,17 @@ import pytest
 from limit import margin_bound
 from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, Nuisances, SimulationRecipe, plan_trials
-from sliplens.simulation.information import (
+from sliplens.simulation.intervention import (
     MARGIN,
+    NOISE_PX,
+    FilmedTrial,
     Sensitivity,
+    marker_readings,
     marker_sensitivity,
     prior_sigma,
     reading_gain,
     visible_markers,
 )
-from sliplens.simulation.intervention import NOISE_PX, FilmedTrial, marker_readings
 from sliplens.simulation.nuisances import Grasp, Touch
 from sliplens.simulation.trials import prepare_trial
 

@@ -10,7 +10,7 @@ from limit import margin_bound, sequence_bound
 from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, Nuisances
 from sliplens.simulation.geometry import FlatPad
-from sliplens.simulation.information import (
+from sliplens.simulation.intervention import (
     MARGIN,
     NUISANCES,
     Sensitivity,

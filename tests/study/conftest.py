@@ -9,9 +9,8 @@ from sliplens.models import Run, load_checkpoint
 from sliplens.recordings import Dataset
 from sliplens.results.study import Choice, MarkedFrame
 from sliplens.study import explain_frames
-from sliplens.study.choice import choose_frames
+from sliplens.study.choice import Material, choose_frames, gather, study_explainers
 from sliplens.study.explaining import frames_at
-from sliplens.study.material import Material, gather, study_explainers
 
 METHODS = ("grad-cam", "integrated-gradients")
 

@@ -8,12 +8,11 @@ from known_ends import ends_of
 from torch import Tensor, nn
 
 from sliplens.explainers import Explanation, IntegratedGradients
-from sliplens.faithfulness.controls import cascade
-from sliplens.faithfulness.map_quality import gini, total_variation
+from sliplens.faithfulness.controls import cascade, gini, total_variation
 from sliplens.recordings import Dataset
 from sliplens.study.checks import explain_untrained, measure_maps, randomise_weights, time_explainers
-from sliplens.study.curves import Setting, influences, score_removal
-from sliplens.study.material import Material
+from sliplens.study.choice import Material
+from sliplens.study.scoring import Setting, influences, score_removal
 
 
 class ShowsTheImage:

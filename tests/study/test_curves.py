@@ -9,7 +9,8 @@ from sliplens.codec import load_result, save_result
 from sliplens.faithfulness.removal import Faithfulness
 from sliplens.intervals import paired_difference
 from sliplens.results.faithfulness import RemovalScores
-from sliplens.study.curves import (
+from sliplens.study.choice import Material
+from sliplens.study.scoring import (
     EQUAL_AREAS,
     STUDY_AREAS,
     Setting,
@@ -19,7 +20,6 @@ from sliplens.study.curves import (
     ranking_alarms,
     score_removal,
 )
-from sliplens.study.material import Material
 
 PIXELS = Setting(fill="grey", unit="pixel")
 MARKERS = Setting(fill="reference", unit="marker")

@@ -16,7 +16,7 @@ from sliplens.files import output_folder
 from sliplens.intervals import Difference
 from sliplens.models import Manifest, Run
 from sliplens.recordings import Dataset, load_dataset
-from sliplens.results.diagnosis import ErrorSlice, ErrorTable, FrictionTable
+from sliplens.results.evaluation import ErrorSlice, ErrorTable, FrictionTable
 from sliplens.simulation import SimulationRecipe, simulate_dataset
 from sliplens.study import diagnose as diagnosing
 from sliplens.study.diagnose import (

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sliplens.study.material import (
+from sliplens.study.choice import (
     STUDY_METHODS,
     THESIS_POLY_CAM,
     as_the_thesis_ran,

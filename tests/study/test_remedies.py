@@ -5,7 +5,7 @@ import torch
 from sliplens.codec import load_result, save_result
 from sliplens.faithfulness import deletion_order
 from sliplens.results.faithfulness import Remedies
-from sliplens.study.material import Material
+from sliplens.study.choice import Material
 from sliplens.study.scoring import score_explanations, score_remedies
 
 STEPS = 8

@@ -20,8 +20,7 @@ from sliplens.results import Explained, ExplainedFrame
 from sliplens.results.explanation import MethodNotes
 from sliplens.results.study import Study, Truth
 from sliplens.simulation import CHROMATOUCH, SimulationRecipe, simulate_dataset
-from sliplens.simulation.information import visible_markers
-from sliplens.simulation.intervention import draw_with_markers_back, marker_readings
+from sliplens.simulation.intervention import draw_with_markers_back, marker_readings, visible_markers
 from sliplens.study import frames_from_dataset
 from sliplens.study.explaining import network_inputs
 from sliplens.study.pool import _with_truth as pooled_truth

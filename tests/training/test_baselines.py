@@ -18,8 +18,7 @@ from sliplens.models import Manifest, build_model, save_checkpoint
 from sliplens.recordings import Dataset
 from sliplens.results.evaluation import BaselinePredictions, Baselines, Predictions
 from sliplens.simulation import SimulationRecipe, simulate_dataset
-from sliplens.training import baselines
-from sliplens.training.baselines import BaselinePlan, choose_training, evaluate_baselines, marker_kind
+from sliplens.training.evaluation import BaselinePlan, choose_training, evaluate_baselines, marker_kind
 
 pytest.importorskip("cv2", reason="markers are found with OpenCV, of the extra `markers`")
 
@@ -134,7 +133,7 @@ def test_fields_that_were_followed_before_are_not_followed_again(data: Dataset, 
     def refuse(*_: object) -> None:
         raise AssertionError("followed again")
 
-    monkeypatch.setattr(baselines, "track_markers", refuse)
+    monkeypatch.setattr("sliplens.training.evaluation.track_markers", refuse)
     again, answered_again = evaluated(data, followed)
     assert again == first
     assert answered_again.table() == answered.table()
@@ -153,7 +152,7 @@ def test_trials_without_markers_are_named_and_answered_with_the_training_mean(
     def find_none(*_: object) -> None:
         raise ImageError("the reference shows 0 whole markers")
 
-    monkeypatch.setattr(baselines, "track_markers", find_none)
+    monkeypatch.setattr("sliplens.training.evaluation.track_markers", find_none)
     found, answered = evaluated(data, tmp_path)
     assert found.failed == dict.fromkeys((lost, blind), "the reference shows 0 whole markers")
     assert found.training_trials == len(data.select(split="train")) - 1
@@ -229,7 +228,7 @@ def test_what_was_followed_before_an_interruption_is_not_followed_again(
             raise KeyboardInterrupt
         return track_markers(*given)
 
-    monkeypatch.setattr(baselines, "track_markers", follow)
+    monkeypatch.setattr("sliplens.training.evaluation.track_markers", follow)
     with pytest.raises(KeyboardInterrupt):
         command.run()
     assert not (tmp_path / "out").exists()

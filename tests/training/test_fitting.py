@@ -9,7 +9,7 @@ from sliplens.errors import InputError, ModelError
 from sliplens.models import load_checkpoint
 from sliplens.models.encodings import get_encoding
 from sliplens.recordings import Dataset
-from sliplens.results.training import Training
+from sliplens.results.evaluation import Training
 from sliplens.training import TrainConfig, evaluate_frames, fit, get_recipe
 from sliplens.training.data import EpochShuffle, FrameSet, load_frames
 from sliplens.training.fitting import require_same_kind

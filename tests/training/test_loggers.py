@@ -9,7 +9,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 
 from sliplens.errors import InputError
 from sliplens.training import TrainConfig
-from sliplens.training.loggers import LOGGERS, open_logger
+from sliplens.training.config import LOGGERS, open_logger
 
 RECIPE = {**asdict(TrainConfig()), "input": "difference", "condition": None}
 

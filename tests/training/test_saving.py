@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sliplens.errors import InputError
-from sliplens.training.trainer import WholeCheckpoints
+from sliplens.training.module import WholeCheckpoints
 
 
 def test_a_checkpoint_comes_back(tmp_path: Path):

@@ -2,7 +2,7 @@ import pytest
 
 from sliplens.errors import InputError
 from sliplens.training import TrainConfig, make_trainer
-from sliplens.training.trainer import share_of_batch
+from sliplens.training.module import share_of_batch
 
 VARIABLES = ("RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "WORLD_SIZE", "TORCHELASTIC_RUN_ID")
 SECOND_NODE = {"SLURM_PROCID": "2", "SLURM_NODEID": "1", "SLURM_LOCALID": "0"}

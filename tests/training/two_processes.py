@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from sliplens.errors import ModelError
 from sliplens.models.encodings import get_encoding
 from sliplens.recordings import load_dataset
-from sliplens.results.training import Training
+from sliplens.results.evaluation import Training
 from sliplens.training import TrainConfig, fit, make_trainer
 from sliplens.training.data import FrameSet, load_frames
 

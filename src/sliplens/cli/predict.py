@@ -66,7 +66,7 @@ class Predict(SourceCommand):
         if self.output is not None:
             require_new_file(self.output, suffix=TABLE_SUFFIXES, overwrite=self.overwrite)
         if self.plot is not None:
-            from sliplens.plots.layout import require_picture_path
+            from sliplens.plots.style import require_picture_path
 
             require_picture_path(self.plot, example="margins.png")
             require_new_file(self.plot, overwrite=self.overwrite)

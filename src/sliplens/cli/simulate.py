@@ -89,7 +89,7 @@ class Simulate(Command):
     def _require_pictures(self) -> None:
         """Refuse a wrong suffix before anything is simulated."""
         if self.preview is not None:
-            from sliplens.plots.layout import require_picture_path
+            from sliplens.plots.style import require_picture_path
 
             require_picture_path(self.preview, example="sheet.png")
         if self.video is not None:

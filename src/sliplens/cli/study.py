@@ -62,7 +62,7 @@ class Study(Command):
 
     def run(self) -> None:
         """Run every stage that is not there yet, and draw the report."""
-        from sliplens.study.material import STUDY_METHODS, study_explainers
+        from sliplens.study.choice import STUDY_METHODS, study_explainers
         from sliplens.study.run import load_network, run_study
 
         if (self.data is None) == (self.preset is None):

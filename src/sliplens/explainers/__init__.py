@@ -1,11 +1,9 @@
 """Why the network predicts this margin: explanations of f(x) - f(reference), signed and in margin units."""
 
-from sliplens.explainers.activations import Layer, capture, find_layers
-from sliplens.explainers.cam import GradCam, HiResCam, LayerCam
+from sliplens.explainers.cam import GradCam, HiResCam, Layer, LayerCam, capture, find_layers
 from sliplens.explainers.contract import Explainer
 from sliplens.explainers.explanation import Approximation, Explanation, Level
-from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients, SmoothGrad
-from sliplens.explainers.lrp import Lrp
+from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients, Lrp, SmoothGrad
 from sliplens.explainers.occlusion import Occlusion, find_markers
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.poly_cam_budget import Likeness

@@ -1,19 +1,232 @@
-"""Class activation maps that keep their sign."""
+"""Class activation maps that keep their sign, and the activations that they weigh."""
 
+import weakref
 from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import ClassVar, TypeAlias
+from difflib import get_close_matches
+from functools import partial
+from itertools import groupby, pairwise
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from sliplens.errors import ModelError
-from sliplens.explainers.activations import Layer, capture, recall_layers
-from sliplens.explainers.contract import Comparison, Method, require_at_least_one
-from sliplens.explainers.explanation import Explanation, check_slopes
-from sliplens.explainers.maps import scale_to, spread
+from sliplens.explainers.contract import Comparison, Method, frozen, require_at_least_one
+from sliplens.explainers.explanation import Explanation, check_slopes, scale_to, spread
 from sliplens.progress import OnProgress
+
+
+@contextmanager
+def capture(model: nn.Module, names: Sequence[str], *, differentiable: bool = False) -> Iterator[dict[str, Tensor]]:
+    """Keep the output of each named module of every forward pass made inside, by name, and always take the hooks off.
+
+    Names are those of `model.named_modules()`; of a module called twice the last output is kept. `differentiable`
+    starts the graph anew at each kept output, so that the gradient of the prediction in it can be taken; with several
+    modules only the last one's gradient is whole.
+    """
+    outputs: dict[str, Tensor] = {}
+    modules = dict(model.named_modules())
+
+    def keep(name: str, _module: nn.Module, _arguments: object, output: Tensor) -> Tensor:
+        outputs[name] = output.detach().requires_grad_(differentiable)
+        # the rest of the network gets a copy: an in-place ReLU would overwrite what is kept
+        return outputs[name].clone()
+
+    with ExitStack() as stack:
+        for name in names:
+            stack.callback(modules[name].register_forward_hook(partial(keep, name)).remove)
+        yield outputs
+
+
+Shape = tuple[int, int, int]
+"""Channels, rows and columns of a map."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A module whose output is a map."""
+
+    name: str
+    """Its name in `model.named_modules()`."""
+    shape: Shape
+    """Channels, rows and columns of the map."""
+
+    @property
+    def channels(self) -> int:
+        """Channels of the map."""
+        return self.shape[0]
+
+
+class _Call(NamedTuple):
+    """One call of a module, with the calls made inside it in the order in which they ran."""
+
+    name: str
+    module: nn.Module
+    input_shape: Shape | None
+    output_shape: Shape | None
+    inner: "list[_Call]"
+
+
+def find_layers(
+    model: nn.Module, images: Float[Tensor, "batch colours height width"], *, names: Sequence[str] | None = None
+) -> tuple[Layer, ...]:
+    """Find the layers to explain, in the order in which they run: fine to coarse in the usual network.
+
+    The network is run once, with one image, and its main path followed: the modules that the network itself calls,
+    looking into plain `Sequential` containers, wrappers whose output is no map, and blocks that shrink the map by more
+    than two, but not into blocks and their branches. Each resolution and width gives its last map; a layer without
+    parameters (pooling) is left out, as are 1 x 1 maps. For TorchVision's ShuffleNetV2 these are conv1, stage2, stage3,
+    stage4 and conv5, for its ResNet-18 relu and layer1 to layer4. With `names`, as `model.named_modules()` has them,
+    those modules are taken instead.
+
+    Raises
+    ------
+    ModelError
+        If a name is unknown or its module gives no map, or if the network has no layer with a map.
+    """
+    root = _record(model, images)
+    layers = _distinct(_main_path(root))
+    if names is not None:
+        return _named(model, root, names, others=layers)
+    if not layers:
+        raise ModelError(
+            f"{type(model).__name__} has no layer with a spatial map for images of {images.shape[-2]} x "
+            f"{images.shape[-1]} pixels; use larger images, a convolutional network, or integrated gradients"
+        )
+    return layers
+
+
+def recall_layers(
+    model: nn.Module, images: Float[Tensor, "batch colours height width"], *, names: Sequence[str] | None = None
+) -> tuple[Layer, ...]:
+    """As `find_layers`, whose pass costs as much as a whole Grad-CAM; made again only where its answer may change."""
+    modules = tuple((name, weakref.ref(module)) for name, module in model.named_modules())
+    key = (modules, tuple(images.shape[1:]), None if names is None else tuple(names))
+    known = _RECALLED.get(model)
+    if known is None or known[0] != key:
+        _RECALLED[model] = known = (key, find_layers(model, images, names=names))
+    return known[1]
+
+
+_RECALLED: weakref.WeakKeyDictionary[nn.Module, tuple[object, tuple[Layer, ...]]] = weakref.WeakKeyDictionary()
+
+
+def find_published_layers(model: nn.Module, images: Float[Tensor, "batch colours height width"]) -> tuple[Layer, ...]:
+    """Layers as the public code finds them: every module that ends just before the size of the output changes.
+
+    Modules are listed as they end, insides before their block: the size goes down and up again inside a block with two
+    branches, and the last layer is missed, since what follows it is no map.
+
+    References
+    ----------
+    Public code of Poly-CAM, `find_layer_list`.
+    """
+    ended = [(call.name, call.output_shape) for call in _finished(_record(model, images))]
+    layers: dict[str, Layer] = {}
+    for (name, shape), (_, following) in pairwise(ended):
+        if shape is None and following is None:
+            continue
+        if shape is None or following is None:
+            break  # the public code stops at what flattens
+        if following[1:] != shape[1:]:
+            layers[name] = Layer(name, shape)
+            if following[1:] == (1, 1):
+                break
+    if not layers:
+        raise ModelError(
+            f"{type(model).__name__} has no layer where the size of the map changes, which score='thesis' looks for; "
+            "name layers"
+        )
+    return tuple(layers.values())
+
+
+def _record(model: nn.Module, images: Tensor) -> _Call:
+    """Run the network and return the tree of its module calls."""
+    finished: list[_Call] = []  # those whose caller is still at work
+    begun: list[int] = []
+
+    def leave(name: str, module: nn.Module, arguments: tuple[object, ...], output: object) -> None:
+        first = begun.pop()
+        shapes = (_map_shape(arguments[0] if arguments else None), _map_shape(output))
+        finished[first:] = [_Call(name, module, *shapes, finished[first:])]
+
+    with ExitStack() as stack, torch.no_grad(), frozen(model):
+        for name, module in model.named_modules():
+            stack.callback(module.register_forward_pre_hook(lambda *_: begun.append(len(finished))).remove)
+            stack.callback(module.register_forward_hook(partial(leave, name)).remove)
+        model(images[:1])
+    return finished[0]
+
+
+def _map_shape(value: object) -> Shape | None:
+    """Channels, rows and columns of a map, else None."""
+    if not isinstance(value, Tensor) or value.ndim != 4:
+        return None
+    channels, height, width = value.shape[1:]
+    return channels, height, width
+
+
+def _is_spatial(shape: Shape | None) -> bool:
+    return shape is not None and shape[1] * shape[2] > 1
+
+
+def _main_path(call: _Call) -> list[_Call]:
+    # the exact forward: a subclass that overrides it may do more than run its items in a row
+    is_sequence = type(call.module).forward is nn.Sequential.forward
+    if not (call.name == "" or is_sequence or call.output_shape is None or _shrinks_repeatedly(call)):
+        return [call]
+    steps = [step for inner in call.inner for step in _main_path(inner)]
+    if steps and is_sequence and call.name and call.output_shape is not None:
+        steps[-1] = steps[-1]._replace(name=call.name)  # the same tensor under the name people know
+    return steps
+
+
+def _shrinks_repeatedly(call: _Call) -> bool:
+    if not call.inner or call.input_shape is None or call.output_shape is None:
+        return False
+    return call.input_shape[1] > 2 * call.output_shape[1] + 1 or call.input_shape[2] > 2 * call.output_shape[2] + 1
+
+
+def _distinct(steps: list[_Call]) -> tuple[Layer, ...]:
+    layers = []
+    for shape, group in groupby(steps, key=lambda step: step.output_shape):
+        members = list(group)
+        has_parameters = any(next(step.module.parameters(), None) is not None for step in members)
+        if shape is not None and _is_spatial(shape) and has_parameters:
+            layers.append(Layer(members[-1].name, shape))
+    return tuple(layers)
+
+
+def _named(model: nn.Module, root: _Call, names: Sequence[str], *, others: tuple[Layer, ...]) -> tuple[Layer, ...]:
+    known = [name for name, _ in model.named_modules() if name]
+    shapes: dict[str, Shape | None] = {}
+    for call in _finished(root):
+        shapes.pop(call.name, None)  # a module called twice counts where it ended last
+        shapes[call.name] = call.output_shape
+    for name in names:
+        if name not in known:
+            choices = [layer.name for layer in others] + get_close_matches(name, known, n=3)
+            raise ModelError(
+                f"{type(model).__name__} has no layer {name!r}; choose among {', '.join(dict.fromkeys(choices))} "
+                "or another name of model.named_modules()"
+            )
+        if not _is_spatial(shapes.get(name)):
+            choices = ", ".join(layer.name for layer in others)
+            raise ModelError(f"layer {name!r} gives no spatial map; choose among {choices or 'none'}")
+    if not names:
+        raise ModelError("the list of layers is empty; name at least one, or pass None to have them found")
+    return tuple(Layer(name, shape) for name, shape in shapes.items() if shape is not None and name in names)
+
+
+def _finished(call: _Call) -> Iterator[_Call]:
+    for inner in call.inner:
+        yield from _finished(inner)
+    yield call
+
 
 _Maps: TypeAlias = Float[Tensor, "batch channels rows columns"]
 _Cells: TypeAlias = Float[Tensor, "batch rows columns"]

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from sliplens.errors import InputError
-from sliplens.explainers.activations import Layer, capture, find_layers, find_published_layers
+from sliplens.explainers.cam import Layer, capture, find_layers, find_published_layers
 from sliplens.explainers.contract import Comparison, Method, black_frames
 from sliplens.explainers.explanation import (
     Approximation,
@@ -19,8 +19,12 @@ from sliplens.explainers.explanation import (
     check_approximations,
     check_rounding,
     check_weights,
+    combine,
+    local_change,
+    resize,
+    scale_to,
+    to_masks,
 )
-from sliplens.explainers.maps import combine, local_change, resize, scale_to, to_masks
 from sliplens.explainers.poly_cam_budget import ChannelSearch, GaussianProcess, Likeness, mask_kernel
 from sliplens.models.engines import Engine
 from sliplens.progress import OnProgress

@@ -13,8 +13,7 @@ from sliplens.errors import ImageError, InputError
 from sliplens.explainers.cam import GradCam, HiResCam, LayerCam
 from sliplens.explainers.contract import Explainer
 from sliplens.explainers.explanation import Explanation
-from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients, SmoothGrad
-from sliplens.explainers.lrp import Lrp
+from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients, Lrp, SmoothGrad
 from sliplens.explainers.occlusion import KnownMarkers, Occlusion, RegionMethod, find_markers, markers_in_frame
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.shapley import Shapley

@@ -1,32 +1,260 @@
-"""Scores of explanations in one call: the sound one against controls, and the thesis's deletion score."""
+"""Scores of explanations: the sound one in one call, the deletion score of the thesis, and where neither measures."""
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
+import pyarrow as pa
 import torch
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Float, Float64, Int, UInt8
+from scipy.stats import kendalltau
 from torch import Tensor
 
 from sliplens.arrays import require_saliency
-from sliplens.errors import SaliencyError
+from sliplens.errors import InputError, SaliencyError
 from sliplens.explainers import Explanation
 from sliplens.explainers.table import network_inputs, open_run
-from sliplens.faithfulness.alarms import controls_win, fill_decides, flat_maps, saturated
 from sliplens.faithfulness.controls import control_maps
-from sliplens.faithfulness.deletion import (
-    DeletionCurves,
-    deletion_curves,
-    deletion_steps,
-    random_order,
-    saliency_orders,
+from sliplens.faithfulness.fills import Fill, get_fill
+from sliplens.faithfulness.removal import (
+    AREAS,
+    RANDOM_ORDERS,
+    Faithfulness,
+    Predict,
+    removal_curves,
+    score_maps,
+    tile_units,
 )
-from sliplens.faithfulness.fills import get_fill
-from sliplens.faithfulness.removal import AREAS, RANDOM_ORDERS, Faithfulness, score_maps, tile_units
 from sliplens.models import Run
 from sliplens.models.engines import Engine, prepare
 from sliplens.progress import OnProgress
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeletionCurves:
+    """Answers of a network while pixels are removed, for several images."""
+
+    pixels_removed: Int[np.ndarray, " steps"]
+    """Pixels that are gone at each step."""
+    base: Float64[np.ndarray, " images"]
+    """Answer on the whole image, in margin units."""
+    predictions: Float64[np.ndarray, "images steps"]
+    """Answer at each step, in margin units."""
+    control: "DeletionCurves | None" = None
+    """The same in random order, where it was asked for: a method that does not beat it has shown nothing."""
+
+    @property
+    def scores(self) -> Float64[np.ndarray, "images steps"]:
+        """Deletion score D at each step."""
+        return deletion_score(self.base[:, None], self.predictions)
+
+    @property
+    def auc(self) -> Float64[np.ndarray, " images"]:
+        """D_AUC of each image: the mean of D over the steps."""
+        return self.scores.mean(axis=1)
+
+    def frame(self) -> pa.Table:
+        """Arrow table, a row for each image and step: pixels removed, prediction in margin units, score D."""
+        images, steps = self.predictions.shape
+        return pa.table(
+            {
+                "image": np.repeat(np.arange(images), steps),
+                "pixels_removed": np.tile(self.pixels_removed, images),
+                "prediction": self.predictions.ravel(),
+                "score": self.scores.ravel(),
+            }
+        )
+
+
+def deletion_score(
+    base: Float[np.ndarray, "*shape"], masked: Float[np.ndarray, "*shape2"]
+) -> Float[np.ndarray, "*shape3"]:
+    """Deletion score D = (1 - |y_base - y_mask|)^2 of answers in margin units; lower means more was destroyed.
+
+    References
+    ----------
+    Polak, eq. 2 (there in percent, hence divided by 100).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.faithfulness import deletion_score
+    >>> deletion_score(np.array(0.9), np.array([0.9, 0.4])).round(2)  # nothing destroyed; half of the range
+    array([1.  , 0.25])
+    """
+    return (1 - np.abs(base - masked)) ** 2
+
+
+def deletion_order(saliency: Float[np.ndarray, "height width"]) -> Int[np.ndarray, " pixels"]:
+    """Flat pixel indices from most to least salient; of ties the later pixel first, as in the thesis's masks.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.faithfulness import deletion_order
+    >>> deletion_order(np.array([[0.1, 0.9], [0.5, 0.1]]))
+    array([1, 2, 3, 0])
+    """
+    return np.argsort(saliency.ravel(), kind="stable")[::-1].copy()
+
+
+def random_order(shape: tuple[int, int], *, rng: np.random.Generator) -> Int[np.ndarray, " pixels"]:
+    """Flat pixel indices in random order: the control that every explanation has to beat."""
+    return rng.permutation(shape[0] * shape[1])
+
+
+def deletion_steps(shape: tuple[int, int], *, steps: int | None = None) -> Int[np.ndarray, " steps"]:
+    """Pixels removed at each step: as many steps as the image is high, the last of which removes all.
+
+    References
+    ----------
+    Polak, section 4 (n_masks = 224 for a 224 x 224 image: 224 steps of 224 pixels).
+    """
+    pixels = shape[0] * shape[1]
+    count = steps or shape[0]
+    if not 1 <= count <= pixels:
+        raise InputError(f"deletion in {count} steps is impossible with {pixels} pixels; choose 1 to {pixels}")
+    return np.round(np.linspace(0, pixels, count + 1)[1:]).astype(np.int64)
+
+
+def deletion_curves(
+    predict: Predict,
+    images: Float[Tensor, "images colours height width"],
+    orders: Int[np.ndarray, "images pixels"],
+    *,
+    fill: Fill,
+    references: Float[Tensor, "images colours height width"] | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    batch_size: int = 128,
+    on_progress: OnProgress | None = None,
+) -> DeletionCurves:
+    """Answers of a network while pixels are removed in one order an image (`deletion_order`, `random_order`).
+
+    So many `steps`, the image's height if None, as in the thesis; all else is as for `removal_curves`.
+
+    Examples
+    --------
+    A network that reads the mean brightness: bright pixels on black, removed one by one.
+
+    >>> import numpy as np
+    >>> import torch
+    >>> from sliplens.faithfulness import deletion_curves, deletion_order, get_fill
+    >>> image = torch.zeros(1, 3, 2, 2)
+    >>> image[0, :, 0] = 1.0
+    >>> order = deletion_order(image[0, 0].numpy())[None]
+    >>> curves = deletion_curves(
+    ...     lambda inputs: inputs.mean(dim=(1, 2, 3)), image, order, fill=get_fill("black"), steps=4
+    ... )
+    >>> curves.predictions
+    array([[0.25, 0.  , 0.  , 0.  ]])
+    """
+    removed = deletion_steps((images.shape[-2], images.shape[-1]), steps=steps)
+    curves = removal_curves(
+        predict,
+        images,
+        orders[None],
+        fill=fill,
+        references=references,
+        areas=[0.0, *removed / removed[-1]],
+        seed=seed,
+        batch_size=batch_size,
+        on_progress=on_progress,
+    )
+    answers = curves.answers[0]
+    return DeletionCurves(pixels_removed=removed, base=answers[:, 0], predictions=answers[:, 1:])
+
+
+def saliency_orders(saliency: Float[np.ndarray, "images height width"], shape: tuple[int, int]) -> np.ndarray:
+    """Deletion orders of several maps."""
+    maps = [require_saliency(each, shape, where=f"saliency map {index}") for index, each in enumerate(saliency)]
+    return np.stack([deletion_order(each) for each in maps])
+
+
+FILL_DECIDES = 0.05
+"""An image of nothing but fill that is answered this near to the whole image, in margin units."""
+_TIED_TO_LAST = 0.8
+_SATURATED = 0.01
+_SAME_ORDER = 0.5
+_FEWEST = 3
+
+
+def fill_decides(whole: Float[np.ndarray, " images"], filled: Float[np.ndarray, " images"], *, fill: str) -> list[str]:
+    """Say in how many images the fill alone is answered like the whole image: there no map can move the answer."""
+    near = int(np.sum(np.abs(whole - filled) < FILL_DECIDES))
+    sentence = (
+        f"the fill decides in {near} of {len(whole)} frames: an image of nothing but {fill} is answered within "
+        f"{FILL_DECIDES:.0%} of the whole frame"
+    )
+    return [sentence] if near else []
+
+
+def follows_last_step(
+    score: Float[np.ndarray, " images"], last: Float[np.ndarray, " images"], *, name: str
+) -> list[str]:
+    """Say whether a score follows its own last step, where all is filled and no map has a part."""
+    if len(score) < _FEWEST or np.std(score) == 0 or np.std(last) == 0:
+        return []
+    tied = float(np.corrcoef(score, last)[0, 1])
+    if tied < _TIED_TO_LAST:
+        return []
+    return [f"{name} correlates with its last step by {tied:.2f}: it measures the fill rather than the map"]
+
+
+def saturated(answers: Float[np.ndarray, " images"]) -> list[str]:
+    """Say how many answers lie at an end of [0, 1] or outside: they move one way only."""
+    ends = int(np.sum((answers < _SATURATED) | (answers > 1 - _SATURATED)))
+    return [f"{ends} of {len(answers)} answers lie at an end of the margin: they can move one way only"] if ends else []
+
+
+def flat_maps(maps: Mapping[str, Float[np.ndarray, "images height width"]]) -> list[str]:
+    """Say which methods gave maps that are constant, or hold NaN: they rank nothing."""
+    alarms = []
+    for method, values in maps.items():
+        bad = int(np.sum(~np.isfinite(values).all(axis=(1, 2))))
+        flat = int(np.sum(values.max(axis=(1, 2)) == values.min(axis=(1, 2))))
+        alarms += [f"{method}: {bad} of {len(values)} maps hold NaN or infinity"] if bad else []
+        alarms += [f"{method}: {flat} of {len(values)} maps are constant and rank nothing"] if flat else []
+    return alarms
+
+
+def rankings_disagree(scores: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Say which fills rank the methods differently, by Kendall's tau; scores by fill, then by method.
+
+    References
+    ----------
+    Kendall, *A new measure of rank correlation* (1938).
+    """
+    alarms = []
+    for first, second in combinations(scores, 2):
+        methods = sorted(set(scores[first]) & set(scores[second]))
+        if len(methods) < _FEWEST:
+            continue
+        ranked = ([scores[fill][method] for method in methods] for fill in (first, second))
+        tau = float(np.asarray(kendalltau(*ranked))[0])
+        if not tau >= _SAME_ORDER:
+            alarms.append(
+                f"{first} and {second} rank the methods differently (Kendall's tau {tau:.2f}): which is best depends "
+                "on what removed pixels become"
+            )
+    return alarms
+
+
+def controls_win(scores: Mapping[str, Faithfulness], controls: Mapping[str, Faithfulness]) -> list[str]:
+    """Say which methods gain no more than a map that knows nothing of the network, or than random orders."""
+    alarms = []
+    best = max(controls, key=lambda name: float(controls[name].symmetric_gain.mean()), default=None)
+    for method, score in scores.items():
+        gain = float(score.symmetric_gain.mean())
+        if gain <= 0:
+            alarms.append(f"{method} does not beat a random order: its symmetric gain is {gain:.3f}")
+        elif best is not None and gain <= (control := float(controls[best].symmetric_gain.mean())):
+            alarms.append(f"{method} gains {gain:.3f}, no more than the control {best} ({control:.3f})")
+    return alarms
+
 
 Frames: TypeAlias = UInt8[np.ndarray, "images height width 3"]
 Maps: TypeAlias = Explanation | Float[np.ndarray, "maps rows columns"]

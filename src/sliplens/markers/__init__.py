@@ -1,10 +1,16 @@
 """Markers: found, followed, and what their displacement tells of the grip."""
 
 from sliplens.markers.detect import KINDS, Appearance, MarkerKind, Markers, detect_markers
-from sliplens.markers.displacement import DisplacementField, compute_field, interpolate_field
 from sliplens.markers.doublets import Doublets, fit_doublets
 from sliplens.markers.tracker import Tracker, track_markers
-from sliplens.markers.tracks import MarkerStatus, TrackedFrame, Tracks
+from sliplens.markers.tracks import (
+    DisplacementField,
+    MarkerStatus,
+    TrackedFrame,
+    Tracks,
+    compute_field,
+    interpolate_field,
+)
 
 __all__ = [
     "KINDS",

@@ -20,11 +20,10 @@ from sliplens.files import MANIFEST_FILE, find_run, hash_file, require_folder
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.images import MOST_PIXELS
 from sliplens.models.backbones import Answers, bin_edges, build_model, ratio_edges
-from sliplens.models.calibration import Calibration, Traction, raw_interval, spread
+from sliplens.models.calibration import Calibration, Traction, raw_interval, spread, told_probabilities
 from sliplens.models.encodings import Encoding, get_encoding
 from sliplens.models.novelty import Novelty, watch_features
-from sliplens.models.told import told_probabilities
-from sliplens.results.training import Training
+from sliplens.results.evaluation import Training
 
 WEIGHTS_FILE = "model.safetensors"
 SCHEMA_VERSION = 1

@@ -26,8 +26,22 @@ from sliplens.plots.contact_sheet import (
     choose_margins,
     plot_margin,
 )
-from sliplens.plots.layout import place_axes, place_text, save_page, write_over
-from sliplens.plots.style import BLACK, BLUE, GREEN, GREY, PURPLE, SKY, VERMILLION, decimals, drawing_style, signed
+from sliplens.plots.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    decimals,
+    drawing_style,
+    place_axes,
+    place_text,
+    save_page,
+    signed,
+    write_over,
+)
 from sliplens.progress import OnProgress, stage
 from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.dataset import trial_path

@@ -28,8 +28,7 @@ from sliplens.plots.contact_sheet import (
     plot_forces,
     plot_margin,
 )
-from sliplens.plots.layout import written_whole
-from sliplens.plots.style import BLACK, GREY, PURPLE, SKY, VERMILLION, YELLOW, drawing_style, percent
+from sliplens.plots.style import BLACK, GREY, PURPLE, SKY, VERMILLION, YELLOW, drawing_style, percent, written_whole
 from sliplens.progress import OnProgress
 from sliplens.recordings import Recording
 from sliplens.recordings.trial import OUTSIDE, STICKS

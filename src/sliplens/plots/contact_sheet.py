@@ -15,9 +15,23 @@ from matplotlib.patheffects import Normal, Stroke
 
 from sliplens.errors import InputError
 from sliplens.images import absolute_difference
-from sliplens.plots.layout import place_axes, place_text, require_picture_path, save_page, write_over
 from sliplens.plots.saliency import NOMINAL_MARGINS
-from sliplens.plots.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILLION, decimals, drawing_style, percent
+from sliplens.plots.style import (
+    BLACK,
+    BLUE,
+    GREY,
+    ORANGE,
+    SKY,
+    VERMILLION,
+    decimals,
+    drawing_style,
+    percent,
+    place_axes,
+    place_text,
+    require_picture_path,
+    save_page,
+    write_over,
+)
 from sliplens.recordings import ContactState, Recording
 from sliplens.recordings.trial import OUTSIDE, STICKS
 

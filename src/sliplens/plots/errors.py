@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
-from sliplens.plots.layout import place_axes, place_text, require_picture_path, save_page, write_over
 from sliplens.plots.style import (
     BLACK,
     BLUE,
@@ -27,7 +26,12 @@ from sliplens.plots.style import (
     inputs_in_order,
     method_name,
     methods_in_order,
+    place_axes,
+    place_text,
+    require_picture_path,
+    save_page,
     short_input_name,
+    write_over,
 )
 from sliplens.results.evaluation import (
     BaselineScores,
@@ -37,9 +41,9 @@ from sliplens.results.evaluation import (
     RegressionScores,
     Reliability,
     RiskCoverage,
+    Training,
 )
 from sliplens.results.faithfulness import DeletionCurve
-from sliplens.results.training import Training
 
 MARGIN_LABEL = "Safety margin Γ (%)"
 _MSE_LABEL, _EPOCH_LABEL = "MSE (Γ as a fraction, squared)", "Epoch (passes over the training frames)"

@@ -15,10 +15,8 @@ from sliplens.codec import Columns
 from sliplens.errors import InputError
 from sliplens.intervals import Difference
 from sliplens.plots.errors import plot_answers, plot_faithfulness, plot_learning_curves
-from sliplens.plots.grip import plot_grip_force
-from sliplens.plots.margins import column, plot_margins
+from sliplens.plots.margins import column, plot_grip_force, plot_margins, plot_readings
 from sliplens.plots.saliency import full_colour, overlay_relevance, overlay_saliency, stretch_saliency
-from sliplens.plots.strip import plot_readings
 from sliplens.plots.style import (
     BLACK,
     BLUE,
@@ -31,7 +29,7 @@ from sliplens.plots.style import (
     methods_in_order,
     percent,
 )
-from sliplens.results.diagnosis import Diagnosis
+from sliplens.results.evaluation import Diagnosis
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionScores, RemovalScores, is_control
 from sliplens.results.study import Study, Truth

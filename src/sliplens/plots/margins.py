@@ -1,5 +1,6 @@
-"""Safety margins that a network reads, over time, with the forces below."""
+"""Safety margins over time: as a network reads them, of a grip from stick to slip, of an episode of a grip."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -7,13 +8,32 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from sliplens.errors import InputError
 from sliplens.plots.errors import MARGIN_LABEL
-from sliplens.plots.layout import require_picture_path, save_page
-from sliplens.plots.style import BLACK, BLUE, GREEN, GREY, ORANGE, drawing_style
+from sliplens.plots.saliency import SIGN_COLOURS, full_colour, overlay_relevance
+from sliplens.plots.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    INPUT_NAMES,
+    ORANGE,
+    SOURCE_NAMES,
+    VERMILLION,
+    drawing_style,
+    method_name,
+    place_axes,
+    place_text,
+    require_picture_path,
+    save_page,
+)
+from sliplens.results.explanation import Strip
+from sliplens.results.grip import GripTrace
 
 MOST_TRIALS = 6
 """Trials on one page."""
@@ -91,3 +111,113 @@ def _across(rows: pa.Table) -> tuple[Float[np.ndarray, " frames"], str]:
 def column(rows: pa.Table, name: str) -> Float[np.ndarray, " frames"]:
     """Numbers of a column; NaN where one is not known."""
     return rows[name].to_numpy().astype(np.float64)
+
+
+_WIDTH_IN, _MARGIN_IN, _GAP_IN, _CHART_IN = 10.0, 0.75, 0.08, 2.2
+
+
+def draw_strip(strip: Strip) -> Figure:
+    """Draw a trial from stick to slip.
+
+    Above, what the camera saw at a few moments with the map over it, on one scale for all: blue where a pixel raises
+    the read margin, orange where it lowers it. Below, the true and the read margin over time, with the 90 % interval.
+    """
+    count = len(strip.shown)
+    cell = (_WIDTH_IN - _MARGIN_IN - 1.0 - _GAP_IN * (count - 1)) / count
+    height = 1.05 + cell + 0.45 + _CHART_IN + 0.6
+    # the map's own units are too small to read: points of the margin for every hundredth of the picture
+    points = strip.relevance * strip.relevance[0].size
+    limit = full_colour(points)
+    with drawing_style():
+        figure = Figure(figsize=(_WIDTH_IN, height))
+        head = f"A {strip.condition} grip from stick to slip ({SOURCE_NAMES[strip.source]})"
+        place_text(figure, 0.1, 0.1, head, fontsize=13, fontweight="bold")
+        place_text(figure, 0.1, 0.36, _subtitle(strip), fontsize=9.5, color="#4B5563")
+        for number, (frame, picture, relevance) in enumerate(zip(strip.shown, strip.pictures, points, strict=True)):
+            ax = place_axes(figure, _MARGIN_IN + number * (cell + _GAP_IN), 1.05, cell, cell)
+            ax.imshow(overlay_relevance(picture, relevance / limit))
+            ax.set_axis_off()
+            read, true = _percent(strip.readings.prediction[frame]), _percent(strip.readings.safety_margin[frame])
+            words = f"{number + 1}: {read} read\n{true} true"
+            ax.set_title(words, fontsize=9.5, loc="center", fontweight="normal")
+        bar = place_axes(figure, _WIDTH_IN - 0.9, 1.05, 0.13, cell)
+        figure.colorbar(ScalarMappable(Normalize(-limit, limit), SIGN_COLOURS), cax=bar)
+        bar.set_ylabel("points of margin\nper 1 % of the image", fontsize=8)
+        bar.tick_params(labelsize=8)
+        chart = place_axes(figure, _MARGIN_IN, 1.05 + cell + 0.4, _WIDTH_IN - _MARGIN_IN - 1.0, _CHART_IN)
+        plot_readings(strip, ax=chart)
+    return figure
+
+
+def plot_readings(strip: Strip, *, ax: Axes) -> Axes:
+    """Draw the true and the read margin over time, with the interval and the moments that have pictures."""
+    readings = strip.readings
+    touched = np.isfinite(readings.safety_margin)
+    time_s = readings.time_s
+    read, low, high = (
+        np.where(touched, 100 * value, np.nan) for value in (readings.prediction, readings.low, readings.high)
+    )
+    if np.isfinite(low).any():  # a network that was never calibrated tells none
+        ax.fill_between(time_s, low, high, color=BLUE, alpha=0.18, linewidth=0, label="90 % interval")
+    ax.plot(time_s, read, color=BLUE, label="read from the image")
+    ax.plot(time_s, 100 * readings.safety_margin, color=BLACK, linestyle="--", label="true")
+    for number, frame in enumerate(strip.shown, start=1):
+        ax.axvline(time_s[frame], color="#9CA3AF", linewidth=0.8, zorder=0)
+        ax.annotate(str(number), (time_s[frame], 106), ha="center", fontsize=9, annotation_clip=False)
+    slipping = readings.contact_state == "full slip"
+    if slipping.any():
+        ends = float(time_s[slipping][0]), float(time_s[-1])
+        ax.axvspan(*ends, color=VERMILLION, alpha=0.15, linewidth=0, label="from the first full slip")
+    ax.set(xlabel="Time (s)", ylabel="Safety margin (%)", ylim=(-4, 104), xlim=(time_s[0], time_s[-1]))
+    ax.legend(loc="lower left")
+    return ax
+
+
+def _subtitle(strip: Strip) -> str:
+    network = INPUT_NAMES.get(strip.input, strip.input).lower()
+    return (
+        f"Camera frames under the map of {method_name(strip.method)}, for the network on {network}: "
+        "orange lowers the margin that it reads, blue raises it"
+    )
+
+
+def _percent(value: float) -> str:
+    return f"{100 * value:.0f} %" if np.isfinite(value) else "-"
+
+
+def plot_grip_force(trace: GripTrace, *, ax: Axes) -> Axes:
+    """Draw the grip force over the least force that holds, and when the markers told of a slip."""
+    ax.plot(trace.time_s, trace.force_n, color=BLUE, label="grip force")
+    ax.plot(trace.time_s, trace.least_force_n, color=BLACK, linestyle="--", label="least that holds")
+    ax.fill_between(trace.time_s, trace.least_force_n, trace.force_n, color=BLUE, alpha=0.12, linewidth=0)
+    for number, time_s in enumerate(trace.time_s[trace.slip_seen]):
+        ax.axvline(time_s, color=VERMILLION, linewidth=1, linestyle=":", label="slip seen" if number == 0 else None)
+    # room for the legend above what is drawn
+    ax.set(xlabel="Time (s)", ylabel="Force (N)", ylim=(0, 1.4 * float(trace.force_n.max()) or 1.0))
+    ax.legend(loc="upper right", ncols=2)
+    return ax
+
+
+def plot_grip_margin(trace: GripTrace, *, ax: Axes) -> Axes:
+    """Draw the margin read, with its interval, and the true one."""
+    ax.fill_between(trace.time_s, 100 * trace.low, 100 * trace.high, color=ORANGE, alpha=0.2, linewidth=0)
+    ax.plot(trace.time_s, 100 * trace.margin, color=ORANGE, linewidth=1, label="read, with 90 % interval")
+    ax.plot(trace.time_s, 100 * trace.true_margin, color=BLACK, linestyle="--", label="true")
+    ax.set(xlabel="Time (s)", ylabel="Safety margin Γ (%)", ylim=(-3, 103))
+    ax.legend(loc="lower right")
+    return ax
+
+
+def plot_grip_slip(trace: GripTrace, *, ax: Axes) -> Axes:
+    """Draw how far the object has slid, in millimetres."""
+    ax.plot(trace.time_s, 1e3 * trace.slip_m, color=GREY)
+    ax.set(xlabel="Time (s)", ylabel="Slip (mm)", ylim=(0, max(1.0, 1.05e3 * float(trace.slip_m.max()))))
+    return ax
+
+
+def plot_grip(trace: GripTrace, *, axes: Sequence[Axes]) -> None:
+    """Draw force, margin and slip on three axes."""
+    for draw, title, ax in zip(
+        (plot_grip_force, plot_grip_margin, plot_grip_slip), ("Force", "Margin", "Slip"), axes, strict=True
+    ):
+        draw(trace, ax=ax).set_title(title)

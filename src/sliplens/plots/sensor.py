@@ -7,8 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from sliplens.markers.gel import SensorProposal
-from sliplens.plots.layout import written_whole
-from sliplens.plots.style import BLUE, VERMILLION, drawing_style
+from sliplens.plots.style import BLUE, VERMILLION, drawing_style, written_whole
 
 
 def draw_proposal(proposal: SensorProposal) -> Figure:

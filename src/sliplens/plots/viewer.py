@@ -30,9 +30,8 @@ from sliplens.extras import require_packages
 from sliplens.images import absolute_difference, encode_png
 from sliplens.plots.audit import Fact, audit_facts, end_of_ratio, force_ratio
 from sliplens.plots.contact_sheet import STATE_COLOURS, TIMES, brighten, brightening
-from sliplens.plots.layout import written_whole
 from sliplens.plots.saliency import full_colour, overlay_relevance
-from sliplens.plots.style import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, method_name
+from sliplens.plots.style import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, method_name, written_whole
 from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset, Recording, TrialFacts, TrialInfo
 from sliplens.recordings.capture import Capture, Forces, Frame

@@ -23,6 +23,7 @@ from sliplens.plots.style import (
     tell_ends,
 )
 from sliplens.report.comparisons import (
+    AS_RUN,
     compare_deletion,
     compare_gain,
     gap_from,
@@ -33,7 +34,6 @@ from sliplens.report.comparisons import (
     voting_settings,
 )
 from sliplens.report.results import Results
-from sliplens.report.thesis import AS_RUN
 from sliplens.results.faithfulness import DeletionCurve, RemovalScores
 from sliplens.results.study import MapQuality, Truth
 

@@ -6,7 +6,6 @@ from dataclasses import fields
 import numpy as np
 
 from sliplens.plots.contact_sheet import brighten
-from sliplens.plots.layout import place_axes
 from sliplens.plots.saliency import SIGN_COLOURS, full_colour, overlay_relevance
 from sliplens.plots.style import (
     BLACK,
@@ -16,13 +15,14 @@ from sliplens.plots.style import (
     drawing_style,
     input_name,
     percent,
+    place_axes,
     signed,
     tell_ends,
 )
 from sliplens.report.charts import make_charts
 from sliplens.report.plates import Cell, Plate, draw_grid, named_columns, picture_brightness, rows_of
 from sliplens.report.tables import Table, make_table
-from sliplens.results.diagnosis import Diagnosis, FrictionTable
+from sliplens.results.evaluation import Diagnosis, FrictionTable
 
 
 def show_diagnosis(diagnosis: Diagnosis) -> Iterable[Table | Plate]:

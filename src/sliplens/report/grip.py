@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from sliplens.plots.grip import plot_grip
+from sliplens.plots.margins import plot_grip
 from sliplens.plots.saliency import overlay_relevance
 from sliplens.plots.style import drawing_style, percent
 from sliplens.report.charts import make_charts

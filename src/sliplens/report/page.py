@@ -9,14 +9,13 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from sliplens.errors import InputError
-from sliplens.plots.layout import written_whole
+from sliplens.plots.style import written_whole
 from sliplens.report.claims import Claim
-from sliplens.report.comparisons import tell_interval
+from sliplens.report.comparisons import CITATION, tell_interval
 from sliplens.report.pictures import plate_strip
 from sliplens.report.plates import FOLDER, Plate, write_plates
 from sliplens.report.results import Results, load_results
 from sliplens.report.sections import Section, build_sections
-from sliplens.report.thesis import CITATION
 from sliplens.report.verdict import Statement, count_alarms, judge, tell_too_few
 from sliplens.results.study import Study
 

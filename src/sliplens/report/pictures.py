@@ -12,10 +12,9 @@ from sliplens.errors import InputError
 from sliplens.markers import DisplacementField, interpolate_field
 from sliplens.plots.contact_sheet import TIMES, brighten, brightening
 from sliplens.plots.errors import MARGIN_LABEL
-from sliplens.plots.layout import place_axes
+from sliplens.plots.margins import draw_strip
 from sliplens.plots.markers import ARROWS, MarkedFrame, draw_fields_beside_saliency, plot_arrows, plot_field
 from sliplens.plots.saliency import FULL_COLOUR_PERCENTILE, full_colour, overlay_relevance
-from sliplens.plots.strip import draw_strip
 from sliplens.plots.style import (
     BLUE,
     GREY,
@@ -27,6 +26,7 @@ from sliplens.plots.style import (
     method_name,
     methods_in_order,
     percent,
+    place_axes,
     short_input_name,
     signed,
     source_name,

@@ -15,9 +15,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sliplens.plots.contact_sheet import TIMES, brighten, brightening
-from sliplens.plots.layout import Picture, figure_picture, place_axes, place_text, save_page, write_over, written_whole
 from sliplens.plots.saliency import choose_columns, overlay_saliency, plot_colour_bar, stretch_saliency
-from sliplens.plots.style import drawing_style
+from sliplens.plots.style import (
+    Picture,
+    drawing_style,
+    figure_picture,
+    place_axes,
+    place_text,
+    save_page,
+    write_over,
+    written_whole,
+)
 from sliplens.report.results import Results
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionCurve

@@ -8,13 +8,11 @@ from sliplens.codec import load_record, load_result
 from sliplens.errors import InputError
 from sliplens.files import RUN_FILE, Provenance, require_folder
 from sliplens.recordings.dataset import load_dataset
-from sliplens.results.diagnosis import Diagnosis
-from sliplens.results.evaluation import Evaluation
+from sliplens.results.evaluation import Diagnosis, Evaluation, Simulation, Training, describe_simulation
 from sliplens.results.explanation import Explained, Strip, load_explained
 from sliplens.results.faithfulness import DeletionScores
 from sliplens.results.grip import Grip
 from sliplens.results.study import STAGES, TABLES, Choice, Study
-from sliplens.results.training import Simulation, Training, describe_simulation
 
 _OF_A_COMMAND: dict[str, type] = {
     "train": Training,

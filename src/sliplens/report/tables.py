@@ -25,9 +25,21 @@ from sliplens.plots.style import (
     signed,
     source_name,
 )
-from sliplens.report.comparisons import against_control, mean_at, settings, tell_bounds, tell_interval, tell_over
+from sliplens.report.comparisons import (
+    ACCURACY,
+    DELETION,
+    MARK,
+    NETWORK_PIXELS,
+    SECONDS,
+    against_control,
+    mean_at,
+    settings,
+    tell_bounds,
+    tell_interval,
+    tell_over,
+    thesis_row,
+)
 from sliplens.report.results import Results
-from sliplens.report.thesis import ACCURACY, DELETION, MARK, NETWORK_PIXELS, SECONDS, thesis_row
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import (
     DeletionScores,

@@ -12,8 +12,7 @@ from jaxtyping import Float
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
-from sliplens.plots.layout import written_whole
-from sliplens.plots.style import UNKNOWN, decimals, percent
+from sliplens.plots.style import UNKNOWN, decimals, percent, written_whole
 from sliplens.recordings.capture import Frame
 from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_path
 from sliplens.recordings.store import load_recording, read_frames

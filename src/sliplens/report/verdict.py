@@ -28,6 +28,7 @@ from sliplens.plots.style import (
 )
 from sliplens.report.claims import POLY_CAM, Claim
 from sliplens.report.comparisons import (
+    NETWORK_PIXELS,
     against_control,
     compare_errors,
     gap_from,
@@ -36,7 +37,6 @@ from sliplens.report.comparisons import (
     voting_settings,
 )
 from sliplens.report.results import Results
-from sliplens.report.thesis import NETWORK_PIXELS
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionScores, Lead, RemovalScores
 from sliplens.results.study import Localisation, Truth

@@ -1,22 +1,26 @@
 """Records of what the stages find: they return them, and a report loads them. None needs torch."""
 
-from sliplens.results.diagnosis import Diagnosis
 from sliplens.results.evaluation import (
     BaselinePredictions,
     Baselines,
     BaselineScores,
     BinScore,
+    Diagnosis,
     Evaluation,
     LeadTimes,
+    LearningCurve,
     Predictions,
     RegressionScores,
     Reliability,
+    Simulation,
+    SplitCount,
+    Training,
+    describe_simulation,
 )
 from sliplens.results.explanation import Explained, ExplainedFrame, load_explained
 from sliplens.results.faithfulness import DeletionCurve, DeletionScores, Remedies, RemovalCurve, RemovalScores
 from sliplens.results.grip import EpisodeTable, Grip, GripTrace
 from sliplens.results.study import Choice, MapQuality, PooledScores, Randomisation, States, Study, Timing, Truth
-from sliplens.results.training import LearningCurve, Simulation, SplitCount, Training, describe_simulation
 
 __all__ = [
     "BaselinePredictions", "BaselineScores", "Baselines", "BinScore", "Choice", "DeletionCurve", "DeletionScores",

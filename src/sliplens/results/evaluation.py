@@ -1,12 +1,87 @@
-"""How well a network reads the safety margin."""
+"""What a network was trained on, how well it reads the safety margin, and where and why it fails."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Float64, Int64, Shaped
+from jaxtyping import Float32, Float64, Int64, Shaped, UInt8
 
 from sliplens.codec import Columns
+from sliplens.intervals import FEWEST_UNITS, Difference
+from sliplens.recordings import Dataset
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitCount:
+    """Trials and frames of one part of the data."""
+
+    trials: int
+    frames: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulation:
+    """Trials and frames that were simulated, in all and by split."""
+
+    trials: int
+    frames: int
+    by_split: dict[str, SplitCount]
+    conditions: tuple[str, ...]
+
+
+def describe_simulation(data: Dataset) -> Simulation:
+    """Count the trials and frames of a data set, as its table has them."""
+    splits = {
+        split: [trial.frames for trial in data.trials if trial.split == split]
+        for split in dict.fromkeys(trial.split for trial in data.trials)
+    }
+    return Simulation(
+        trials=len(data.trials),
+        frames=sum(trial.frames for trial in data.trials),
+        by_split={split: SplitCount(trials=len(frames), frames=sum(frames)) for split, frames in splits.items()},
+        conditions=tuple(sorted({trial.condition for trial in data.trials})),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearningCurve(Columns):
+    """Errors after each epoch, in squared margin units, and the minutes until then."""
+
+    epoch: Float64[np.ndarray, " epochs"]
+    """Passes over the training frames; the last may be cut short."""
+    train_mse: Float64[np.ndarray, " epochs"]
+    """On augmented images, while the weights change."""
+    validation_mse: Float64[np.ndarray, " epochs"]
+    minutes: Float64[np.ndarray, " epochs"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training:
+    """One training: what was trained on what, how long, and its learning curve."""
+
+    input: str
+    """Name of the encoding that the network sees."""
+    condition: str | None = None
+    """Condition of all its trials; None where it was not restricted to one."""
+    backbone: str
+    image_size: int
+    """Height and width of the network's input, in pixels."""
+    frame_size: tuple[int, int]
+    """Height and width of the sensor's frames, in pixels."""
+    train_frames: int
+    validation_frames: int
+    seed: int
+    epochs: float
+    """Passes over the training frames, the last maybe in part."""
+    minutes: float
+    stopped_by: str
+    """`epochs` or `time limit`."""
+    best_validation_mse: float
+    """Lowest validation error of the curve, in squared margin units: that of the weights that were kept."""
+    parameters: int
+    processes: int
+    """Processes that shared it, one a device."""
+    curve: LearningCurve
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,3 +257,112 @@ class Evaluation:
     def frame(self) -> pa.Table:
         """Arrow table of the predictions, a row a frame."""
         return self.predictions.table()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorTable(Predictions):
+    """Label and answer of frames, and what may have made the answer wrong; NaN where not known."""
+
+    sensor: Shaped[np.ndarray, " frames"]
+    friction: Float64[np.ndarray, " frames"]
+    """Coefficient of friction that holds."""
+    normal_force_n: Float64[np.ndarray, " frames"]
+    contact_x: Float64[np.ndarray, " frames"]
+    contact_y: Float64[np.ndarray, " frames"]
+    """Middle of the contact, right and down, as shares of the image's width and height."""
+    slice: Int64[np.ndarray, " frames"]
+    """Place in `Diagnosis.slices`; -1 where no held-out frame is."""
+
+    @property
+    def error(self) -> Float64[np.ndarray, " frames"]:
+        """Answer less label: above 0 where the margin is read too high."""
+        return self.prediction - self.safety_margin
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorSlice:
+    """Frames of one leaf of the tree, and their error on trials that the tree has not seen."""
+
+    name: str
+    """What they have in common, in words."""
+    frames: int
+    trials: int
+    error: float
+    bias: float
+    """Mean size of the error, and mean error, in margin units."""
+    excess: Difference
+    """Size of the error less that on all other held-out frames."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether the error is larger there beyond the interval, on enough held-out trials."""
+        return self.trials >= FEWEST_UNITS and self.excess.above_zero
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExplainedErrors(ErrorTable):
+    """Frames that were explained; what needs the truth of each marker is NaN without it."""
+
+    agreement: Float64[np.ndarray, " frames"]
+    """Signed rank correlation, marker by marker, of the Shapley values for the answer and for the best reading."""
+    reliability: Float64[np.ndarray, " frames"]
+    """Correlation that another estimate of the Shapley values from as many scenes would have with these."""
+    network_slipping: Float64[np.ndarray, " frames"]
+    reading_slipping: Float64[np.ndarray, " frames"]
+    """Share on slipping markers, of the sizes of these values on markers in contact."""
+    cluster: Int64[np.ndarray, " frames"]
+    """Kind of explanation, that of the largest error first."""
+    example: Int64[np.ndarray, " frames"]
+    """Place in `Diagnosis.pictures` of the frames that are most like their kind, else -1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrictionTable(Columns):
+    """The same press and pull with other frictions, a row a frame and friction, in margin units."""
+
+    frame_id: Shaped[np.ndarray, " rows"]
+    trial: Shaped[np.ndarray, " rows"]
+    condition: Shaped[np.ndarray, " rows"]
+    day: Int64[np.ndarray, " rows"]
+    friction: Float64[np.ndarray, " rows"]
+    safety_margin: Float64[np.ndarray, " rows"]
+    """True margin with that friction."""
+    prediction: Float64[np.ndarray, " rows"]
+    reading_slope: Float64[np.ndarray, " rows"]
+    """Rise of the best reading over that of the margin there (`simulation.intervention.reading_slope`)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrictionSlope:
+    """How far answers follow the margin where friction alone changes, 1 being all the way: of both, and the gap."""
+
+    condition: str
+    network: Difference
+    reading: Difference
+    gap: Difference
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diagnosis:
+    """Where a network fails and why: slices of its errors, its markers, other frictions, kinds of explanations."""
+
+    input: str
+    source: str
+    sentences: tuple[str, ...]
+    """What was found, with figures."""
+    left_out: str
+    """What could not be asked, and why; empty where all could."""
+    slices: tuple[ErrorSlice, ...]
+    """Leaves of the tree, the largest error first."""
+    slopes: tuple[FrictionSlope, ...]
+    method: str
+    """What the maps show."""
+    errors: ErrorTable
+    explained: ExplainedErrors
+    frictions: FrictionTable
+    pictures: UInt8[np.ndarray, "examples size size 3"]
+    maps: Float32[np.ndarray, "examples size size"]
+    """Examples of each kind as the network saw them, and their maps in margin units."""
+    shown_frame: str
+    other_frictions: UInt8[np.ndarray, "shown size size 3"]
+    """Frame that is shown with each of its frictions in `frictions`, as the network would see it; empty without any."""

@@ -17,8 +17,17 @@ from sliplens.codec import keep_part
 from sliplens.errors import ModelError
 from sliplens.explainers import Explainer, Explanation, IntegratedGradients, PolyCam
 from sliplens.explainers.shapley import Shapley
-from sliplens.faithfulness.controls import cascade, even_channels, histogram_entropy, randomisation_scores, smooth_maps
-from sliplens.faithfulness.map_quality import gini, resolution, stability, total_variation
+from sliplens.faithfulness.controls import (
+    cascade,
+    even_channels,
+    gini,
+    histogram_entropy,
+    randomisation_scores,
+    resolution,
+    smooth_maps,
+    stability,
+    total_variation,
+)
 from sliplens.intervals import paired_difference
 from sliplens.models import Run
 from sliplens.progress import OnProgress, continued, counted
@@ -35,8 +44,8 @@ from sliplens.results.study import (
     Timing,
     UntrainedMaps,
 )
+from sliplens.study.choice import Material, as_the_thesis_ran
 from sliplens.study.explaining import mean_of_known
-from sliplens.study.material import Material, as_the_thesis_ran
 
 _NORMAL_QUARTILE = 0.6745
 """Median size of a standard normal number."""

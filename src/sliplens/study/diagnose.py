@@ -26,8 +26,15 @@ from sliplens.plots.style import decimals, signed, tell_ends
 from sliplens.progress import OnProgress, counted, note, stage, wrote
 from sliplens.recordings import Dataset
 from sliplens.recordings.dataset import load_dataset
-from sliplens.results.diagnosis import Diagnosis, ErrorSlice, ErrorTable, ExplainedErrors, FrictionSlope, FrictionTable
-from sliplens.results.evaluation import Predictions
+from sliplens.results.evaluation import (
+    Diagnosis,
+    ErrorSlice,
+    ErrorTable,
+    ExplainedErrors,
+    FrictionSlope,
+    FrictionTable,
+    Predictions,
+)
 from sliplens.results.explanation import Explained
 from sliplens.simulation.intervention import film_with_friction, marker_readings, reading_slope
 from sliplens.study.explaining import explain_frames, frames_at, network_inputs

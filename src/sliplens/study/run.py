@@ -26,22 +26,31 @@ from sliplens.results.faithfulness import DeletionScores, RemovalScores
 from sliplens.results.study import STAGES, TABLES, Choice, MarkedFrame, States, Study, Truth, UntrainedMaps
 from sliplens.simulation.intervention import rebuild_trial
 from sliplens.study.checks import CASCADE, explain_untrained, measure_maps, randomise_weights, time_explainers
-from sliplens.study.choice import choose_frames, show_states
-from sliplens.study.curves import SETTINGS, STUDY_AREAS, Setting, influences, score_removal
-from sliplens.study.explaining import explain_frames, frames_at
-from sliplens.study.material import (
+from sliplens.study.choice import (
     STUDY_BUDGET,
     STUDY_METHODS,
     Material,
+    choose_frames,
     gather,
     method_options,
     seen_places,
+    show_states,
     study_explainers,
     with_markers,
     without_markers,
 )
+from sliplens.study.explaining import explain_frames, frames_at
 from sliplens.study.processes import run_together
-from sliplens.study.scoring import STEPS, score_explanations, score_remedies
+from sliplens.study.scoring import (
+    SETTINGS,
+    STEPS,
+    STUDY_AREAS,
+    Setting,
+    influences,
+    score_explanations,
+    score_remedies,
+    score_removal,
+)
 from sliplens.study.truth import TRUE_FILL, TRUTH_PAIRS, judge_by_truth, true_curves
 from sliplens.training.evaluation import evaluate
 

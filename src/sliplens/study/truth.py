@@ -15,8 +15,7 @@ from sliplens.codec import keep_part
 from sliplens.errors import InputError
 from sliplens.explainers.shapley import shapley_values
 from sliplens.faithfulness import get_fill
-from sliplens.faithfulness.controls import lead_over_controls
-from sliplens.faithfulness.map_quality import relevance_mass, relevance_rank
+from sliplens.faithfulness.controls import lead_over_controls, relevance_mass, relevance_rank
 from sliplens.faithfulness.removal import (
     RANDOM_ORDERS,
     SHARES,
@@ -42,13 +41,13 @@ from sliplens.recordings.trial import SLIPS
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import is_control
 from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTest, OracleTest, Truth
-from sliplens.simulation.information import visible_markers
 from sliplens.simulation.intervention import (
     FilmedTrial,
     draw_with_markers_back,
     marker_outlines,
     marker_readings,
     rebuild_trial,
+    visible_markers,
 )
 from sliplens.study.explaining import mean_of_known, network_inputs
 from sliplens.study.scoring import require_same_network

@@ -32,6 +32,7 @@ from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import open_source
 from sliplens.results.explanation import Explained, Strip, StripReadings, load_explained
 from sliplens.results.faithfulness import DeletionScores
+from sliplens.study.choice import STUDY_BUDGET, study_explainers, with_markers
 from sliplens.study.explaining import (
     DEFAULT_LEVELS,
     ChosenFrames,
@@ -43,7 +44,6 @@ from sliplens.study.explaining import (
     nearest_frame,
     require_methods,
 )
-from sliplens.study.material import STUDY_BUDGET, study_explainers, with_markers
 from sliplens.study.scoring import require_same_network, score_explanations
 
 RECOMMENDED_METHODS = ("shapley-marker", "poly-cam")

@@ -4,7 +4,7 @@ from sliplens.training.config import RECIPES, TrainConfig, get_recipe
 from sliplens.training.evaluation import evaluate, evaluate_frames
 from sliplens.training.fitting import fit, train
 from sliplens.training.metrics import lead_times, regression_scores
-from sliplens.training.trainer import make_trainer
+from sliplens.training.module import make_trainer
 
 __all__ = [
     "RECIPES",

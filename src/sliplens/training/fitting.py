@@ -44,12 +44,10 @@ from sliplens.models.novelty import Novelty, fit_novelty
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset
-from sliplens.results.training import Training
-from sliplens.training.config import TrainConfig, get_recipe
+from sliplens.results.evaluation import Training
+from sliplens.training.config import TrainConfig, get_recipe, open_logger
 from sliplens.training.data import EpochShuffle, FrameSet, extract_features, get_augmentation, load_frames, make_loaders
-from sliplens.training.loggers import open_logger
-from sliplens.training.module import Clock, DivergedError, Regressor
-from sliplens.training.trainer import make_trainer, run_trainer, share_of_batch
+from sliplens.training.module import Clock, DivergedError, Regressor, make_trainer, run_trainer, share_of_batch
 
 _ENOUGH_TRIALS, _FEW_TRIALS = 10, 30
 """Labelled trials after which adapting gains little more, and up to which it beat a network that begins with nothing,
