@@ -10,6 +10,7 @@ from sliplens.explainers import EXPLAINERS
 from sliplens.extras import Table
 from sliplens.faithfulness import FILLS
 from sliplens.grip import CONDITIONS, CONTROLLERS
+from sliplens.grip.gripper import ROS_MESSAGES
 from sliplens.live.sinks import SINKS
 from sliplens.live.sources import SOURCES
 from sliplens.markers import KINDS
@@ -32,6 +33,7 @@ TABLES = {
     "sliplens.explainers": EXPLAINERS,
     "sliplens.fills": FILLS,
     "sliplens.formats": FORMATS,
+    "sliplens.gripper_messages": ROS_MESSAGES,
     "sliplens.sinks": SINKS,
     "sliplens.sources": SOURCES,
     "sliplens.augmentations": AUGMENTATIONS,

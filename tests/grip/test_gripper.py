@@ -7,10 +7,20 @@ import threading
 import time
 from contextlib import suppress
 
+import numpy as np
 import pytest
+from zenoh_router import open_router
 
 from sliplens.errors import InputError
-from sliplens.grip.gripper import DryRun, GripperError, GuardedGripper, open_gripper
+from sliplens.grip.gripper import (
+    ROS_MESSAGES,
+    DryRun,
+    GripperError,
+    GuardedGripper,
+    LineGripper,
+    RosGripper,
+    open_gripper,
+)
 
 SOON_S = 0.03
 
@@ -91,6 +101,7 @@ def test_a_wrong_answer_is_told_in_a_sentence(fake, answer, told):
 def test_a_late_answer_is_forgotten_and_the_next_one_counts(fake):
     fake.answer = None
     gripper = open_gripper(fake.address, timeout_s=0.05)
+    assert isinstance(gripper, LineGripper)
     with pytest.raises(GripperError, match="did not answer"):
         gripper.set_force(1.0)
     fake.send(b"ERR too late\n")
@@ -222,9 +233,124 @@ def test_a_width_that_cannot_be_is_refused(width_m):
         gripper.set_width(width_m)
 
 
-@pytest.mark.parametrize("address", ["tcp://nowhere", "tcp://:80", "/dev/no-such-device"])
+class FakeRosGripper:
+    """A gripper of ROS 2 behind a router: what it is told it hears as its own messages, and it tells what it likes."""
+
+    def __init__(self, session, address: str) -> None:
+        typesys = pytest.importorskip("rosbags.typesys")
+        self.types = typesys.get_typestore(typesys.Stores.LATEST)
+        definition = "float64 position\nfloat64 max_effort"
+        self.types.register(typesys.get_types_from_msg(definition, "control_msgs/msg/GripperCommand"))
+        self.address, self.heard = f"zenoh:hand@{address}", []
+        self.state: bytes | None = self.joints(effort=[1.0, 2.0], position=[0.5, 0.04])
+        self._session, self._stop = session, threading.Event()
+        self._names = {f"hand/{one.topic}": one.kind for row in ROS_MESSAGES.values() for one in (row.force, row.width)}
+        self._ears = session.declare_subscriber("hand/**", self._hear)
+        self._thread = threading.Thread(target=self._tell, daemon=True)
+        self._thread.start()
+
+    def joints(self, **fields: list[float]) -> bytes:
+        """State of an arm's joint and of the gripper's."""
+        types = self.types.types
+        header = types["std_msgs/msg/Header"](
+            stamp=types["builtin_interfaces/msg/Time"](sec=0, nanosec=0), frame_id="hand"
+        )
+        arrays = {name: np.array(fields.get(name, []), dtype=float) for name in ("position", "velocity", "effort")}
+        message = types["sensor_msgs/msg/JointState"](header=header, name=["elbow", "finger"], **arrays)
+        return bytes(self.types.serialize_cdr(message, "sensor_msgs/msg/JointState"))
+
+    def _hear(self, sample) -> None:
+        kind = self._names.get(str(sample.key_expr))
+        if kind is not None:
+            message = self.types.deserialize_cdr(bytes(sample.payload), kind)
+            told = [getattr(message, name).tolist() if name == "data" and "Array" in kind else getattr(message, name)
+                    for name in ("position", "max_effort", "data") if hasattr(message, name)]  # fmt: skip
+            self.heard.append((str(sample.key_expr), *told))
+
+    def _tell(self) -> None:
+        while not self._stop.wait(0.005):
+            if self.state is not None:
+                self._session.put("hand/joint_states", self.state)
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+@pytest.fixture
+def hand():
+    with open_router() as (session, address):
+        gripper = FakeRosGripper(session, address)
+        yield gripper
+        gripper.close()
+
+
+@pytest.mark.parametrize(
+    ("messages", "told"),
+    [
+        ("gripper-command", [("hand/command", 0.0, 1.25), ("hand/command", 0.04, 2.0)]),
+        ("numbers", [("hand/force", 1.25), ("hand/width", 0.04)]),
+        ("controllers", [("hand/effort_controller/commands", [1.25]), ("hand/position_controller/commands", [0.04])]),
+    ],
+)
+def test_a_gripper_of_ros_hears_forces_and_widths_as_its_messages(hand, messages, told):
+    gripper = open_gripper(hand.address, timeout_s=2.0, messages=messages, joint="finger")
+    gripper.set_force(1.25)
+    gripper.set_width(0.04)
+    state = gripper.read_state()
+    wait_until(lambda: len(hand.heard) == 2)
+    gripper.close()
+    assert hand.heard == told
+    assert (state.force_n, state.width_m) == (2.0, 0.04)
+
+
+def test_a_gripper_of_ros_that_misbehaves_is_told_in_a_sentence_and_held(hand):
+    gripper = open_gripper(hand.address, timeout_s=2.0)
+    assert isinstance(gripper, RosGripper)
+    for state, told in (
+        (b"\x00\x01", "tells no force and width"),
+        (b"", "tells no force and width"),
+        (hand.joints(position=[0.04, 0.04]), "tells no force and width"),
+        (hand.joints(effort=[math.nan, 1.0], position=[0.04, 0.04]), "tells nan N"),
+    ):
+        hand.state = state
+        wait_until(lambda state=state: gripper._told == state)
+        with pytest.raises(GripperError, match=told):
+            gripper.read_state()
+    gripper._timeout_s, hand.state = SOON_S, None
+    wait_until(lambda: time.monotonic() - gripper._told_s > SOON_S)
+    with pytest.raises(GripperError, match="tells nothing of itself on /hand/joint_states"):
+        gripper.set_force(1.0)
+    with GuardedGripper(gripper, ceiling_n=4.0, watchdog_s=SOON_S) as guarded:
+        guarded.set_force(1e9)  # told to a gripper that has fallen silent, and again until it speaks
+        assert guarded.holding
+        wait_until(lambda: len(hand.heard) > 3)
+        gripper._timeout_s, hand.state = 2.0, hand.joints(effort=[4.0, 0.0], position=[0.04, 0.0])
+        wait_until(lambda: guarded.failure is None)
+    assert {told for _, _, told in hand.heard} == {1.0, 4.0}
+
+
+def test_no_force_is_told_to_ros_as_almost_none_for_0_may_mean_without_a_limit(hand):
+    gripper = open_gripper(hand.address, timeout_s=2.0)
+    gripper.set_force(0.0)
+    wait_until(lambda: hand.heard)
+    gripper.close()
+    [(_, _, effort)] = hand.heard
+    assert 0 < effort < 0.1
+
+
+def test_a_gripper_of_ros_that_was_never_heard_is_told(hand, monkeypatch):
+    monkeypatch.setattr("sliplens.grip.gripper._FIRST_STATE_S", 0.05)
+    hand.state = None
+    with pytest.raises(GripperError, match="tells nothing of itself"):
+        open_gripper(hand.address)
+    with pytest.raises(InputError, match="no kind of gripper messages named 'morse'; choose one of gripper-command"):
+        open_gripper(hand.address, messages="morse")
+
+
+@pytest.mark.parametrize("address", ["tcp://nowhere", "tcp://:80", "/dev/no-such-device", "zenoh:1@"])
 def test_an_address_that_is_none_is_refused(address):
-    with pytest.raises(InputError, match=r"no address|no serial device"):
+    with pytest.raises(InputError, match=r"no address|no serial device|names no key"):
         open_gripper(address)
 
 

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from PIL import Image
+from zenoh_router import open_router
 
 import sliplens as sl
 from sliplens.errors import InputError
@@ -127,15 +128,7 @@ def test_a_rerun_file_is_read_by_rerun(tmp_path: Path):
 
 
 def test_what_zenoh_carries_is_read_as_messages_of_ros(monkeypatch: pytest.MonkeyPatch):
-    zenoh = pytest.importorskip("zenoh", reason="Zenoh is not installed")
-    typesys = pytest.importorskip("rosbags.typesys", reason="rosbags is not installed")
     monkeypatch.setenv("ROS_DOMAIN_ID", "7")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-    config = zenoh.Config()
-    for name, value in (("listen/endpoints", [address]), ("scouting/multicast/enabled", False)):
-        config.insert_json5(name, json.dumps(value))
     samples: dict[str, list] = {}
     all_sent = Event()
 
@@ -144,12 +137,13 @@ def test_what_zenoh_carries_is_read_as_messages_of_ros(monkeypatch: pytest.Monke
         if sum(map(len, samples.values())) == 8:
             all_sent.set()
 
-    with zenoh.open(config) as session, session.declare_subscriber("**", hear):
+    with open_router() as (session, address), session.declare_subscriber("**", hear):
         sink = open_sink(f"zenoh:tip/left@{address}")
         sink.send(READING, IMAGE)
         sink.send(replace(READING, number=8, margin=None, withheld="the camera moved"), None)
         assert all_sent.wait(10)
         sink.close()
+    typesys = pytest.importorskip("rosbags.typesys")
     types = typesys.get_typestore(typesys.Stores.LATEST)
     own = {key: heard for key, heard in samples.items() if key.startswith("tip/left/")}
     assert {key: len(heard) for key, heard in own.items()} == {

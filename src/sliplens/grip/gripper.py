@@ -1,4 +1,4 @@
-"""Out to a real gripper: one protocol, a line protocol over serial or TCP, and a guard that nothing gets past.
+"""Out to a real gripper: lines over serial or TCP, topics of ROS 2, and a guard that nothing gets past.
 
 A guard stands between whatever controls and the gripper. It cuts every force at a ceiling, and when commands stop
 coming it holds: the last force is told again, and nothing is opened. A dry run notes what would be sent and sends
@@ -11,12 +11,18 @@ import select
 import socket
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from types import SimpleNamespace
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
 
 from sliplens.errors import InputError, SliplensError
+from sliplens.extras import Table
+from sliplens.live.sinks import ZENOH_ADDRESS, ZenohRos, parse_zenoh
 
 _ANSWER_BYTES = 200
 """Longer lines are no answers."""
@@ -129,23 +135,191 @@ class LineGripper:
         return heard
 
 
-def open_gripper(address: str, *, timeout_s: float = 0.1) -> LineGripper:
-    """Open a gripper that speaks the line protocol; on Linux and macOS.
+@dataclass(frozen=True, kw_only=True)
+class RosCommand:
+    """What tells a gripper of ROS 2 a force or a width."""
+
+    topic: str
+    """Below the key of the gripper."""
+    kind: str
+    """Type of its messages."""
+    fields: Callable[[float], dict[str, Any]]
+    """Fields of the message of a force in newtons, or of a width in metres."""
+    definition: str | None = None
+    """What the `.msg` file of a type has that ROS itself does not bring."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RosMessages:
+    """Messages that a gripper of ROS 2 takes."""
+
+    force: RosCommand
+    width: RosCommand
+
+
+_LEAST_EFFORT_N = 0.01
+"""Told in place of no force: to some drivers an effort of 0 is one without a limit."""
+_MOVING_EFFORT_N = 2.0
+"""Told with a width: it moves open fingers, and crushes little that is between them."""
+
+
+def _number(topic: str) -> RosCommand:
+    return RosCommand(topic=topic, kind="std_msgs/msg/Float64", fields=lambda value: {"data": value})
+
+
+def _controller(topic: str) -> RosCommand:
+    # as the forward controllers of ros2_control take it: one number a joint
+    kind, layout = "std_msgs/msg/Float64MultiArray", SimpleNamespace(dim=[], data_offset=0)
+    return RosCommand(topic=topic, kind=kind, fields=lambda value: {"layout": layout, "data": np.array([value])})
+
+
+def _command(fields: Callable[[float], dict[str, Any]]) -> RosCommand:
+    kind, definition = "control_msgs/msg/GripperCommand", "float64 position\nfloat64 max_effort"
+    return RosCommand(topic="command", kind=kind, fields=fields, definition=definition)
+
+
+ROS_MESSAGES = Table(
+    "kind of gripper messages",
+    "sliplens.gripper_messages",
+    {
+        # closed as far as the effort brings it
+        "gripper-command": RosMessages(
+            force=_command(lambda force_n: {"position": 0.0, "max_effort": max(force_n, _LEAST_EFFORT_N)}),
+            width=_command(lambda width_m: {"position": width_m, "max_effort": _MOVING_EFFORT_N}),
+        ),
+        "numbers": RosMessages(force=_number("force"), width=_number("width")),
+        "controllers": RosMessages(
+            force=_controller("effort_controller/commands"), width=_controller("position_controller/commands")
+        ),
+    },
+)
+"""Messages of grippers of ROS 2 by name; an installed package adds its own by `sliplens.gripper_messages`."""
+_STATE_TOPIC, _STATE_KIND = "joint_states", "sensor_msgs/msg/JointState"
+_FIRST_STATE_S = 3.0
+
+
+class RosGripper:
+    """A gripper of ROS 2, told by topics over Zenoh; its state is `sensor_msgs/msg/JointState` on `joint_states`.
+
+    The joint's position is the width in metres and its effort the force in newtons. Topics confirm nothing: a gripper
+    that has told no state for `timeout_s` is a `GripperError` after each command, though the command was sent, and so
+    is a state that cannot be read.
+
+    Parameters
+    ----------
+    key
+        Key of its topics, such as `gripper`, which ROS names `/gripper/command` and `/gripper/joint_states`.
+    address
+        Router or bridge to connect to.
+    messages
+        Row of `ROS_MESSAGES`.
+    joint
+        Joint of the gripper among those in its state; the first if None.
+    timeout_s
+        Age, in seconds, from which a state says nothing of now.
+    """
+
+    def __init__(
+        self,
+        key: str,
+        address: str = ZENOH_ADDRESS,
+        *,
+        messages: str = "gripper-command",
+        joint: str | None = None,
+        timeout_s: float = 0.1,
+    ) -> None:
+        row = ROS_MESSAGES.pick(messages)
+        self._ros = ZenohRos(address, purpose="a gripper of ROS 2")
+        self._topic, self._joint, self._timeout_s = f"{key}/{_STATE_TOPIC}", joint, timeout_s
+        self._told, self._told_s, self._new = b"", -math.inf, threading.Condition()
+        self._senders = [(one, self._publisher(key, one)) for one in (row.force, row.width)]
+        self._ros.subscribe(self._topic, _STATE_KIND, self._hear)
+        try:
+            self._await_state(_FIRST_STATE_S)
+        except GripperError:
+            self.close()
+            raise
+
+    def set_force(self, force_n: float) -> None:
+        """Press with so many newtons."""
+        self._tell(0, force_n)
+
+    def set_width(self, width_m: float) -> None:
+        """Open to so many metres."""
+        self._tell(1, width_m)
+
+    def read_state(self) -> GripperState:
+        """Measured force and width, as they were told last."""
+        told = self._await_state(self._timeout_s)
+        try:
+            state = self._ros.decode(told, _STATE_KIND)
+            at = 0 if self._joint is None else list(state.name).index(self._joint)
+            force_n, width_m = float(state.effort[at]), float(state.position[at])
+        except Exception as error:  # whatever a decoder does at bytes of anybody
+            raise GripperError(
+                f"/{self._topic} tells no force and width of {self._joint or 'a joint'} "
+                f"({str(error) or type(error).__name__}); it has to be {_STATE_KIND} with position and effort"
+            ) from None
+        if not (math.isfinite(force_n) and math.isfinite(width_m)):
+            raise GripperError(f"/{self._topic} tells {force_n:g} N and {width_m:g} m; check the gripper's sensors")
+        return GripperState(force_n=force_n, width_m=width_m)
+
+    def close(self) -> None:
+        """Let go of the connection."""
+        self._ros.close()
+
+    def _publisher(self, key: str, command: RosCommand) -> Callable[[dict[str, Any], int], None]:
+        if command.definition is not None:
+            self._ros.define(command.kind, command.definition)
+        return self._ros.publisher(f"{key}/{command.topic}", command.kind)
+
+    def _tell(self, which: int, value: float) -> None:
+        command, send = self._senders[which]
+        try:
+            send(command.fields(value), time.time_ns())
+        except OSError as error:
+            raise GripperError(f"the gripper cannot be reached ({error}); check its bridge") from None
+        self.read_state()
+
+    def _hear(self, message: bytes) -> None:
+        with self._new:
+            self._told, self._told_s = message, time.monotonic()
+            self._new.notify_all()
+
+    def _await_state(self, wait_s: float) -> bytes:
+        with self._new:
+            if not self._new.wait_for(lambda: time.monotonic() - self._told_s <= self._timeout_s, wait_s):
+                raise GripperError(
+                    f"the gripper tells nothing of itself on /{self._topic}; check its power, its driver and its bridge"
+                )
+            return self._told
+
+
+def open_gripper(
+    address: str, *, timeout_s: float = 0.1, messages: str = "gripper-command", joint: str | None = None
+) -> LineGripper | RosGripper:
+    """Open a gripper that speaks the line protocol (on Linux and macOS), or one of ROS 2.
 
     Parameters
     ----------
     address
-        `tcp://host:port`, or a serial device such as `/dev/ttyUSB0`, whose speed was set before (`stty`).
+        `tcp://host:port`, or a serial device such as `/dev/ttyUSB0`, whose speed was set before (`stty`); for ROS 2
+        `zenoh:KEY`, or `zenoh:KEY@tcp/HOST:PORT`, by `zenoh-bridge-ros2dds` or `rmw_zenohd`.
     timeout_s
         Time, in seconds, within which an answer has to come.
+    messages, joint
+        Of a gripper of ROS 2, as `RosGripper` takes them.
 
     Raises
     ------
     InputError
-        If the address is none.
+        If the address is none, or packages are missing.
     GripperError
         If nobody is there.
     """
+    if address.startswith("zenoh:"):
+        key, where = parse_zenoh(address.removeprefix("zenoh:"), purpose="zenoh")
+        return RosGripper(key, where, messages=messages, joint=joint, timeout_s=timeout_s)
     if not address.startswith("tcp://"):
         return LineGripper(_open_serial(Path(address)), timeout_s=timeout_s)
     host, _, port = address.removeprefix("tcp://").rpartition(":")
@@ -161,7 +335,7 @@ def open_gripper(address: str, *, timeout_s: float = 0.1) -> LineGripper:
 def _open_serial(path: Path) -> FileIO:
     """Open a serial device whose bytes come as they are."""
     if not path.exists():
-        raise InputError(f"there is no serial device {path}; name one, or tcp://HOST:PORT")
+        raise InputError(f"there is no serial device {path}; name one, or tcp://HOST:PORT, or zenoh:KEY for ROS 2")
     try:
         import termios  # noqa: PLC0415 (not on every system)
         import tty  # noqa: PLC0415 (the same)
@@ -288,4 +462,7 @@ class GuardedGripper:
                     self._tell()
 
 
-__all__ = ["DryRun", "Gripper", "GripperError", "GripperState", "GuardedGripper", "LineGripper", "open_gripper"]
+__all__ = [
+    "ROS_MESSAGES", "DryRun", "Gripper", "GripperError", "GripperState", "GuardedGripper", "LineGripper", "RosCommand",
+    "RosGripper", "RosMessages", "open_gripper",
+]  # fmt: skip

@@ -1,6 +1,7 @@
 """Where readings go: one row a kind of sink."""
 
 import errno
+import itertools
 import json
 import os
 import re
@@ -295,36 +296,41 @@ ROS_TOPICS = (
     ),
 )
 """Topics of ROS 2 that the sink `zenoh` sends; a margin that is withheld is not sent at all."""
-_ZENOH_ADDRESS = "tcp/127.0.0.1:7447"
+ZENOH_ADDRESS = "tcp/127.0.0.1:7447"
 _ZENOH_PATIENCE_MS = 3000
 
 
-class ZenohTopics:
+class ZenohRos:
     """Messages of ROS 2 in its own encoding (CDR) over Zenoh, for nodes that reach it by a bridge or by `rmw_zenoh`.
 
-    Each is sent twice, and goes on the way only where somebody listens: under the name of its topic, as
-    `zenoh-bridge-ros2dds` has it, and under the name that `rmw_zenoh` makes of domain, topic, type and its hash, with
-    the attachment that it asks for.
+    Each topic has two names: its own, as `zenoh-bridge-ros2dds` has it, and the one that `rmw_zenoh` makes of domain,
+    topic, type and its hash, with the attachment that it asks for. Messages are sent under both, and go on the way only
+    where somebody listens.
 
     Parameters
     ----------
-    key
-        Key of all topics, such as `tip`, which ROS names `/tip/margin`, `/tip/reading` and `/tip/image/compressed`.
     address
         Router or bridge to connect to.
+    purpose
+        What wants it, as a person wrote it, for messages.
+
+    Raises
+    ------
+    InputError
+        If a package is missing, or nobody is there.
 
     References
     ----------
     Open Source Robotics Foundation, *rmw_zenoh design* (topics, attachments).
     """
 
-    def __init__(self, key: str, address: str = _ZENOH_ADDRESS) -> None:
-        require_packages("zenoh", "rosbags", extra="sinks", purpose="--sink zenoh")
+    def __init__(self, address: str = ZENOH_ADDRESS, *, purpose: str) -> None:
+        require_packages("zenoh", "rosbags", extra="sinks", purpose=purpose)
         import zenoh  # noqa: PLC0415 (an extra)
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
         from zenoh import ext  # noqa: PLC0415
 
-        self._types, self._ext = get_typestore(Stores.LATEST), ext
+        self._types, self._ext, self._error = get_typestore(Stores.LATEST), ext, zenoh.ZError
         config = zenoh.Config()
         for name, value in (
             ("mode", "client"),
@@ -335,49 +341,104 @@ class ZenohTopics:
             config.insert_json5(name, json.dumps(value))
         try:
             self._session = zenoh.open(config)
-            self._publishers = {topic: self._publishers_of(f"{key}/{topic.name}", topic.kind) for topic in ROS_TOPICS}
         except zenoh.ZError as error:
             raise InputError(
-                f"--sink zenoh reaches nobody at {address} ({error}); start zenoh-bridge-ros2dds or rmw_zenohd there, "
+                f"{purpose} reaches nobody at {address} ({error}); start zenoh-bridge-ros2dds or rmw_zenohd there, "
                 "or name another with zenoh:KEY@tcp/HOST:PORT"
             ) from None
-        self._stamps, self._id, self._sent = _Stamps(), secrets.token_bytes(16), 0
 
-    def _publishers_of(self, name: str, kind: str) -> tuple[Any, Any]:
-        package, _, message = kind.split("/")
-        domain = os.environ.get("ROS_DOMAIN_ID") or "0"
-        own = f"{domain}/{name}/{package}::msg::dds_::{message}_/{self._types.hash_rihs01(kind)}"
-        return self._session.declare_publisher(name), self._session.declare_publisher(own)
+    def define(self, kind: str, definition: str) -> None:
+        """Add a type of messages that ROS itself does not bring, as its `.msg` file has it."""
+        from rosbags.typesys import get_types_from_msg  # noqa: PLC0415 (an extra)
 
-    def send(self, reading: Reading, image: Frame | None, /) -> None:
-        """Send what there is of the reading on each topic, at the time of its capture."""
-        at_ns = self._stamps.of(reading)
-        ext, types = self._ext, self._types
-        stamp = types.types["builtin_interfaces/msg/Time"](sec=at_ns // 10**9, nanosec=at_ns % 10**9)
-        header = types.types["std_msgs/msg/Header"](stamp=stamp, frame_id=_FRAME_ID)
-        self._sent += 1
-        attachment = ext.z_serialize((ext.Int64(self._sent), ext.Int64(at_ns), self._id))
-        for topic, (by_name, by_type) in self._publishers.items():
-            fields = topic.fields(reading, image, header)
-            if fields is None:
-                continue
-            message = bytes(types.serialize_cdr(types.types[topic.kind](**fields), topic.kind))
-            by_name.put(message)
-            by_type.put(message, attachment=attachment)
+        if kind not in self._types.types:
+            self._types.register(get_types_from_msg(definition, kind))
+
+    def header(self, at_ns: int) -> Any:
+        """Header of a message, at nanoseconds since 1970."""
+        stamp = self._types.types["builtin_interfaces/msg/Time"](sec=at_ns // 10**9, nanosec=at_ns % 10**9)
+        return self._types.types["std_msgs/msg/Header"](stamp=stamp, frame_id=_FRAME_ID)
+
+    def publisher(self, topic: str, kind: str) -> Callable[[dict[str, Any], int], None]:
+        """Declare a topic; gives what sends a message of these fields on it, at nanoseconds since 1970.
+
+        Sending raises `OSError` where the way is closed.
+        """
+        publishers = [self._session.declare_publisher(name) for name in self._names(topic, kind)]
+        ext, own_id, count = self._ext, secrets.token_bytes(16), itertools.count(1)
+
+        def send(fields: dict[str, Any], at_ns: int) -> None:
+            message = bytes(self._types.serialize_cdr(self._types.types[kind](**fields), kind))
+            attachment = ext.z_serialize((ext.Int64(next(count)), ext.Int64(at_ns), own_id))
+            by_name, by_type = publishers
+            try:
+                by_name.put(message)
+                by_type.put(message, attachment=attachment)
+            except self._error as error:
+                raise OSError(str(error)) from None
+
+        return send
+
+    def subscribe(self, topic: str, kind: str, heard: Callable[[bytes], None]) -> None:
+        """Hand over each message of a topic, undecoded, in a thread of Zenoh's."""
+        for name in self._names(topic, kind):
+            self._session.declare_subscriber(name, lambda sample: heard(bytes(sample.payload)))
+
+    def decode(self, message: bytes, kind: str) -> Any:
+        """Message of a type; raises whatever its decoder does at one of another."""
+        return self._types.deserialize_cdr(message, kind)
 
     def close(self) -> None:
         """Leave the router."""
         self._session.close()
 
+    def _names(self, topic: str, kind: str) -> tuple[str, str]:
+        package, _, message = kind.split("/")
+        domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+        return topic, f"{domain}/{topic}/{package}::msg::dds_::{message}_/{self._types.hash_rihs01(kind)}"
 
-def _open_zenoh(address: str) -> Sink:
+
+class ZenohTopics:
+    """Readings and frames as messages of ROS 2 over Zenoh (`ZenohRos`).
+
+    Parameters
+    ----------
+    key
+        Key of all topics, such as `tip`, which ROS names `/tip/margin`, `/tip/reading` and `/tip/image/compressed`.
+    address
+        Router or bridge to connect to.
+    """
+
+    def __init__(self, key: str, address: str = ZENOH_ADDRESS) -> None:
+        self._ros, self._stamps = ZenohRos(address, purpose="--sink zenoh"), _Stamps()
+        self._publishers = {topic: self._ros.publisher(f"{key}/{topic.name}", topic.kind) for topic in ROS_TOPICS}
+
+    def send(self, reading: Reading, image: Frame | None, /) -> None:
+        """Send what there is of the reading on each topic, at the time of its capture."""
+        at_ns = self._stamps.of(reading)
+        for topic, send in self._publishers.items():
+            fields = topic.fields(reading, image, self._ros.header(at_ns))
+            if fields is not None:
+                send(fields, at_ns)
+
+    def close(self) -> None:
+        """Leave the router."""
+        self._ros.close()
+
+
+def parse_zenoh(address: str, *, purpose: str) -> tuple[str, str]:
+    """Key of the topics and address of the router in KEY or KEY@tcp/HOST:PORT."""
     key, at, where = address.partition("@")
     if not re.fullmatch(r"[A-Za-z]\w*(/[A-Za-z]\w*)*", key) or bool(at) != bool(where):
         raise InputError(
-            f"--sink zenoh:{address} names no key that ROS can have; give letters and digits, as zenoh:tip or "
-            "zenoh:tip@tcp/127.0.0.1:7447"
+            f"{purpose}:{address} names no key that ROS can have; give letters and digits, as zenoh:tip or "
+            f"zenoh:tip@{ZENOH_ADDRESS}"
         )
-    return ZenohTopics(key, where or _ZENOH_ADDRESS)
+    return key, where or ZENOH_ADDRESS
+
+
+def _open_zenoh(address: str) -> Sink:
+    return ZenohTopics(*parse_zenoh(address, purpose="--sink zenoh"))
 
 
 SINKS = Table[Callable[[str], Sink]](
@@ -473,5 +534,6 @@ class Sender:
 
 __all__ = [
     "IMAGE_TOPIC", "READING_TOPIC", "ROS_TOPICS", "SINKS", "Datagrams", "FoxgloveTopics", "JsonLines", "RerunFile",
-    "RosTopic", "Sender", "Sink", "SinkState", "ZenohTopics", "encode_reading", "open_sink", "reading_schema",
+    "RosTopic", "Sender", "Sink", "SinkState", "ZenohRos", "ZenohTopics", "encode_reading", "open_sink", "parse_zenoh",
+    "reading_schema",
 ]  # fmt: skip
