@@ -12,6 +12,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from sliplens.errors import ImageError, InputError
+from sliplens.extras import import_cv2, missing_packages
 from sliplens.files import require_file, require_folder
 
 __all__ = ["absolute_difference", "list_images", "read_image", "signed_difference", "write_png"]
@@ -155,6 +156,18 @@ def is_image(path: Path) -> bool:
 def natural_key(text: str) -> list[tuple[int, int | str]]:
     """Sort key that reads runs of digits as numbers."""
     return [(0, int(part)) if part.isdecimal() else (1, part.lower()) for part in re.split(r"(\d+)", text)]
+
+
+def shrink(image: UInt8[np.ndarray, "height width 3"], factor: int) -> UInt8[np.ndarray, "rows columns 3"]:
+    """Means of square blocks, rounded; what fills no block at the right and below is left out."""
+    if factor == 1:
+        return image
+    height, width = (side // factor for side in image.shape[:2])
+    image = image[: height * factor, : width * factor]
+    if not missing_packages("cv2", extra="markers"):  # several times as fast
+        cv2 = import_cv2()
+        return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(Image.fromarray(image).reduce(factor))
 
 
 def absolute_difference(

@@ -6,6 +6,7 @@
 
 const QUIET_MS = 3000; // without a message, after which nothing shown can be believed
 const RETRY_MS = 1000;
+const TOLD_MS = 200; // between two drawings of chart, lamps and facts: numbers that change faster nobody reads
 
 export default {
   template: `
@@ -73,7 +74,12 @@ export default {
     this.gone = false;
     this.connect();
     this.watch = setInterval(() => this.lookForSilence(), 500);
-    this.redraw = () => this.schedule();
+    this.toldAt = -TOLD_MS;
+    this.redraw = () => {
+      this.hasNewPicture = true;
+      this.toldAt = -TOLD_MS;
+      this.schedule();
+    };
     this.sizes = new ResizeObserver(this.redraw);
     this.sizes.observe(this.$el);
     this.theme = new MutationObserver(this.redraw);
@@ -107,6 +113,7 @@ export default {
     async take(data) {
       const length = new DataView(data).getUint32(0, true);
       const update = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
+      const hadMap = this.map !== null;
       let at = 4 + length;
       if (update.picture) {
         const jpeg = new Blob([new Uint8Array(data, at, update.picture_bytes)], { type: "image/jpeg" });
@@ -122,6 +129,7 @@ export default {
       } else if (!update.has_map) {
         this.map = this.mapFacts = null;
       }
+      this.hasNewPicture ||= Boolean(update.picture || update.map) || hadMap !== (this.map !== null);
       this.points.push(...update.points);
       while (this.points.length && this.points[0].at_s < update.now_s - this.chartS) this.points.shift();
       this.update = update;
@@ -155,11 +163,15 @@ export default {
       });
     },
     draw() {
-      this.drawPicture();
+      if (this.hasNewPicture) this.drawPicture();
+      this.hasNewPicture = false;
+      if (this.update) this.tellMargin();
+      const now = performance.now();
+      if (now - this.toldAt < TOLD_MS) return;
+      this.toldAt = now;
       this.drawMargins();
       if (this.grips) this.drawForces();
       if (!this.update) return;
-      this.tellMargin();
       this.tellHealth();
       this.tellFacts();
     },

@@ -218,6 +218,7 @@ def _serving(app: "ASGIApp", listening: socket.socket, page: Page) -> Iterator[N
         loop="asyncio",
         lifespan="off",
         ws="websockets-sansio",
+        ws_per_message_deflate=False,  # of a JPEG it leaves what it was
         timeout_graceful_shutdown=1,
     )
     server = uvicorn.Server(config)

@@ -15,7 +15,7 @@ from sliplens.errors import ImageError, InputError
 from sliplens.friction import FrictionLike, SlipLearner, as_friction
 from sliplens.live.contract import LiveSource
 from sliplens.live.health import OFF, HealthMonitor, margin_risk
-from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading
+from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading, small_factor, small_picture
 from sliplens.markers import TrackedFrame, Tracker
 from sliplens.models.checkpoint import Run
 from sliplens.models.engines import Engine
@@ -49,6 +49,7 @@ _STILL_S = 0.3
 _STILL_FRAMES = 5
 _STILL_GREY = 0.75
 _DARK, _BRIGHT = 8.0, 247.0
+_WIDE_PX = 5.0
 
 
 class _ReferenceTaker:
@@ -143,6 +144,7 @@ class FrameReader:
         self._health: HealthWatch | None = None
         self._slip: SlipWatch | None = None
         self._tracker: Tracker | None = None
+        self._smaller = 1
         self._taker: _ReferenceTaker | None = None
         self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
         self._has_margin = False
@@ -204,8 +206,9 @@ class FrameReader:
         begun = time.perf_counter()
         followed = markers = None
         if self._tracker is not None and self._slip is not None:
-            followed, rest_px = self._tracker.update(frame.image), self._tracker.rest.centre_px
-            self.markers_px = rest_px, followed.position_px[: len(rest_px)]
+            followed = self._tracker.update(frame.image if self._smaller == 1 else frame.small)
+            rest_px = self._tracker.rest.centre_px
+            self.markers_px = self._in_frame(rest_px), self._in_frame(followed.position_px[: len(rest_px)])
             markers = self._slip.update(self.markers_px[1], frame.time_s)
         health = () if self._health is None else self._health.check(frame, followed)
         latency = Latency(decode_ms=frame.decode_ms, checks_ms=1e3 * (time.perf_counter() - begun))
@@ -295,16 +298,31 @@ class FrameReader:
         self.markers_px = None
         if self._make_slip is not None and self.reference is not None:
             try:
-                self._tracker = Tracker(self.reference)
-                self._slip = self._make_slip(self._tracker.rest.centre_px)
+                self._tracker, self._smaller = _follow(self.reference)
+                self._slip = self._make_slip(self._in_frame(self._tracker.rest.centre_px))
             except (ImageError, InputError):
                 self._tracker = self._slip = None  # it shows no markers, or too few
+
+    def _in_frame(self, places_px: Float[np.ndarray, "markers 2"]) -> Float[np.ndarray, "markers 2"]:
+        """Places in the frame of places in the picture in which markers are followed; pixel centres are whole."""
+        return (places_px + 0.5) * self._smaller - 0.5
 
     def _clock_jump(self, last: LiveFrame, frame: LiveFrame) -> float:
         """Seconds by which the clock of the source jumped; 0 where it went on."""
         passed_s = frame.time_s - last.time_s
         off_s = passed_s - self.source.speed * (frame.captured_s - last.captured_s)
         return 0.0 if passed_s > 0 and abs(off_s) <= _JUMP_S else off_s
+
+
+def _follow(reference: Frame) -> tuple[Tracker, int]:
+    """Tracker of a sensor's markers, and how many times smaller than the frame it wants its pictures.
+
+    A disc as wide as several pixels is measured as well in means of blocks, in a third of the time.
+    """
+    tracker, factor = Tracker(reference), small_factor(reference.shape)
+    if factor == 1 or tracker.rest.appearance.radius_px < _WIDE_PX * factor:
+        return tracker, 1
+    return Tracker(small_picture(reference)), factor
 
 
 def _in_pixels(size: tuple[int, ...]) -> str:

@@ -7,10 +7,10 @@ from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Num
+from jaxtyping import Float, Float32
 
 from sliplens.errors import InputError
-from sliplens.live.reading import Check, LiveFrame
+from sliplens.live.reading import Check, LiveFrame, small_picture
 from sliplens.markers import MarkerStatus, TrackedFrame
 from sliplens.models.checkpoint import Run
 from sliplens.models.novelty import read_features
@@ -20,7 +20,6 @@ from sliplens.recordings.labels.lag import soften
 Plane = Float32[np.ndarray, "height width"]
 
 _BRIGHT, _DARK = 250, 5
-_SIDE_PX = 224  # pictures are looked at about as large, so that limits in pixels mean the same
 _BORDER = 0.14  # share of the side: what touches seldom reaches there
 _COARSE = 4
 _REACH_PX = 8
@@ -103,10 +102,10 @@ class HealthMonitor:
     def __init__(self, reference: Frame, run: Run | None = None, limits: HealthLimits | None = None) -> None:
         self.limits = limits or HealthLimits()
         self._reference, self._run = reference, run
-        self._soft, self._grey = soften(reference), _grey(reference)
-        self._sharp = _sharpness(self._grey)
-        self._fine, self._coarse = (_Border(plane) for plane in (self._grey, _shrink(self._grey, _COARSE)))
-        self._lost = _saturated(reference)
+        small = small_picture(reference)
+        grey = _green(small)
+        self._soft, self._sharp, self._lost = soften(small), _sharpness(grey), _saturated(small)
+        self._fine, self._coarse = (_Border(plane) for plane in (grey, _shrink(grey, _COARSE)))
         self._before: np.ndarray | None = None
         self._changed_s = self._moved_px = 0.0
         self._numbers: deque[tuple[float, int]] = deque()
@@ -122,7 +121,7 @@ class HealthMonitor:
         The first check that is not fine names the cause: what is wrong with the camera comes before what that changes
         in the picture.
         """
-        soft, grey = soften(frame.image), _grey(frame.image)
+        soft, grey = soften(frame.small), _green(frame.small)
         both = (self._soft > _SEEN) & (soft > _SEEN) & (self._soft < _BRIGHT) & (soft < _BRIGHT)
         ratio = np.log2(np.where(both, soft, 1) / np.where(both, self._soft, 1))
         gain = float(np.median(ratio[both])) if both.any() else 0.0
@@ -130,7 +129,7 @@ class HealthMonitor:
             self._check_repeated(frame),
             self._check_late(frame),
             self._check_drops(frame),
-            self._check_saturation(frame.image),
+            self._check_saturation(frame.small),
             self._check_exposure(gain),
             self._check_focus(grey, gain),
             self._check_light(ratio - gain, both),
@@ -144,9 +143,8 @@ class HealthMonitor:
         return tuple(checks)
 
     def _check_repeated(self, frame: LiveFrame) -> Check:
-        pixels = frame.image[::4, ::4]
-        if self._before is None or not np.array_equal(pixels, self._before):
-            self._before, self._changed_s = pixels.copy(), frame.time_s
+        if self._before is None or not np.array_equal(frame.small, self._before):
+            self._before, self._changed_s = frame.small.copy(), frame.time_s
         value = max(0.0, frame.time_s - self._changed_s)
         told = f"the picture has not changed by a single pixel for {value:.2g} s"
         return _judge("repeated", value, self.limits.repeated_s, told, "start the camera again")
@@ -313,7 +311,7 @@ def _judge(name: str, value: float, limit: float, told: str, cure: str) -> Check
     return Check(name=name, value=value, limit=limit, ok=ok, sentence=told if ok else f"{told}; {cure}")
 
 
-def _shrink(plane: Num[np.ndarray, "height width"], factor: int) -> Float32[np.ndarray, "rows columns"]:
+def _shrink(plane: Plane, factor: int) -> Float32[np.ndarray, "rows columns"]:
     """Means of square blocks; what fills no block at the right and below is left out."""
     height, width = (side // factor for side in plane.shape)
     # line by line, several times as fast as a mean over two axes
@@ -326,17 +324,19 @@ def _shrink(plane: Num[np.ndarray, "height width"], factor: int) -> Float32[np.n
     return means / np.float32(factor**2)
 
 
-def _grey(image: Frame) -> Float32[np.ndarray, "rows columns"]:
-    """Green, which cameras see best, about 224 pixels high."""
-    return _shrink(image[..., 1], max(1, min(image.shape[:2]) // _SIDE_PX))
+def _green(image: Frame) -> Plane:
+    """Green, which cameras see best."""
+    return image[..., 1].astype(np.float32)
 
 
 def _sharpness(grey: Plane) -> float:
     """Slope of the sharpest fortieth of the pixels, in grey levels a pixel; of means of 3 x 3, above the noise."""
     rows = grey[:-2] + grey[1:-1] + grey[2:]
     means = (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 9
-    slope = np.hypot(means[1:-1, 2:] - means[1:-1, :-2], means[2:, 1:-1] - means[:-2, 1:-1])
-    return float(np.quantile(slope[::2, ::2], 0.975)) / 2
+    # of every other pixel, down and along
+    along = means[1:-1:2, 2::2] - means[1:-1:2, :-2:2]
+    down = means[2::2, 1:-1:2] - means[:-2:2, 1:-1:2]
+    return float(np.quantile(np.hypot(along, down), 0.975)) / 2
 
 
 def _saturated(image: Frame) -> float:

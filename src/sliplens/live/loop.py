@@ -1,5 +1,6 @@
 """The loop of a running sensor: one thread captures, one reads, and what is too late is dropped and counted."""
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -10,10 +11,12 @@ from threading import Event, Lock, Thread
 from typing import ParamSpec, TypeVar
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
 from sliplens.errors import InputError, RecordingError, SourceError
+from sliplens.extras import import_cv2, missing_packages
 from sliplens.friction import FrictionLike
 from sliplens.images import read_image
 from sliplens.live.contract import LiveSource, SourceOptions
@@ -40,31 +43,59 @@ Subscriber = Callable[[Reading, LiveFrame | None], None]
 _MOST_FRAMES = 10**6
 _RETRY_S = 1.0  # between two tries to open a source that was lost
 _PATIENCE_S = 3.0
+_SWITCH_S = 5e-4
 
 
-_BLAS_LOCK, _BLAS_LIMITS = Lock(), list[threadpool_limits]()
+class _SharedCores:
+    """Threads of the whole process, held down from when the first reader is entered until the last one is left.
+
+    A frame is checked in one thread and read by the network in another, and the page draws beside them. Threads that
+    share one step of that wait for each other, and some spin meanwhile: on cores that are all in use a matrix of
+    markers takes ten times as long by two threads as by one.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._readers, self._restore = Lock(), 0, ExitStack()
+
+    @contextmanager
+    def __call__(self) -> Iterator[None]:
+        """Hold them down."""
+        with self._lock:
+            self._readers += 1
+            if self._readers == 1:
+                self._hold()
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._readers -= 1
+                if not self._readers:
+                    self._restore.close()
+
+    def _hold(self) -> None:
+        later = self._restore.callback
+        later(threadpool_limits(1, user_api="blas").restore_original_limits)
+        threads = torch.get_num_threads()
+        later(torch.set_num_threads, threads)
+        torch.set_num_threads(max(1, threads - 1))  # the checks have a core
+        # a thread that has waited for a core waits for Python too, and the usual 5 ms are a third of a frame
+        later(sys.setswitchinterval, sys.getswitchinterval())
+        sys.setswitchinterval(_SWITCH_S)
+        if not missing_packages("cv2", extra="markers"):
+            cv2 = import_cv2()
+            later(cv2.setNumThreads, cv2.getNumThreads())
+            cv2.setNumThreads(1)
 
 
-@contextmanager
-def _one_blas_thread() -> Iterator[None]:
-    """Keep NumPy's matrices to one thread, in the whole process, until the last who wants that is done."""
-    with _BLAS_LOCK:
-        _BLAS_LIMITS.append(_BLAS_LIMITS[0] if _BLAS_LIMITS else threadpool_limits(1, user_api="blas"))
-    try:
-        yield
-    finally:
-        with _BLAS_LOCK:
-            limit = _BLAS_LIMITS.pop()
-            if not _BLAS_LIMITS:
-                limit.restore_original_limits()
+_share_cores = _SharedCores()
 
 
 class LiveReader:
     """Readings of a running sensor; a context manager that captures and reads while it is entered.
 
     One thread captures and one reads, with a place for the newest frame only between them: a network that is slower
-    than the camera drops frames, counts them, and never lags behind. While it is entered, NumPy's matrices have one
-    thread, in the whole process.
+    than the camera drops frames, counts them, and never lags behind. While it is entered, NumPy's matrices and OpenCV
+    have one thread and torch has one less than before, in the whole process.
 
     Parameters
     ----------
@@ -215,9 +246,7 @@ class LiveReader:
         if self._threads:
             raise InputError("a reader reads once; make another one of the same source")
         with ExitStack() as stack:
-            # its threads spin while they wait for each other: a matrix of markers then takes ten times as long on cores
-            # that something else uses too, and the network runs beside it
-            stack.enter_context(_one_blas_thread())
+            stack.enter_context(_share_cores())
             stack.callback(self._reader.close)
             stack.callback(self._end_outputs)
             stack.enter_context(self.source)

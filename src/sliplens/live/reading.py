@@ -2,9 +2,28 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
+from typing import TypeAlias
 
+import numpy as np
+from jaxtyping import UInt8
+
+from sliplens.images import shrink
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.trial import ContactState
+
+SmallPicture: TypeAlias = UInt8[np.ndarray, "rows columns 3"]
+_SMALL_PX = 224
+
+
+def small_factor(size: tuple[int, ...]) -> int:
+    """How many times smaller `small_picture` makes a frame of a size (height, width), in pixels."""
+    return max(1, min(size[:2]) // _SMALL_PX)
+
+
+def small_picture(image: Frame) -> SmallPicture:
+    """Picture of 224 to 448 pixels, in which limits in pixels mean the same for every camera; means of blocks."""
+    return shrink(image, small_factor(image.shape))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +48,11 @@ class LiveFrame:
     def size(self) -> tuple[int, int]:
         """Height and width, in pixels."""
         return self.image.shape[0], self.image.shape[1]
+
+    @cached_property
+    def small(self) -> SmallPicture:
+        """What `small_picture` makes of it, made once for all who look at the picture as a whole."""
+        return small_picture(self.image)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,7 @@
 """From one frame to the next: a step where the pattern moved little, a search where it may have jumped."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -14,6 +15,7 @@ Chosen: TypeAlias = Bool[np.ndarray, " markers"]
 
 _NEIGHBOURS = 8
 _FEWEST = 3
+_KEPT = 16
 _STIFFNESS = 0.3  # of the prior that holds slopes down where few neighbours are left
 
 
@@ -26,6 +28,33 @@ class Neighbours:
     """Way from the marker, over the pitch."""
     pitch_px: Float[np.ndarray, " markers"]
     """Distance of the nearest one."""
+
+    def weights(self, known: Chosen) -> Float[np.ndarray, "markers neighbours"]:
+        """Weight of each neighbour in what the known ones tell of a marker; NaN where fewer than three are known.
+
+        Least squares on a plane, whose value at the marker is a sum over its neighbours. Frame after frame mostly the
+        same markers are known, so the last answers are kept.
+        """
+        key = known.tobytes()
+        if key not in self._weights:
+            if len(self._weights) == _KEPT:
+                self._weights.clear()
+            self._weights[key] = self._fit(known[self.index])
+        return self._weights[key]
+
+    @cached_property
+    def _weights(self) -> dict[bytes, Float[np.ndarray, "markers neighbours"]]:
+        return {}
+
+    def _fit(self, usable: Bool[np.ndarray, "markers neighbours"]) -> Float[np.ndarray, "markers neighbours"]:
+        near = np.exp(-(self.offset**2).sum(axis=-1) / (2 * 1.5**2))
+        terms = np.concatenate([np.ones((*usable.shape, 1)), self.offset], axis=-1)
+        weighted = np.swapaxes(terms * np.where(usable, near, 0.0)[..., None], 1, 2)
+        normal = weighted @ terms
+        normal[:, [1, 2], [1, 2]] += _STIFFNESS * 0.1
+        normal[:, 0, 0] += 1e-9  # a marker without neighbours is answered below
+        fit = np.linalg.solve(normal, weighted)
+        return np.where(usable.sum(axis=1)[:, None] >= _FEWEST, fit[:, 0], np.nan)
 
 
 def find_neighbours(place_px: Places) -> Neighbours:
@@ -44,17 +73,8 @@ def predict_from_neighbours(neighbours: Neighbours, displacement_px: Places, kno
 
     A plane through the known neighbours' displacements, the near ones weighing most, its slopes held down a little.
     """
-    usable = known[neighbours.index]
-    values = np.where(usable[..., None], displacement_px[neighbours.index], 0.0)
-    squared = (neighbours.offset**2).sum(axis=-1)
-    weight = np.where(usable, np.exp(-squared / (2 * 1.5**2)), 0.0)
-    terms = np.concatenate([np.ones((*weight.shape, 1)), neighbours.offset], axis=-1)
-    weighted = terms * weight[..., None]
-    normal = np.swapaxes(weighted, 1, 2) @ terms
-    normal[:, [1, 2], [1, 2]] += _STIFFNESS * 0.1
-    normal[:, 0, 0] += 1e-9  # a marker without neighbours is answered below
-    fit = np.linalg.solve(normal, np.swapaxes(weighted, 1, 2) @ values)
-    return np.where(usable.sum(axis=1)[:, None] >= _FEWEST, fit[:, 0], np.nan)
+    values = np.where(known[:, None], displacement_px, 0.0)[neighbours.index]
+    return (neighbours.weights(known)[:, None] @ values)[:, 0]
 
 
 GATE = 0.45
@@ -148,17 +168,18 @@ def likely_shifts(places_px: Places, found_px: Spots, *, pitch_px: float) -> Flo
     if not len(ways):
         return np.zeros((0, 2))
     keys = np.round(ways / (pitch_px / 3)).astype(np.int64)
-    cells, inverse, votes = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    most = int(np.abs(keys).max()) + 1
+    side = 2 * most + 1
+    votes = np.bincount((keys + most) @ (side, 1), minlength=side**2).reshape(side, side)
     # a peak may lie on the border of cells: neighbours lend their votes
-    near = np.eye(len(cells), dtype=bool)
-    if len(cells) < 4000:
-        near = np.abs(cells[:, None] - cells[None]).max(axis=-1) <= 1
+    around = sum(np.roll(votes, (down, along), axis=(0, 1)) for down in (-1, 0, 1) for along in (-1, 0, 1))
+    cells = np.flatnonzero(votes)
     shifts: list[np.ndarray] = []
-    for at in np.argsort(-(near @ votes), kind="stable"):
+    for at in cells[np.argsort(-np.ravel(around)[cells], kind="stable")]:
         if len(shifts) == _VOTES:
             break
-        chosen = near[at][inverse.ravel()]
-        shift = np.median(ways[chosen], axis=0)
+        cell = np.array(divmod(int(at), side)) - most
+        shift = np.median(ways[np.abs(keys - cell).max(axis=1) <= 1], axis=0)
         if all(np.linalg.norm(shift - other) > 0.5 * pitch_px for other in shifts):
             shifts.append(shift)
     return np.array(shifts)
