@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 from command_line import refused, run
 
+from sliplens.codec import save_record
 from sliplens.report import Written, load_results, write_report
+from sliplens.results.study import ASKED_FILE, Asked
 
 from .study_results import Made, write_choice, write_others
 
@@ -250,6 +252,17 @@ def test_a_stage_alone_makes_a_page_that_names_the_others(pristine_study, tmp_pa
     assert len(missing[-1].split(", ")) >= 6
     assert all("not run yet; `sliplens study` makes it." in one for one in missing)
     assert "<h2>Verdict</h2>" in page
+
+
+def test_a_page_misses_nothing_that_was_not_asked_for(pristine_study, tmp_path):
+    for kept in ("choice", "states", "truth-raw"):
+        shutil.copytree(pristine_study / kept, tmp_path / kept)
+    save_record(Asked(tests=("truth", "timing")), tmp_path / ASKED_FILE)
+
+    page = write_report(tmp_path).page.read_text(encoding="utf-8")
+
+    *_, missing = re.findall(r'<p class="missing">([^<]*)</p>', page)
+    assert missing.partition(":")[0] == "Accuracy, Cost"
 
 
 def test_too_few_trials_are_told_before_anything_else(tmp_path, text):

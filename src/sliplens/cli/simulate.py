@@ -117,6 +117,6 @@ class Simulate(Command):
         with terminal.stage("Simulating the trial") as count:
             recording = simulate_trial(plan, device=self.device, on_progress=count)
         with terminal.stage("Writing the clip") as count:
-            write_clip(recording, path, on_progress=count)
+            write_clip(recording, path, frames_per_s=_CLIP_FRAMES_PER_S, on_progress=count)
         rate = f"{_CLIP_FRAMES_PER_S} frames/s"
         terminal.wrote(path, f"trial {plan.trial} at {rate}; to watch, not to train on: video is lossy")

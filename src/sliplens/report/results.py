@@ -12,7 +12,7 @@ from sliplens.results.evaluation import Diagnosis, Evaluation, Simulation, Train
 from sliplens.results.explanation import Explained, Strip, load_explained
 from sliplens.results.faithfulness import DeletionScores
 from sliplens.results.grip import Grip
-from sliplens.results.study import STAGES, TABLES, Choice, Study
+from sliplens.results.study import ASKED_FILE, STAGES, TABLES, Asked, Choice, Study
 
 _OF_A_COMMAND: dict[str, type] = {
     "train": Training,
@@ -109,6 +109,7 @@ def load_results(workspace: Path) -> Results:
         return {name: value for (own, name, _), value in found.items() if own == stage}
 
     choice: Choice | None = of("choice").get("")
+    asked = workspace / ASKED_FILE
     of_study = {stage: of(stage) for stage in TABLES}
     if choice is not None:
         for stage in _BY_SOURCE:
@@ -126,6 +127,7 @@ def load_results(workspace: Path) -> Results:
         strip=next(iter(of("strip").values()), None),
         study=Study(
             folder=workspace,
+            asked=load_record(asked, Asked, command="sliplens study") if asked.exists() else None,
             choice=choice,
             states=of("states").get(""),
             **{table: of_study[stage] for stage, table in TABLES.items()},  # pyright: ignore[reportArgumentType]

@@ -45,6 +45,8 @@ class Section:
     """Whether they are no part of a study, which does not miss them."""
     simulated: bool = False
     """Whether a study has them of simulated data alone."""
+    test: str = ""
+    """Test of a study whose results they are, which it may leave out; empty where every study has them."""
     build: Callable[[Results, np.random.Generator], Iterable[Block | None]] = lambda *_: ()
     """Makes its blocks; None for one that is not there. Without any, the section is left out."""
     needs: Callable[[Results], Collection[str]] = lambda results: results.inputs
@@ -61,9 +63,10 @@ def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Secti
     sections, absent = [], []
     for section in SECTIONS:
         blocks = tuple(block for block in section.build(results, rng) if block is not None)
-        # a study that stopped was asked for all that its data can tell; single commands are asked for one by one
-        unasked = section.apart or not results.study or (section.simulated and results.study.source == "real")
-        if not blocks and unasked:
+        # a study that stopped was asked for what it says; single commands are asked for one by one
+        study = results.study
+        unasked = section.apart or not study or (section.simulated and study.source == "real")
+        if not blocks and (unasked or (section.test and study.asked and section.test not in study.asked.tests)):
             continue
         if not blocks:
             absent.append(section.short_title)
@@ -268,6 +271,7 @@ SECTIONS: tuple[Section, ...] = (
     ),
     Section(
         id="faithfulness",
+        test="faithfulness",
         of_sample=True,
         title="How far the explanations can be believed",
         short_title="Faithfulness",
@@ -280,6 +284,7 @@ SECTIONS: tuple[Section, ...] = (
     ),
     Section(
         id="deletion",
+        test="score",
         of_sample=True,
         title="The thesis's score, step by step",
         short_title="Deletion",
@@ -293,6 +298,7 @@ SECTIONS: tuple[Section, ...] = (
     ),
     Section(
         id="randomisation",
+        test="randomisation",
         of_sample=True,
         title="Does the explanation notice that the network forgot everything?",
         short_title="New weights",
@@ -322,6 +328,7 @@ SECTIONS: tuple[Section, ...] = (
     ),
     Section(
         id="timing",
+        test="timing",
         title="What an explanation costs",
         short_title="Cost",
         intro="Seconds a frame; a study measures them with warm-up, and waiting for the device to finish.",
@@ -337,6 +344,7 @@ SECTIONS: tuple[Section, ...] = (
     ),
     Section(
         id="truth",
+        test="truth",
         simulated=True,
         of_sample=True,
         title="What the network should have looked at",

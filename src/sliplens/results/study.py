@@ -391,6 +391,18 @@ TABLES |= {stage: stage.replace("-", "_") for stage in STAGES if stage not in ("
 """Tables of a study by the stage that fills them, a record an input."""
 
 
+ASKED_FILE = "study.json"
+"""File of a study's workspace that holds what was asked for (`Asked`)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asked:
+    """What a study was asked for: its page misses nothing else."""
+
+    tests: tuple[str, ...]
+    """Some of `sliplens.study.TESTS`."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Study:
     """A study, stage by stage; tables are by input, and empty where a stage was not run."""
@@ -399,6 +411,8 @@ class Study:
     """Workspace that holds the stages."""
     scratch: TemporaryDirectory[str] | None = field(default=None, repr=False, compare=False)
     """Keeps a temporary workspace as long as the study lives."""
+    asked: Asked | None = None
+    """None where nobody tells: all that its data can tell."""
     evaluations: dict[str, Evaluation] = field(default_factory=dict)
     choice: Choice | None = None
     states: States | None = None

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 import torch
 
-from sliplens.codec import load_result, save_result
+from sliplens.codec import load_result, save_record, save_result
 from sliplens.errors import InputError
 from sliplens.explainers import Explainer
 from sliplens.faithfulness.removal import Faithfulness
@@ -23,7 +23,18 @@ from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionScores, RemovalScores
-from sliplens.results.study import STAGES, TABLES, Choice, MarkedFrame, States, Study, Truth, UntrainedMaps
+from sliplens.results.study import (
+    ASKED_FILE,
+    STAGES,
+    TABLES,
+    Asked,
+    Choice,
+    MarkedFrame,
+    States,
+    Study,
+    Truth,
+    UntrainedMaps,
+)
 from sliplens.simulation.intervention import rebuild_trial
 from sliplens.study.checks import CASCADE, explain_untrained, measure_maps, randomise_weights, time_explainers
 from sliplens.study.choice import (
@@ -168,6 +179,8 @@ def run_study(
         evaluation = evaluate(run, stages.data, folder, overwrite=overwrite, on_progress=on_progress)
         stages.found[name] = {"evaluate": evaluation}
     choice, states = stages.choose(split=split, condition=condition, trials=trials, tolerance=tolerance)
+    asked = Asked(tests=tuple(test for test in TESTS if test in tests))
+    save_record(asked, stages.folder / ASKED_FILE)
     cores, judging = torch.get_num_threads(), stages
     if min(jobs, len(networks), cores) > 1:
         # they leave their stages in folders, and what is here reads them
@@ -182,7 +195,7 @@ def run_study(
         table: {name: own[stage] for name, own in stages.found.items() if stage in own}
         for stage, table in TABLES.items()
     }
-    return Study(folder=stages.folder, scratch=scratch, choice=choice, states=states, **tables)
+    return Study(folder=stages.folder, scratch=scratch, asked=asked, choice=choice, states=states, **tables)
 
 
 def load_network(network: Network, name: str, *, device: str = "cpu") -> Run:
