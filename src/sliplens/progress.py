@@ -5,7 +5,8 @@ also names them where the callback can show that (`Stages`), as the command line
 """
 
 import re
-from collections.abc import Callable, Collection, Iterator
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Protocol, TypeAlias, TypeVar, runtime_checkable
@@ -80,6 +81,39 @@ def note(on_progress: OnProgress | None, message: str) -> None:
         on_progress.note(message)
 
 
+def fold_equal(messages: Iterable[str]) -> list[str]:
+    """Tell once what is said again and again, in the order of the first: names and numbers of the others are folded.
+
+    Examples
+    --------
+    >>> from sliplens.progress import fold_equal
+    >>> fold_equal(["cup-1: 3 s are missing", "dark", "cup-2: 4 s are missing", "dark"])
+    ['cup-1: 3 s are missing (with other numbers also cup-2)', 'dark (2 times)']
+    """
+    alike: dict[str, Counter[str]] = {}
+    for message in messages:
+        words = message.removeprefix(_named(message))
+        alike.setdefault(re.sub(r"[-\u2212]?\d+(?:[.,]\d+)?", "#", words), Counter())[message] += 1
+    folded = []
+    for counts in alike.values():
+        first, times = next(iter(counts.items()))
+        others = [name[:-2] for name in dict.fromkeys(map(_named, counts)) if name != _named(first)]
+        same = len({message.removeprefix(_named(message)) for message in counts}) == 1
+        more = f" and {len(others) - 2} more" if len(others) > 3 else ""
+        if others:
+            shown = ", ".join(others[:2] if more else others)
+            told = f"{'' if same else 'with other numbers '}also {shown}{more}"
+        else:
+            told = f"{times} times" if same else f"and {len(counts) - 1} more with other numbers"
+        folded.append(first if counts.total() == 1 else f"{first} ({told})")
+    return folded
+
+
+def _named(message: str) -> str:
+    """Name that a message begins with, and the colon after it; empty where it begins with none."""
+    return found[0] if (found := re.match(r"\S+: ", message)) else ""
+
+
 def continued(on_progress: OnProgress | None, *, before: int, total: int) -> OnProgress | None:
     """Callback for a part of longer work, which comes after `before` of `total`; None where nobody listens."""
     return None if on_progress is None else lambda done, _: on_progress(before + done, total)
@@ -97,4 +131,4 @@ def _ignore(done: int, total: int) -> None:
     """Show nothing."""
 
 
-__all__ = ["OnProgress", "Stages", "continued", "counted", "note", "stage", "wrote"]
+__all__ = ["OnProgress", "Stages", "continued", "counted", "fold_equal", "note", "stage", "wrote"]

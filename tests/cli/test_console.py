@@ -6,8 +6,8 @@ import pytest
 from rich.console import Console
 
 from sliplens.cli import console
-from sliplens.cli.console import Terminal, fold_equal, print_table
-from sliplens.progress import Stages, stage
+from sliplens.cli.console import Terminal, print_table
+from sliplens.progress import Stages, fold_equal, stage
 
 METHODS = ["Grad-CAM", "Integrated Gradients", "Poly-CAM (thesis)"]
 HEAD = ["Method", "Score D (lower is better)", "Standard deviation", "SRG, grey fill", "SRG, blurred fill", "Seconds"]

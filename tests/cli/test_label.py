@@ -1,5 +1,6 @@
 """`sliplens label`, and the import of recordings that bring labels of their own."""
 
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from command_line import refused, run
 from sliplens.images import write_png
 from sliplens.recordings import ContactState, LabelSettings, Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.edits import EDITS_FILE, keep_edit, make_edit, read_edits
+from sliplens.recordings.edits import EDITS_FILE, edits_in_force, keep_edit, make_edit, read_edits
 from sliplens.recordings.importing import relabel_trial
 from sliplens.recordings.store import forces_path, load_forces, load_recording, read_header, save_recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
@@ -289,9 +290,14 @@ def test_edits_that_do_not_fit_their_data_set_are_told(
     line = '{"trial": "%s", "kind": "bad", "value": [100, 900], "by": "ana", "at": "2026-11-23T00:00:00+00:00"}\n'
     path = tmp_path / "data" / EDITS_FILE
     path.write_text(line % trial.trial)
-    assert "frames 100 to 900 cannot be marked as bad: the trial has frames 0 to 239" in refused(
-        capsys, "label", tmp_path / "data", "--no-audit"
-    )
+    told = refused(capsys, "label", tmp_path / "data", "--no-audit")
+    assert "frames 100 to 900 cannot be marked as bad: the trial has frames 0 to 239" in told
+    undo = shlex.split(told.split("`")[1])  # one command ends it
+    assert undo[0] == "sliplens"
+    assert run(*undo[1:], "--by", "bo") == 0
+    assert "took back what ana set on 2026-11-23: bad 100, 900" in capsys.readouterr().out
+    assert edits_in_force(read_edits(tmp_path / "data"), trial.trial) == ()
+    assert "no edit that could be undone" in refused(capsys, *undo[1:])
     path.write_text(line % "gone")
     assert run("label", tmp_path / "data", "--no-audit") == 0
     assert "edits gone, which is no trial of the data set" in capsys.readouterr().err
@@ -300,4 +306,5 @@ def test_edits_that_do_not_fit_their_data_set_are_told(
 
 def test_the_page_is_refused_what_it_cannot_heed(relabelled: Path, capsys: pytest.CaptureFixture[str]):
     assert "leave --output" in refused(capsys, "label", relabelled, "--page", "-o", "elsewhere")
+    assert "leave --page or --undo out" in refused(capsys, "label", relabelled, "--page", "--undo", "cup")
     assert "add --page" in refused(capsys, "label", relabelled, "--by", "ana")

@@ -5,9 +5,19 @@ from pathlib import Path
 
 import pytest
 
-from sliplens.errors import RecordingError
+from sliplens.errors import InputError, RecordingError
 from sliplens.recordings import Dataset, LabelSettings
-from sliplens.recordings.edits import EDITS_FILE, Edit, apply_edits, edits_in_force, keep_edit, make_edit, read_edits
+from sliplens.recordings.edits import (
+    EDITS_FILE,
+    Edit,
+    apply_edits,
+    edits_in_force,
+    keep_edit,
+    make_edit,
+    read_edits,
+    undo_edit,
+)
+from sliplens.recordings.importing import import_recordings, label_dataset
 
 
 def test_an_edit_changes_its_own_setting_and_the_last_one_counts():
@@ -81,6 +91,32 @@ def test_edits_are_kept_with_who_and_when_and_found_again(tmp_path: Path, small_
         with pytest.raises(RecordingError, match=why):
             keep_edit(data, edit)
     assert (tmp_path / EDITS_FILE).read_bytes() == kept
+
+
+def test_an_edit_that_contradicts_is_refused_with_the_reason_and_keeps_nothing(tmp_path: Path, small_dataset: Dataset):
+    data = Dataset(folder=tmp_path, trials=small_dataset.trials)
+    (tmp_path / "trials").symlink_to(small_dataset.folder / "trials")
+    name = data.trials[0].trial
+    contact = make_edit(name, "contact_s", 0.2)
+    keep_edit(data, contact)
+    with pytest.raises(RecordingError, match=r"slip is set to 0\.10 s and the contact to 0\.20 s"):
+        keep_edit(data, make_edit(name, "slip_s", 0.1))
+    assert read_edits(tmp_path) == (contact,)
+    assert undo_edit(data, name) == contact
+    keep_edit(data, make_edit(name, "slip_s", 0.1))
+
+
+def test_an_import_in_the_place_of_a_data_set_keeps_its_edits(tmp_path: Path, small_dataset: Dataset):
+    out = tmp_path / "data"
+    data = import_recordings(small_dataset.folder, out=out)
+    edit = make_edit(data.trials[0].trial, "mu", 0.5)
+    keep_edit(data, edit)
+    import_recordings(small_dataset.folder, out=out, test_trials=1, overwrite=True)
+    assert read_edits(out) == (edit,)
+    # and labels of another data set do not take their place
+    with pytest.raises(InputError, match=r"has edits by hand that .* has not"):
+        label_dataset(small_dataset, out=out, overwrite=True)
+    assert read_edits(out) == (edit,)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import TextWrapper
@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sliplens.progress import OnProgress, visible
+from sliplens.progress import OnProgress, fold_equal, visible
 
 OUT, ERR = Console(), Console(stderr=True)
 
@@ -92,19 +92,6 @@ class Terminal:
         for message in fold_equal(self._notes.elements()):
             ERR.print(f"  note: {_shown(message)}", soft_wrap=True, highlight=False)
         self._notes.clear()
-
-
-def fold_equal(messages: Iterable[str]) -> list[str]:
-    """Keep each message once, in the order of the first; those that differ in numbers alone are counted with it."""
-    alike: dict[str, Counter[str]] = {}
-    for message in messages:
-        alike.setdefault(re.sub(r"[-\u2212]?\d+(?:[.,]\d+)?", "#", message), Counter())[message] += 1
-    folded = []
-    for counts in alike.values():
-        first, times = next(iter(counts.items()))
-        others = f"and {len(counts) - 1} more with other numbers" if len(counts) > 1 else f"{times} times"
-        folded.append(first if counts.total() == 1 else f"{first} ({others})")
-    return folded
 
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

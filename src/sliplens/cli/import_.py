@@ -1,5 +1,6 @@
 """`sliplens import`."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,7 +10,11 @@ import tyro
 
 from sliplens.cli.command import Command, Output
 from sliplens.cli.console import Terminal, print_table, say, wrote
+from sliplens.progress import fold_equal
 from sliplens.recordings.options import LabelSettings, ReadOptions
+
+_MOST_ROWS = 24
+"""Trials of which each has a line."""
 
 if TYPE_CHECKING:
     from sliplens.recordings import Dataset
@@ -90,7 +95,7 @@ def show_trials(data: "Dataset") -> None:
 
 def show_labelling(title: str, data: "Dataset") -> None:
     """Show what the labels of each trial rest on, what was assumed, and which frames have none."""
-    rows, notes, lost = [], [], []
+    rows, notes, lost = [], [], {}
     for info in data.trials:
         labels = data.read_labels(info)
         counts = labels.count()
@@ -98,11 +103,16 @@ def show_labelling(title: str, data: "Dataset") -> None:
         rows.append((info.trial, f"{counts.get('valid', 0)} of {info.frames}", *_basis(kept, counts)))
         if kept is not None:
             notes += kept.notes
-        why = ", ".join(f"{count} {reason}" for reason, count in counts.items() if reason != "valid")
-        lost.append(f"  {info.trial}: frames without a valid label: {why or 'none'}")
-    print_table(title, ("trial", "valid", "mu", "lag, ms", "reference"), rows)
-    for line in (*(f"  note: {note}" for note in dict.fromkeys(notes)), *lost):
-        say(line)
+        lost[info.trial] = Counter({reason: count for reason, count in counts.items() if reason != "valid"})
+    print_table(title, ("trial", "valid", "mu", "lag, ms", "reference"), rows[:_MOST_ROWS])
+    if len(rows) > _MOST_ROWS:
+        say(f"  and {len(rows) - _MOST_ROWS} more trials, which the page of all trials shows")
+        lost = {f"all {len(rows)} trials": sum(lost.values(), Counter())}
+    for line in fold_equal(dict.fromkeys(notes)):
+        say(f"  note: {line}")
+    for what, counts in lost.items():
+        why = ", ".join(f"{count:,} {reason}" for reason, count in counts.items())
+        say(f"  {what}: frames without a valid label: {why or 'none'}")
 
 
 def _basis(labelling: "Labelling | None", counts: dict[str, int]) -> Sequence[str]:

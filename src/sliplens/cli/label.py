@@ -21,7 +21,7 @@ class Label(Command):
 
     For another friction, axis or threshold than on import, or to see how well the labels of a simulated data set come
     back when only its frames and forces are known. Splits stay. Without --output the data set itself gets the new
-    labels, once all of them are there. Repairs that were made by hand with --page are followed.
+    labels, once all of them are there. Repairs by hand (--page) are followed.
     """
 
     data: Data
@@ -35,16 +35,20 @@ class Label(Command):
     page: bool = False
     """Change no label: show the trials in a browser on this machine, to set reference, contact, slip, tare, sign and
     bad spans by hand. Each edit is kept beside the data set; ends with Ctrl-C."""
+    undo: Annotated[str | None, tyro.conf.arg(metavar="TRIAL")] = None
+    """Change no label: take back the last edit by hand of this trial."""
     by: str | None = None
-    """Who edits on the page; who is logged in if not given."""
+    """Who edits on the page, or takes an edit back; who is logged in if not given."""
 
     def check(self) -> None:
-        """Refuse what the page cannot heed."""
+        """Refuse what does not go together."""
         super().check()
-        if self.page and (self.output is not None or self.audit_only):
-            raise InputError("--page keeps edits beside the data set itself; leave --output and --audit-only out")
-        if self.by is not None and not self.page:
-            raise InputError("--by says who edits on the page; add --page, or leave it out")
+        if (self.page or self.undo is not None) and (self.output is not None or self.audit_only):
+            raise InputError("edits are kept beside the data set itself; leave --output and --audit-only out")
+        if self.page and self.undo is not None:
+            raise InputError("the page has an undo of its own; leave --page or --undo out")
+        if self.by is not None and not self.page and self.undo is None:
+            raise InputError("--by says who edits; add --page, or leave it out")
 
     def run(self) -> None:
         """Label anew, write, and show what was found."""
@@ -53,6 +57,9 @@ class Label(Command):
 
         if self.page:
             self._repair()
+            return
+        if self.undo is not None:
+            self._take_back(self.undo)
             return
         terminal, data, out = Terminal(), load_dataset(self.data), self.output or self.data
         if self.audit_only:
@@ -63,6 +70,14 @@ class Label(Command):
             draw_audits(labelled, out / "audit", terminal)
         show_labelling("Labelled", labelled)
         show_trials(labelled)
+
+    def _take_back(self, trial: str) -> None:
+        from sliplens.recordings.dataset import load_dataset
+        from sliplens.recordings.edits import undo_edit
+
+        edit = undo_edit(load_dataset(self.data), trial, by=self.by)
+        value = ", ".join(f"{number:g}" for number in edit.numbers) or "as found"
+        say(f"took back what {edit.by} set on {edit.at[:10]}: {edit.kind} {value}, of {trial}")
 
     def _repair(self) -> None:
         """Show the page until it is ended."""

@@ -46,7 +46,7 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
         If the folder is no data set at all.
     """
     data = data if isinstance(data, Dataset) else load_dataset(data)
-    folder, findings = data.folder, []
+    folder, findings, labellings = data.folder, [], []
     for trial, count in Counter(info.trial for info in data.trials).items():
         if count > 1:
             splits = sorted({info.split for info in data.trials if info.trial == trial})
@@ -63,7 +63,8 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
         for info, wrong in zip(counted(data.trials, on_progress), checked, strict=True):
             findings += [Finding(where=info.trial, what=what) for what in wrong]
             with suppress(SliplensError):  # what cannot be read is found
-                tell_flags(info.trial, read_header(trial_path(folder, info.trial)).labelling, on_progress)
+                labellings.append((info.trial, read_header(trial_path(folder, info.trial)).labelling))
+    tell_flags(labellings, on_progress)
     return tuple(findings)
 
 

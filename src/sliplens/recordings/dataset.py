@@ -1,7 +1,7 @@
 """A data set on disk: one Parquet file a trial, frames without loss beside their labels."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -9,7 +9,7 @@ from pathlib import Path
 from sliplens.codec import from_builtins, save_record
 from sliplens.errors import RecordingError
 from sliplens.files import hash_file, hash_json, read_json, require_folder
-from sliplens.progress import OnProgress, note
+from sliplens.progress import OnProgress, fold_equal, note
 from sliplens.recordings.journal import JOURNAL_FOLDER, JournalLock, finish_journal, journals_of
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, load_profile, profile_text
@@ -205,11 +205,11 @@ def finish_recording(folder: Path, lock: JournalLock | None = None) -> None:
             folder.rmdir()
 
 
-def tell_flags(trial: str, labelling: Labelling | None, on_progress: OnProgress | None) -> None:
-    """Note all that puts the labels of a trial in doubt."""
-    basis = None if labelling is None else labelling.basis
-    for flag in () if basis is None else basis.flags:
-        note(on_progress, f"{trial}: {flag}")
+def tell_flags(trials: Iterable[tuple[str, Labelling | None]], on_progress: OnProgress | None) -> None:
+    """Note all that puts the labels of trials in doubt, what is said of several once."""
+    bases = [(trial, labelling.basis) for trial, labelling in trials if labelling and labelling.basis]
+    for message in fold_equal(f"{trial}: {flag}" for trial, basis in bases for flag in basis.flags):
+        note(on_progress, message)
 
 
 def keep_profile(folder: Path, profile: SensorProfile) -> None:

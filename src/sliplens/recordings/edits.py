@@ -2,6 +2,7 @@
 
 import getpass
 import os
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -80,14 +81,19 @@ def keep_edit(data: Dataset, edit: Edit) -> None:
     Raises
     ------
     RecordingError
-        If there is no such trial, what is set lies outside it, there is nothing to undo, or the file is damaged.
+        If there is no such trial, what is set lies outside it or contradicts what was set before, there is nothing to
+        undo, or the file is damaged.
     """
     info, before = data.find(edit.trial), read_edits(data.folder)
-    if edit.kind is EditKind.UNDO and not edits_in_force(before, edit.trial):
+    in_force = edits_in_force(before, edit.trial)
+    if edit.kind is not EditKind.UNDO:
+        capture = read_stored_trial(data, info)
+        times = capture.frame_time_s if capture.forces is None else capture.forces.time_s
+        # by itself first: the reason is then its own
+        for edits in ([edit], [*in_force, edit]):
+            require_inside(apply_edits(LabelSettings(), edits), frames=len(capture), time_s=times)
+    elif not in_force:
         raise RecordingError(f"{edit.trial} has no edit that could be undone")
-    capture = read_stored_trial(data, info)
-    times = capture.frame_time_s if capture.forces is None else capture.forces.time_s
-    require_inside(apply_edits(LabelSettings(), [edit]), frames=len(capture), time_s=times)
     path = data.folder / EDITS_FILE
     # a last line whose end somebody took away is ended first
     apart = b"\n" if path.is_file() and not path.read_bytes().endswith(b"\n") and path.stat().st_size else b""
@@ -95,6 +101,24 @@ def keep_edit(data: Dataset, edit: Edit) -> None:
         stream.write(apart + msgspec.json.encode(to_builtins(edit)) + b"\n")
         stream.flush()
         os.fsync(stream.fileno())
+
+
+def undo_edit(data: Dataset, trial: str, *, by: str | None = None) -> Edit:
+    """Take back the last edit of a trial that is in force; gives that edit.
+
+    Raises
+    ------
+    RecordingError
+        If there is no such trial, or no edit that could be undone.
+    """
+    in_force = edits_in_force(read_edits(data.folder), trial)
+    keep_edit(data, make_edit(trial, EditKind.UNDO, by=by))
+    return in_force[-1]
+
+
+def undo_command(folder: Path, trial: str) -> str:
+    """Command that takes back the last edit of a trial."""
+    return shlex.join(["sliplens", "label", str(folder), "--undo", trial])
 
 
 def edits_in_force(edits: Sequence[Edit], trial: str) -> tuple[Edit, ...]:
@@ -139,5 +163,5 @@ def apply_edits(settings: LabelSettings, edits: Sequence[Edit]) -> LabelSettings
 
 __all__ = [
     "EDITS_FILE", "Edit", "EditKind", "apply_edits", "edits_in_force", "keep_edit", "login_name", "make_edit",
-    "read_edits",
+    "read_edits", "undo_command", "undo_edit",
 ]  # fmt: skip

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
+from threadpoolctl import threadpool_limits
 
 from sliplens.errors import InputError, RecordingError, SliplensError
 from sliplens.files import output_folder
@@ -28,7 +29,7 @@ from sliplens.recordings.dataset import (
     trial_path,
     write_dataset_table,
 )
-from sliplens.recordings.edits import EDITS_FILE, apply_edits, edits_in_force, read_edits
+from sliplens.recordings.edits import EDITS_FILE, apply_edits, edits_in_force, read_edits, undo_command
 from sliplens.recordings.formats.stored import read_stored, read_stored_trial
 from sliplens.recordings.labelling import Edit, EditKind, Labelling, ReferenceChoice
 from sliplens.recordings.labels import Reason, choose_reference, label_trial, measure_motion, require_inside, soften
@@ -139,7 +140,7 @@ def import_recordings(
         raise InputError("one table of forces goes with one recording; name what belongs together in a manifest (CSV)")
     if splits is not None and (validation_trials is not None or test_trials is not None):
         raise InputError("splits come from a file or from numbers of trials, not from both; leave one out")
-    before = load_dataset(out) if add else None
+    before, kept_edits = load_dataset(out) if add else None, read_edits(Path(out))
     with stage(on_progress, "Opening the recordings") as count:
         found = [(path, asked.find_rows(path)) for path in paths]
         jobs, left_out = asked.open(found, count)
@@ -172,6 +173,8 @@ def import_recordings(
         if not output.complete:
             if before is not None:
                 _link_trials(before.folder, output.folder)
+            elif kept_edits:
+                _keep_words(Path(out), output.folder, (EDITS_FILE,))
             for one in {job.profile.name: job.profile for job in jobs if job.profile}.values():
                 keep_profile(output.folder, one)
             table, failed = _write_trials(output.folder, jobs, on_progress, title="Importing frames", first=len(known))
@@ -190,6 +193,8 @@ def import_recordings(
             write_dataset_table(output.folder, table, simulated=simulated, left_out=left_out)
     for message in dealt.notes if dealt else ():
         note(on_progress, message)
+    if kept_edits and not output.complete and before is None:
+        note(on_progress, f"the edits by hand in {out} are kept; `sliplens label {out}` makes the labels follow them")
     return _tell(load_dataset(out), on_progress, kept=output.complete)
 
 
@@ -201,6 +206,8 @@ class _Job:
     settings: LabelSettings
     edits: tuple[Edit, ...] = ()
     """Repairs by hand that its labels follow."""
+    undo: str = ""
+    """How the last of them is taken back; empty where there is none."""
     profile: SensorProfile | None = None
     """What its frames went through."""
     one_of_many: bool = False
@@ -325,12 +332,12 @@ def _link_trials(source: Path, folder: Path) -> None:
     _keep_words(source, folder)
 
 
-def _keep_words(source: Path, folder: Path) -> None:
+def _keep_words(source: Path, folder: Path, names: Sequence[str] = (SENSORS_FOLDER, SPLITS_FILE, EDITS_FILE)) -> None:
     """Copy what a data set keeps of its sensors, splits and edits."""
-    if (source / SENSORS_FOLDER).is_dir():
-        shutil.copytree(source / SENSORS_FOLDER, folder / SENSORS_FOLDER, dirs_exist_ok=True)
-    for name in (SPLITS_FILE, EDITS_FILE):
-        if (source / name).is_file():
+    for name in names:
+        if (source / name).is_dir():
+            shutil.copytree(source / name, folder / name, dirs_exist_ok=True)
+        elif (source / name).is_file():
             shutil.copyfile(source / name, folder / name)
 
 
@@ -368,6 +375,10 @@ def label_dataset(
     captures, edits = read_stored(data.folder), read_edits(data.folder)
     jobs = [_relabelling(data, capture, labelling, edits) for capture in captures]
     in_place = out.resolve() == data.folder.resolve()
+    if set(read_edits(out)) - set(edits):
+        raise InputError(
+            f"{out} has edits by hand that {data.folder} has not; label {out} itself, or name a new folder"
+        )
     for capture in captures:
         kept = capture.labels.labelling if capture.labels else None
         if in_place and (kept is None or kept.basis is None):
@@ -422,7 +433,9 @@ def relabel_trial(
     rng = np.random.default_rng((job.settings.seed, data.trials.index(info)))
     path = trial_path(data.folder, trial)
     motion = measure_motion(map(soften, stream_frames(path))) if image_motion is None else image_motion
-    return _label(job, _Footage(motion=motion, read=lambda places: stream_frames(path, set(places))), rng)[1]
+    footage = _Footage(motion=motion, read=lambda places: stream_frames(path, set(places)))
+    with threadpool_limits(1, user_api="blas"):  # see _write_trials
+        return _label(job.capture, footage, settings=job.settings, edits=job.edits, rng=rng)[1]
 
 
 def _relabelling(data: Dataset, capture: Capture, labelling: LabelSettings, edits: Sequence[Edit]) -> _Job:
@@ -434,19 +447,20 @@ def _relabelling(data: Dataset, capture: Capture, labelling: LabelSettings, edit
         )
     profile, mine = data.profile(capture.sensor), edits_in_force(edits, capture.trial)
     settings = apply_edits(labelling if profile is None else profile.settings(labelling), mine)
+    undo = f"`{undo_command(data.folder, capture.trial)}` takes back the last edit by hand" if mine else ""
     try:
         require_inside(settings, frames=len(capture), time_s=capture.forces.time_s)
     except RecordingError as error:
-        where = f" ({data.folder / EDITS_FILE})" if mine else ""
-        raise RecordingError(f"{capture.trial}: {error}{where}") from None
+        raise RecordingError(f"{capture.trial}: {error}{undo and f'; {undo}'}") from None
     capture = _without_labels(capture)
-    first = read_first_reference(trial_path(data.folder, capture.trial))
-    return _Job(capture=capture if first is None else replace(capture, reference=first), settings=settings, edits=mine)
+    if (first := read_first_reference(trial_path(data.folder, capture.trial))) is not None:
+        capture = replace(capture, reference=first)
+    return _Job(capture=capture, settings=settings, edits=mine, undo=undo)
 
 
 def _tell(data: Dataset, on_progress: OnProgress | None, *, kept: bool) -> Dataset:
-    for info in data.trials:
-        tell_flags(info.trial, read_header(trial_path(data.folder, info.trial)).labelling, on_progress)
+    headers = [(info.trial, read_header(trial_path(data.folder, info.trial))) for info in data.trials]
+    tell_flags([(trial, header.labelling) for trial, header in headers], on_progress)
     wrote(on_progress, data.folder, f"{len(data.trials)} trials, {data.frames:,} frames", kept=kept)
     return data
 
@@ -523,9 +537,12 @@ def _write_trials(
         if not path.is_file():
             rng = np.random.default_rng((job.settings.seed, first + number))
             try:
-                _import_job(job, path, rng=rng, forces_file=samples, on_progress=tell)
+                own = {"settings": job.settings, "edits": job.edits, "rng": rng}
+                import_trial(capture, path, **own, forces_file=samples, on_progress=tell)
             except SliplensError as error:
                 samples.unlink(missing_ok=True)
+                if job.undo:
+                    raise RecordingError(f"{error}; {job.undo}") from None
                 if not job.one_of_many:
                     raise
                 return LeftOut(trial=capture.trial, source=capture.source, why=str(error))
@@ -535,7 +552,9 @@ def _write_trials(
     stopped = Event()
     # decoding, arrays and compression run beside one another in threads; each holds one frame of its trial
     workers = min(os.cpu_count() or 1, len(jobs))
-    with stage(on_progress, title) as count, ThreadPoolExecutor(max_workers=workers) as pool:
+    # and the threads of NumPy's matrices, which are small here, would only take the cores from these while they spin
+    blas = threadpool_limits(1, user_api="blas")
+    with blas, stage(on_progress, title) as count, ThreadPoolExecutor(max_workers=workers) as pool:
         try:
             rows = [future.result() for future in [pool.submit(write, number, count) for number in range(len(jobs))]]
         except BaseException:
@@ -551,6 +570,7 @@ def import_trial(
     path: Path,
     *,
     settings: LabelSettings | None = None,
+    edits: Sequence[Edit] = (),
     rng: np.random.Generator,
     forces_file: Path | None = None,
     on_progress: OnProgress | None = None,
@@ -558,21 +578,13 @@ def import_trial(
     """Write a recording as a trial of a data set, with the labels that came with it, or found; whole or not at all.
 
     The frames are decoded once, never all at once. The samples of the force sensor, from which labels can be made anew,
-    are kept in `forces_file`.
+    are kept in `forces_file`. `edits` are those by hand that the settings follow, to be kept with the trial.
     """
-    job = _Job(capture=capture, settings=settings or LabelSettings())
-    _import_job(job, path, rng=rng, forces_file=forces_file, on_progress=on_progress)
-
-
-def _import_job(
-    job: _Job, path: Path, *, rng: np.random.Generator, forces_file: Path | None, on_progress: OnProgress | None
-) -> None:
-    capture = job.capture
     _require_forces(capture)
     with Spool(path.parent) as images:
         footage = _read_footage(capture, images, on_progress)
         try:
-            reference, labels = _label(job, footage, rng)
+            reference, labels = _label(capture, footage, settings=settings or LabelSettings(), edits=edits, rng=rng)
         except RecordingError as error:
             raise RecordingError(f"{capture.source}: {error}") from None
         # before the trial, whose file tells that all of it is there
@@ -624,9 +636,10 @@ def _require_forces(capture: Capture) -> None:
         )
 
 
-def _label(job: _Job, footage: _Footage, rng: np.random.Generator) -> tuple[Frame, Labels]:
+def _label(
+    capture: Capture, footage: _Footage, *, settings: LabelSettings, edits: Sequence[Edit], rng: np.random.Generator
+) -> tuple[Frame, Labels]:
     """Image of the untouched sensor, and the labels that came with the recording, or are found."""
-    capture, settings = job.capture, job.settings
     index = capture.reference_index if settings.reference_frame is None else settings.reference_frame
     labels, found, image = capture.labels, None, capture.reference
     if labels is None:
@@ -654,8 +667,8 @@ def _label(job: _Job, footage: _Footage, rng: np.random.Generator) -> tuple[Fram
         reference=choice,
         clip=capture.clip,
         basis=found.basis if found else None,
-        edits=job.edits,
-        first_reference=_first_reference(capture, job.edits),
+        edits=tuple(edits),
+        first_reference=_first_reference(capture, edits),
     )
     return image, replace(labels, labelling=labelling)
 
