@@ -18,6 +18,7 @@ from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.formats.lerobot_export import write_lerobot
 from sliplens.recordings.options import ReadOptions
+from sliplens.recordings.trial import ContactState
 
 TRIAL = "test-wet-7"
 
@@ -71,6 +72,7 @@ def test_a_data_set_is_predicted_frame_by_frame(trained: Run, small_dataset: Dat
         "safety_margin",
         "normal_force_n",
         "tangential_force_n",
+        "touches",
         "prediction",
         "sigma",
         "low_90",
@@ -79,6 +81,7 @@ def test_a_data_set_is_predicted_frame_by_frame(trained: Run, small_dataset: Dat
     assert rows["trial"] == ["test-dry-6"] * 12 + [TRIAL] * 12
     assert rows["frame"] == [*range(12), *range(12)]
     assert rows["time_s"][12:] == wet.time_s.tolist()
+    assert rows["touches"][12:] == [state != ContactState.NO_CONTACT for state in wet.contact_state]
     # the first frame has no contact, and so no label
     assert rows["safety_margin"][12] is None
     assert rows["safety_margin"][13:] == wet.safety_margin[1:].tolist()
@@ -118,6 +121,19 @@ def test_predictions_do_not_depend_on_the_batch(batch_size: int, trained: Run, s
 def test_all_trials_are_predicted_unless_a_split_is_named(trained: Run, small_dataset: Dataset, tmp_path: Path):
     rows = predict(small_dataset.folder, trained, tmp_path / "a.parquet")
     assert list(dict.fromkeys(rows["trial"])) == [info.trial for info in small_dataset.trials]
+
+
+def test_the_lowest_margin_is_of_a_frame_that_touches(trained: Run, wet: Recording):
+    noise = np.random.default_rng(0).integers(-3, 4, (6, *wet.reference.shape))
+    untouched = np.clip(wet.reference.astype(int) + noise, 0, 255).astype(np.uint8)
+    frames = np.concatenate([untouched, wet.frames[4:]])
+    table = predict_source(trained, frames, reference=wet.reference)
+    assert table.frame()["touches"].to_pylist() == [False] * 6 + [True] * 8
+    margins = table.frame()["prediction"].to_numpy()
+    (told,) = table.trials()
+    assert (told.touching, told.lowest) == (8, 6 + int(margins[6:].argmin()))
+    (told,) = predict_source(trained, untouched, reference=wet.reference).trials()
+    assert (told.touching, told.lowest) == (0, int(margins[:6].argmin()))
 
 
 def test_a_folder_of_frames_and_its_differences_are_the_same(trained: Run, wet: Recording, tmp_path: Path):

@@ -123,9 +123,10 @@ def _course(trial: "TrialMargins") -> str:
     where = f"frame {trial.lowest}" if trial.time_s is None else f"{trial.time_s:.2f} s"
     low, high = trial.interval or (None, None)
     interval = "" if low is None else f" ({_interval(low, high)})"
+    touching = "" if trial.touching is None else f", {trial.touching:,} touch" if trial.touching else ", none touches"
     return (
         f"{trial.trial}  {_sparkline(trial.margin.tolist())}  lowest {_percent(float(trial.margin[trial.lowest]))}"
-        f"{interval} at {where}, {len(trial.margin):,} frames"
+        f"{interval} at {where}, {len(trial.margin):,} frames{touching}"
     )
 
 

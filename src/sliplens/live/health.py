@@ -15,7 +15,7 @@ from sliplens.markers import MarkerStatus, TrackedFrame
 from sliplens.models.checkpoint import Run
 from sliplens.models.novelty import read_features
 from sliplens.recordings.capture import Frame
-from sliplens.recordings.labels.lag import soften
+from sliplens.recordings.labels.lag import LEAST_TOUCH, picture_change, soften
 
 Plane = Float32[np.ndarray, "height width"]
 
@@ -60,7 +60,7 @@ class HealthLimits:
     """Motion of the border as a whole against the reference, in pixels of a picture 224 high."""
     markers: float = 0.15
     """Share of the reference's markers that are not seen where they should be."""
-    touch: float = 7.0
+    touch: float = LEAST_TOUCH
     """Least change of the picture, in grey levels, that shows a contact."""
 
     def __post_init__(self) -> None:
@@ -222,7 +222,7 @@ class HealthMonitor:
         return _judge("markers", value, self.limits.markers, told, cure)
 
     def _check_touch(self, soft: np.ndarray, gain: float) -> Check:
-        value = float(np.quantile(np.abs(soft * 2**-gain - self._soft).max(axis=-1), 0.98))
+        value = picture_change(soft * 2**-gain, self._soft)
         told = f"the picture differs by {value:.2g} grey levels from the untouched sensor"
         touches = value >= self.limits.touch
         sentence = told if touches else "nothing touches the sensor; press it on something"

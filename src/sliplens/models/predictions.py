@@ -22,9 +22,11 @@ from sliplens.progress import OnProgress, note, stage
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import DATASET_FILE
+from sliplens.recordings.labels.lag import LEAST_TOUCH, picture_change, soften
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import Frame, Frames, open_source
+from sliplens.recordings.trial import ContactState
 
 LEVEL = 0.9
 """Confidence of the intervals."""
@@ -37,6 +39,7 @@ _COLUMNS = {
     "safety_margin": pa.float64(),
     "normal_force_n": pa.float64(),
     "tangential_force_n": pa.float64(),
+    "touches": pa.bool_(),
     "prediction": pa.float64(),
     "sigma": pa.float64(),
     "low_90": pa.float64(),
@@ -57,7 +60,9 @@ class TrialMargins:
     margin: Float[np.ndarray, " frames"]
     """In margin units, frame by frame; not clipped to [0, 1]."""
     lowest: int
-    """Frame of the lowest margin."""
+    """Frame of the lowest margin, of those that touch; of all where none does, or nobody knows."""
+    touching: int | None
+    """How many frames touch; None where nobody knows."""
     time_s: float | None
     """Time of that frame; None where it is not known."""
     interval: tuple[float, float] | None
@@ -87,10 +92,11 @@ class Predictions:
         """Arrow table; `.to_pandas()` where pandas is installed.
 
         Columns are `trial`, `frame`, `file` (of a folder of images), `time_s`, `safety_margin` (where the source has
-        labels), `normal_force_n` and `tangential_force_n` (where it has forces), `prediction`, `sigma`, `low_90` and
-        `high_90`, and `traction_ratio` and `traction_ratio_sigma` of a network that tells F_t / F_n. What is not known
-        is null: the time of images without a rate, sigma of a network that answers with one number, intervals of one
-        that was never calibrated. Predictions are not clipped to [0, 1].
+        labels), `normal_force_n` and `tangential_force_n` (where it has forces), `touches` (whether anything does, by
+        the labels, else by how far the picture is from that of the untouched sensor), `prediction`, `sigma`, `low_90`
+        and `high_90`, and `traction_ratio` and `traction_ratio_sigma` of a network that tells F_t / F_n. What is not
+        known is null: the time of images without a rate, sigma of a network that answers with one number, intervals
+        of one that was never calibrated. Predictions are not clipped to [0, 1].
         """
         if self.rows is not None:
             return self.rows
@@ -117,16 +123,21 @@ class Predictions:
             name: table[name].to_numpy(zero_copy_only=False).astype(np.float64)
             for name in ("prediction", "time_s", "low_90", "high_90")
         }
+        known = "touches" in table.column_names
+        touches = table["touches"].to_numpy(zero_copy_only=False).astype(bool) if known else np.ones(len(table), bool)
         found = []
         for trial in dict.fromkeys(names.tolist()):
             own = {name: values[names == trial] for name, values in numbers.items()}
-            lowest = int(own["prediction"].argmin())
+            touching = touches[names == trial]
+            # of an untouched sensor a difference image shows noise alone, brightened
+            lowest = int(np.where(touching | ~touching.any(), own["prediction"], np.inf).argmin())
             at = {name: float(values[lowest]) for name, values in own.items()}
             found.append(
                 TrialMargins(
                     trial=trial,
                     margin=own["prediction"],
                     lowest=lowest,
+                    touching=int(touching.sum()) if known else None,
                     time_s=at["time_s"] if np.isfinite(at["time_s"]) else None,
                     interval=(at["low_90"], at["high_90"]) if np.isfinite(at["low_90"]) else None,
                 )
@@ -327,10 +338,17 @@ def _schema(trials: Sequence[Capture], metadata: dict[str, str], *, ratio: bool)
         "safety_margin": any(trial.safety_margin is not None for trial in trials),
         "traction_ratio": ratio,
         "traction_ratio_sigma": ratio,
+        "touches": all(trial.read_reference or _states(trial) for trial in trials),
         **dict.fromkeys(_FORCES, any(trial.labels is not None for trial in trials)),
     }
     columns = [pa.field(name, kind) for name, kind in _COLUMNS.items() if known.get(name, True)]
     return pa.schema(columns, metadata={"sliplens.version": __version__, **metadata})
+
+
+def _states(trial: Capture) -> tuple[ContactState, ...]:
+    """Contact states of the labels; none where they do not tell them."""
+    states = () if trial.labels is None else trial.labels.contact_state
+    return () if ContactState.UNKNOWN in states else states
 
 
 def _tables(
@@ -346,11 +364,11 @@ def _tables(
     waiting: dict[str, list] = {name: [] for name in schema.names}
     total, done = sum(trial.frames for trial in trials), 0
     # batches are encoded while the ones before are under way
-    encoded: deque[tuple[Capture, int]] = deque()
+    encoded: deque[tuple[Capture, int, list[bool]]] = deque()
     for answers in engine.answers(_encode(trained, trials, engine.batch_size, encoded)):
-        trial, first = encoded.popleft()
+        trial, first, touches = encoded.popleft()
         estimate = trained.to_estimate(*answers, friction=friction)
-        for name, values in _columns(estimate, trial, first).items():
+        for name, values in (_columns(estimate, trial, first) | {"touches": touches}).items():
             if name in waiting:
                 waiting[name].extend(values)
         if len(waiting["frame"]) >= _ROW_GROUP:
@@ -363,14 +381,22 @@ def _tables(
 
 
 def _encode(
-    trained: Run, trials: Sequence[Capture], batch_size: int, encoded: deque[tuple[Capture, int]]
+    trained: Run, trials: Sequence[Capture], batch_size: int, encoded: deque[tuple[Capture, int, list[bool]]]
 ) -> Iterator[Tensor]:
-    """Batches of encoded frames; trial and first frame of each are appended to `encoded`."""
+    """Batches of encoded frames; trial and first frame of each, and which touch, are appended to `encoded`."""
     for trial in trials:
         reference = None if trial.read_reference is None else trial.read_reference()
+        untouched = None if reference is None else soften(reference)
+        states = _states(trial)
         first, frames = 0, trial.read_frames()
         while batch := list(islice(frames, batch_size)):
-            encoded.append((trial, first))
+            if states:
+                touches = [state != ContactState.NO_CONTACT for state in states[first : first + len(batch)]]
+            elif untouched is not None:
+                touches = [picture_change(soften(frame), untouched) >= LEAST_TOUCH for frame in batch]
+            else:
+                touches = [True] * len(batch)
+            encoded.append((trial, first, touches))
             first += len(batch)
             yield trained.encode(np.stack(batch), reference)
 

@@ -33,6 +33,15 @@ def soften(frame: Frame) -> Soft:
     return (blocks / np.float32(side * side)).astype(np.float32)
 
 
+LEAST_TOUCH = 7.0
+"""Least `picture_change` that shows a contact, in grey levels: noise and lossy video change a picture by less."""
+
+
+def picture_change(softened: Soft, untouched: Soft) -> float:
+    """How far a softened picture is from that of the untouched sensor where it is farthest (98 %), in grey levels."""
+    return float(np.quantile(np.abs(softened - untouched).max(axis=-1), 0.98))
+
+
 def measure_motion(softened: Iterable[Soft]) -> Float[np.ndarray, " frames"]:
     """Mean absolute difference of each softened frame from the one before it, in grey levels; 0 for the first."""
     motion: list[float] = []
