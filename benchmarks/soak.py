@@ -49,8 +49,17 @@ from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 FAST = 96.0
 """How many times as fast as the world the stamps of the second part run."""
-METHODS = ("grad-cam", "layer-cam", "integrated-gradients", "smooth-grad", "occlusion-marker")
-"""Explainers of a few seconds: the others do the same for longer."""
+METHODS = (
+    "grad-cam",
+    "layer-cam",
+    "integrated-gradients",
+    "smooth-grad",
+    "occlusion",
+    "occlusion-marker",
+    "lrp",
+    "shapley",
+)
+"""Explainers of a few seconds; the others do the same for longer."""
 STAYS_S = 180.0
 """Time after which the visitor leaves, and comes back."""
 PATIENCE_S = 30.0
@@ -254,6 +263,8 @@ def read_on(log: Log, part: str, *, seconds: float, rate_hz: float, fast: bool) 
             did = next(tasks)()
             # as long as this step still lasts, in the beat of the whole
             time.sleep(max(0.0, begun_s + step_s * (now_s // step_s + 1) - time.monotonic()))
+            if page.feed.ended is not None:
+                raise SystemExit(f"the reading ended after {now_s:.0f} s of {seconds:.0f}: {page.feed.ended}")
             times_ms = latencies_ms.copy()
             del latencies_ms[: len(times_ms)]
             middle, late = (round(float(value), 1) for value in np.quantile(times_ms or [np.nan], (0.5, 0.99)))

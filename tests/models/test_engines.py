@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -129,6 +130,26 @@ def test_a_network_that_cannot_be_traced_is_run_as_it_is(images: Tensor):
     model = Branches().eval()
     with torch.no_grad():
         assert torch.equal(fold_batch_norm(model)(images), model(images))
+
+
+def test_a_network_that_another_thread_runs_while_one_is_folded_answers_as_before(images: Tensor):
+    other, answers = small_network(head="point").model, []
+
+    class Meanwhile(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.inner = small_network(head="point").model
+
+        def forward(self, images: Tensor) -> Tensor:
+            elsewhere = Thread(target=lambda: answers.append(other(some)))  # no proxy: numbers of its own
+            elsewhere.start()
+            elsewhere.join()
+            return self.inner(images)
+
+    some = images
+    folded = fold_batch_norm(Meanwhile().eval())
+    torch.testing.assert_close(answers[0], other(images))
+    assert not [one for one in folded.modules() if isinstance(one, nn.BatchNorm2d)]
 
 
 def test_an_unknown_engine_is_refused(networks: dict[str, Run]):

@@ -10,12 +10,13 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock, get_ident
 from typing import Any, TypeAlias
 from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor, fx, nn
 from torch.fx.experimental.optimization import fuse
 from torch.fx.proxy import TraceError
 
@@ -238,11 +239,32 @@ def fold_batch_norm(model: nn.Module) -> nn.Module:
         copied.backbone = fold_batch_norm(copied.backbone)
         return copied
     try:
-        folded = fuse(copied)
+        with _TRACING:
+            graph = _Tracer().trace(copied)
+        folded = fuse(fx.GraphModule(copied, graph), inplace=True, no_trace=True)
     except (TraceError, TypeError, NotImplementedError):  # branches on values, or takes a tensor apart
         return copied
     # folding makes new kernels; channels last as `load_checkpoint` has them
     return folded.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+
+
+_TRACING = Lock()  # of two at once each would put back what the other one changed
+
+
+class _Tracer(fx.Tracer):
+    """Tracer that lets the networks of other threads run: while torch traces, it changes what all of them call."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._thread = get_ident()
+
+    def call_module(
+        self, m: nn.Module, forward: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
+    ) -> Any:
+        """Note the call of a module of this thread, and let any other be."""
+        return (
+            super().call_module(m, forward, args, kwargs) if get_ident() == self._thread else forward(*args, **kwargs)
+        )
 
 
 def _obstacle(name: str, kind: EngineKind, model: nn.Module, images: Tensor) -> str | None:
