@@ -3,8 +3,8 @@
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from sliplens.codec import load_record, load_result, save_record, save_result
 from sliplens.errors import InputError
@@ -28,20 +28,21 @@ STRIP_METHOD = "poly-cam"
 """Method of the first picture: the one whose maps are quickest to read."""
 _BUDGET = 0.1
 """Share of the channels that Poly-CAM measures at first."""
-_STUDY: dict[str, Any] = {
-    "methods": METHODS,
-    "trials": 2,
-    "budget": _BUDGET,
-    "tests": ("score", "faithfulness"),
-    "settings": (Setting(fill="reference", unit="pixel"), Setting(fill="noisy-linear", unit="pixel")),
-    "random_orders": 3,
-    "steps": STEPS,
-}
+_study = partial(
+    run_study,
+    methods=METHODS,
+    trials=2,
+    budget=_BUDGET,
+    tests=("score", "faithfulness"),
+    settings=(Setting(fill="reference", unit="pixel"), Setting(fill="noisy-linear", unit="pixel")),
+    random_orders=3,
+    steps=STEPS,
+)
 """The study of a first look: too few trials to decide anything, as the page says, but there within minutes."""
 DEMO_SEED = 20261122
 """No seed of the data that the networks of the package were trained on."""
-_FIRST_LOOK: dict[str, Any] = {"dry_trials": 8, "wet_trials": 4, "frames_per_trial": 40, "days": 4, "test_days": 3}
-_TO_TRAIN: dict[str, Any] = {"dry_trials": 96, "wet_trials": 8, "frames_per_trial": 48, "days": 12}
+_to_look_at = partial(simulate, dry_trials=8, wet_trials=4, frames_per_trial=40, days=4, test_days=3)
+_to_train_on = partial(simulate, dry_trials=96, wet_trials=8, frames_per_trial=48, days=12)
 _OTHER_MINUTES = 3.5
 """What the path takes beside the training, on two cores."""
 _SHORTEST_TRAINING = 1.4
@@ -100,26 +101,26 @@ def run_demo(
     later = ("how well both networks read", "which explanation can be believed") + (
         ("what the network reads from real frames",) if real is not None else ()
     )
-    sizes = _FIRST_LOOK if train_minutes is None else _TO_TRAIN
-    data = simulate(folder / "data", seed=seed, on_progress=on_progress, **sizes)
+    make = _to_look_at if train_minutes is None else _to_train_on
+    data = make(folder / "data", seed=seed, on_progress=on_progress)
     networks = {name: f"chromatouch-{name}" for name in INPUTS}
     if train_minutes is not None:
         minutes = max(_SHORTEST_TRAINING, (train_minutes - _OTHER_MINUTES) / len(INPUTS))
         for name in INPUTS:
             networks[name] = str(folder / f"train-{name}")
-            recipe: dict[str, Any] = {"image_size": image_size, "epochs": 60, "max_minutes": minutes, "seed": seed}
-            train(data, networks[name], input=name, **recipe, on_progress=on_progress)
+            trained = partial(train, image_size=image_size, epochs=60, max_minutes=minutes, seed=seed)
+            trained(data, networks[name], input=name, on_progress=on_progress)
     difference, raw = networks["difference"], networks["raw"]
     _make_strip(folder / "strip", data, difference, on_progress=on_progress)
     show(*later)
     for name in INPUTS:
         evaluate(networks[name], data, folder / f"evaluate-{name}", on_progress=on_progress)
     show(*later[1:])
-    run_study(data, out=folder, difference=difference, raw=raw, **_STUDY, jobs=jobs, seed=seed, on_progress=on_progress)
+    _study(data, out=folder, difference=difference, raw=raw, jobs=jobs, seed=seed, on_progress=on_progress)
     if real is not None:
         maps = folder / "explain-real"
-        settings: dict[str, Any] = {"methods": REAL_METHODS, "budget": _BUDGET, "labels_in_names": True}
-        explain_source(difference, real, **settings, out=maps, on_progress=on_progress)
+        explain = partial(explain_source, methods=REAL_METHODS, budget=_BUDGET, labels_in_names=True)
+        explain(difference, real, out=maps, on_progress=on_progress)
         score_explained(difference, maps, out=folder / "score-real", steps=STEPS, seed=seed, on_progress=on_progress)
     return show()
 

@@ -107,10 +107,10 @@ def write_png(path: Path, pixels: UInt8[np.ndarray, "height width *channels"]) -
     Image.fromarray(pixels).save(path, format="PNG")
 
 
-def encode_png(pixels: UInt8[np.ndarray, "height width *channels"], *, compress_level: int = 1) -> bytes:
+def encode_png(pixels: UInt8[np.ndarray, "height width *channels"]) -> bytes:
     """Bytes of an image as PNG; noisy tactile frames hardly shrink above the lowest level."""
     buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=compress_level)
+    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=1)
     return buffer.getvalue()
 
 

@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
 from sliplens.errors import InputError, SaliencyError
-from sliplens.markers import compute_field, interpolate_field, track_markers
+from sliplens.markers import interpolate_field, track_markers
 from sliplens.plots.markers import (
     MarkedFrame,
     draw_fields_beside_saliency,
@@ -47,7 +47,7 @@ def test_a_field_is_coloured_by_its_length_and_a_still_one_has_no_streamlines():
 
 def test_frame_field_and_map_stand_side_by_side(tracked):
     trial, tracks = tracked
-    field = compute_field(tracks, 10, size=(224, 224))
+    field = interpolate_field(tracks.rest_px, tracks.displacement_px[10], size=(224, 224))
     rows = [MarkedFrame(title="10", frame=trial.frames[10], field=field, saliency=np.full((224, 224), 0.5))] * 2
     figure = draw_fields_beside_saliency(rows)
     assert len(figure.axes) == 2 * 3 + 2

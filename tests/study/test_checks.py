@@ -89,7 +89,7 @@ def test_the_untrained_controls_leave_the_network_as_it_is_and_go_on_after_the_l
 def test_each_trial_has_a_network_of_its_own(material: Material):
     small = replace(material, explainers={"grad-cam": material.explainers["grad-cam"]})
     found = explain_untrained(small, seed=7).maps["grad-cam-new-weights"]
-    trials = material.clusters[1].tolist()
+    trials = material.explained.clusters[1].tolist()
     for number, trial in enumerate(dict.fromkeys(trials)):
         # no two trials of this study or the next have the same
         ((_, network),) = cascade(material.trained.model, seed=7000 + number, stages=1, images=material.inputs)

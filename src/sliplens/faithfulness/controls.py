@@ -13,11 +13,11 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sliplens.arrays import require_saliency
 from sliplens.errors import InputError, ModelError
 from sliplens.explainers.cam import capture, recall_layers
 from sliplens.explainers.explanation import combine, local_change, pearson_r
 from sliplens.intervals import paired_difference
+from sliplens.results.explanation import require_saliency
 from sliplens.results.faithfulness import CHANCE, Lead
 
 _SAMPLES = 33
@@ -120,6 +120,8 @@ _QUARTER_GREY_LEVEL = 0.001
 """Added to what is divided by: where nothing changed there is nothing to compare."""
 _SEEDS_APART = 1000
 """Seeds that each network has for its layers, of which none has so many: those of no other network."""
+_NOISE_SD = 0.02
+"""Of the noise over which maps are averaged, in shares of the range of an input."""
 _BATCH_NORMS = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm)
 
 
@@ -313,7 +315,6 @@ def smooth_maps(
     model: nn.Module,
     images: Images,
     *,
-    noise_sd: float = 0.02,
     samples: int = 16,
     seed: int = 0,
 ) -> Maps:
@@ -326,6 +327,6 @@ def smooth_maps(
     generator = torch.Generator().manual_seed(seed)
     total = np.zeros((len(images), *images.shape[-2:]))
     for _ in range(samples):
-        noise = noise_sd * torch.randn(images.shape, generator=generator).to(images)
+        noise = _NOISE_SD * torch.randn(images.shape, generator=generator).to(images)
         total += explain(model, (images + noise).clamp(0, 1))
     return total / samples

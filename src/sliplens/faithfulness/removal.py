@@ -11,13 +11,13 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
-from sliplens.arrays import require_saliency
 from sliplens.errors import InputError
 from sliplens.explainers.occlusion import marker_regions, tile_regions
 from sliplens.faithfulness.fills import Fill, Painter
 from sliplens.intervals import Difference, mean_interval
 from sliplens.models.engines import Engine
 from sliplens.progress import OnProgress, counted
+from sliplens.results.explanation import require_saliency
 
 Units = Int[np.ndarray, "height width"]
 """Number of what is removed at once, a pixel, a tile or a marker, that each pixel belongs to, from 0."""

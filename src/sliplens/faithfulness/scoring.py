@@ -13,7 +13,6 @@ from jaxtyping import Float, Float64, Int, UInt8
 from scipy.stats import kendalltau
 from torch import Tensor
 
-from sliplens.arrays import require_saliency
 from sliplens.errors import InputError, SaliencyError
 from sliplens.explainers import Explanation
 from sliplens.explainers.table import network_inputs, open_run
@@ -31,6 +30,7 @@ from sliplens.faithfulness.removal import (
 from sliplens.models import Run
 from sliplens.models.engines import Engine, prepare
 from sliplens.progress import OnProgress
+from sliplens.results.explanation import require_saliency
 
 
 @dataclass(frozen=True, kw_only=True)

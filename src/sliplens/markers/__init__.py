@@ -8,24 +8,10 @@ from sliplens.markers.tracks import (
     MarkerStatus,
     TrackedFrame,
     Tracks,
-    compute_field,
     interpolate_field,
 )
 
 __all__ = [
-    "KINDS",
-    "Appearance",
-    "DisplacementField",
-    "Doublets",
-    "MarkerKind",
-    "MarkerStatus",
-    "Markers",
-    "TrackedFrame",
-    "Tracker",
-    "Tracks",
-    "compute_field",
-    "detect_markers",
-    "fit_doublets",
-    "interpolate_field",
-    "track_markers",
-]
+    "KINDS", "Appearance", "DisplacementField", "Doublets", "MarkerKind", "MarkerStatus", "Markers", "TrackedFrame",
+    "Tracker", "Tracks", "detect_markers", "fit_doublets", "interpolate_field", "track_markers",
+]  # fmt: skip

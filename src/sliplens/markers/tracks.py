@@ -206,16 +206,3 @@ def interpolate_field(
         gradient=(np.swapaxes(fit[:, 1:], 1, 2) / reach_px).reshape(*shape, 2, 2),
         confidence=(np.minimum(support, 1) / (1 + variance)).reshape(shape),
     )
-
-
-def compute_field(tracks: Tracks, frame: int, *, size: tuple[int, int], step_px: float = 8.0) -> DisplacementField:
-    """Field of one frame of a trial, from the markers that were followed.
-
-    Raises
-    ------
-    InputError
-        If there is no such frame, or fewer than 3 markers were followed into it.
-    """
-    if not 0 <= frame < len(tracks):
-        raise InputError(f"there is no frame {frame}; name one from 0 to {len(tracks) - 1}")
-    return interpolate_field(tracks.rest_px, tracks.displacement_px[frame], size=size, step_px=step_px)

@@ -7,19 +7,6 @@ from sliplens.models.onnx import export_onnx
 from sliplens.models.predictions import Predictions, predict
 
 __all__ = [
-    "ENGINES",
-    "Engine",
-    "Estimate",
-    "Manifest",
-    "Predictions",
-    "Ratio",
-    "Run",
-    "build_model",
-    "export_onnx",
-    "load",
-    "load_checkpoint",
-    "make_engine",
-    "predict",
-    "prepare",
-    "save_checkpoint",
-]
+    "ENGINES", "Engine", "Estimate", "Manifest", "Predictions", "Ratio", "Run", "build_model", "export_onnx", "load",
+    "load_checkpoint", "make_engine", "predict", "prepare", "save_checkpoint",
+]  # fmt: skip

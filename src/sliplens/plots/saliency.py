@@ -11,9 +11,8 @@ from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from sliplens.arrays import require_saliency
 from sliplens.plots.style import ORANGE, SKY, in_order
-from sliplens.results.explanation import ExplainedFrame
+from sliplens.results.explanation import ExplainedFrame, require_saliency
 
 # perceptually uniform, rises in lightness, and read alike under every common colour blindness
 COLORMAP = "inferno"

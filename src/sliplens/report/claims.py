@@ -29,6 +29,7 @@ from sliplens.report.comparisons import (
     gap_from,
     mean_at,
     removal_by_setting,
+    sentence,
     share_of_strongest,
     tell_interval,
     voting_settings,
@@ -188,16 +189,12 @@ def _over_fills(
     findings = [replace(one, outcome=one.outcome if one.where in voting else None) for one in findings]
     by_setting = {name: own for name, own in by_setting.items() if name in voting}
     names = {found: [name for name, own in by_setting.items() if own == found] for found in (*_OPPOSITE, "undecided")}
-    text = _sentence("; ".join(f"{outcome} under {listed(where)}" for outcome, where in names.items() if where))
+    text = sentence("; ".join(f"{outcome} under {listed(where)}" for outcome, where in names.items() if where))
     first = findings[0].where
     told = [f"{one.compared}: {tell_interval(one.gap)}" for one in findings if one.gap and one.where == first]
     text += f" Under {first}, {'; '.join(told)}." if told else " "
     outcome = most_of(list(by_setting.values()))
     return Answer(subject=subject, outcome=outcome, text=text, findings=tuple(findings))
-
-
-def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}."
 
 
 def _judged(where: str, gaps: Mapping[str, Difference | None]) -> list[Finding]:
@@ -311,7 +308,7 @@ def _noisiest(looks: MapQuality) -> Answer:
         if measure != "total_variation":
             compared = f"{method_name(NOISY)} against {others}"
             findings.append(Finding(where=name, compared=compared, value=decimals(own, 3), outcome="undecided"))
-    return Answer(subject=subject, outcome=rougher, text=_sentence(listed(parts)), findings=tuple(findings))
+    return Answer(subject=subject, outcome=rougher, text=sentence(listed(parts)), findings=tuple(findings))
 
 
 def _looks_at_two(truth: Truth, *, rng: np.random.Generator) -> Answer:

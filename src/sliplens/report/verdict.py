@@ -32,6 +32,7 @@ from sliplens.report.comparisons import (
     against_control,
     compare_errors,
     gap_from,
+    sentence,
     tell_interval,
     tell_sample,
     voting_settings,
@@ -166,18 +167,18 @@ def _tell_recommended(topic: str, best: Recommended, truth: Truth, faithful: Rem
     )
     if best.shown:
         text = f"Believe {name}: of {len(over) + 1} methods its map tells best what each marker adds to this answer. "
-        text += _sentence(f"{evidence}, {ahead}")
+        text += sentence(f"{evidence}, {ahead}")
         if over:
             near = min(over, key=lambda one: over[one].estimate)
             text += f" It leads the next method, {method_name(near)}, by {tell_interval(over[near], digits=2)}."
     elif best.lead.shows_something:
         tied = [f"{method_name(one)} ({tell_interval(over[one], digits=2)})" for one in best.tied]
         text = f"No method is shown to be best: {name} comes first, and {len(tied)} of {len(over)} others tie with it. "
-        text += _sentence(f"{evidence}, {ahead}")
+        text += sentence(f"{evidence}, {ahead}")
         text += f" Not told apart from it, by the lead over each: {listed(tied)}."
     else:
         text = f"None: no map is shown to tell what this network uses; the first, {name}, does not beat every control. "
-        text += _sentence(f"{evidence}, but {ahead}, not off zero")
+        text += sentence(f"{evidence}, but {ahead}, not off zero")
     if truth.reliability is not None:
         most = decimals(max(truth.reliability.estimate, 0.0) ** 0.5, 2)
         text += f" These values are themselves estimates: even a perfect map would reach {most}."
@@ -212,10 +213,6 @@ def _tell_limits(gap: Difference, overturned_by: str) -> str:
     if single:
         text += f": another {' or '.join(single)} may say otherwise"
     return f"{text}. It would be overturned by {overturned_by}."
-
-
-def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}."
 
 
 def _tell_claims(claims: Sequence[Claim], results: Results) -> list[Statement]:

@@ -5,11 +5,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, Shaped, UInt8
+from jaxtyping import Float, Float32, Float64, Shaped, UInt8
 
-from sliplens.arrays import require_saliency
 from sliplens.codec import Columns, load_record, load_result
-from sliplens.errors import InputError
+from sliplens.errors import InputError, SaliencyError
 from sliplens.files import RUN_FILE, Provenance, require_folder
 
 
@@ -89,6 +88,35 @@ class Explained:
             relevance={name: maps[chosen] for name, maps in self.relevance.items()},
             saliency={name: maps[chosen] for name, maps in self.saliency.items()},
         )
+
+
+def require_saliency(
+    saliency: Float[np.ndarray, "height width"], shape: Sequence[int], *, where: str = "the saliency map"
+) -> Float[np.ndarray, "height width"]:
+    """Return the map unchanged when it is finite and has the image's height and width, its shape in pixels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.results.explanation import require_saliency
+    >>> require_saliency(np.array([[0.0, np.nan]]), (1, 2))
+    Traceback (most recent call last):
+        ...
+    sliplens.errors.SaliencyError: the saliency map holds NaN or infinity in 1 of 2 pixels; explain the frame again, ...
+    """
+    height, width = shape
+    if saliency.shape != (height, width):
+        raise SaliencyError(
+            f"{where} has shape {tuple(saliency.shape)} but its image is {height} x {width} pixels; "
+            "explain the same frames that are scored"
+        )
+    bad = int(np.size(saliency) - np.count_nonzero(np.isfinite(saliency)))
+    if bad:
+        raise SaliencyError(
+            f"{where} holds NaN or infinity in {bad} of {saliency.size} pixels; "
+            "explain the frame again, or drop it from the set"
+        )
+    return saliency
 
 
 def is_explained(folder: Path) -> bool:

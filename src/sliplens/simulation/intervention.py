@@ -312,14 +312,14 @@ def put_markers_back(film: Film, frame: int, back: Bool[np.ndarray, "variants ma
 
 
 def draw_with_markers_back(
-    film: Film, frame: int, back: Bool[np.ndarray, "variants markers"], *, device: str | torch.device = "cpu"
+    film: Film, frame: int, back: Bool[np.ndarray, "variants markers"]
 ) -> UInt8[Tensor, "variants height width 3"]:
     """Draw a frame with markers put back (`put_markers_back`), once for each choice of them.
 
     With none put back it is the frame as it is stored.
     """
     changed = put_markers_back(film, frame, back)
-    return torch.cat([changed.draw(part, device=device) for part in batches(len(back), device=device)])
+    return torch.cat([changed.draw(part) for part in batches(len(back), device="cpu")])
 
 
 def marker_outlines(film: Film, frame: int) -> Outlines:
@@ -339,32 +339,32 @@ _NEAREST_END = 0.02
 
 
 def marker_readings(
-    trial: FilmedTrial, frame: int, *, noise_px: float = NOISE_PX
+    trial: FilmedTrial, frame: int
 ) -> tuple[Int[np.ndarray, " markers"], Float[np.ndarray, " markers"]]:
     """Part of each marker that lies wholly in the image in the best reading of a frame's margin.
 
     Gives numbers of the markers, and the reading as it is less the reading with that marker put back, in margin units.
     """
-    gain, _ = _best_reading(trial, frame, noise_px)
+    gain, _ = _best_reading(trial, frame)
     motion, seen = trial.film.motion, visible_markers(trial.plan.recipe.sensor)
     moved = (motion.centres_px[frame] - motion.rest_px)[seen]
     return seen, (gain.reshape(-1, 2) * moved).sum(axis=1)
 
 
-def reading_slope(trial: FilmedTrial, frame: int, *, noise_px: float = NOISE_PX) -> float:
+def reading_slope(trial: FilmedTrial, frame: int) -> float:
     """Rise of the best reading over that of the margin, where friction alone changes and the forces stay.
 
     It is told from the same markers whether the margin or the friction differs, and how far the reader expects each:
     below 1 the best reader, too, ascribes a part of what it sees to the friction. With friction mu and the same forces
     d log(mu) = d Gamma / (1 - Gamma).
     """
-    gain, sensitivity = _best_reading(trial, frame, noise_px)
+    gain, sensitivity = _best_reading(trial, frame)
     moved = dict(zip(sensitivity.unknowns, sensitivity.jacobian[0].T, strict=True))
     used = max(1 - float(trial.loading.safety_margin[frame]), _NEAREST_END)
     return float(gain @ (moved[MARGIN] + moved["log_friction"] / used))
 
 
-def _best_reading(trial: FilmedTrial, frame: int, noise_px: float) -> tuple[np.ndarray, Sensitivity]:
+def _best_reading(trial: FilmedTrial, frame: int) -> tuple[np.ndarray, Sensitivity]:
     """Gain of the best linear reading of a frame, and what it rests on."""
     recipe, margin = trial.plan.recipe, float(trial.loading.safety_margin[frame])
     if np.isnan(margin):
@@ -378,5 +378,5 @@ def _best_reading(trial: FilmedTrial, frame: int, noise_px: float) -> tuple[np.n
         displacement=recipe.resolved_displacement,
     )
     prior = prior_sigma(recipe.nuisances, wet=trial.plan.condition == "wet")
-    gain = reading_gain(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=noise_px, prior=prior)
+    gain = reading_gain(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=NOISE_PX, prior=prior)
     return gain, sensitivity

@@ -78,17 +78,13 @@ def simulate_trial(
 
 
 def simulate_examples(
-    recipe: SimulationRecipe,
-    *,
-    count: int = 4,
-    device: str | torch.device = "cpu",
-    on_progress: OnProgress | None = None,
+    recipe: SimulationRecipe, *, device: str | torch.device = "cpu", on_progress: OnProgress | None = None
 ) -> list[Recording]:
-    """Simulate a few trials, `count` at most, that show the range of a recipe, a wet one last."""
+    """Simulate four trials at most that show the range of a recipe, a wet one last."""
     plans = plan_trials(recipe)
     dry = [plan for plan in plans if plan.condition == "dry"]
     wet = [plan for plan in plans if plan.condition == "wet"][:1]
-    shown = min(count - len(wet), len(dry))
+    shown = min(4 - len(wet), len(dry))
     chosen = [dry[index * (len(dry) - 1) // max(1, shown - 1)] for index in range(shown)] + wet
     return [simulate_trial(plan, device=device) for plan in counted(chosen, on_progress)]
 

@@ -51,18 +51,22 @@ _NORMAL_QUARTILE = 0.6745
 """Median size of a standard normal number."""
 
 
+_REPEATED, _REDRAWN = 3, 2
+"""Frames that are explained again for the stability of maps, and for networks with new weights."""
+
+
 def measure_maps(
-    material: Material, data: Dataset, *, repeated: int = 3, seed: int = 0, on_progress: OnProgress | None = None
+    material: Material, data: Dataset, *, seed: int = 0, on_progress: OnProgress | None = None
 ) -> MapQuality:
     """Measure resolution, smoothness, sparsity and stability of the maps.
 
     Stability is the correlation with the map of the same frame under other camera noise, as large as what differs
-    between frames that follow each other, and with the map of the next frame; so the first `repeated` frames are
-    explained twice more.
+    between frames that follow each other, and with the map of the next frame; so the first frames are explained
+    twice more.
     """
     explained, rng = material.explained, np.random.default_rng(seed)
-    noisy, following, noise_sd = _once_more(material.trained, data, material.chosen[:repeated], rng=rng)
-    references = material.references[:repeated]
+    noisy, following, noise_sd = _once_more(material.trained, data, material.chosen[:_REPEATED], rng=rng)
+    references = material.references[:_REPEATED]
     methods, roughness, clusters = {}, {}, explained.clusters
     for name, explainer in counted(material.explainers.items(), on_progress):
 
@@ -70,7 +74,7 @@ def measure_maps(
             return explainer(material.trained.model, images, reference=references).relevance.double().cpu().numpy()
 
         maps = explained.saliency[name].astype(np.float64)
-        before = explained.relevance[name][:repeated].astype(np.float64)
+        before = explained.relevance[name][:_REPEATED].astype(np.float64)
         resolutions = [
             resolution(saliency, material.places(frame.id)[0])
             for saliency, frame in zip(maps, explained.frames, strict=True)
@@ -189,11 +193,9 @@ _STILL_SIMILAR = 0.5
 Maps = Float[np.ndarray, "frames height width"]
 
 
-def randomise_weights(
-    material: Material, *, frames: int = 2, seed: int = 0, on_progress: OnProgress | None = None
-) -> Randomisation:
+def randomise_weights(material: Material, *, seed: int = 0, on_progress: OnProgress | None = None) -> Randomisation:
     """Explain networks with weights drawn anew from the output on, to see how far the maps of a few frames change."""
-    inputs, references = material.inputs[:frames], material.references[:frames]
+    inputs, references = material.inputs[:_REDRAWN], material.references[:_REDRAWN]
     methods, alarms = {}, []
     for name, whole in counted(material.explainers.items(), on_progress):
         explainer = _shortened(whole)
@@ -208,7 +210,7 @@ def randomise_weights(
             inputs,
             seed=seed,
             stages=CASCADE,
-            before=material.towards_target(name)[:frames],
+            before=material.towards_target(name)[:_REDRAWN],
         )
         seconds = (time.perf_counter() - started) / CASCADE / len(inputs)
         similarity = tuple(mean_of_known(row) for row in scores.similarity)
@@ -298,7 +300,7 @@ def explain_untrained(
 
     maps: dict[str, Float32[np.ndarray, "frames size size"]] = {}
     jobs, total = 0, len(inputs) * len(material.explainers)
-    _, trials = material.clusters
+    _, trials = material.explained.clusters
     for number, trial in enumerate(dict.fromkeys(trials.tolist())):
         frames = np.flatnonzero(trials == trial).tolist()
         on_frame = continued(on_progress, before=jobs, total=total)

@@ -7,7 +7,7 @@ from itertools import groupby
 from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 from torch import Tensor
 
 from sliplens.errors import ImageError, InputError, RecordingError
@@ -296,11 +296,6 @@ class Material:
     """By frame, in camera pixels; frames in which none could be followed are absent."""
     explainers: Mapping[str, Explainer]
     """By name, with the options that made the maps."""
-
-    @property
-    def clusters(self) -> Shaped[np.ndarray, "2 frames"]:
-        """Day and trial of each frame."""
-        return self.explained.clusters
 
     def towards_target(self, method: str) -> Float[np.ndarray, "frames size size"]:
         """The part of a method's relevance that works towards each frame's target."""

@@ -351,12 +351,12 @@ def score_removal(
         curves[setting] = {name: Faithfulness(areas=kept.areas, curves=own) for name, own in kept.curves.items()}
     whole = answer_whole(predict, inputs, batch_size=64)
     blank = {setting.fill: _answer_blank(predict, material, setting.fill, seed) for setting in known}
-    scores, comparisons = judge_curves(curves, clusters=material.clusters, seed=seed)
+    scores, comparisons = judge_curves(curves, clusters=explained.clusters, seed=seed)
     return RemovalScores(
         input=explained.input,
         source=explained.source,
         frames=len(inputs),
-        trials=len(set(material.clusters[1].tolist())),
+        trials=len(set(explained.clusters[1].tolist())),
         random_orders=random_orders,
         fills=tuple(dict.fromkeys(setting.fill for setting in curves)),
         units=tuple(dict.fromkeys(setting.unit for setting in curves)),

@@ -246,8 +246,8 @@ def _common_scale(points: Float32[np.ndarray, "frames height width"]) -> float:
     return max(full_colour(finite), _LEAST) if len(finite) else _LEAST
 
 
-def _short(name: str, longest: int = 22) -> str:
-    return name if len(name) <= longest else f"\N{HORIZONTAL ELLIPSIS}{name[1 - longest :]}"
+def _short(name: str) -> str:
+    return name if len(name) <= 22 else f"\N{HORIZONTAL ELLIPSIS}{name[-21:]}"
 
 
 def _show_first(folder: Path, ids: Sequence[str], on_progress: OnProgress | None) -> OnMap:

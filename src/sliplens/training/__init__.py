@@ -7,14 +7,6 @@ from sliplens.training.metrics import lead_times, regression_scores
 from sliplens.training.module import make_trainer
 
 __all__ = [
-    "RECIPES",
-    "TrainConfig",
-    "evaluate",
-    "evaluate_frames",
-    "fit",
-    "get_recipe",
-    "lead_times",
-    "make_trainer",
-    "regression_scores",
-    "train",
-]
+    "RECIPES", "TrainConfig", "evaluate", "evaluate_frames", "fit", "get_recipe", "lead_times", "make_trainer",
+    "regression_scores", "train",
+]  # fmt: skip

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from sliplens.arrays import require_saliency
 from sliplens.errors import SaliencyError
+from sliplens.results.explanation import require_saliency
 
 
 def test_a_map_that_fits_passes_unchanged():
