@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sliplens.errors import InputError
+from sliplens.grip.fingertip import Fingertip
 from sliplens.live import MarkerReading, SlipDetector, SlipLimits, SlipState
 
 RATE_HZ = 60.0
@@ -109,3 +110,20 @@ def test_too_few_markers_and_limits_that_cannot_be_are_told():
         SlipDetector(REST[:5])
     with pytest.raises(InputError, match="the slip limit window_s must be positive, got 0"):
         SlipLimits(window_s=0.0)
+
+
+def test_a_gripper_that_tightens_and_loosens_does_not_pass_for_a_slip_and_a_slip_is_told(rng: np.random.Generator):
+    tip = Fingertip(seed=int(rng.integers(100)))
+    grip = np.interp(
+        np.arange(400), [20, 40, 70, 100, 130, 133, 160, 200, 203, 240], [0, 2, 2, 1, 1.1, 2, 1.2, 1.3, 2.2, 1]
+    )
+    pulled = np.interp(np.arange(400), [45, 60], [0, 0.6])
+    friction = np.where(np.arange(400) < 300, 0.7, 0.25)  # of a sudden it slides
+    margins = 1 - np.minimum(1, pulled / np.maximum(friction * grip, 1e-9))
+    film = tip.film(grip, friction=friction, margins=margins)
+    detector = SlipDetector(film.marker_rest_px)
+    places = film.marker_px + rng.normal(0, 0.05, film.marker_px.shape)
+    said = [detector.update(place, number / 30).state for number, place in enumerate(places)]
+    assert SlipState.SLIP not in said[:300]
+    assert set(said[60:300]) == {SlipState.STICKING}
+    assert SlipState.SLIP in said[300:304]

@@ -76,11 +76,11 @@ class SlipDetector:
 
     When a contact slips, friction falls from its static to its kinetic value and the stretched skin springs back
     against the pull within some hundredths of a second. So a slip is told where the markers move back along the pattern
-    in which they were sheared before, while the contact is pressed as before, and where what is left of that motion
-    besides the best rigid one still follows the pattern: a camera that moves takes all markers along. The pattern is
-    the mean shear of the last moments; projected on it, dozens of markers of a tenth of a pixel's noise tell a recoil
-    of a few hundredths. Old and new frames are told apart where they differ most, in units of what the sensor showed in
-    its first still moments.
+    in which they were sheared before, and where what is left of that motion besides the best rigid one still follows
+    the pattern: a camera that moves takes all markers along. The pattern is the mean shear of the last moments;
+    projected on it, dozens of markers of a tenth of a pixel's noise tell a recoil of a few hundredths. Old and new
+    frames are told apart where they differ most, in units of what the sensor showed in its first still moments. What
+    the press moves is projected out of all that: a gripper tightens and loosens all the time.
 
     What it cannot tell: a contact that slides on evenly looks as one that holds, and one whose friction does not fall
     has no recoil; after a slip it says "cannot tell" until the shear grows again. A load that is taken away as fast as
@@ -247,34 +247,58 @@ class SlipDetector:
         """Time at which the skin began to spring back; None where it did not, or where that tells no slip."""
         if self._pattern is None or len(self._window) < 2:
             return None
+        assert self._hold is not None
         fields = np.stack([field for *_, field in self._window])
         known = np.isfinite(fields[..., 0]).all(axis=0) & np.isfinite(self._pattern[:, 0])
-        pattern = self._pattern[known]
+        if known.sum() < _FEWEST:
+            return None
+        # a grip that is tightened or loosened moves the markers as its press did
+        press = _press_motions(self._rest[known], self._hold[known])
+        pattern = self._pattern[known].ravel()
+        pattern = pattern - press.T @ (press @ pattern)
         length = float(np.linalg.norm(pattern))
-        if known.sum() < _FEWEST or length < 2 * self.limits.recoil * usual.together_px:
+        if length < 2 * self.limits.recoil * usual.together_px:
             return None  # of so little shear the pattern is noise
-        pattern = pattern.ravel() / length
+        pattern = pattern / length
         rigid = _rigid_motions(self._rest[known])
         bent = pattern - rigid.T @ (rigid @ pattern)
         left = max(float(np.linalg.norm(bent)), 1e-9)
-        directions = np.stack([pattern, bent / left], axis=1)
-        heights = fields[:, known].reshape(len(fields), -1) @ directions
+        heights = fields[:, known].reshape(len(fields), -1) @ np.stack([pattern, bent / left], axis=1)
         old = np.arange(1, len(fields))[:, None]
         total = np.cumsum(heights, axis=0)
         drop_px = total[:-1] / old - (total[-1] - total[:-1]) / (len(fields) - old)
         ratio = drop_px / np.sqrt(1 / old + 1 / (len(fields) - old)) / [usual.together_px, usual.noise_px]
         cut = int(ratio[:, 0].argmax())
         whole, bending = ratio[cut].tolist()
+        drop = float(drop_px[cut, 0])
         # a large motion must show more than noise that happens to bend
-        if drop_px[cut, 0] < self.limits.fall * length or whole < self.limits.recoil:
-            return None
-        if bending < max(self.limits.evidence, _BENT_SHARE * left * whole):
-            return None
+        springs = drop >= self.limits.fall * length and whole >= self.limits.recoil
+        bends = bending >= max(self.limits.evidence, _BENT_SHARE * left * whole)
+        found = springs and bends and not self._is_handled(fields, cut + 1, known, drop / np.sqrt(known.sum()), usual)
+        return self._window[cut][0] if found else None
+
+    def _is_handled(
+        self,
+        fields: Float[np.ndarray, "frames markers 2"],
+        cut: int,
+        known: Bool[np.ndarray, " markers"],
+        drop_px: float,
+        usual: _Usual,
+    ) -> bool:
+        """Whether the contact was let go, pressed or pulled further from a frame of the window on."""
         spreads = np.array([spread for _, spread, _ in self._window])
-        pressed = abs(float(spreads[: cut + 1].mean() - spreads[cut + 1 :].mean()))
-        if pressed / 2 * self._reach_px > drop_px[cut, 0] / np.sqrt(known.sum()):
-            return None  # let go, or pressed further
-        return self._window[cut][0]
+        pressed = abs(float(spreads[:cut].mean() - spreads[cut:].mean()))
+        inner = known & self._inner
+        middle = fields[:, inner if inner.any() else known].mean(axis=1)
+        before, after = (float(np.linalg.norm(part.mean(axis=0))) for part in (middle[:cut], middle[cut:]))
+        pulled = after > before + self.limits.recoil * self._middle_noise_px(usual)
+        return bool(pulled or pressed / 2 * self._reach_px > drop_px)
+
+
+def _press_motions(places_px: Field, pressed_px: Field) -> Float[np.ndarray, "motions coordinates"]:
+    """What the press moved, and a spread from the middle, as unit vectors that are orthogonal to each other."""
+    arm = places_px - places_px.mean(axis=0)
+    return np.linalg.qr(np.stack([pressed_px.ravel(), arm.ravel()], axis=1))[0].T
 
 
 def _rigid_motions(places_px: Field) -> Float[np.ndarray, "3 coordinates"]:
