@@ -7,11 +7,12 @@ drawn again 400 times, the same for all controllers. With `--json` the last line
 """
 
 import argparse
+import itertools
 import json
 import os
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 # as the command line does; must be set before torch is imported
@@ -29,6 +30,7 @@ from sliplens.grip import (
     RenderedEyes,
     Scripts,
     TableEyes,
+    Tick,
     draw_scripts,
     load_readings,
     make_controller,
@@ -37,6 +39,7 @@ from sliplens.grip import (
 )
 from sliplens.grip.readings import ReadingTable
 from sliplens.models import load
+from sliplens.results.grip import EpisodeTable
 
 SEED = 500_000
 CHOSEN = 64
@@ -167,27 +170,65 @@ def rendered_rate(ticks: int = 120) -> float:
     return ticks / (time.perf_counter() - begin)
 
 
-def validate(count: int, conditions: Sequence[str]) -> dict[str, object]:
-    """Close the loop through pixels with fingertips of the table, and read the table at every state on the way."""
-    differences, noise = [], READINGS.noise
+def validate(count: int, conditions: Sequence[str], rng: np.random.Generator) -> dict[str, object]:
+    """Run episodes through pixels with fingertips of the table, and again with what the table has of the same ones.
+
+    Differences are pixels less table: of the margins read at every state that the loop through pixels went through
+    after the lift, and of what became of the episodes. Intervals (95 %) are over fingertips and over episodes.
+    """
+    gaps: list[np.ndarray] = []
+    forces: list[np.ndarray] = []
+    pairs: list[tuple[EpisodeTable, EpisodeTable]] = []
     for pair in range(count):
         scripts = draw_scripts("cup", conditions[pair % len(conditions)], episodes=1, seed=SEED + pair)
-        eyes = RenderedEyes(RUN, seed=READINGS.seed + 2 * pair)
-        loop = GripLoop(Plant(OBJECTS["cup"]), eyes, make_controller("margin"))
-        for _ in range(round(3.5 * 60)):
-            state = loop.plant.state
-            sight = loop.tick(scripts.world(state.time_s)).sight
-            if state.time_s > 0.6:  # lifted
-                tips, force = 2 * pair + np.arange(2), np.full(2, state.force_n[0])
-                read, *_ = READINGS.read(tips, force, friction=state.holding_friction[0], margins=state.margin[0])
-                differences.append(sight.margin[0] - read)
-    gap = np.array(differences)
+        scripts = replace(scripts, fingertips=np.array([float(pair)]))
+        ticks: list[Tick] = []
+        seen = GripLoop(
+            Plant(OBJECTS["cup"]), RenderedEyes(RUN, seed=READINGS.seed + 2 * pair), make_controller("margin")
+        )
+        looked_up = GripLoop(
+            Plant(OBJECTS["cup"]),
+            TableEyes(READINGS, fingertips=scripts.fingertips, rng=np.random.default_rng(pair)),
+            make_controller("margin"),
+        )
+        pairs.append((run_scripts(seen, scripts, on_tick=ticks.append), run_scripts(looked_up, scripts)))
+        held = [
+            (before.state, now.sight.margin[0])
+            for before, now in itertools.pairwise(ticks)
+            if before.state.time_s > 0.6 and not before.state.dropped[0]
+        ]
+        force = np.array([np.full(2, state.force_n[0]) for state, _ in held])
+        friction, margins = (
+            np.array([getattr(state, name)[0] for state, _ in held]) for name in ("holding_friction", "margin")
+        )
+        read, *_ = READINGS.read(2 * pair + np.arange(2), force, friction=friction, margins=margins)
+        gaps.append(np.array([margin for _, margin in held]) - read)
+        forces.append(force)
     return {
-        "fingertips": 2 * count,
-        "bias": round(float(gap.mean()), 4),
-        "rms": round(float(np.sqrt((gap**2).mean())), 4),
-        "noise_of_the_table": round(noise, 4),
-    }
+        "episodes": count,
+        "bias": _over(np.concatenate([gap.mean(axis=0) for gap in gaps]), rng),
+        "rms": _over(np.concatenate([(gap**2).mean(axis=0) for gap in gaps]), rng, then=np.sqrt),
+        "rms_by_force": {
+            f"{low:g} to {high:g} N": round(float(np.sqrt((near**2).mean())), 4)
+            for low, high in itertools.pairwise((0.0, 1.5, 2.5, 3.0, 3.5, 4.1))
+            if len(near := np.concatenate(gaps)[(np.concatenate(forces) >= low) & (np.concatenate(forces) < high)])
+        },
+        "noise_of_the_table": round(READINGS.noise, 4),
+        "mean_force_n": _over(np.array([float((a.mean_force_n - b.mean_force_n)[0]) for a, b in pairs]), rng),
+        "slip_mm": _over(np.array([1e3 * float((a.slip_m - b.slip_m)[0]) for a, b in pairs]), rng),
+        "dropped": {
+            "pixels": sum(int(a.dropped[0]) for a, _ in pairs), "table": sum(int(b.dropped[0]) for _, b in pairs)
+        },
+    }  # fmt: skip
+
+
+def _over(
+    values: np.ndarray, rng: np.random.Generator, then: Callable[[np.ndarray], np.ndarray] = np.asarray
+) -> dict[str, float | None]:
+    """Mean of independent values with its interval, both turned into another unit at the end."""
+    means = values[rng.integers(len(values), size=(_DRAWS, len(values)))].mean(axis=1)
+    low, high = then(np.quantile(means, (0.025, 0.975)))
+    return {"estimate": _number(float(then(values.mean()))), "low": _number(low), "high": _number(high)}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -248,7 +289,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             own = hold("margin", {}, fewer, friction=tell(how, fewer, rng))
             found["friction_told"][how] = {name: compare(own, beside, one, rng) for name, one in groups.items()}
     if options.rendered:
-        found["validation"] = validate(options.rendered, conditions)
+        found["validation"] = validate(options.rendered, conditions, rng)
     for name, value in found.items():
         print(f"{name}: {json.dumps(value)}")
     if options.json:

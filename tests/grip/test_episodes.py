@@ -245,6 +245,7 @@ def test_an_interrupted_run_goes_on_to_the_same_record(tmp_path: Path, monkeypat
         ({"script": {"weight": 1.0}}, "an episode has no weight; choose of"),
         ({"script": {"mass_kg": 0.0}}, "mass_kg must be above 0, got 0"),
         ({"latency_s": -1.0}, "latency and error scale must not be negative"),
+        ({"method": "guess", "rendered": True}, "there is no method named 'guess'"),
     ],
 )
 def test_what_cannot_be_run_is_told_in_a_sentence(options, told):

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError
-from sliplens.explainers import explain
+from sliplens.explainers import explain, get_explainer
 from sliplens.files import output_folder, to_builtins
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.grip.controllers import Controller, make_controller
@@ -127,9 +127,11 @@ def run_episodes(
         raise InputError("latency and error scale must not be negative; give 0 or more")
     held = pick_object(object)
     if isinstance(controller, str):
-        make_controller(controller, settings)  # a mistake is told before anything is measured
+        make_controller(controller, settings)  # mistakes are told before anything is measured
     elif settings:
         raise InputError("settings are for the controllers of the table; set those of your own where you make it")
+    if method is not None:
+        get_explainer(method)
     told: Friction | Literal["each"] | None = None
     if friction is not None:
         told = "each" if isinstance(friction, str) and friction == "each" else as_friction(friction)

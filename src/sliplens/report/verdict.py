@@ -8,6 +8,7 @@ from itertools import combinations
 from typing import Literal
 
 import numpy as np
+from scipy.stats import binomtest
 
 from sliplens.intervals import FEWEST_UNITS, Difference
 from sliplens.plots.style import (
@@ -40,6 +41,7 @@ from sliplens.report.comparisons import (
 from sliplens.report.results import Results
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionScores, Lead, RemovalScores
+from sliplens.results.grip import Grip
 from sliplens.results.study import Localisation, Truth
 
 Tone = Literal["good", "plain", "caution"]
@@ -92,10 +94,29 @@ def judge(results: Results, *, claims: Sequence[Claim] = (), rng: np.random.Gene
             statements.append(_what_deletion_measures(results))
     real = {name: one for (name, source), one in results.explanations.items() if source == "real"}
     statements += [_real_touch(real[name]) for name in inputs_in_order(real)]
+    statements += [_tell_grip(results.grip)] if results.grip is not None else []
     statements += _tell_scale(results)
     if study.choice is not None and not study.choice.sound:
         statements = [replace(one, tone="plain") if one.tone == "good" else one for one in statements]
     return tuple(sorted(statements, key=lambda one: one.tone == "caution"))
+
+
+def _tell_grip(grip: Grip) -> Statement:
+    """What became of what was held, and how much harder than needed it was pressed."""
+    table, setup, count = grip.episodes, grip.setup, len(grip.episodes)
+    excess = f"{percent(float(table.force_excess.mean()))} harder than the least force that holds"
+    if count == 1:
+        fate = f"fell, pressed {excess}" if table.dropped[0] else f"was held, pressed {excess}"
+        text = f"The {setup.object} {fate}. One simulated episode ({setup.condition}): more of them tell how often."
+        return Statement(topic="The grip", text=text)
+    fell = int(table.dropped.sum())
+    low, high = binomtest(fell, count).proportion_ci(method="wilson")
+    text = (
+        f"Of {count:,} episodes ({setup.object}, {setup.condition}) {percent(fell / count, digits=1)} ended in a fall "
+        f"({percent(low, digits=1)} to {percent(high, digits=1)}); the controller {setup.controller} pressed {excess}."
+        " All are simulated; another controller has to be run on the same seed to be compared."
+    )
+    return Statement(topic="The grip", text=text)
 
 
 def tell_too_few(results: Results) -> str:
