@@ -1,6 +1,7 @@
 """Fixtures that several tests share."""
 
 import os
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from sliplens.models.calibration import Calibration, Traction
 from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
+from sliplens.shards import EXECUTORS
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SimulationRecipe, plan_trials, simulate_trial
 
 # the same examples every time: a change is judged by its own doing, and a failure can be looked at again
@@ -110,6 +112,14 @@ def difference_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def raw_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save_untrained(tmp_path_factory.mktemp("raw-run"), kind="raw", seed=1)
+
+
+@pytest.fixture
+def elsewhere(monkeypatch: pytest.MonkeyPatch) -> str:
+    """A place to work that gets what another process gets, without the seconds in which that imports torch."""
+    serial = EXECUTORS["serial"]
+    monkeypatch.setitem(EXECUTORS._rows, "elsewhere", lambda work, _: serial(pickle.loads(pickle.dumps(work)), ""))  # noqa: S301
+    return "elsewhere"
 
 
 @pytest.fixture

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sliplens.recordings.importing import import_recordings, label_dataset
     from sliplens.recordings.splits import split_dataset
     from sliplens.report.page import write_report
+    from sliplens.shards import read_status
     from sliplens.simulation.sharing import compare_datasets
     from sliplens.simulation.trials import simulate
     from sliplens.study.diagnose import diagnose
@@ -52,6 +53,7 @@ _MODULES = {
     "plot": "sliplens.plots.figure",
     "predict": "sliplens.models.predictions",
     "read_live": "sliplens.live.loop",
+    "read_status": "sliplens.shards",
     "run_episodes": "sliplens.grip.episodes",
     "run_study": "sliplens.study.run",
     "score": "sliplens.faithfulness.scoring",
@@ -83,6 +85,7 @@ __all__ = [
     "plot",
     "predict",
     "read_live",
+    "read_status",
     "run_episodes",
     "run_study",
     "score",

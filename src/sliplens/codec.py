@@ -354,8 +354,22 @@ def _table_writer(part: Path, schema: pa.Schema, suffix: str) -> Any:
     return _JsonWriter(part) if suffix == ".json" else pq.ParquetWriter(part, schema, compression="zstd")
 
 
+def regrouped(tables: Iterable[pa.Table], *, rows: int) -> Iterator[pa.Table]:
+    """The same rows in tables of so many at least, but for the last."""
+    waiting: list[pa.Table] = []
+    for table in tables:
+        waiting.append(table)
+        if sum(map(len, waiting)) >= rows:
+            yield pa.concat_tables(waiting)
+            waiting = []
+    if waiting:
+        yield pa.concat_tables(waiting)
+
+
 def read_written(path: Path, schema: pa.Schema) -> pa.Table:
-    """Read a table that `write_tables` wrote."""
+    """Read a table that `write_tables` wrote, or a data set of such, a folder a trial."""
+    if path.is_dir():
+        return pa.concat_tables([pq.ParquetFile(part).read() for part in sorted(path.glob("*=*/*.parquet"))])
     if path.suffix == ".csv":
         return pa_csv.read_csv(path, convert_options=pa_csv.ConvertOptions(column_types=schema))
     if path.suffix == ".json":

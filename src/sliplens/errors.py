@@ -1,5 +1,7 @@
 """The exceptions sliplens raises for mistakes a user can mend; each message is one sentence with the cure."""
 
+from collections.abc import Mapping
+
 
 class SliplensError(Exception):
     """Base of every error that is the user's to mend; the command line prints it and exits with code 2."""
@@ -25,6 +27,17 @@ class CheckpointError(InputError):
     """A checkpoint that is incomplete, damaged, or does not fit the data it is asked about."""
 
 
+class ShardError(SliplensError):
+    """Some of many shards failed again and again, while all others were done; the command line exits with code 1."""
+
+    def __init__(self, why: Mapping[str, str], *, shards: int) -> None:
+        self.why = dict(why)
+        """Sentence of each shard by its name."""
+        each = "".join(f"\n  {name}: {sentence}" for name, sentence in self.why.items())
+        failed = f"{len(self.why)} of {shards} could not be done, all others are"
+        super().__init__(f"{failed}; mend what is wrong and give the same command with --retry-failed:{each}")
+
+
 class ContactError(SliplensError):
     """A physical parameter or load that cannot occur."""
 
@@ -39,5 +52,5 @@ class SaliencyError(SliplensError):
 
 __all__ = [
     "CheckpointError", "ContactError", "ImageError", "InputError", "ModelError", "RecordingError", "SaliencyError",
-    "SliplensError", "SourceError",
+    "ShardError", "SliplensError", "SourceError",
 ]  # fmt: skip

@@ -106,6 +106,13 @@ def hash_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+def hash_tree(path: Path) -> str:
+    """SHA-256 of a file's bytes, or of the names and bytes of all files below a folder."""
+    if path.is_file():
+        return hash_file(path)
+    return hash_json({str(one.relative_to(path)): hash_file(one) for one in path.rglob("*") if one.is_file()})
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write a value as indented JSON, beside the target first, so that no half-written file is ever seen."""
     part = path.with_name(path.name + ".part")
@@ -264,7 +271,7 @@ def output_folder(
     config_hash = hash_json({"stage": stage, "config": recipe, "sliplens": __version__})
     aside = _aside(target)
     if aside.exists():  # whoever replaced it was killed, before or after the new one took its place
-        with _held(partial_folder(target), target):  # or is about to put it there
+        with held_folder(partial_folder(target), target):  # or is about to put it there
             if aside.exists():
                 shutil.rmtree(aside) if target.exists() else aside.rename(target)
             with suppress(OSError):  # what was begun stays
@@ -279,7 +286,7 @@ def output_folder(
         yield Output(folder=target, complete=True)
         return
     partial = partial_folder(target)
-    with _held(partial, target):
+    with held_folder(partial, target):
         state = partial / ".recipe"
         if not (resumable and state.is_file() and state.read_text() == config_hash):
             _empty(partial)
@@ -308,7 +315,7 @@ def output_folder(
 
 
 @contextmanager
-def _held(partial: Path, target: Path) -> Iterator[None]:
+def held_folder(partial: Path, target: Path) -> Iterator[None]:
     """Make the folder in which a target is made, and keep other processes out of it."""
     try:
         partial.mkdir(parents=True, exist_ok=True)

@@ -66,7 +66,7 @@ def stage(on_progress: OnProgress | None, title: str) -> Iterator[OnProgress]:
         with on_progress.stage(title) as count:
             yield count
     else:
-        yield on_progress or _ignore
+        yield on_progress or ignore
 
 
 def wrote(on_progress: OnProgress | None, path: Path, what: str, *, kept: bool = False) -> None:
@@ -127,7 +127,7 @@ def counted(items: Collection[Item], on_progress: OnProgress | None) -> Iterator
             on_progress(done, len(items))
 
 
-def _ignore(done: int, total: int) -> None:
+def ignore(_done: int, _total: int) -> None:
     """Show nothing."""
 
 

@@ -110,7 +110,7 @@ def test_colours_of_the_thesis(difference_run: Path, difference_folder: Path, tm
 def test_a_budget_reaches_poly_cam(difference_run: Path, difference_folder: Path, tmp_path: Path, monkeypatch):
     seen = []
 
-    def explain(trained, chosen, *, methods, explainers, parts, on_map, on_progress):
+    def explain(trained, chosen, *, explainers, **_):
         seen.append(explainers["poly-cam"].budget)
         raise KeyboardInterrupt
 

@@ -1,24 +1,29 @@
 """Predictions: those of the network, one frame at a time, from every kind of source."""
 
+import shutil
 import weakref
 from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from sliplens.errors import ImageError, InputError, RecordingError
+from sliplens.errors import ImageError, InputError, RecordingError, ShardError
 from sliplens.images import absolute_difference, write_png
 from sliplens.models import Run, load_checkpoint
+from sliplens.models.predictions import Predictions
 from sliplens.models.predictions import predict as predict_source
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.capture import Capture
+from sliplens.recordings.dataset import trial_path
 from sliplens.recordings.formats.lerobot_export import write_lerobot
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.trial import ContactState
+from sliplens.shards import read_status
 
 TRIAL = "test-wet-7"
 
@@ -311,3 +316,41 @@ def test_a_recording_brings_its_own_reference_and_labels_unless_told_otherwise(
     assert rows["safety_margin"] == [None, *wet.safety_margin[1:].tolist()]
     rows = predict(made, trained, tmp_path / "b.parquet", reference_frame=2)
     np.testing.assert_allclose(rows["prediction"], one_by_one(trained, wet.frames, wet.frames[2]), atol=1e-5)
+
+
+def test_another_process_writes_the_same_bytes_and_a_folder_is_a_data_set_of_them(
+    trained: Run, small_dataset: Dataset, tmp_path: Path, elsewhere: str
+):
+    def write(path: Path, **options: object) -> Predictions:
+        given: dict[str, object] = {"split": "test", "engine": "eager", **options}
+        return predict_source(trained, small_dataset.folder, out=path, **given)  # pyright: ignore[reportArgumentType]
+
+    serial, others = write(tmp_path / "a.parquet"), write(tmp_path / "b.parquet", on=elsewhere)
+    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
+    folder = write(tmp_path / "set")
+    assert folder.frame().to_pylist() == serial.frame().to_pylist() == others.frame().to_pylist()
+    assert sorted(path.name for path in (tmp_path / "set").iterdir()) == [
+        "run.json",
+        "trial=test-dry-6",
+        f"trial={TRIAL}",
+    ]
+    refused(small_dataset.folder, trained, InputError, "other settings", out=tmp_path / "set", engine="folded")
+    frames = np.zeros((2, 48, 48, 3), dtype=np.uint8)
+    with pytest.raises(InputError, match="frames in memory are worked on in this process"):
+        predict_source(trained, frames, on="processes")
+
+
+def test_a_damaged_trial_does_not_lose_the_others(trained: Run, small_dataset: Dataset, tmp_path: Path):
+    data = tmp_path / "data"
+    shutil.copytree(small_dataset.folder, data)
+    good = trial_path(data, TRIAL).read_bytes()
+    trial_path(data, TRIAL).write_bytes(good[:-100])
+    own: dict[str, Any] = {"split": "test", "engine": "eager", "out": tmp_path / "set"}
+    with pytest.raises(ShardError, match=f"1 of 2 could not be done.*--retry-failed:\n  {TRIAL}: .*{TRIAL}"):
+        predict_source(trained, data, **own)
+    assert not (tmp_path / "set").exists()
+    (status,) = read_status(tmp_path / "set")
+    assert (status.done, [one.name for one in status.failed]) == (1, [TRIAL])
+    trial_path(data, TRIAL).write_bytes(good)
+    assert predict_source(trained, data, **own, retry_failed=True).frames == 24
+    assert read_status(tmp_path / "set") == []

@@ -29,16 +29,19 @@ from sliplens.cli.score import Score
 from sliplens.cli.sensor import Sensor
 from sliplens.cli.simulate import Simulate
 from sliplens.cli.split import Split
+from sliplens.cli.status import Status
 from sliplens.cli.study import Study
 from sliplens.cli.track import Track
 from sliplens.cli.train import Train
 from sliplens.cli.view import View
-from sliplens.errors import InputError, SliplensError
+from sliplens.errors import InputError, ShardError, SliplensError
 from sliplens.recordings.options import LabelSettings, ReadOptions
 
 _Recordings = Sensor | Simulate | Import | Label | Split | Check | View | Track
 _Networks = Train | Evaluate | Predict | Export
-Command = Demo | Live | _Recordings | _Networks | Explain | Score | Diagnose | Study | Grip | Report | Doctor | Help
+Command = (
+    Demo | Live | _Recordings | _Networks | Explain | Score | Diagnose | Study | Status | Grip | Report | Doctor | Help
+)
 
 _DESCRIPTION = """sliplens tells how close a soft robotic fingertip is to losing its grip, from the images of the camera
 inside it, and shows why the network says so. Start with `sliplens demo runs/demo`; `sliplens help` tells which commands
@@ -81,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 on success, 2 for a mistake the user can mend, 130 when interrupted.
+        0 on success, 1 where some of many shards failed, 2 for a mistake the user can mend, 130 when interrupted.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words == ["--version"]:
@@ -100,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except SliplensError as error:
         fail(str(error) if command is None else in_options(str(error), command))
-        return 2
+        return 1 if isinstance(error, ShardError) else 2
     except OSError as error:
         fail(
             f"{error.filename or 'a file'} could not be read or written ({error.strerror or error}); "

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sliplens.cli.command import Command, Device, require_path
+from sliplens.cli.command import Command, Device, On, RetryFailed, require_path
 from sliplens.cli.console import print_table
 from sliplens.errors import InputError
 
@@ -53,6 +53,8 @@ class Explain(Command):
     levels: tuple[float, ...] = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
     """Safety margins at which frames are taken."""
     device: Device = "cpu"
+    on: On = "serial"
+    retry_failed: RetryFailed = False
 
     def check(self) -> None:
         """Refuse what is wrong at first sight."""

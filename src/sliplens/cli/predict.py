@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from sliplens.cli.command import NETWORK_HELP, SOURCE_HELP, Device, Friction, SourceCommand
+from sliplens.cli.command import NETWORK_HELP, SOURCE_HELP, Device, Friction, On, RetryFailed, SourceCommand
 from sliplens.cli.console import print_table, say, wrote
 from sliplens.errors import InputError
 from sliplens.files import require_new_file
@@ -40,9 +40,10 @@ class Predict(SourceCommand):
         ),
     ]
     source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE", help=SOURCE_HELP)] = None
-    output: Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="FILE.csv")] = None
-    """Table to write, by its ending .parquet, .csv or .json: trial, frame, time, margin, interval, and label and forces
-    where they are known. Memory does not grow with the recording."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="FILE.csv|FOLDER")] = None
+    """Table to write, by its ending .parquet, .csv or .json; without one a folder, a Parquet data set with a file a
+    trial: trial, frame, time, margin, interval, and label and forces where they are known. Memory does not grow with
+    the recording."""
     plot: Annotated[Path | None, tyro.conf.arg(metavar="FILE.png")] = None
     """Picture to draw: margin with its interval over time, and label and forces where they are known."""
     engine: str = "auto"
@@ -53,6 +54,8 @@ class Predict(SourceCommand):
     batch_size: int = 8
     """Frames predicted together; on a CPU more are slower, as they no longer fit its cache."""
     device: Device = "cpu"
+    on: On = "serial"
+    retry_failed: RetryFailed = False
 
     def __post_init__(self) -> None:
         if self.source is None:  # one word alone is what to read
@@ -63,7 +66,7 @@ class Predict(SourceCommand):
         """Refuse what is wrong at first sight."""
         from sliplens.codec import TABLE_SUFFIXES
 
-        if self.output is not None:
+        if self.output is not None and self.output.suffix:
             require_new_file(self.output, suffix=TABLE_SUFFIXES, overwrite=self.overwrite)
         if self.plot is not None:
             from sliplens.plots.style import require_picture_path

@@ -7,6 +7,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,7 +134,9 @@ def prepare(
     ModelError
         If an engine that is asked for by name cannot run the network, or answers otherwise.
     """
-    _PASSES[model] = known = _PASSES.get(model, 0) + passes
+    known = _EXPECTED.get(model)
+    if known is None:
+        _PASSES[model] = known = _PASSES.get(model, 0) + passes
     paying = [name for name, kind in ENGINES.items() if kind.pays_after is not None and known >= kind.pays_after]
     paying = [name for name in ENGINES if name in paying or (onnx_file is not None and name in _CONVERTED)]
     for name in [engine] if engine != "auto" else reversed(paying):
@@ -167,6 +170,19 @@ def prepare(
             cure = "choose another engine" if onnx_file is None else f"export {onnx_file} again"
             raise ModelError(f"the engine {name} cannot run {type(model).__name__} ({reason}); {cure}")
     raise AssertionError  # eager has no obstacle
+
+
+@contextmanager
+def expecting(model: nn.Module, passes: int) -> Iterator[None]:
+    """Choose engines for so many passes in all, however many of them are made before, here or elsewhere.
+
+    What is worked on in parts is so answered by one engine, and is the same wherever each part was made.
+    """
+    _EXPECTED[model] = passes
+    try:
+        yield
+    finally:
+        del _EXPECTED[model]
 
 
 def make_engine(
@@ -296,6 +312,8 @@ def _hash_weights(model: nn.Module) -> str:
 
 _PASSES: WeakKeyDictionary[nn.Module, int] = WeakKeyDictionary()
 """Passes that each network was asked for so far."""
+_EXPECTED: WeakKeyDictionary[nn.Module, int] = WeakKeyDictionary()
+"""Passes that are expected of a network in all, wherever they are made."""
 _BUILT: WeakKeyDictionary[nn.Module, tuple[tuple[Any, ...], RunBatches]] = WeakKeyDictionary()
 """What was built last of each network; it must not hold the network itself, which would never die."""
 

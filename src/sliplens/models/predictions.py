@@ -1,8 +1,9 @@
 """Safety margins of any number of frames, from any source, in the memory of a few batches."""
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from torch import Tensor
 from sliplens._version import __version__
 from sliplens.codec import TABLE_SUFFIXES, read_written, write_tables
 from sliplens.errors import InputError
-from sliplens.files import hash_json, require_new_file
+from sliplens.files import hash_file, hash_json, require_new_file
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.models.checkpoint import Estimate, Run, load, sensor_kind
 from sliplens.models.engines import Engine, make_engine
@@ -25,12 +26,12 @@ from sliplens.recordings.dataset import DATASET_FILE
 from sliplens.recordings.labels.lag import LEAST_TOUCH, picture_change, soften
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.sensor import SensorProfile, load_profile
-from sliplens.recordings.source import Frame, Frames, open_source
+from sliplens.recordings.source import Frame, Frames, Trials, open_trials
 from sliplens.recordings.trial import ContactState
+from sliplens.shards import MakePart, make_table
 
 LEVEL = 0.9
 """Confidence of the intervals."""
-_ROW_GROUP = 8192
 _COLUMNS = {
     "trial": pa.string(),
     "frame": pa.int64(),
@@ -163,6 +164,8 @@ def predict(
     onnx_file: Path | None = None,
     batch_size: int = 8,
     device: str = "cpu",
+    on: str = "serial",
+    retry_failed: bool = False,
     out: Path | str | None = None,
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
@@ -193,8 +196,12 @@ def predict(
         Frames predicted together; on a processor more are slower, their layers no longer fit its cache.
     device
         Device of a network that is loaded here: cpu or cuda.
+    on, retry_failed
+        Where the trials are read, a row of `shards.EXECUTORS`: `serial`, `processes`, `processes=4`; and whether those
+        are tried again that failed three times before.
     out
-        File to write, Parquet, CSV or JSON by its ending, whole or not at all; rows are kept in memory if None.
+        File to write, Parquet, CSV or JSON by its ending; without an ending a folder, a Parquet data set with a file a
+        trial. Whole or not at all, and interrupted it goes on after its last trial; rows are kept in memory if None.
 
     Raises
     ------
@@ -204,6 +211,8 @@ def predict(
         If frames are of another size than those of the network's sensor.
     RecordingError
         If the source cannot be read.
+    ShardError
+        If some of many trials failed again and again, when all others are there.
 
     Examples
     --------
@@ -215,7 +224,7 @@ def predict(
     ['trial', 'frame', 'time_s', 'prediction']
     """
     path = None if out is None else Path(out)
-    if path is not None:
+    if path is not None and path.suffix:
         require_new_file(path, suffix=TABLE_SUFFIXES, overwrite=overwrite)
     if batch_size < 1:
         raise InputError(f"--batch-size must be at least 1, got {batch_size}")
@@ -233,38 +242,48 @@ def predict(
     known = None if friction is None else as_friction(friction)
     if known is not None:
         trained.require_ratio()
-    if isinstance(source, Path | str | np.ndarray | Dataset):
-        with stage(on_progress, "Opening the source"):
-            source = open_source(
-                source,
-                reference=reference,
-                reference_frame=reference_frame,
-                split=split,
-                format=format,
-                options=options,
-                sensor=sensor,
-            )
-    source = [_assume_reference(trained, one) for one in source]
-    notes = tuple(dict.fromkeys(words for one in source for words in (*one.notes, *_require_comparable(trained, one))))
-    if known is not None:
-        notes = (*notes, f"The coefficient of friction is taken for {known}.")
-    total = sum(trial.frames for trial in source)
-    with stage(on_progress, "Making the network ready"):
-        for sentence in notes:
-            note(on_progress, sentence)
-        ready = make_engine(engine, trained, frames=total, batch_size=batch_size, onnx_file=onnx_file)
+    with stage(on_progress, "Opening the source"):
+        trials = open_trials(
+            source,
+            on=on,
+            reference=reference,
+            reference_frame=reference_frame,
+            split=split,
+            format=format,
+            options=options,
+            sensor=None if sensor is None else load_profile(sensor),
+        )
+    kinds = [_assume_reference(trained, one) for one in trials.kinds]
+    notes = tuple(dict.fromkeys(words for one in kinds for words in (*one.notes, *_require_comparable(trained, one))))
     metadata = {
-        "sliplens.engine": ready.name,
-        "sliplens.source": source[0].opened,
+        "sliplens.source": kinds[0].opened,
         "sliplens.manifest_hash": hash_json(trained.manifest),
         "sliplens.weights_sha256": trained.manifest.weights_sha256,
     }
     if known is not None:
+        notes = (*notes, f"The coefficient of friction is taken for {known}.")
         metadata["sliplens.friction"] = str(known)
-    schema = _schema(source, metadata, ratio=trained.manifest.traction is not None)
-    with stage(on_progress, f"Predicting frames ({trained.manifest.input}, {ready.name})") as count:
-        rows = write_tables(_tables(ready, trained, source, schema, friction=known, on_progress=count), path, schema)
-    return Predictions(frames=total, engine=ready.name, path=path, rows=rows, schema=path and schema, notes=notes)
+    for sentence in notes:
+        note(on_progress, sentence)
+    schema = _schema(kinds, metadata, ratio=trained.manifest.traction is not None)
+    run_with = {"frames": trials.frames, "batch_size": batch_size, "onnx_file": onnx_file}
+    make = partial(make_engine, engine, trained, **run_with)
+    recipe = run_with | {"onnx_file": onnx_file and hash_file(onnx_file), "engine": engine, **metadata}
+    recipe |= {"columns": schema.names, "device": str(trained.device), "source": trials.recipe}
+    written, rows = make_table(
+        _Reading(trained=trained, trials=trials, schema=schema, friction=known, make_engine=make),
+        partial(trials.shards, recipe),
+        path,
+        title=f"Predicting frames ({trained.manifest.input})",
+        recipe=recipe,
+        resumable=trials.travels,
+        on=on,
+        retry_failed=retry_failed,
+        overwrite=overwrite,
+        on_progress=on_progress,
+    )
+    name = (written.metadata or {})[b"sliplens.engine"].decode()
+    return Predictions(frames=trials.frames, engine=name, path=path, rows=rows, schema=path and written, notes=notes)
 
 
 def _find_network(source: object, sensor: SensorProfile | Path | str | None) -> tuple[str, str]:
@@ -351,54 +370,62 @@ def _states(trial: Capture) -> tuple[ContactState, ...]:
     return () if ContactState.UNKNOWN in states else states
 
 
-def _tables(
-    engine: Engine,
-    trained: Run,
-    trials: Sequence[Capture],
-    schema: pa.Schema,
-    *,
-    friction: Friction | None,
-    on_progress: OnProgress,
-) -> Iterator[pa.Table]:
-    # plain numbers: small arrays kept between the large ones of each batch would leave holes in the memory
-    waiting: dict[str, list] = {name: [] for name in schema.names}
-    total, done = sum(trial.frames for trial in trials), 0
-    # batches are encoded while the ones before are under way
-    encoded: deque[tuple[Capture, int, list[bool]]] = deque()
-    for answers in engine.answers(_encode(trained, trials, engine.batch_size, encoded)):
-        trial, first, touches = encoded.popleft()
-        estimate = trained.to_estimate(*answers, friction=friction)
-        for name, values in (_columns(estimate, trial, first) | {"touches": touches}).items():
-            if name in waiting:
-                waiting[name].extend(values)
-        if len(waiting["frame"]) >= _ROW_GROUP:
-            yield pa.Table.from_pydict(waiting, schema)
-            waiting = {name: [] for name in schema.names}
-        done += len(estimate.margin)
-        on_progress(done, total)
-    if waiting["frame"]:
-        yield pa.Table.from_pydict(waiting, schema)
+@dataclass(frozen=True, kw_only=True)
+class _Reading:
+    """Work on shards of (trial, first frame, number of frames): their rows, as a Parquet file."""
 
+    trained: Run
+    trials: Trials
+    schema: pa.Schema
+    friction: Friction | None
+    make_engine: Callable[[], Engine]
 
-def _encode(
-    trained: Run, trials: Sequence[Capture], batch_size: int, encoded: deque[tuple[Capture, int, list[bool]]]
-) -> Iterator[Tensor]:
-    """Batches of encoded frames; trial and first frame of each, and which touch, are appended to `encoded`."""
-    for trial in trials:
-        reference = None if trial.read_reference is None else trial.read_reference()
-        untouched = None if reference is None else soften(reference)
-        states = _states(trial)
-        first, frames = 0, trial.read_frames()
-        while batch := list(islice(frames, batch_size)):
-            if states:
-                touches = [state != ContactState.NO_CONTACT for state in states[first : first + len(batch)]]
-            elif untouched is not None:
-                touches = [picture_change(soften(frame), untouched) >= LEAST_TOUCH for frame in batch]
-            else:
-                touches = [True] * len(batch)
-            encoded.append((trial, first, touches))
-            first += len(batch)
-            yield trained.encode(np.stack(batch), reference)
+    def begin(self) -> MakePart:
+        ready, read = self.make_engine(), self.trials.reader()
+        schema = self.schema.with_metadata({"sliplens.engine": ready.name, **(self.schema.metadata or {})})
+
+        def make(item: tuple[str, int, int], path: Path, on_progress: OnProgress) -> None:
+            rows = self._rows(ready, *read(*item), count=item[-1], on_progress=on_progress)
+            write_tables([pa.Table.from_pydict(rows, schema)], path, schema)
+
+        return make
+
+    def _rows(
+        self,
+        engine: Engine,
+        capture: Capture,
+        frames: Iterator[tuple[int, Frame]],
+        *,
+        count: int,
+        on_progress: OnProgress,
+    ) -> dict[str, list]:
+        # plain numbers: small arrays kept between the large ones of each batch would leave holes in the memory
+        rows: dict[str, list] = {name: [] for name in self.schema.names}
+        capture = _assume_reference(self.trained, capture)
+        reference = None if capture.read_reference is None else capture.read_reference()
+        untouched, states = None if reference is None else soften(reference), _states(capture)
+        # batches are encoded while the ones before are under way; first frame of each, and which touch
+        encoded: deque[tuple[int, list[bool]]] = deque()
+
+        def encode() -> Iterator[Tensor]:
+            while batch := list(islice(frames, engine.batch_size)):
+                first, images = batch[0][0], [frame for _, frame in batch]
+                if states:
+                    touches = [state != ContactState.NO_CONTACT for state in states[first : first + len(batch)]]
+                elif untouched is not None:
+                    touches = [picture_change(soften(frame), untouched) >= LEAST_TOUCH for frame in images]
+                else:
+                    touches = [True] * len(batch)
+                encoded.append((first, touches))
+                yield self.trained.encode(np.stack(images), reference)
+
+        for answers in engine.answers(encode()):
+            estimate, (first, touches) = self.trained.to_estimate(*answers, friction=self.friction), encoded.popleft()
+            for name, values in (_columns(estimate, capture, first) | {"touches": touches}).items():
+                if name in rows:
+                    rows[name].extend(values)
+            on_progress(len(rows["frame"]), count)
+        return rows
 
 
 def _columns(estimate: Estimate, trial: Capture, first: int) -> dict[str, list]:

@@ -1,7 +1,9 @@
 """One way to open frames: of a data set, a folder of images, a video, a bag, whatever a reader opens, or arrays."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -9,6 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from sliplens.errors import ImageError, InputError, RecordingError
+from sliplens.files import hash_file, hash_json, hash_tree
 from sliplens.images import list_images, read_image
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import DATASET_FILE, Dataset, load_dataset
@@ -18,6 +21,7 @@ from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
 from sliplens.recordings.options import LIMITS, Budget, ReadOptions, spoken
 from sliplens.recordings.sensor import SensorProfile, load_profile
+from sliplens.shards import LONGEST, Shard, shard
 
 Frames: TypeAlias = UInt8[np.ndarray, "frames height width 3"]
 """RGB images of the camera, one after another."""
@@ -105,6 +109,99 @@ def open_source(
     if profile is not None:
         opened = [profile.prepare(one) for one in opened]
     return tuple(_chosen(opened, [one.name for one in opened], trial, source))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trials:
+    """Trials of a source that every process can open again, by paths and names."""
+
+    source: Path | Dataset | tuple[Capture, ...]
+    """What is opened; captures stay in this process."""
+    named: Mapping[str, Any]
+    """Parameters of `open_source`."""
+    kinds: tuple[Capture, ...]
+    """A capture of each sensor and size of frames, to see whether it can be read: to open all takes as long as there
+    are trials."""
+    rows: tuple[tuple[str, int, str], ...]
+    """Name, number of frames, and hash of what it shows, of each trial."""
+
+    @property
+    def frames(self) -> int:
+        """Number of frames of all trials."""
+        return sum(frames for _, frames, _ in self.rows)
+
+    @property
+    def travels(self) -> bool:
+        """Whether other processes can open it."""
+        return isinstance(self.source, Path | Dataset)
+
+    def shards(self, recipe: object) -> Iterator[Shard]:
+        """Shards of (trial, first frame, number of frames), whose parts are Parquet files."""
+        recipe = hash_json(recipe)
+        for trial, total, shown in self.rows:
+            for first in range(0, total, LONGEST):
+                frames, known = min(LONGEST, total - first), {"recipe": recipe, "shown": shown, "suffix": ".parquet"}
+                yield shard((trial, first, frames), trial=trial, first=first, frames=frames, **known)
+
+    @property
+    def recipe(self) -> object:
+        """What was named of the source, as JSON holds it: an image by its hash."""
+        image = self.named.get("reference")
+        if image is not None:
+            pixels = isinstance(image, np.ndarray)
+            image = hashlib.sha256(image.tobytes()).hexdigest() if pixels else hash_file(Path(image))
+        return {**self.named, "reference": image}
+
+    def reader(self) -> Callable[[str, int, int], tuple[Capture, Iterator[tuple[int, Frame]]]]:
+        """Open shards, in whatever process: gives the trial, and the frames with their numbers.
+
+        Shards of a long trial that come one after another go on where the one before ended.
+        """
+        given = self.source
+        opened = open_source(given, **self.named) if isinstance(given, Path) else given
+        known = {} if isinstance(opened, Dataset) else {one.name: one for one in opened}
+        following: tuple[tuple[str, int], Iterator[tuple[int, Frame]]] | None = None
+
+        def read(trial: str, first: int, count: int) -> tuple[Capture, Iterator[tuple[int, Frame]]]:
+            nonlocal following
+            (capture,) = open_source(given, trial=trial, **self.named) if isinstance(given, Dataset) else [known[trial]]
+            if following is not None and following[0] == (trial, first):
+                frames = following[1]
+            else:
+                frames = islice(enumerate(capture.read_frames()), first, None)
+            following = (trial, first + count), frames
+            return capture, islice(frames, count)
+
+        return read
+
+
+def open_trials(
+    source: Path | str | Frames | Dataset | Sequence[Capture], *, on: str = "serial", **named: Any
+) -> Trials:
+    """Open a source for work that may be done elsewhere; the other parameters are those of `open_source`.
+
+    Raises
+    ------
+    InputError
+        As `open_source`, and if frames in memory are to be worked on elsewhere than in this process.
+    """
+    if isinstance(source, Path | str):
+        source = Path(source)
+        if named.get("format") in {None, "sliplens"} and (source / DATASET_FILE).is_file():
+            source = load_dataset(source)
+    if isinstance(source, Dataset):
+        infos = [info for info in source.select(split=named.get("split")) if named.get("trial") in {None, info.trial}]
+        first = {(info.sensor, info.height, info.width): info.trial for info in reversed(infos)}
+        told = {"trial": named.pop("trial", None)}
+        kinds = [open_source(source, **named, trial=trial)[0] for trial in reversed(first.values() or told.values())]
+        rows = [(info.trial, info.frames, info.sha256) for info in infos]
+        return Trials(source=source, named=named, kinds=tuple(kinds), rows=tuple(rows))
+    if on != "serial" and not isinstance(source, Path):
+        raise InputError("frames in memory are worked on in this process; name their file or folder, or leave out --on")
+    opened = tuple(open_source(source, **named) if isinstance(source, Path | np.ndarray) else source)
+    shown = hash_tree(source) if isinstance(source, Path) else ""
+    rows = [(one.name, one.frames, shown) for one in opened]
+    return Trials(source=source if isinstance(source, Path) else opened, named=named, kinds=opened, rows=tuple(rows))
 
 
 def _open(source: Path | Frames, format: str | None, options: ReadOptions, *, whole: bool) -> Sequence[Capture]:

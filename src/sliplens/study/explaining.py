@@ -1,10 +1,11 @@
 """Frames to explain, and their explanations, made one map at a time."""
 
+import hashlib
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import groupby, islice, product
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -13,18 +14,21 @@ import torch
 from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
-from sliplens.codec import keep_part
+from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError, RecordingError
 from sliplens.explainers import EXPLAINERS, Explainer
 from sliplens.explainers.table import network_images
+from sliplens.files import scratch_folder
 from sliplens.models import Run
+from sliplens.models.engines import expecting
 from sliplens.plots.saliency import NOMINAL_MARGINS
-from sliplens.progress import OnProgress, counted
+from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import open_source
 from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
+from sliplens.shards import MakePart, Shard, make_parts, shard
 
 DEFAULT_LEVELS = NOMINAL_MARGINS
 """Safety margins at which the thesis explains frames (section 4)."""
@@ -214,6 +218,49 @@ class _Map:
     warnings: tuple[str, ...]
 
 
+_PASSES_A_MAP = 300
+"""Of a map by Poly-CAM on a budget, or by Shapley values."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Explaining:
+    """Work on shards of (method, frame): their maps."""
+
+    trained: Run
+    chosen: ChosenFrames
+    explainers: Mapping[str, Explainer]
+
+    def begin(self) -> MakePart:
+        run, references = self.trained, self.chosen.references
+
+        def make(item: tuple[str, int], path: Path, _: OnProgress) -> None:
+            method, frame = item[0], slice(item[1], item[1] + 1)
+            inputs = run.encoding.normalise(self.chosen.images[frame]).to(run.device)
+            passes = _PASSES_A_MAP * len(self.chosen.ids) * len(self.explainers)
+            with expecting(run.model, passes):
+                explanation = self.explainers[method](run.model, inputs, reference=references[frame].to(run.device))
+            path.mkdir()
+            explained = _Map(
+                relevance=explanation.relevance[0].cpu().numpy(),
+                saliency=explanation.saliency[0].cpu().numpy(),
+                seconds=explanation.seconds,
+                warnings=explanation.warnings,
+            )
+            save_result(explained, path)
+
+        return make
+
+    def shards(self) -> Iterator[Shard]:
+        weights = self.trained.manifest.weights_sha256
+        for method in self.explainers:
+            # the folder of the parts is one of these options alone (`files.output_folder`)
+            recipe = {"weights_sha256": weights, "method": method}
+            for index, trial in enumerate(self.chosen.trial):
+                shown = self.chosen.images[index].numpy().tobytes() + self.chosen.references[index].numpy().tobytes()
+                known = {"recipe": recipe, "shown": hashlib.sha256(shown).hexdigest(), "first": index, "frames": 1}
+                yield shard((method, index), trial=trial, name=f"{method} of {self.chosen.ids[index]}", **known)
+
+
 def explain_frames(
     trained: Run,
     chosen: ChosenFrames,
@@ -221,40 +268,43 @@ def explain_frames(
     methods: Sequence[str] = DEFAULT_METHODS,
     explainers: Mapping[str, Explainer] = EXPLAINERS,
     parts: Path | None = None,
+    on: str = "serial",
+    retry_failed: bool = False,
     on_map: OnMap | None = None,
     on_progress: OnProgress | None = None,
 ) -> Explained:
     """Explain frames with several methods.
 
-    `parts` is a folder that keeps each map as soon as it is there, so that an interrupted run loses at most one.
-    `on_map` is called with each: method, number of the frame, its picture, and the map.
+    `parts` is a folder that keeps each map as soon as it is there, so that an interrupted run loses at most one a
+    process. `on` says where maps are made, a row of `shards.EXECUTORS`; `retry_failed` tries those again that failed
+    before. `on_map` is called with each: method, number of the frame, its picture, and the map.
 
     Raises
     ------
     InputError
         If a method is unknown.
+    ShardError
+        If some of many maps failed again and again, when all others are there.
     """
     require_methods(methods, explainers)
     inputs = trained.encoding.normalise(chosen.images).to(trained.device)
-    references = chosen.references.to(trained.device)
-
-    def explain(method: str, index: int) -> _Map:
-        frame = slice(index, index + 1)
-        explanation = explainers[method](trained.model, inputs[frame], reference=references[frame])
-        return _Map(
-            relevance=explanation.relevance[0].cpu().numpy(),
-            saliency=explanation.saliency[0].cpu().numpy(),
-            seconds=explanation.seconds,
-            warnings=explanation.warnings,
-        )
-
     pictures = (255 * inputs[:, :3]).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous().cpu().numpy()
+    work = _Explaining(trained=trained, chosen=chosen, explainers={name: explainers[name] for name in methods})
     maps: dict[str, list[_Map]] = {method: [] for method in methods}
-    for method, index in counted(list(product(methods, range(len(inputs)))), on_progress):
-        part = parts and parts / f"{method}-{index:05d}"
-        maps[method].append(keep_part(part, _Map, partial(explain, method, index)))
-        if on_map is not None:
-            on_map(method, index, pictures[index], maps[method][-1].relevance)
+    with nullcontext(parts) if parts else scratch_folder() as folder:
+
+        def read(one: Shard) -> _Map:
+            return load_result(folder / one.part, _Map, command="sliplens explain")
+
+        def show(one: Shard) -> None:
+            if on_map is not None:
+                method, index = one.item
+                on_map(method, index, pictures[index], read(one).relevance)
+
+        own: dict[str, Any] = {"on": on, "retry_failed": retry_failed, "on_part": show, "on_progress": on_progress}
+        make_parts(work, work.shards, folder, title=f"Explaining frames ({trained.encoding.name})", **own)
+        for one in work.shards():
+            maps[one.item[0]].append(read(one))
     # the same answers for every method: asked once, on all frames
     predictions, untouched = trained.predict(inputs).tolist(), trained.predict(chosen.references).tolist()
     return Explained(

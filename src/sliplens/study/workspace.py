@@ -66,6 +66,8 @@ def explain_source(
     trials: int = 1,
     levels: Sequence[float] = DEFAULT_LEVELS,
     device: str = "cpu",
+    on: str = "serial",
+    retry_failed: bool = False,
     out: Path | None = None,
     colours: Literal["signed", "jet"] = "signed",
     overwrite: bool = False,
@@ -88,6 +90,9 @@ def explain_source(
         and Poly-CAM, with all its channels for a single image and on a budget for several.
     split, condition, trials, levels
         Which trials of a data set and how many, and the safety margins at which frames are taken.
+    on, retry_failed
+        Where maps are made, a row of `shards.EXECUTORS`: `serial`, `processes`, `processes=4`; and whether those are
+        tried again that failed three times before.
     out
         Folder to write: maps, overlays of every map, all of them side by side; nowhere if None. A folder that was
         interrupted goes on after its last map.
@@ -99,6 +104,8 @@ def explain_source(
     ------
     InputError
         If there is no such method, the source has no such frames, or the folder holds something else.
+    ShardError
+        If some of many maps failed again and again, when all others are there.
     """
     require_methods(methods or ())
     if trials < 1:
@@ -126,7 +133,8 @@ def explain_source(
         methods = tuple(explainers)
     else:
         explainers = choose(methods=methods)
-    explain = partial(explain_frames, trained, chosen, methods=methods, explainers=explainers)
+    own: dict[str, Any] = {"methods": methods, "explainers": explainers, "on": on, "retry_failed": retry_failed}
+    explain = partial(explain_frames, trained, chosen, **own)
     title = f"Explaining {len(chosen.ids)} frames ({trained.manifest.input}, {chosen.source})"
     if out is None:
         with stage(on_progress, title) as count:

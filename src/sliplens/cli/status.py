@@ -1,0 +1,49 @@
+"""`sliplens status`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from sliplens.cli.console import say
+
+if TYPE_CHECKING:
+    from sliplens.shards import Status as Progress
+
+_SHOWN = 20
+"""Shards of which each has a line."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Status:
+    """Show how far a command is that works on many trials: what is done, by whom, how fast, when it ends, what failed.
+
+    Reads the parts that are there, so that it can be asked from another terminal or machine while the command runs.
+    """
+
+    output: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """File or folder that the command was told to write."""
+
+    def run(self) -> None:
+        """Read the parts and show them."""
+        from sliplens.shards import read_status
+
+        works = read_status(self.output)
+        if not works:
+            say(f"{self.output} is complete" if self.output.exists() else f"{self.output} is begun, with no part yet")
+        for work in works:
+            _show(work)
+
+
+def _show(work: "Progress") -> None:
+    frames = f"{work.frames_done:,} of {work.frames:,} frames"
+    say(f"{work.title}, --on {work.on}: {work.done:,} of {work.shards:,} shards, {frames}")
+    if work.frames_per_s is not None:
+        say(f"  {work.frames_per_s:.3g} a second" + (f", done at {work.ends}" if work.ends else ""))
+    for one in work.doing[:_SHOWN]:
+        say(f"  {one.name}: process {one.process} of {one.host}, since {one.since}")
+    if not work.doing and work.done + len(work.failed) < work.shards:
+        say("  nobody works on it; give the same command again and it goes on")
+    for one in work.failed[:_SHOWN]:
+        say(f"  failed, {len(one.why)} times: {one.name}: {one.why[-1]}")

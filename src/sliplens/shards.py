@@ -1,0 +1,610 @@
+"""Work on many trials, cut into shards: each is kept as a part that is whole or absent, wherever it is made.
+
+What is done, doing and failed is read from the folder of the parts, and stands nowhere else: a part that is there is
+done, one that a process holds is being made, one that failed has left a sentence.
+"""
+
+import json
+import os
+import pickle
+import re
+import shutil
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias, runtime_checkable
+from urllib.parse import quote
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from sliplens._version import __version__
+from sliplens.codec import load_record, regrouped, save_record, write_tables
+from sliplens.errors import InputError, ShardError, SliplensError
+from sliplens.extras import Table
+from sliplens.files import hash_json, held_folder, hold, output_folder, partial_folder, scratch_folder
+from sliplens.progress import OnProgress, ignore, stage
+
+TRIES = 3
+"""How often a shard is tried before it is set aside."""
+LONGEST = 8192
+"""Frames of a shard; a longer trial is cut."""
+_STATE = "_shards"  # readers of Parquet data sets leave out what begins so
+_PART = re.compile(r"(\d{8})-(\d+)-([0-9a-f]{16})(\.\w+)?")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Shard:
+    """Some frames of a trial, which are worked on together."""
+
+    item: Any
+    """What the work has to know of it; it travels, so that it holds names and numbers and no frames."""
+    name: str
+    """For people."""
+    frames: int
+    part: str
+    """Path of its part in the folder of all."""
+
+    @property
+    def key(self) -> str:
+        """Hash of all that shapes the part."""
+        found = _PART.fullmatch(self.part.rpartition("/")[2])
+        assert found is not None
+        return found[3]
+
+
+def shard(
+    item: Any,
+    *,
+    trial: str,
+    frames: int,
+    recipe: object,
+    shown: str,
+    first: int = 0,
+    suffix: str = "",
+    name: str | None = None,
+) -> Shard:
+    """Shard of a trial whose part is named by all that shapes it.
+
+    `shown` is the hash of its frames, `recipe` what else shapes the part (weights, configuration); `suffix` is the
+    part's ending, empty for one that is a folder; `name` is for people, that of the trial if None.
+    """
+    key = hash_json({"recipe": recipe, "shown": shown, "first": first, "frames": frames, "sliplens": __version__})
+    part = f"trial={quote(trial, safe='')}/{first:08d}-{frames}-{key}{suffix}"
+    name = name or (f"{trial} from frame {first}" if first else trial)
+    return Shard(item=item, name=name, frames=frames, part=part)
+
+
+MakePart: TypeAlias = Callable[[Any, Path, OnProgress], None]
+"""Takes the item of a shard, the path where its part is to be written, and what is told the frames done."""
+
+
+@runtime_checkable
+class Work(Protocol):
+    """What is done with every shard; it travels to other processes, so that it holds paths and settings."""
+
+    def begin(self) -> MakePart:
+        """Load what all shards need; called once in each process that takes part."""
+        ...
+
+
+class Worker:
+    """One that makes parts, one after another, in whatever process."""
+
+    def __init__(self, work: Work | bytes) -> None:
+        self._work = work
+
+    def start(self) -> Exception | None:
+        """Load what all shards need; what is wrong with it is given back."""
+        try:
+            # bytes that this program packed for a process of its own
+            work = pickle.loads(self._work) if isinstance(self._work, bytes) else self._work  # noqa: S301
+            self._make = work.begin()
+        except Exception as error:  # raised again where the work was asked for
+            return error
+        return None
+
+    def attempt(self, folder: Path, given: Shard, on_progress: OnProgress = ignore) -> Any:
+        """Make a part unless it is there; why that failed is kept beside the parts, and given back."""
+        part = folder / given.part
+        draft = part.with_name(f".{part.name}.draft")
+        try:
+            part.parent.mkdir(parents=True, exist_ok=True)
+            with _claim(folder, given):
+                if part.exists():
+                    return None
+                _remove(draft)
+                self._make(given.item, draft, on_progress)
+                _flush(draft)
+                draft.replace(part)
+        except Exception as error:  # a bad trial must not end the others
+            why = str(error) if isinstance(error, SliplensError) else f"{type(error).__name__}: {error}"
+            _keep_failure(folder, given, why)
+            return error
+        finally:
+            _remove(draft)
+        _state(folder, given, "failed").unlink(missing_ok=True)
+        return None
+
+
+@runtime_checkable
+class Seat(Protocol):
+    """Place of one worker; a future that raises `Lost` says that it is gone."""
+
+    def start(self) -> Future:
+        """Begin `Worker.start`."""
+        ...
+
+    def submit(self, folder: Path, given: Shard, on_progress: OnProgress) -> Future:
+        """Begin `Worker.attempt`."""
+        ...
+
+    def close(self) -> None:
+        """End the worker, whatever it does."""
+        ...
+
+
+class _Here:
+    """The process that asks for the work."""
+
+    def __init__(self, work: Work) -> None:
+        self._worker = Worker(work)
+
+    def start(self) -> Future:
+        return _settled(self._worker.start())
+
+    def submit(self, folder: Path, given: Shard, on_progress: OnProgress) -> Future:
+        return _settled(self._worker.attempt(folder, given, on_progress))
+
+    def close(self) -> None:
+        """Nothing is left behind."""
+
+
+def _settled(result: Exception | None) -> Future:
+    future: Future = Future()
+    future.set_result(result)
+    return future
+
+
+class _Process:
+    """A process of its own on this machine."""
+
+    def __init__(self, work: bytes, *, threads: int) -> None:
+        context = get_context("spawn")  # a fork would inherit locks of torch's threads
+        alive, self._life = context.Pipe(duplex=False)
+        self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=_enter, initargs=(work, threads, alive))
+
+    def start(self) -> Future:
+        return self._pool.submit(_start)
+
+    def submit(self, folder: Path, given: Shard, on_progress: OnProgress) -> Future:  # noqa: ARG002 (of whole shards)
+        return self._pool.submit(_attempt, folder, given)
+
+    def close(self) -> None:
+        self._life.close()
+        self._pool.shutdown(cancel_futures=True)
+
+
+_HERE: list[Worker] = []
+"""Worker of a process that was made for one."""
+
+
+def _enter(work: bytes, threads: int, alive: Connection) -> None:
+    # an interruption reaches every process of a terminal; the first of them ends the others
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(alive,), daemon=True).start()
+    os.environ["OMP_NUM_THREADS"] = str(threads)  # before torch is imported, which unpacking the work does
+    _HERE.append(Worker(work))
+
+
+def _end_with(alive: Connection) -> None:
+    alive.poll(None)  # until the process that began this one closes its end, or is gone
+    os._exit(1)
+
+
+def _start() -> Exception | None:
+    return _HERE[0].start()
+
+
+def _attempt(folder: Path, given: Shard) -> Any:
+    return _HERE[0].attempt(folder, given)
+
+
+Seats: TypeAlias = tuple[int, Callable[[], Seat], type[Exception]]
+"""How many workers there are, what makes one, and what a future raises when its worker is gone."""
+
+
+@contextmanager
+def _serial(work: Work, _: str) -> Iterator[Seats]:
+    yield 1, lambda: _Here(work), BrokenProcessPool
+
+
+@contextmanager
+def _processes(work: Work, number: str) -> Iterator[Seats]:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if number and not (number.isdigit() and int(number)):
+        raise InputError(f"--on processes={number} is no number of processes; say processes or processes=2")
+    count, packed = int(number or cores), pickle.dumps(work)
+    yield count, lambda: _Process(packed, threads=max(1, cores // count)), BrokenProcessPool
+
+
+EXECUTORS = Table("place to work", "sliplens.executors", {"serial": _serial, "processes": _processes})
+"""Where shards are worked on: each row takes the work and what follows `=`, and opens its `Seats`."""
+
+
+@contextmanager
+def parts_folder(target: Path | None) -> Iterator[Path]:
+    """Folder for the parts of a file, beside it: gone when all is well, kept for the next try where something is done.
+
+    Without a file it is a temporary one.
+    """
+    if target is None:
+        with scratch_folder() as folder:
+            yield folder
+        return
+    folder = partial_folder(target)
+    with held_folder(folder, target):
+        try:
+            yield folder
+        except BaseException:
+            if not any(path.is_file() for path in folder.rglob("*")):
+                shutil.rmtree(folder)
+            raise
+        shutil.rmtree(folder)
+
+
+def make_parts(
+    work: Work,
+    shards: Callable[[], Iterable[Shard]],
+    folder: Path,
+    *,
+    title: str,
+    on: str = "serial",
+    retry_failed: bool = False,
+    on_part: Callable[[Shard], None] | None = None,
+    on_progress: OnProgress | None = None,
+) -> None:
+    """Make the parts that are not there yet.
+
+    A shard that fails three times is set aside with its sentence, and the rest goes on. The driver holds as many shards
+    as there are workers, however many come.
+
+    Parameters
+    ----------
+    work
+        What is done with each shard.
+    shards
+        Gives all shards, anew at every call.
+    folder
+        Where the parts are kept.
+    title
+        What is done, for `read_status`.
+    on
+        Row of `EXECUTORS`, with its argument: `serial`, `processes`, `processes=4`.
+    retry_failed
+        Try those again that were set aside before.
+    on_part
+        Called with each shard whose part is there, in the order in which they become so.
+
+    Raises
+    ------
+    ShardError
+        If shards were set aside, when all others are done; of a single one its own error.
+    InputError
+        If the place to work is unknown.
+    """
+    name, _, argument = on.partition("=")
+    open_seats = EXECUTORS.pick(name)
+    count = frames = 0
+    for one in shards():
+        count, frames = count + 1, frames + one.frames
+    tally = _Tally(total=frames, on_part=on_part, on_progress=on_progress or ignore)
+    missing = _missing(shards, folder, tally, retry_failed=retry_failed)
+    first = next(missing, None)
+    if first is not None:
+        plan = _Plan(title=title, shards=count, frames=frames, started_s=time.time(), on=on)
+        (folder / _STATE).mkdir(parents=True, exist_ok=True)
+        save_record(plan, folder / _STATE / _PLAN)
+        with open_seats(work, argument) as (places, make_seat, lost), ExitStack() as seats:
+            _drive(first, missing, folder, tally, places=min(places, count), make_seat=make_seat, lost=lost, open=seats)
+    if failed := [failure for one in shards() if (failure := _failure(folder, one)) is not None]:
+        if count == 1 and tally.error is not None:
+            shutil.rmtree(folder / _STATE)
+            raise tally.error
+        raise ShardError({failure.name: failure.why[-1] for failure in failed}, shards=count)
+    shutil.rmtree(folder / _STATE, ignore_errors=True)
+
+
+def make_table(
+    work: Work,
+    shards: Callable[[], Iterable[Shard]],
+    out: Path | None,
+    *,
+    title: str,
+    recipe: object,
+    resumable: bool = True,
+    on: str = "serial",
+    retry_failed: bool = False,
+    overwrite: bool = False,
+    on_progress: OnProgress | None = None,
+) -> tuple[pa.Schema, pa.Table | None]:
+    """Make the parts, Parquet files, and join them: into a file by its ending, or in memory without one.
+
+    Without an ending `out` is a folder, and the parts stay what they are: a Parquet data set with a folder a trial.
+    Gives the columns, and the rows where they are in memory.
+    """
+
+    def make(folder: Path) -> pa.Schema:
+        with stage(on_progress, title) as count:
+            make_parts(work, shards, folder, title=title, on=on, retry_failed=retry_failed, on_progress=count)
+        return pq.read_schema(folder / next(iter(shards())).part)
+
+    if out is not None and not out.suffix:
+        with output_folder(out, stage=title, config=recipe, overwrite=overwrite) as output:
+            return make(output.folder), None
+    with parts_folder(out if resumable else None) as parts:
+        schema = make(parts)
+        # not read_table, which imports pandas
+        tables = (pq.ParquetFile(parts / one.part).read() for one in shards())
+        return schema, write_tables(regrouped(tables, rows=LONGEST), out, schema)
+
+
+@dataclass(kw_only=True)
+class _Tally:
+    """Frames that are done, told as they become so."""
+
+    total: int
+    on_part: Callable[[Shard], None] | None
+    on_progress: OnProgress
+    done: int = 0
+    shown: int = 0
+    error: Exception | None = None
+
+    def add(self, given: Shard) -> None:
+        self.within(given.frames, given.frames)
+        self.done += given.frames
+        if self.on_part is not None:
+            self.on_part(given)
+
+    def within(self, done: int, _: int) -> None:
+        if self.done + done != self.shown:
+            self.shown = self.done + done
+            self.on_progress(self.shown, self.total)
+
+
+def _missing(
+    shards: Callable[[], Iterable[Shard]], folder: Path, tally: _Tally, *, retry_failed: bool
+) -> Iterator[Shard]:
+    for one in shards():
+        if (folder / one.part).exists():
+            tally.add(one)
+        elif retry_failed or (failure := _failure(folder, one)) is None or len(failure.why) < TRIES:
+            if retry_failed:
+                _state(folder, one, "failed").unlink(missing_ok=True)
+            yield one
+
+
+def _drive(
+    first: Shard,
+    missing: Iterator[Shard],
+    folder: Path,
+    tally: _Tally,
+    *,
+    places: int,
+    make_seat: Callable[[], Seat],
+    lost: type[Exception],
+    open: ExitStack,
+) -> None:
+    """Hand shards to workers until none is left; a worker that is lost is replaced."""
+    again: list[Shard] = [first]
+    busy: dict[Future, tuple[Seat, Shard | None]] = {}
+
+    def add_seat() -> None:
+        seat = make_seat()
+        open.callback(seat.close)
+        busy[seat.start()] = seat, None
+
+    for _ in range(places):
+        add_seat()
+    while busy:
+        for future in wait(busy, return_when=FIRST_COMPLETED).done:
+            seat, given = busy.pop(future)
+            try:
+                error = future.result()
+            except lost:
+                if given is None:
+                    raise SliplensError(
+                        "a process was ended from outside as it began, perhaps for want of memory; "
+                        "give the same command again with fewer of them"
+                    ) from None
+                error = SliplensError("the process was ended from outside, perhaps for want of memory")
+                _keep_failure(folder, given, str(error))
+                add_seat()
+                seat = None
+            if given is None and error is not None:
+                raise error
+            if given is not None and error is None:
+                tally.add(given)
+            elif given is not None:
+                tally.error = error
+                failure = _failure(folder, given)
+                if failure is None or len(failure.why) < TRIES:
+                    again.append(given)
+            if seat is not None and (given := again.pop() if again else next(missing, None)) is not None:
+                busy[seat.submit(folder, given, tally.within)] = seat, given
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """Why a shard could not be made."""
+
+    name: str
+    why: tuple[str, ...]
+    """A sentence of each try."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doing:
+    """Shard that is being made, and who makes it."""
+
+    name: str
+    host: str
+    process: int
+    since: str
+    """Date and time in UTC, as ISO 8601."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Plan:
+    title: str
+    shards: int
+    frames: int
+    started_s: float
+    on: str
+
+
+_PLAN = "plan.json"
+_COMMAND = "the command that was interrupted"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Status:
+    """How far a work is, read from its parts."""
+
+    title: str
+    """What is done."""
+    on: str
+    """Where it was begun last, as `--on` says it."""
+    shards: int
+    done: int
+    """Shards whose part is there."""
+    frames: int
+    """Frames of all shards, or maps where each is a shard."""
+    frames_done: int
+    doing: tuple[Doing, ...]
+    failed: tuple[Failure, ...]
+    frames_per_s: float | None
+    """Since it was begun last; None where no part is newer."""
+    ends: str | None
+    """Date and time in UTC at which that rate would end it; None where nobody works on it."""
+
+
+def read_status(out: Path | str) -> list[Status]:
+    """How far each work on a result is that is not complete, read from its parts, from any process or machine.
+
+    `out` is the file or folder that a command is writing, or has written all but for some failures. A complete one has
+    nothing to tell: the list is empty.
+
+    Raises
+    ------
+    InputError
+        If nothing of that name was begun.
+
+    Examples
+    --------
+    >>> from sliplens import read_status
+    >>> for work in read_status("runs/mine/margins"):  # doctest: +SKIP
+    ...     print(work.title, work.done, work.shards, work.ends)
+    Predicting frames (difference) 812 1404 2026-11-23T18:20:11+00:00
+    """
+    out = Path(out)
+    places = [place for place in (out, partial_folder(out)) if place.exists()]
+    if not places:
+        raise InputError(f"nothing was begun at {out}; name the file or folder that a command writes")
+    plans = [path for place in places if place.is_dir() for path in sorted(place.rglob(f"{_STATE}/{_PLAN}"))]
+    return [_read_status(path.parent) for path in plans]
+
+
+def _read_status(state: Path) -> Status:
+    plan = load_record(state / _PLAN, _Plan, command=_COMMAND)
+    done = frames_done = new_frames = 0
+    last_s = plan.started_s
+    for path in state.parent.glob("trial=*/*"):
+        if (found := _PART.fullmatch(path.name)) is not None:
+            done, frames_done = done + 1, frames_done + int(found[2])
+            if (made_s := path.stat().st_mtime) >= plan.started_s:
+                new_frames, last_s = new_frames + int(found[2]), max(last_s, made_s)
+    doing = tuple(one for path in sorted(state.glob("*.doing")) if (one := _doing(path)) is not None)
+    rate = new_frames / (last_s - plan.started_s) if new_frames and last_s > plan.started_s else None
+    left_s = None if rate is None or not doing else (plan.frames - frames_done) / rate
+    return Status(
+        title=plan.title,
+        on=plan.on,
+        shards=plan.shards,
+        done=done,
+        frames=plan.frames,
+        frames_done=frames_done,
+        doing=doing,
+        failed=tuple(load_record(path, Failure, command=_COMMAND) for path in sorted(state.glob("*.failed"))),
+        frames_per_s=rate,
+        ends=None
+        if left_s is None
+        else (datetime.fromtimestamp(last_s, UTC) + timedelta(seconds=left_s)).isoformat(timespec="seconds"),
+    )
+
+
+def _doing(path: Path) -> Doing | None:
+    """What a lock says; None where its owner is gone."""
+    with suppress(OSError, ValueError, InputError):
+        if (held := hold(path)) is None:
+            return Doing(**json.loads(path.read_text()))
+        os.close(held)
+    return None
+
+
+def _state(folder: Path, given: Shard, kind: str) -> Path:
+    return folder / _STATE / f"{given.key}.{kind}"
+
+
+def _failure(folder: Path, given: Shard) -> Failure | None:
+    path = _state(folder, given, "failed")
+    return load_record(path, Failure, command=_COMMAND) if path.is_file() else None
+
+
+def _keep_failure(folder: Path, given: Shard, why: str) -> None:
+    known = _failure(folder, given)
+    kept = Failure(name=given.name, why=(*(known.why if known else ()), why))
+    save_record(kept, _state(folder, given, "failed"))
+
+
+@contextmanager
+def _claim(folder: Path, given: Shard) -> Iterator[None]:
+    """Hold a shard against others, who see by whom; whoever comes second waits."""
+    path = _state(folder, given, "doing")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+    while (held := hold(path)) is None:  # by a process whose driver was killed a moment ago
+        time.sleep(0.05)
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    path.write_text(
+        json.dumps({"name": given.name, "host": socket.gethostname(), "process": os.getpid(), "since": now})
+    )
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        os.close(held)
+
+
+def _flush(path: Path) -> None:
+    """Have what was written on the disk before it gets its name: a machine may go down between the two."""
+    for one in path.iterdir() if path.is_dir() else [path]:
+        with one.open("rb+") as stream:
+            os.fsync(stream)
+
+
+def _remove(path: Path) -> None:
+    shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+
+
+__all__ = ["Doing", "Failure", "Shard", "Status", "make_parts", "read_status"]
