@@ -30,6 +30,15 @@ def test_help_is_for_people(command: str, capsys: pytest.CaptureFixture[str], mo
     assert text.splitlines()[-1] == f"  {EXAMPLES[command]}"
 
 
+def test_the_overview_has_a_line_a_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COLUMNS", "70")
+    with pytest.raises(SystemExit):
+        run("--help")
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 70
+    assert [line.split()[0] for line in lines if line[:2] == "  " and line[2:3].strip()] == list(EXAMPLES)
+
+
 def test_paragraphs_of_options_have_no_ragged_lines(capsys: pytest.CaptureFixture[str]):
     words = " ".join(told(capsys, "study").replace("\u2502", " ").split())
     assert "which takes" not in words

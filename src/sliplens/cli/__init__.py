@@ -19,7 +19,7 @@ from sliplens.cli.evaluate import Evaluate
 from sliplens.cli.explain import Explain
 from sliplens.cli.export import Export
 from sliplens.cli.grip import Grip
-from sliplens.cli.help import EXAMPLES, OPTIONAL, Help, HelpText, describe_options, print_help, tell_unknown
+from sliplens.cli.help import EXAMPLES, OPTIONAL, Help, HelpText, describe_options, overview, print_help, tell_unknown
 from sliplens.cli.import_ import Import
 from sliplens.cli.label import Label
 from sliplens.cli.live import Live
@@ -45,11 +45,14 @@ Command = (
 
 _DESCRIPTION = """sliplens tells how close a soft robotic fingertip is to losing its grip, from the images of the camera
 inside it, and shows why the network says so. Start with `sliplens demo runs/demo`; `sliplens help` tells which commands
-do what you came for."""
+do what you came for, `sliplens COMMAND --help` every option of one."""
 
 
 def _parse(words: Sequence[str]) -> Any:
     """Make the command that the words name; help is printed here, and ends the program."""
+    if words[0] in {"-h", "--help"}:
+        print(overview(_DESCRIPTION, get_args(Command)))
+        raise SystemExit(0)
     if words[0] not in EXAMPLES and not words[0].startswith("-"):
         raise InputError(tell_unknown(words[0], EXAMPLES, what="command", help_of="sliplens"))
     help_text = HelpText()
@@ -59,7 +62,6 @@ def _parse(words: Sequence[str]) -> Any:
             command, unknown = tyro.cli(
                 Command,  # pyright: ignore[reportArgumentType]
                 prog="sliplens",
-                description=_DESCRIPTION,
                 args=words,
                 registry=OPTIONAL,
                 return_unknown_args=True,

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import tyro
 
@@ -13,9 +13,7 @@ from sliplens.cli.console import Terminal
 from sliplens.errors import InputError
 from sliplens.extras import require_device
 from sliplens.files import find_run
-
-if TYPE_CHECKING:
-    from sliplens.recordings.options import ReadOptions
+from sliplens.recordings.options import Budget, ReadOptions
 
 Result = TypeVar("Result")
 NETWORK_HELP = "Folder of a trained network, or the name of one that comes with sliplens."
@@ -102,15 +100,13 @@ class SourceCommand(Command):
     """Topic of the images; the only one if not given."""
     camera_key: str | None = None
     """Feature of a LeRobot data set with the images."""
-    allow_large: tuple[Literal["frames", "pixels", "samples", "span"], ...] = ()
-    """Limits that do not hold, where a recording really is so large."""
+    allow_large: Annotated[tuple[Budget, ...], tyro.conf.arg(metavar="LIMIT")] = ()
+    """Limits that do not hold, where a recording really is so large: frames, pixels, samples or span (of time)."""
     sensor: Path | None = None
     """Profile of the sensor: a file that `sliplens sensor new` made, or chromatouch, digit, gelsight-mini or tactip."""
 
     @property
-    def options(self) -> "ReadOptions":
+    def options(self) -> ReadOptions:
         """What is said of the source, as the library takes it."""
-        from sliplens.recordings.options import ReadOptions
-
         said = ("frame_rate", "image_topic", "camera_key", "allow_large")
         return ReadOptions(**{name: getattr(self, name) for name in said})

@@ -23,7 +23,7 @@ EXAMPLES = {
     "live": "sliplens live 0 --network chromatouch-difference --reference untouched.png",
     "sensor": "sliplens sensor new --from tip.mp4 -o tip.toml",
     "simulate": "sliplens simulate runs/mine/data --preset small",
-    "import": "sliplens import cup.mp4 --forces cup.csv --sensor tip -o runs/mine/data",
+    "import": "sliplens import cup.mp4 --forces cup.csv --sensor tip.toml -o runs/mine/data",
     "label": "sliplens label runs/mine/data --page",
     "split": "sliplens split runs/mine/data --preset trials --dry-run",
     "check": "sliplens check runs/mine/data",
@@ -31,7 +31,7 @@ EXAMPLES = {
     "track": "sliplens track cup.mp4 --reference untouched.png -o markers.parquet",
     "train": "sliplens train runs/mine/data -o runs/mine/train --start-from chromatouch-difference --epochs 5",
     "evaluate": "sliplens evaluate runs/mine/train runs/mine/data -o runs/mine/evaluate",
-    "predict": "sliplens predict runs/mine/train cup.mp4 --reference untouched.png --plot margin.png -o margins.csv",
+    "predict": "sliplens predict cup.mp4 --sensor tip.toml --plot margin.png -o margins.csv",
     "export": "sliplens export runs/mine/train --onnx -o tip.onnx",
     "explain": "sliplens explain runs/mine/train --frames frames --reference untouched.png -o runs/mine/explain",
     "score": "sliplens score runs/mine/train runs/mine/explain -o runs/mine/score",
@@ -46,7 +46,7 @@ EXAMPLES = {
 """One line for each command that can be typed as it stands, once the files are there."""
 TASKS = {
     "look": ("See what sliplens does, without any data", ("demo",)),
-    "read": ("Read the safety margin from images, a video or a bag", ("predict", "view")),
+    "read": ("Read the safety margin from images, a video or a bag", ("sensor", "predict", "view")),
     "explain": ("See which parts of an image a margin comes from", ("explain", "score")),
     "teach": ("Teach a network your own sensor", ("sensor", "import", "check", "label", "train", "evaluate")),
     "judge": ("Find out where a network fails, and which explanation can be believed", ("diagnose", "study")),
@@ -59,7 +59,7 @@ TASKS = {
 class Help:
     """Show which commands do what you came for: look, read, explain, teach, judge or live."""
 
-    task: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")] = None
+    task: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[TASK]")] = None
     """One of the six; all if not given."""
 
     def run(self) -> None:
@@ -112,7 +112,7 @@ def describe_options(*commands: type) -> None:
         said = {one.arg_name: one.description for one in docstring_parser.parse_from_object(kind).params}
         hints: dict[str, str] = {}
         for one in fields(kind):  # pyright: ignore[reportArgumentType]
-            if one.default is None or one.default == ():
+            if one.default in (None, (), False):
                 hints[one.name] = ""
             elif one.default is MISSING and one.default_factory is MISSING:
                 hints[one.name] = "(required)"
@@ -122,6 +122,13 @@ def describe_options(*commands: type) -> None:
             settings |= {"help_behavior_hint": hints[name]} if name in hints else {}
             if settings:
                 kind.__annotations__[name] = Annotated[annotation, tyro.conf.arg(**settings)]
+
+
+def overview(description: str, commands: Iterable[type]) -> str:
+    """Say what the program is for, and what each of its commands does, in lines as wide as the terminal."""
+    width, said = shutil.get_terminal_size().columns, {kind.__name__.lower(): kind.__doc__ or "" for kind in commands}
+    lines = [fill(f"  {name:10}{said[name].splitlines()[0]}", width, subsequent_indent=" " * 12) for name in EXAMPLES]
+    return "\n".join(["usage: sliplens COMMAND ...", "", fill(description, width), "", *lines])
 
 
 class HelpText(io.StringIO):
@@ -140,5 +147,4 @@ def print_help(text: str, words: Iterable[str]) -> None:
     lines = [line if len(line) <= width else fill(line, width, break_on_hyphens=False) for line in text.splitlines()]
     command = next((word for word in words if word in EXAMPLES), None)
     tail = [] if command is None else ["", "Example:", f"  {EXAMPLES[command]}"]
-    sys.stdout.write("\n".join([*lines, *tail, ""]))
-    sys.stdout.flush()
+    print("\n".join([*lines, *tail]), flush=True)

@@ -32,9 +32,9 @@ class Live:
     printed. Ends with Ctrl-C or after --seconds; with --no-page or --sink also when the source ends.
     """
 
-    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE", help=_SOURCE)] = "simulated"
+    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[SOURCE]", help=_SOURCE)] = "simulated"
     network: str | None = None
-    """Folder or name of a trained network: chromatouch-difference for what is simulated, none if not given."""
+    """Folder or name of a trained network. If not given, chromatouch-difference for what is simulated, else none."""
     reference: Path | None = None
     """Image of the untouched sensor; taken when the picture is still at first if not given."""
     friction: Friction = None

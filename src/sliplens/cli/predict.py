@@ -15,6 +15,7 @@ from sliplens.files import require_new_file
 if TYPE_CHECKING:
     from sliplens.models.predictions import Predictions, TrialMargins
 
+_RUN = f"{NETWORK_HELP} If left out, the one that the sensor's profile names, else chromatouch-difference."
 _FEW = 24
 """Frames of which each has a line on the terminal."""
 _TRIALS = 40
@@ -30,15 +31,7 @@ class Predict(SourceCommand):
     lowest point. Images of a folder are taken for difference images if no reference is named.
     """
 
-    model: Annotated[
-        Path | None,
-        tyro.conf.Positional,
-        tyro.conf.arg(
-            name="run",
-            metavar="[RUN]",
-            help=f"{NETWORK_HELP} If left out, the one that the sensor's profile names, else chromatouch-difference.",
-        ),
-    ]
+    model: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="[RUN]", help=_RUN)] = None
     source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE", help=SOURCE_HELP)] = None
     output: Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="FILE.csv|FOLDER")] = None
     """Table to write, by its ending .parquet, .csv or .json; without one a folder, a Parquet data set with a file a
@@ -66,6 +59,8 @@ class Predict(SourceCommand):
         """Refuse what is wrong at first sight."""
         from sliplens.codec import TABLE_SUFFIXES
 
+        if self.source is None:
+            raise InputError("name what to read: sliplens predict [RUN] SOURCE")
         if self.output is not None and self.output.suffix:
             require_new_file(self.output, suffix=TABLE_SUFFIXES, overwrite=self.overwrite)
         if self.plot is not None:

@@ -34,13 +34,13 @@ class Study(Command):
     """Network on difference images: a folder, or a name of one that comes with sliplens; none to leave it out. If not
     given, chromatouch-difference, or with --preset thesis-difference."""
     raw: str | None = None
-    """Network on raw images, named and chosen alike."""
+    """Network on raw images: a folder, a name, or none. If not given, chromatouch-raw, or with --preset thesis-raw."""
     preset: Literal["thesis"] | None = None
     """Simulate the data set first: the days and trials of the thesis, 80 frames each, some 1.5 GB; and explain networks
     that were trained on its training trials with the recipe of the thesis."""
     method: tuple[str, ...] | None = None
-    """Explainers to compare; those that end in -thesis are as the thesis ran them. If not given, these three, the same
-    against the untouched sensor, occlusion, and Shapley values of markers."""
+    """Explainers to compare; those that end in -thesis are as the thesis ran them. If not given, the three of the
+    thesis, the same three against the untouched sensor, occlusion, and Shapley values of markers."""
     split: str = "test"
     """Trials to choose from."""
     condition: str = "dry"

@@ -21,8 +21,8 @@ _SOURCE = f"{SOURCE_HELP} Or a table of `sliplens predict`, which names its sour
 class View(SourceCommand):
     """Look at a trial in the Rerun viewer: frames, differences, forces, labels, predictions, maps on one clock.
 
-    Needs the extra `view`: pip install "sliplens[view]". The viewer opens on this machine and listens to it alone; with
-    --output a file is written instead, to be opened with `rerun FILE.rrd` wherever Rerun is installed.
+    Needs the extra `view`: pip install "sliplens[view]". The viewer opens on this machine and listens to it alone. Or
+    name a file to write (-o), to be opened with `rerun FILE.rrd` wherever Rerun is installed.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE", help=_SOURCE)]

@@ -22,7 +22,7 @@ def spoken(names: Iterable[str]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class ReadOptions:
-    """What a user may say of a source; each reader understands some of it (`Reader.takes`)."""
+    """What is known of a source; each format takes some of it, and says so where it does not."""
 
     forces: Path | None = None
     """Table of forces beside a video or folder of images (CSV)."""

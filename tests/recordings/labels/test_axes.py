@@ -85,7 +85,7 @@ def test_two_axes_that_press_alike_are_doubtful(trial: Trial):
 
 def test_a_sensor_that_is_never_touched_is_refused(trial: Trial, rng: np.random.Generator):
     forces = Forces(time_s=trial.time_s, force_n=rng.normal(0.5, 0.02, (len(trial.time_s), 3)), source="sensor")
-    with pytest.raises(RecordingError, match=r"sensor never departs from its noise.*; declare normal axis, sign and"):
+    with pytest.raises(RecordingError, match=r"sensor never departs from its noise.*; give --normal-axis"):
         infer_axes(forces)
     assert infer_axes(forces, normal="z", sign=1).still_until_s is None
 

@@ -55,7 +55,7 @@ def test_a_lag_that_was_measured_otherwise_is_used(trial: Trial, rng: np.random.
 
 def test_a_trial_that_never_slips_needs_its_friction_by_hand(trial_without_slip: Trial, rng: np.random.Generator):
     trial = trial_without_slip
-    with pytest.raises(RecordingError, match="give the coefficient of friction by hand"):
+    with pytest.raises(RecordingError, match="give it with --mu"):
         label_trial(trial.frame_time_s, trial.motion, trial.forces(), settings=LabelSettings(), rng=rng)
 
 

@@ -131,7 +131,7 @@ def infer_axes(
     if np.isinf(touch) and (normal is None or sign is None):
         raise RecordingError(
             f"{forces.source} never departs from its noise: no touch to infer the axes from; "
-            "declare normal axis, sign and tare, or leave the trial out"
+            "give --normal-axis, --normal-sign and --tare, or leave the trial out"
         )
     still = forces.force_n[forces.time_s < until]
     tare, tare_sigma, tare_found = np.zeros(3), np.zeros(3), Found.ASSUMED

@@ -79,7 +79,7 @@ def _bracket_break(time_s: Samples, values: Samples, *, about_s: float, rng: np.
     if len(before) < _LEAST_LINE or before[-1] + 1 == len(time_s):
         raise RecordingError(
             f"only {np.sum(time_s < about_s)} samples before the slip at {about_s:.2f} s and "
-            f"{np.sum(time_s > about_s)} after it can be used; record the forces faster or give the friction by hand"
+            f"{np.sum(time_s > about_s)} after it can be used; record the forces faster or give the friction with --mu"
         )
     last_s, next_s = time_s[before[-1] : before[-1] + 2]
     line = np.polynomial.Polynomial.fit(time_s[before], values[before], 1)
@@ -171,7 +171,7 @@ def estimate_friction(
     if not candidates:
         raise RecordingError(
             f"the trial never slips (F_t / F_n reaches {highest:.2f} without breaking off), so its friction is "
-            "unknown; give the coefficient of friction by hand"
+            "unknown; give it with --mu, or in the column mu of a manifest"
         )
     # a slip that the image does not see is a knock at the force sensor, unless no fall is seen
     seen = [rough for rough in candidates if (_image_sigmas(image, rough) or 0) >= _SEEN_SIGMAS]
@@ -194,7 +194,7 @@ def estimate_friction(
     if low <= 0:
         raise RecordingError(
             f"the slip at {fit.time_s:.2f} s tells a friction of {fit.level:.2g} with a 68 % interval from {low:.2g} "
-            f"to {high:.2g}, which is none; give the coefficient of friction by hand"
+            f"to {high:.2g}, which is none; give the coefficient of friction with --mu"
         )
     early, late = np.quantile(fit.times_s, _BAND)
     return FrictionEstimate(

@@ -335,7 +335,7 @@ def _label_screened(
         if lost.sum() > _MOST_LOST * len(lost):
             raise RecordingError(
                 "most samples between touch and slip are faulty, so the contact may have slipped before; give "
-                "the coefficient of friction by hand, or record the trial again"
+                "the coefficient of friction with --mu, or record the trial again"
             )
     return label_frames(
         frame_time_s,
