@@ -1,12 +1,14 @@
 """A small recording, and a network that nobody trained: enough to test everything around them."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import nn
 
 from sliplens.models import Manifest, build_model, save_checkpoint
-from sliplens.models.calibration import Traction
+from sliplens.models.calibration import Calibration, Traction
 from sliplens.recordings import ContactState, Recording
 
 FRAME_SIZE = 48
@@ -45,18 +47,22 @@ def make_recording(trial: str, *, condition: str = "dry", day: int = 1, frames: 
 def save_untrained(
     folder: Path,
     *,
+    head: str = "point",
     kind: str = "difference",
     seed: int = 0,
     frame_size: int = FRAME_SIZE,
     image_size: int = IMAGE_SIZE,
+    calibration: Calibration | None = None,
     traction: Traction | None = None,
+    prepare: Callable[[nn.Module], None] = lambda _: None,
 ) -> Path:
-    """A checkpoint with random weights: enough to test everything around a network."""
-    head = "point" if traction is None else "margin-and-ratio"
+    """A checkpoint with random weights: enough to test everything around a network; what prepares them comes last."""
+    head = head if traction is None else "margin-and-ratio"
     folder.mkdir(parents=True, exist_ok=True)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         model = build_model(head=head)
+    prepare(model)
     manifest = Manifest(
         backbone="shufflenet_v2_x1_0",
         input=kind,
@@ -65,7 +71,7 @@ def save_untrained(
         sensor="test-sensor",
         data_hash="none",
         head=head,
-        calibration=None if traction is None else traction.calibration,
+        calibration=calibration if traction is None else traction.calibration,
         traction=traction,
     )
     save_checkpoint(folder, model.eval(), manifest)

@@ -4,15 +4,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from small import IMAGE_SIZE, save_untrained
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sliplens.models import Manifest, Run, build_model, load_checkpoint, save_checkpoint
+from sliplens.models import Run, load_checkpoint
 from sliplens.models.backbones import HistogramRegressor
 from sliplens.models.calibration import Calibration, Traction
 from sliplens.models.onnx import export_onnx
 
-FRAME_SIZE, IMAGE_SIZE = 48, 32
 CALIBRATION = Calibration(temperature=1.0, offsets={"0.68": 0.02, "0.9": 0.05}, frames=100, mse=0.01)
 TRACTION = Traction(
     calibration=CALIBRATION, told=CALIBRATION, friction=tuple(0.15 + 0.105 * part for part in range(11))
@@ -27,8 +27,9 @@ def some_images(count: int, *, seed: int) -> Tensor:
 
 
 @torch.no_grad()
-def awaken(network: nn.Module) -> None:
+def awaken(model: nn.Module) -> None:
     """Give a network at its beginning statistics and answers that vary, else a mistake would hardly be seen."""
+    network = model.backbone if isinstance(model, HistogramRegressor) else model
     for one in network.modules():
         if isinstance(one, nn.BatchNorm2d):
             one.momentum = None  # the true statistics; a few steps towards them would let the signal die
@@ -41,24 +42,10 @@ def awaken(network: nn.Module) -> None:
 
 
 def save_run(folder: Path, *, head: str, kind: str = "difference") -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(5)
-        model = build_model(head=head)
-    awaken(model.backbone if isinstance(model, HistogramRegressor) else model)
-    manifest = Manifest(
-        backbone="shufflenet_v2_x1_0",
-        input=kind,
-        image_size=IMAGE_SIZE,
-        frame_size=(FRAME_SIZE, FRAME_SIZE),
-        sensor="test-sensor",
-        data_hash="none",
-        head=head,
-        calibration=None if head == "point" else CALIBRATION,
-        traction=TRACTION if head == "margin-and-ratio" else None,
+    calibration, traction = None if head == "point" else CALIBRATION, TRACTION if head == "margin-and-ratio" else None
+    return save_untrained(
+        folder, head=head, kind=kind, seed=5, calibration=calibration, traction=traction, prepare=awaken
     )
-    save_checkpoint(folder, model.eval(), manifest)
-    return folder
 
 
 @pytest.fixture(scope="session")

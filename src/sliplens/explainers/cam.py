@@ -121,8 +121,6 @@ def find_published_layers(model: nn.Module, images: Float[Tensor, "batch colours
     Modules are listed as they end, insides before their block: the size goes down and up again inside a block with two
     branches, and the last layer is missed, since what follows it is no map.
 
-    References
-    ----------
     Public code of Poly-CAM, `find_layer_list`.
     """
     ended = [(call.name, call.output_shape) for call in _finished(_record(model, images))]

@@ -62,8 +62,6 @@ def to_masks(
 
     A map below zero all over gives the empty mask; `as_published` it gives one of ones, divided by 1e-12.
 
-    References
-    ----------
     Englebert, Cornu and De Vleeschouwer, *Poly-CAM: High resolution class activation map for convolutional neural
     networks*, ICPR 2022, and its public code for the division by hi rather than by the range.
     """
@@ -90,8 +88,6 @@ def combine(
     From the last layer on a layer's map is divided by itself resized to the coarser result and back (LNorm), then
     multiplied by that result; a level's saliency is this product normalised like a mask.
 
-    References
-    ----------
     Englebert, Cornu and De Vleeschouwer, *Poly-CAM*, ICPR 2022, section III, and its public code.
     """
     saliencies = []

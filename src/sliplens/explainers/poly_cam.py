@@ -57,8 +57,6 @@ def thesis_support(image: Tensor, _empty: Tensor, points: Points, *, variant: st
 
     In float32 it is 1 from 17 % on, so that there the weights of PCAM+/- are all 1 and those of PCAM- all 0.
 
-    References
-    ----------
     Englebert, Cornu and De Vleeschouwer, *Poly-CAM*, ICPR 2022, eqs. 8 to 10, and its public code for the sigmoid of
     a single output.
     """
@@ -236,11 +234,7 @@ class PolyCam(Method):
             scale_to(torch.stack(shown), total=comparison.change),
             method="poly-cam",
             complete=True,
-            warnings=(
-                *check_weights(names, weights, change=change),
-                *check_approximations(approximations),
-                *rounding,
-            ),
+            warnings=(*check_weights(names, weights, change=change), *check_approximations(approximations), *rounding),
             levels=levels,
             approximations=tuple(approximations),
             engine=engine.name,

@@ -29,8 +29,6 @@ def mask_kernel(
     What a mask uncovers is its mean over each of 14 x 14 cells, times the contrast |x - b| there: where the image
     equals the reference a mask shows nothing. The kernel asks no smoothness of the network.
 
-    References
-    ----------
     Rasmussen and Williams, *Gaussian processes for machine learning* (2006), eq. 4.18.
     """
     weights = functional.adaptive_avg_pool2d(contrast[None], _GRID).flatten().double()
@@ -47,8 +45,6 @@ class GaussianProcess:
     The factor L of the covariance is built column by column (a pivoted Cholesky decomposition), so that the variance
     that is left after each choice is known before anything is measured.
 
-    References
-    ----------
     Rasmussen and Williams, *Gaussian processes for machine learning* (2006), eqs. 2.23 and 2.24.
     """
 

@@ -54,8 +54,6 @@ def shapley_values(
 
     `pairs` are asked, or all, exactly, where the players have no more; at least twice as many as the players.
 
-    References
-    ----------
     Lundberg and Lee, *A Unified Approach to Interpreting Model Predictions* (2017), Theorem 2; Covert and Lee,
     *Improving KernelSHAP: Practical Shapley Value Estimation via Linear Regression* (2021), section 4.2, pairs.
     Patterson and Thompson, *Recovery of inter-block information when block sizes are unequal* (1971), for how far to
@@ -160,8 +158,6 @@ class Shapley(RegionMethod):
     first guess (`shapley_values`). Where the contributions are hardly surer than they differ, a warning says so; more
     `pairs` help.
 
-    References
-    ----------
     Shapley, *A Value for n-Person Games* (1953); Lundberg and Lee, *A Unified Approach to Interpreting Model
     Predictions* (2017). Estimated by `shapley_values`.
     """

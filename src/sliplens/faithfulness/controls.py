@@ -35,8 +35,6 @@ def total_variation(saliency: Float[np.ndarray, "height width"]) -> float:
 def gini(saliency: Float[np.ndarray, "height width"]) -> float:
     """Gini index of the sizes of a map's values: 0 where all are alike, towards 1 where one pixel has all.
 
-    References
-    ----------
     Chalasani et al., *Concise Explanations of Neural Networks using Adversarial Training* (2020), sparsity.
     """
     values = np.sort(np.abs(saliency).ravel())
@@ -79,8 +77,6 @@ def stability(
 def relevance_mass(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "height width"]) -> float:
     """Share of a map's sum that lies inside the truth; NaN for a map that is zero.
 
-    References
-    ----------
     Arras, Osman and Samek, *CLEVR-XAI* (2022): relevance mass accuracy.
     """
     _require(saliency, truth)
@@ -93,8 +89,6 @@ def relevance_mass(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "
 def relevance_rank(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "height width"]) -> float:
     """Share of the K highest pixels that lie inside the truth, which has K pixels; ties count by chance.
 
-    References
-    ----------
     Arras, Osman and Samek, *CLEVR-XAI* (2022): relevance rank accuracy.
     """
     _require(saliency, truth)
@@ -142,8 +136,6 @@ def change(images: Images, references: Images) -> ControlMaps:
 def relative_change(images: Images, references: Images) -> ControlMaps:
     """|x - b| over a marker's width, divided by that over four: where more changed than thereabouts.
 
-    References
-    ----------
     Carandini and Heeger, *Normalization as a canonical neural computation* (2012).
     """
     pairs = list(zip(images, references, strict=True))
@@ -179,8 +171,6 @@ def control_maps(model: nn.Module, images: Images, references: Images) -> dict[s
     Beside these stand random orders, and each explainer on networks whose weights were drawn anew. A network without
     layers that have a map has no `weights-1`.
 
-    References
-    ----------
     Clark et al., *XAI-TRIS* (2024), edge filters; Adebayo et al., *Sanity Checks for Saliency Maps* (2018).
     """
     maps = {
@@ -207,8 +197,6 @@ def lead_over_controls(
     the method is ahead of each for sure, whichever would be the strongest in other trials. The score is one that is 0
     by chance, which stands among the controls.
 
-    References
-    ----------
     Berger, *Multiparameter hypothesis testing and acceptance sampling* (1982): intersection-union tests.
     """
     others = {**controls, CHANCE: np.zeros(len(own))}
@@ -226,8 +214,6 @@ def cascade(model: nn.Module, *, seed: int, stages: int, images: Images) -> Iter
     it. Normalisation gets the statistics of the images, two at least: with those of an untrained network new weights
     shrink what passes through them layer by layer, until it gives one answer to every image.
 
-    References
-    ----------
     Adebayo et al., *Sanity Checks for Saliency Maps* (2018): cascading randomisation.
     """
     changed = copy.deepcopy(model).eval()
@@ -287,8 +273,6 @@ def randomisation_scores(
 ) -> RandomisationScores:
     """Explain a network whose weights are drawn anew from the output on, and compare with the maps of the trained one.
 
-    References
-    ----------
     Adebayo et al. (2018); Hedstroem et al., *Sanity Checks Revisited* (2024): eMPRT, the rise of complexity, and its
     histogram entropy.
     """
@@ -311,17 +295,10 @@ def histogram_entropy(values: Float[np.ndarray, "height width"]) -> float:
 
 
 def smooth_maps(
-    explain: Callable[[nn.Module, Tensor], Maps],
-    model: nn.Module,
-    images: Images,
-    *,
-    samples: int = 16,
-    seed: int = 0,
+    explain: Callable[[nn.Module, Tensor], Maps], model: nn.Module, images: Images, *, samples: int = 16, seed: int = 0
 ) -> Maps:
     """Mean of the maps of several noisy copies of each image: so that randomisation compares signal with signal.
 
-    References
-    ----------
     Hedstroem et al. (2024): sMPRT.
     """
     generator = torch.Generator().manual_seed(seed)

@@ -31,8 +31,6 @@ def noisy_linear(
     All equations are solved together by conjugate gradients, until no filled pixel is farther than the tolerance from
     the mean of its neighbours. An image of which nothing is left becomes its own mean.
 
-    References
-    ----------
     Rong et al., *A Consistent and Efficient Evaluation Strategy for Attribution Methods* (2022): ROAD, section 4 and
     appendix; weights of 1/6 for the four nearest and 1/12 for the diagonal neighbours.
     """
@@ -47,10 +45,7 @@ def noisy_linear(
 
 
 def _solve(
-    images: Float[Tensor, "batch 3 height width"],
-    gone: Bool[Tensor, "batch 3 height width"],
-    *,
-    tolerance: float,
+    images: Float[Tensor, "batch 3 height width"], gone: Bool[Tensor, "batch 3 height width"], *, tolerance: float
 ) -> Float[Tensor, "batch 3 height width"]:
     """Images whose removed pixels are the weighted means of their neighbours, from the solution at half the size on.
 
@@ -94,10 +89,7 @@ def _solve(
 
 
 def _begin(
-    images: Float[Tensor, "batch 3 height width"],
-    left: Float[Tensor, "batch 3 height width"],
-    *,
-    tolerance: float,
+    images: Float[Tensor, "batch 3 height width"], left: Float[Tensor, "batch 3 height width"], *, tolerance: float
 ) -> Float[Tensor, "batch 3 height width"]:
     """A first guess: the solution at half the size, or the mean of what is left of a small or whole image."""
     known = left.sum(dim=(2, 3), keepdim=True)

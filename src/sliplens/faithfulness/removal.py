@@ -320,8 +320,6 @@ def score_maps(
     target counts like removing what speaks for it: order by |influence| then, or a map of what each marker really does
     can rank below the same map half shuffled (docs/study.md).
 
-    References
-    ----------
     Section 3 of the notes on faithfulness; Samek et al., *Evaluating the Visualization of What a Deep Neural Network
     Has Learned* (2017), most and least relevant first.
     """

@@ -109,8 +109,6 @@ def random_order(shape: tuple[int, int], *, rng: np.random.Generator) -> Int[np.
 def deletion_steps(shape: tuple[int, int], *, steps: int | None = None) -> Int[np.ndarray, " steps"]:
     """Pixels removed at each step: as many steps as the image is high, the last of which removes all.
 
-    References
-    ----------
     Polak, section 4 (n_masks = 224 for a 224 x 224 image: 224 steps of 224 pixels).
     """
     pixels = shape[0] * shape[1]
@@ -224,8 +222,6 @@ def flat_maps(maps: Mapping[str, Float[np.ndarray, "images height width"]]) -> l
 def rankings_disagree(scores: Mapping[str, Mapping[str, float]]) -> list[str]:
     """Say which fills rank the methods differently, by Kendall's tau; scores by fill, then by method.
 
-    References
-    ----------
     Kendall, *A new measure of rank correlation* (1938).
     """
     alarms = []

@@ -3,13 +3,7 @@
 from sliplens.markers.detect import KINDS, Appearance, MarkerKind, Markers, detect_markers
 from sliplens.markers.doublets import Doublets, fit_doublets
 from sliplens.markers.tracker import Tracker, track_markers
-from sliplens.markers.tracks import (
-    DisplacementField,
-    MarkerStatus,
-    TrackedFrame,
-    Tracks,
-    interpolate_field,
-)
+from sliplens.markers.tracks import DisplacementField, MarkerStatus, TrackedFrame, Tracks, interpolate_field
 
 __all__ = [
     "KINDS", "Appearance", "DisplacementField", "Doublets", "MarkerKind", "MarkerStatus", "Markers", "TrackedFrame",

@@ -43,11 +43,7 @@ class SensorProposal:
 
 
 def propose_profile(
-    source: Path | str | Frames,
-    *,
-    name: str,
-    network: str | None = None,
-    size_px: tuple[int, int] | None = (224, 224),
+    source: Path | str | Frames, *, name: str, network: str | None = None, size_px: tuple[int, int] | None = (224, 224)
 ) -> SensorProposal:
     """Propose the profile of a sensor from a recording that begins untouched.
 
@@ -123,12 +119,7 @@ def propose_profile(
         network=network,
     )
     return SensorProposal(
-        profile=profile,
-        frame=frame,
-        gel_px=gel,
-        markers_px=places,
-        spacing_px=factor * spacing,
-        notes=tuple(notes),
+        profile=profile, frame=frame, gel_px=gel, markers_px=places, spacing_px=factor * spacing, notes=tuple(notes)
     )
 
 

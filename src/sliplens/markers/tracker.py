@@ -7,14 +7,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from sliplens.errors import ImageError, RecordingError
 from sliplens.markers.detect import MarkerKind, Markers, detect_markers
-from sliplens.markers.linking import (
-    Usual,
-    drop_contradicting,
-    drop_strays,
-    find_neighbours,
-    link,
-    match_left_over,
-)
+from sliplens.markers.linking import Usual, drop_contradicting, drop_strays, find_neighbours, link, match_left_over
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame, Tracks, stack_tracks
 
 _STEADY_FRAMES = 3  # in a row, before a spot counts as a marker: specks come and go

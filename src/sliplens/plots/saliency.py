@@ -98,8 +98,6 @@ def overlay_jet(
 
     Jet has bright bands where nothing changes and is not read alike by everyone; use it to compare with those figures.
 
-    References
-    ----------
     `show_cam_on_image` of the public pytorch-grad-cam, which the thesis's code calls.
     """
     mixed = 0.5 * colormaps["jet"](np.clip(saliency, 0, 1))[..., :3] + 0.5 * picture / 255

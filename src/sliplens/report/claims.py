@@ -331,10 +331,7 @@ def _looks_at_two(truth: Truth, *, rng: np.random.Generator) -> Answer:
         where="each marker put back", compared="share of the two strongest markers", gap=share, outcome=two
     )
     massed = Finding(
-        where="relevance mass",
-        compared=f"on edges, less their {percent(area)} of the image",
-        gap=gap,
-        outcome=on_edges,
+        where="relevance mass", compared=f"on edges, less their {percent(area)} of the image", gap=gap, outcome=on_edges
     )
     return Answer(
         subject=input_name(truth.input),

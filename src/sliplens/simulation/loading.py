@@ -249,13 +249,7 @@ def load_at_states(
 
 
 def _label(
-    time_s: Frames,
-    *,
-    normal: Frames,
-    static: Frames,
-    friction: Friction,
-    held_s: Frames,
-    course: Pull | None = None,
+    time_s: Frames, *, normal: Frames, static: Frames, friction: Friction, held_s: Frames, course: Pull | None = None
 ) -> Loading:
     """Label frames of which is known how much of the friction they use, and whether the pull was let back before."""
     let_back = retaken = np.zeros(len(time_s))

@@ -26,10 +26,7 @@ class SharedMaterial:
 
 
 def compare_datasets(
-    first: Dataset | Path | str,
-    second: Dataset | Path | str,
-    *,
-    splits: tuple[str | None, str | None] = (None, None),
+    first: Dataset | Path | str, second: Dataset | Path | str, *, splits: tuple[str | None, str | None] = (None, None)
 ) -> SharedMaterial:
     """Tell which trials, days and sensors two data sets share.
 

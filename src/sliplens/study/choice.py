@@ -46,8 +46,6 @@ def choose_frames(
     error is smallest are taken too; where more do, the first of them in the data set's order. In each the frames
     nearest to `LEVELS` are taken: those at `SCORED_LEVELS`, and all of the trial that the panels show, the best read.
 
-    References
-    ----------
     Polak, section 4: 14 trials read within 3 %, 6 levels, 42 frames to score.
     """
     if not networks:

@@ -132,8 +132,6 @@ def score_remedies(
 
     Stopping early needs no pass of its own: the same frames, scored by deletion to grey, are given.
 
-    References
-    ----------
     Polak, discussion of the faithfulness curves: stop once all pixels with saliency above 0.5 are gone; another fill.
     """
     explained, inputs = material.explained, material.inputs

@@ -30,14 +30,7 @@ from sliplens.models.backbones import (
     with_ratio,
     with_reference,
 )
-from sliplens.models.calibration import (
-    LEVELS,
-    Calibration,
-    Traction,
-    conformal_offset,
-    fit_temperature,
-    raw_interval,
-)
+from sliplens.models.calibration import LEVELS, Calibration, Traction, conformal_offset, fit_temperature, raw_interval
 from sliplens.models.checkpoint import Estimate, Ratio, load, tell_each
 from sliplens.models.encodings import Encoding, get_encoding
 from sliplens.models.novelty import Novelty, fit_novelty

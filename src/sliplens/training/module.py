@@ -244,11 +244,7 @@ class Clock(Callback):
 
 
 def make_trainer(
-    config: TrainConfig,
-    *,
-    accelerator: Literal["auto", "cpu", "gpu"] = "auto",
-    devices: int = 1,
-    num_nodes: int = 1,
+    config: TrainConfig, *, accelerator: Literal["auto", "cpu", "gpu"] = "auto", devices: int = 1, num_nodes: int = 1
 ) -> lightning.Trainer:
     """Trainer of this process, which knows its number among all (`global_rank`); nothing runs yet.
 
