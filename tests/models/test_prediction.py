@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+import sliplens as sl
 from sliplens.errors import ImageError, InputError, RecordingError, ShardError
 from sliplens.images import absolute_difference, write_png
 from sliplens.models import Run, load_checkpoint
@@ -105,6 +106,17 @@ def test_how_sure_the_network_is_comes_from_its_distribution(
     for name, values in zip(("sigma", "low_90", "high_90"), (estimate.sigma, *interval), strict=True):
         np.testing.assert_allclose(rows[name][12:], values, atol=1e-5)  # as above
     assert np.all(np.array(rows["low_90"]) <= rows["high_90"])
+
+
+def test_how_far_the_network_knows_each_frame_is_told(trials: dict[str, Recording]):
+    trial, network = trials["chromatouch"], sl.load("chromatouch-difference")
+    bright = np.clip(trial.frames[20:22] * 1.5, 0, 255).astype(np.uint8)
+    frames = np.concatenate([trial.frames[18:23], bright])
+    predictions = sl.predict(network, frames, reference=trial.reference, engine="folded", batch_size=3)
+    estimate = network.estimate(network.encode(frames, trial.reference))
+    assert estimate.known is not None
+    np.testing.assert_allclose(predictions.frame()["known"].to_numpy(), estimate.known, atol=1e-3)
+    assert predictions.strange == (estimate.known < 0.01).sum() == 2
 
 
 def test_a_network_with_one_number_tells_nothing_of_it(

@@ -81,6 +81,8 @@ class Predict(SourceCommand):
         named = {"run": run, "source": source, "options": self.options, "onnx_file": self.onnx, "out": self.output}
         predictions = self.call(predict, **named)
         _show(predictions)
+        if strange := predictions.strange:
+            say(f"{strange:,} frames are strange to the network (known below 1 %): do not rely on their margins")
         if self.friction is not None:
             say(f"margins for a friction of {self.friction}, as you told it")
         if self.plot is not None:
@@ -96,18 +98,18 @@ class Predict(SourceCommand):
 def _show(predictions: "Predictions") -> None:
     if predictions.frames <= _FEW:
         rows = predictions.frame().to_pylist()
-        labelled = any(row.get("safety_margin") is not None for row in rows)
-        head = ("frame", "safety margin", "90 % interval", *(["true"] if labelled else []))
+        more = {"true": "safety_margin", "known": "known"}
+        more = {head: name for head, name in more.items() if any(row.get(name) is not None for row in rows)}
         told = [
             (
                 row.get("file") or f"{row['trial']} {row['frame']}",
                 _percent(row["prediction"]),
                 _interval(row["low_90"], row["high_90"]),
-                *([_percent(row["safety_margin"])] if labelled else []),
+                *(_percent(row[name]) for name in more.values()),
             )
             for row in rows
         ]
-        print_table("Safety margins", head, told)
+        print_table("Safety margins", ("frame", "safety margin", "90 % interval", *more), told)
         return
     trials = predictions.trials()
     for trial in trials[:_TRIALS]:

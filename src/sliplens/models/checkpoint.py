@@ -202,14 +202,17 @@ class Run:
 
     def estimate_batches(self, batches: Iterable[Tensor], *, friction: FrictionLike | None = None) -> "Estimate":
         """Safety margins as `estimate` tells them, of batches of encoded frames."""
-        novelty = self.manifest.novelty
-        if novelty is None or not novelty.strangeness:
+        if (novelty := self.novelty) is None:
             return self.to_estimate(*self.answers(batches), friction=friction)
         with watch_features(self.model, novelty.layer) as features:
             answers = self.answers(batches)
-        sigma = self.to_estimate(*answers).sigma  # before friction narrows it
-        known = novelty.known(np.concatenate(features), sigma)
-        return replace(self.to_estimate(*answers, friction=friction), known=known)
+        return self.to_estimate(*answers, friction=friction, features=np.concatenate(features))
+
+    @property
+    def novelty(self) -> Novelty | None:
+        """What tells how far it knows a frame; None of a network that does not tell."""
+        novelty = self.manifest.novelty
+        return novelty if novelty is not None and novelty.strangeness else None
 
     def to_estimate(
         self,
@@ -218,8 +221,12 @@ class Run:
         ratio: Float[Tensor, "batch ratio_bins"] | None = None,
         *,
         friction: FrictionLike | None = None,
+        features: Float[np.ndarray, "batch features"] | None = None,
     ) -> "Estimate":
-        """Estimate from what the network answered (`Answers`), and from friction where it is told."""
+        """Estimate from what the network answered (`Answers`), and from friction where it is told.
+
+        `features`: what `read_features` gives of the layer of `novelty`, to tell how far it knows the frames.
+        """
         traction, of_ratio = self.manifest.traction, ratio_edges(self.model)
         estimate = Estimate(
             margin=margin.double().cpu().numpy(),
@@ -234,6 +241,8 @@ class Run:
                 calibration=None if traction is None else traction.calibration,
             ),
         )
+        if features is not None and self.novelty is not None:  # before friction narrows the answer
+            estimate = replace(estimate, known=self.novelty.known(features, estimate.sigma))
         if friction is None:
             return estimate
         traction = self.require_ratio()
@@ -296,7 +305,7 @@ class Estimate:
     known: Float[np.ndarray, " frames"] | None = None
     """How far the network knows such frames, from 0 to 1: the share of its validation frames that were as strange or
     stranger, in its features or in the spread of its answer (`Novelty.known`). None of a network that does not tell,
-    and of engines, which answer without their features.
+    and of an engine alone, which answers without its features.
 
     An unknown friction is nothing strange: a network that was trained on frictions from 0.15 to 1.2 takes wet for one
     more of them, and no value of this warns of it."""

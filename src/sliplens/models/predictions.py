@@ -19,6 +19,7 @@ from sliplens.files import hash_file, hash_json, require_new_file
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.models.checkpoint import Estimate, Run, load, sensor_kind
 from sliplens.models.engines import Engine, make_engine
+from sliplens.models.novelty import read_features
 from sliplens.progress import OnProgress, note, stage
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.capture import Capture
@@ -32,6 +33,7 @@ from sliplens.shards import MakePart, make_table
 
 LEVEL = 0.9
 """Confidence of the intervals."""
+_STRANGE = 0.01
 _COLUMNS = {
     "trial": pa.string(),
     "frame": pa.int64(),
@@ -45,6 +47,7 @@ _COLUMNS = {
     "sigma": pa.float64(),
     "low_90": pa.float64(),
     "high_90": pa.float64(),
+    "known": pa.float64(),
     "traction_ratio": pa.float64(),
     "traction_ratio_sigma": pa.float64(),
 }
@@ -95,9 +98,10 @@ class Predictions:
         Columns are `trial`, `frame`, `file` (of a folder of images), `time_s`, `safety_margin` (where the source has
         labels), `normal_force_n` and `tangential_force_n` (where it has forces), `touches` (whether anything does, by
         the labels, else by how far the picture is from that of the untouched sensor), `prediction`, `sigma`, `low_90`
-        and `high_90`, and `traction_ratio` and `traction_ratio_sigma` of a network that tells F_t / F_n. What is not
-        known is null: the time of images without a rate, sigma of a network that answers with one number, intervals
-        of one that was never calibrated. Predictions are not clipped to [0, 1].
+        and `high_90`, `known` (as in `Estimate`) of a network that tells it, and `traction_ratio` and
+        `traction_ratio_sigma` of one that tells F_t / F_n. What is not known is null: the time of images without a
+        rate, sigma of a network that answers with one number, intervals of one that was never calibrated. Predictions
+        are not clipped to [0, 1].
         """
         if self.rows is not None:
             return self.rows
@@ -115,6 +119,15 @@ class Predictions:
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
         """Rows for whatever reads Arrow's stream (the Arrow PyCapsule interface)."""
         return self.frame().__arrow_c_stream__(requested_schema)
+
+    @property
+    def strange(self) -> int:
+        """Frames that touch and are like at most 1 in 100 of those that the network was validated on (`known`)."""
+        table = self.frame()
+        if "known" not in table.column_names:
+            return 0
+        touches = table["touches"].to_numpy() if "touches" in table.column_names else True
+        return int((touches & (table["known"].to_numpy() < _STRANGE)).sum())
 
     def trials(self) -> list[TrialMargins]:
         """Course and lowest margin of every trial."""
@@ -265,7 +278,7 @@ def predict(
         metadata["sliplens.friction"] = str(known)
     for sentence in notes:
         note(on_progress, sentence)
-    schema = _schema(kinds, metadata, ratio=trained.manifest.traction is not None)
+    schema = _schema(trained, kinds, metadata)
     run_with = {"frames": trials.frames, "batch_size": batch_size, "onnx_file": onnx_file}
     make = partial(make_engine, engine, trained, **run_with)
     recipe = run_with | {"onnx_file": onnx_file and hash_file(onnx_file), "engine": engine, **metadata}
@@ -351,12 +364,12 @@ def _compare_markers(trained: Run, trial: Capture) -> str:
     return f"; markers are {found_px:.1f} pixels apart, those it learned from {wanted_px:.1f}"
 
 
-def _schema(trials: Sequence[Capture], metadata: dict[str, str], *, ratio: bool) -> pa.Schema:
+def _schema(trained: Run, trials: Sequence[Capture], metadata: dict[str, str]) -> pa.Schema:
     known = {
         "file": any(trial.files is not None for trial in trials),
         "safety_margin": any(trial.safety_margin is not None for trial in trials),
-        "traction_ratio": ratio,
-        "traction_ratio_sigma": ratio,
+        "known": trained.novelty is not None,
+        **dict.fromkeys(("traction_ratio", "traction_ratio_sigma"), trained.manifest.traction is not None),
         "touches": all(trial.read_reference or _states(trial) for trial in trials),
         **dict.fromkeys(_FORCES, any(trial.labels is not None for trial in trials)),
     }
@@ -404,8 +417,9 @@ class _Reading:
         capture = _assume_reference(self.trained, capture)
         reference = None if capture.read_reference is None else capture.read_reference()
         untouched, states = None if reference is None else soften(reference), _states(capture)
-        # batches are encoded while the ones before are under way; first frame of each, and which touch
-        encoded: deque[tuple[int, list[bool]]] = deque()
+        # batches are encoded while the ones before are under way; first frame of each, which touch, and features
+        encoded: deque[tuple[int, list[bool], np.ndarray | None]] = deque()
+        novelty = self.trained.novelty
 
         def encode() -> Iterator[Tensor]:
             while batch := list(islice(frames, engine.batch_size)):
@@ -416,11 +430,15 @@ class _Reading:
                     touches = [picture_change(soften(frame), untouched) >= LEAST_TOUCH for frame in images]
                 else:
                     touches = [True] * len(batch)
-                encoded.append((first, touches))
-                yield self.trained.encode(np.stack(images), reference)
+                inputs = self.trained.encode(np.stack(images), reference)
+                # engines answer without them
+                features = None if novelty is None else read_features(self.trained.model, novelty.layer, inputs)
+                encoded.append((first, touches, features))
+                yield inputs
 
         for answers in engine.answers(encode()):
-            estimate, (first, touches) = self.trained.to_estimate(*answers, friction=self.friction), encoded.popleft()
+            first, touches, features = encoded.popleft()
+            estimate = self.trained.to_estimate(*answers, friction=self.friction, features=features)
             for name, values in (_columns(estimate, capture, first) | {"touches": touches}).items():
                 if name in rows:
                     rows[name].extend(values)
@@ -438,6 +456,7 @@ def _columns(estimate: Estimate, trial: Capture, first: int) -> dict[str, list]:
     if ratio is not None:
         numbers = {"traction_ratio": ratio.mean, "traction_ratio_sigma": ratio.sigma}
     numbers |= {"time_s": times, "safety_margin": margins, "sigma": estimate.sigma, "low_90": low, "high_90": high}
+    numbers["known"] = estimate.known
     numbers |= {name: None if trial.labels is None else getattr(trial.labels, name)[here] for name in _FORCES}
     return {
         "trial": [trial.name] * count,
