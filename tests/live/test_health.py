@@ -52,6 +52,19 @@ def blurred(picture: np.ndarray) -> np.ndarray:
     return np.lib.stride_tricks.sliding_window_view(padded, (5, 5), axis=(0, 1)).mean(axis=(-1, -2))
 
 
+@pytest.mark.parametrize(("rate_hz", "frames"), [(60.0, 3), (30.0, 3), (5.0, 1)])
+def test_what_changes_slowly_takes_turns_and_is_told_within_a_tenth_of_a_second(
+    monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator, rate_hz: float, frames: int
+):
+    for number in range(4):
+        assert failed(monitor.check(shot(untouched, rng, number=number, time_s=number / rate_hz))) == set()
+    moved = np.roll(untouched, 3, axis=1)
+    times_s = (4 + np.arange(frames)) / rate_hz
+    told = [failed(monitor.check(shot(moved, rng, number=0, time_s=time_s))) for time_s in times_s]
+    assert "camera" in told[-1]
+    assert times_s[-1] - times_s[0] < 0.1
+
+
 def test_a_healthy_frame_passes_every_check(monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator):
     checks = monitor.check(shot(untouched, rng))
     assert failed(checks) == set()

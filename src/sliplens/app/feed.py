@@ -36,7 +36,7 @@ CHART_S = 30.0
 """Time that the chart of the page spans, in seconds."""
 LIVE_METHOD = "grad-cam"
 """Explainer of the running picture, one of the cheapest; any other explains a frozen one."""
-_PICTURES_HZ, _MAPS_HZ = 30.0, 2.0
+_PICTURES_HZ, _LEAST_HZ, _MAPS_HZ = 30.0, 5.0, 2.0
 _LONGEST_PX = 800
 _QUALITY = 85
 _UNANSWERED = 2  # messages under way to one viewer: one is drawn while the next one travels
@@ -290,8 +290,7 @@ class Feed:
             for _ in self.reader.readings():
                 if self._closed.is_set():
                     return
-                # frames that come as fast as pictures are drawn are never early
-                if time.monotonic() - drawn_s < 0.7 / _PICTURES_HZ:
+                if time.monotonic() - drawn_s < self._pause_s:
                     continue
                 drawn_s = time.monotonic()
                 newest = self._newest
@@ -304,6 +303,13 @@ class Feed:
         if self.reading is not None:
             self.reading = replace(self.reading, margin=None, low=None, high=None, withheld=self.ended)
         self._wake()
+
+    @property
+    def _pause_s(self) -> float:
+        """Time between two pictures: twice what the quickest viewer takes to draw one, on cores that may be ours."""
+        takes_s = min((viewer.takes_s for viewer in tuple(self.viewers)), default=0.0)
+        # frames that come as fast as pictures are drawn are never early
+        return 0.7 * min(max(1 / _PICTURES_HZ, 2 * takes_s), 1 / _LEAST_HZ)
 
     def _wake(self) -> None:
         loop = self._loop
@@ -404,11 +410,13 @@ class Viewer:
         self.waiting = ""
         """What this viewer waits for, in words."""
         self.shows_map = self.shows_arrows = True
+        self.takes_s = 0.0
+        """Time from sending a message to its answer, over the last few, in seconds."""
         self._changed = asyncio.Event()
         self._sending: asyncio.Task[None] | None = None
         self._has_news = True
         self._serial = 0
-        self._unanswered: dict[int, float] = {}
+        self._unanswered: dict[int, tuple[float, float]] = {}
         self._forget()
 
     def _forget(self) -> None:
@@ -454,9 +462,11 @@ class Viewer:
         try:
             while True:
                 answer = msgspec.json.decode(await socket.receive_text(), type=Answer)
-                captured_s = self._unanswered.pop(answer.serial, None)
-                if captured_s is not None and answer.drawn and np.isfinite(captured_s):
-                    self._drawn_ms = 1e3 * (time.monotonic() - captured_s)
+                captured_s, sent_s = self._unanswered.pop(answer.serial, (np.nan, np.nan))
+                if answer.drawn and np.isfinite(captured_s):
+                    now_s = time.monotonic()
+                    self._drawn_ms = 1e3 * (now_s - captured_s)
+                    self.takes_s += 0.2 * (now_s - sent_s - self.takes_s)
                 self._changed.set()
         except (WebSocketDisconnect, msgspec.MsgspecError, KeyError):
             pass  # it has gone, or speaks another language
@@ -513,7 +523,8 @@ class Viewer:
             map_bytes=len(cells),
         )
         # what was not drawn anew tells nothing of how long drawing takes
-        self._unanswered[self._serial] = picture.frame.captured_s if jpeg and picture is not None else np.nan
+        captured_s = picture.frame.captured_s if jpeg and picture is not None else np.nan
+        self._unanswered[self._serial] = captured_s, update.now_s
         self._picture, self._map = picture, overlay
         self._told_s = points[-1].at_s if points else self._told_s
         header = msgspec.json.encode(to_builtins(update))

@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 
@@ -31,6 +31,7 @@ _SEEN = 10.0
 """Grey levels below which a ratio of brightness means nothing."""
 _NOVELTY_EVERY_S = 0.25
 _DROPS_OVER_S = 1.0
+_OLDEST_S = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,11 +73,12 @@ class HealthLimits:
 class HealthMonitor:
     """Checks frames against the untouched sensor, and against what a network was trained on.
 
-    Looked at are whether frames repeat, come late or are lost; saturation and exposure; focus; light that falls
-    unevenly, as when a lamp is out; the border of the picture, which moves as a whole when the camera does (in a wide
-    contact only what was seen before it is known); markers that are
-    missing or have jumped; whether anything touches at all; and, every quarter of a second, how far the network's own
-    features are from those of its training frames, for networks whose manifest holds that.
+    Looked at in every frame are whether frames repeat, come late or are lost; saturation and exposure; markers that are
+    missing or have jumped; and whether anything touches at all. What changes slowly takes turns, one of the three a
+    frame, and is told of a frame at most 0.1 s ago: focus; light that falls unevenly, as when a lamp is out; and the
+    border of the picture, which moves as a whole when the camera does (in a wide contact only what was seen before it
+    is known). Every quarter of a second, how far the network's own features are from those of its training frames,
+    for networks whose manifest holds that.
 
     Parameters
     ----------
@@ -109,6 +111,7 @@ class HealthMonitor:
         self._before: np.ndarray | None = None
         self._changed_s = self._moved_px = 0.0
         self._numbers: deque[tuple[float, int]] = deque()
+        self._sometimes: dict[str, tuple[float, Check]] = {}
         self._novelty: tuple[float, Check] | None = None
         self._coming: Future[Check] | None = None
         self.beside: Executor | None = None
@@ -121,7 +124,7 @@ class HealthMonitor:
         The first check that is not fine names the cause: what is wrong with the camera comes before what that changes
         in the picture.
         """
-        soft, grey = soften(frame.small), _green(frame.small)
+        soft = soften(frame.small)
         both = (self._soft > _SEEN) & (soft > _SEEN) & (self._soft < _BRIGHT) & (soft < _BRIGHT)
         ratio = np.log2(np.where(both, soft, 1) / np.where(both, self._soft, 1))
         gain = float(np.median(ratio[both])) if both.any() else 0.0
@@ -131,9 +134,14 @@ class HealthMonitor:
             self._check_drops(frame),
             self._check_saturation(frame.small),
             self._check_exposure(gain),
-            self._check_focus(grey, gain),
-            self._check_light(ratio - gain, both),
-            self._check_camera(grey, gain),
+            *self._check_sometimes(
+                {
+                    "focus": lambda: self._check_focus(_green(frame.small), gain),
+                    "light": lambda: self._check_light(ratio - gain, both),
+                    "camera": lambda: self._check_camera(_green(frame.small), gain),
+                },
+                frame.time_s,
+            ),
         ]
         if markers is not None:
             checks.append(self._check_markers(markers))
@@ -141,6 +149,15 @@ class HealthMonitor:
         if self._run is not None and self._run.manifest.novelty is not None:
             checks.append(self._check_novelty(frame, self._run))
         return tuple(checks)
+
+    def _check_sometimes(self, checks: Mapping[str, Callable[[], Check]], time_s: float) -> Iterable[Check]:
+        """Checks of what changes slowly, of which a frame brings one anew, and all that would else be too old."""
+        age_s = {name: time_s - self._sometimes[name][0] if name in self._sometimes else np.inf for name in checks}
+        # of the very same time it may be another frame, of a source without a clock
+        due = [name for name in checks if not 0 < age_s[name] < _OLDEST_S]
+        for name in due or [max(checks, key=lambda name: age_s[name])]:
+            self._sometimes[name] = time_s, checks[name]()
+        return [self._sometimes[name][1] for name in checks]
 
     def _check_repeated(self, frame: LiveFrame) -> Check:
         if self._before is None or not np.array_equal(frame.small, self._before):
