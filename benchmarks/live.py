@@ -8,8 +8,8 @@
 headless Chromium beside it draws the page (`--page browser`); `p99_ms_with_maps` is the same while the page shows maps,
 twice a second. `drops` are frames that were never read, `memory_growth_mb` how much more memory the process holds at
 the end than after the first 10 seconds (or a tenth of a shorter run). `of_it_ms` says where the time of the slowest
-hundredth went, on average, checks and network side by side: `waiting` is what neither took, `gc_ms` the longest pause
-of Python's garbage collector.
+hundredth went, on average: `network` is what a frame waits for that after its checks, `waiting` what none of them took,
+`gc_ms` the longest pause of Python's garbage collector.
 """
 
 import argparse
@@ -132,8 +132,8 @@ def measure(frames: np.ndarray, untouched: np.ndarray, *, seconds: float, shown:
             return
         spent = reading.latency
         own_ms = (spent.decode_ms, spent.checks_ms, spent.encode_ms, spent.network_ms)
-        # a replayed frame was decoded before it was due; network and checks are worked on at once
-        waiting_ms = spent.total_ms - max(spent.checks_ms, spent.encode_ms + spent.network_ms)
+        # a replayed frame was decoded before it was due
+        waiting_ms = spent.total_ms - spent.checks_ms - spent.encode_ms - spent.network_ms
         if kept[0] == len(table):
             return
         table[kept[0]] = (reading.margin is not None, spent.total_ms, waiting_ms, *own_ms)

@@ -1,7 +1,7 @@
 """From a frame to its reading: the untouched sensor, markers, health, network and smoothing, all in one thread."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from threading import Event
@@ -109,8 +109,9 @@ class _Answers:
 class FrameReader:
     """Reads frames one after another, each against the untouched sensor; `read` is called in one thread.
 
-    The network runs beside the checks of the same frame, in a thread of its own, for as long as the frame before it had
-    a margin: what the checks then withhold was read in vain.
+    The frame is checked while the network reads it, for as long as the frame before it had a margin: what the checks
+    then withhold was read in vain. An engine that has threads of its own, as OpenVINO and ONNX Runtime, needs no second
+    thread of Python for that, which would wait for the first.
 
     Parameters are those of `LiveReader`.
     """
@@ -146,7 +147,7 @@ class FrameReader:
         self._tracker: Tracker | None = None
         self._smaller = 1
         self._taker: _ReferenceTaker | None = None
-        self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
+        self._beside = ThreadPoolExecutor(1, thread_name_prefix="novelty")
         self._has_margin = False
         self._last: LiveFrame | None = None
         self._dropped = 0
@@ -202,7 +203,16 @@ class FrameReader:
         if self.reference is None:
             still = "the picture must be still for a moment: leave the sensor untouched"
             return self._withhold(begin, frame, f"there is no reference frame yet; {still}")
-        answers = self._beside.submit(self._ask, frame) if self._has_margin else None
+        checked: list[tuple[Reading, str | None]] = []
+        answers = self._ask(frame, lambda: checked.append(self._check(begin, frame))) if self._has_margin else None
+        [(reading, withheld)] = checked or [self._check(begin, frame)]
+        if self.network is None or withheld is not None:
+            return self._withhold(reading, frame, withheld)
+        self._has_margin = True
+        return self._estimate(reading, frame, answers or self._ask(frame))
+
+    def _check(self, begin: Reading, frame: LiveFrame) -> tuple[Reading, str | None]:
+        """Follow the markers of a frame and look at its health; gives the reading so far, and why it has no margin."""
         begun = time.perf_counter()
         followed = markers = None
         if self._tracker is not None and self._slip is not None:
@@ -222,11 +232,7 @@ class FrameReader:
             slipping_s = None if markers is None else markers.slipping_s
             touches = reading.contact_state != ContactState.NO_CONTACT
             self._friction.update(frame.time_s, slipping_s=slipping_s, touches=touches)
-        if self.network is None or withheld is not None:
-            return self._withhold(reading, frame, withheld)
-        self._has_margin = True
-        answers = answers or self._beside.submit(self._ask, frame)
-        return self._estimate(reading, frame, answers.result())
+        return reading, withheld
 
     def _withhold(self, reading: Reading, frame: LiveFrame, why: str | None) -> Reading:
         self._smooth.forget()
@@ -234,17 +240,25 @@ class FrameReader:
         latency = replace(reading.latency, decode_ms=frame.decode_ms, total_ms=_since_ms(frame.captured_s))
         return replace(reading, withheld=why, latency=latency)
 
-    def _ask(self, frame: LiveFrame) -> _Answers:
-        """Have the network read a frame."""
+    def _ask(self, frame: LiveFrame, meanwhile: Callable[[], None] = lambda: None) -> _Answers:
+        """Have the network read a frame, and do something meanwhile."""
         assert self.network is not None
         assert self.engine is not None
         assert self.reference is not None
         begun = time.perf_counter()
         inputs = self.network.encode(frame.image[None], self.reference)
-        encoded = time.perf_counter()
-        [parts] = self.engine.answers([inputs])
-        done = time.perf_counter()
-        return _Answers(parts=parts, encode_ms=1e3 * (encoded - begun), network_ms=1e3 * (done - encoded))
+        encoded, spent_s = time.perf_counter(), 0.0
+
+        def batches() -> Iterator[Tensor]:
+            nonlocal spent_s
+            yield inputs
+            before = time.perf_counter()
+            meanwhile()  # the batch is under way: an engine looks for the next one before it waits
+            spent_s = time.perf_counter() - before
+
+        [parts] = self.engine.answers(batches())
+        waited_s = time.perf_counter() - encoded - spent_s
+        return _Answers(parts=parts, encode_ms=1e3 * (encoded - begun), network_ms=1e3 * waited_s)
 
     def _estimate(self, reading: Reading, frame: LiveFrame, answers: _Answers) -> Reading:
         assert self.network is not None

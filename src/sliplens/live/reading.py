@@ -66,6 +66,7 @@ class Latency:
     encode_ms: float = 0.0
     """From pixels to the network's input."""
     network_ms: float = 0.0
+    """From the network's input to its answer, but for the checks that were made meanwhile."""
     total_ms: float = 0.0
     """From the capture to the reading, waiting included."""
 
