@@ -5,6 +5,7 @@ done, one that a process holds is being made, one that failed has left a sentenc
 """
 
 import json
+import logging
 import os
 import pickle
 import re
@@ -13,6 +14,7 @@ import signal
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -31,7 +33,7 @@ import pyarrow.parquet as pq
 from sliplens._version import __version__
 from sliplens.codec import load_record, regrouped, save_record, write_tables
 from sliplens.errors import InputError, ShardError, SliplensError
-from sliplens.extras import Table
+from sliplens.extras import Table, require_packages
 from sliplens.files import hash_json, held_folder, hold, output_folder, partial_folder, scratch_folder
 from sliplens.progress import OnProgress, ignore, stage
 
@@ -93,6 +95,11 @@ MakePart: TypeAlias = Callable[[Any, Path, OnProgress], None]
 class Work(Protocol):
     """What is done with every shard; it travels to other processes, so that it holds paths and settings."""
 
+    @property
+    def on_gpu(self) -> bool:
+        """Whether each worker needs a graphics card."""
+        ...
+
     def begin(self) -> MakePart:
         """Load what all shards need; called once in each process that takes part."""
         ...
@@ -101,12 +108,14 @@ class Work(Protocol):
 class Worker:
     """One that makes parts, one after another, in whatever process."""
 
-    def __init__(self, work: Work | bytes) -> None:
-        self._work = work
+    def __init__(self, work: Work | bytes, folder: str | None = None) -> None:
+        self._work, self._folder = work, folder
 
     def start(self) -> Exception | None:
         """Load what all shards need; what is wrong with it is given back."""
         try:
+            if self._folder is not None:
+                os.chdir(self._folder)  # paths count from there
             # bytes that this program packed for a process of its own
             work = pickle.loads(self._work) if isinstance(self._work, bytes) else self._work  # noqa: S301
             self._make = work.begin()
@@ -121,12 +130,11 @@ class Worker:
         try:
             part.parent.mkdir(parents=True, exist_ok=True)
             with _claim(folder, given):
-                if part.exists():
-                    return None
-                _remove(draft)
-                self._make(given.item, draft, on_progress)
-                _flush(draft)
-                draft.replace(part)
+                if not part.exists():
+                    _remove(draft)
+                    self._make(given.item, draft, on_progress)
+                    _flush(draft)
+                    draft.replace(part)
         except Exception as error:  # a bad trial must not end the others
             why = str(error) if isinstance(error, SliplensError) else f"{type(error).__name__}: {error}"
             _keep_failure(folder, given, why)
@@ -238,7 +246,51 @@ def _processes(work: Work, number: str) -> Iterator[Seats]:
     yield count, lambda: _Process(packed, threads=max(1, cores // count)), BrokenProcessPool
 
 
-EXECUTORS = Table("place to work", "sliplens.executors", {"serial": _serial, "processes": _processes})
+class _Actor:
+    """An actor of Ray, wherever its cluster has a core for it."""
+
+    def __init__(self, actor: Any, kill: Callable[[Any], None]) -> None:
+        self._actor, self._kill = actor, kill
+
+    def start(self) -> Future:
+        return self._actor.start.remote().future()
+
+    def submit(self, folder: Path, given: Shard, on_progress: OnProgress) -> Future:  # noqa: ARG002 (of whole shards)
+        return self._actor.attempt.remote(folder, given).future()
+
+    def close(self) -> None:
+        self._kill(self._actor)
+
+
+@contextmanager
+def _ray(work: Work, address: str) -> Iterator[Seats]:
+    require_packages("ray", extra="ray", purpose="--on ray")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # else it reports its use to its makers
+    import ray  # noqa: PLC0415 (an extra)
+    from ray.exceptions import RayError  # noqa: PLC0415
+
+    connected = ray.is_initialized()
+    if not connected:
+        where: dict[str, Any] = {"address": address} if address else {"include_dashboard": False}
+        try:
+            ray.init(**where, log_to_driver=False, logging_level=logging.ERROR)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            told = " ".join(str(error).split())[:200]
+            raise InputError(f"--on ray={address} reaches no cluster of Ray ({told}); start it, or check it") from None
+    try:
+        unit = "GPU" if work.on_gpu else "CPU"
+        if (count := int(ray.cluster_resources().get(unit, 0))) < 1:
+            raise InputError(f"the cluster of Ray has no {unit}; start a node that has one")
+        packed = ray.put(pickle.dumps(work))  # once a node, not once a worker
+        kind: Any = ray.remote(num_cpus=1, num_gpus=int(work.on_gpu), scheduling_strategy="SPREAD")(Worker)
+        here = os.getcwd()  # noqa: PTH109 (a worker elsewhere has another)
+        yield count, lambda: _Actor(kind.remote(packed, here), ray.kill), RayError
+    finally:
+        if not connected:
+            ray.shutdown()
+
+
+EXECUTORS = Table("place to work", "sliplens.executors", {"serial": _serial, "processes": _processes, "ray": _ray})
 """Where shards are worked on: each row takes the work and what follows `=`, and opens its `Seats`."""
 
 
@@ -336,12 +388,13 @@ def make_table(
     on: str = "serial",
     retry_failed: bool = False,
     overwrite: bool = False,
+    on_rows: Callable[[pa.Table], None] | None = None,
     on_progress: OnProgress | None = None,
 ) -> tuple[pa.Schema, pa.Table | None]:
     """Make the parts, Parquet files, and join them: into a file by its ending, or in memory without one.
 
     Without an ending `out` is a folder, and the parts stay what they are: a Parquet data set with a folder a trial.
-    Gives the columns, and the rows where they are in memory.
+    Gives the columns, and the rows where they are in memory; `on_rows` is called with those of each part in turn.
     """
 
     def make(folder: Path) -> pa.Schema:
@@ -349,14 +402,22 @@ def make_table(
             make_parts(work, shards, folder, title=title, on=on, retry_failed=retry_failed, on_progress=count)
         return pq.read_schema(folder / next(iter(shards())).part)
 
+    def read(folder: Path) -> Iterator[pa.Table]:
+        for one in shards():
+            table = pq.ParquetFile(folder / one.part).read()  # not read_table, which imports pandas
+            if on_rows is not None:
+                on_rows(table)
+            yield table
+
     if out is not None and not out.suffix:
         with output_folder(out, stage=title, config=recipe, overwrite=overwrite) as output:
-            return make(output.folder), None
+            schema = make(output.folder)
+            if on_rows is not None:
+                deque(read(output.folder), maxlen=0)
+            return schema, None
     with parts_folder(out if resumable else None) as parts:
         schema = make(parts)
-        # not read_table, which imports pandas
-        tables = (pq.ParquetFile(parts / one.part).read() for one in shards())
-        return schema, write_tables(regrouped(tables, rows=LONGEST), out, schema)
+        return schema, write_tables(regrouped(read(parts), rows=LONGEST), out, schema)
 
 
 @dataclass(kw_only=True)
@@ -408,6 +469,7 @@ def _drive(
     """Hand shards to workers until none is left; a worker that is lost is replaced."""
     again: list[Shard] = [first]
     busy: dict[Future, tuple[Seat, Shard | None]] = {}
+    more = True
 
     def add_seat() -> None:
         seat = make_seat()
@@ -416,7 +478,8 @@ def _drive(
 
     for _ in range(places):
         add_seat()
-    while busy:
+    # a worker that has not begun when all is done was never needed: a cluster may have lost the node for it
+    while more or again or any(given is not None for _, given in busy.values()):
         for future in wait(busy, return_when=FIRST_COMPLETED).done:
             seat, given = busy.pop(future)
             try:
@@ -442,6 +505,7 @@ def _drive(
                     again.append(given)
             if seat is not None and (given := again.pop() if again else next(missing, None)) is not None:
                 busy[seat.submit(folder, given, tally.within)] = seat, given
+            more = more and given is not None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,6 +7,7 @@ from sliplens.cli.track import Track
 from sliplens.errors import ImageError, InputError
 from sliplens.images import write_png
 from sliplens.markers import track_markers
+from sliplens.markers.tracking import track
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
 
@@ -51,6 +52,18 @@ def test_without_a_reference_the_first_frame_stands_for_it_and_says_so(folder, t
     first = np.array(table["frame"]) == 0
     np.testing.assert_allclose(np.array(table["dx_px"])[first], 0.0, atol=1e-5)
     assert "displacements count from the first frame" in capsys.readouterr().err
+
+
+def test_a_folder_of_parts_holds_the_same_rows_wherever_they_were_made(folder, tmp_path, elsewhere):
+    reference = tmp_path / "untouched.png"
+    whole = track(folder, reference=reference, out=tmp_path / "a.parquet")
+    parts = track(folder, reference=reference, out=tmp_path / "set", on=elsewhere)
+    assert parts.frame().to_pylist() == whole.frame().to_pylist()
+    assert [str(trial) for trial in parts.trials] == [str(trial) for trial in whole.trials]
+    assert whole.trials[0].markers == 30
+    assert whole.trials[0].followed_share == 1
+    with pytest.raises(InputError, match="leave out --on, or --video"):
+        Track(source=folder, output=tmp_path / "b.parquet", video=tmp_path / "b.mp4", on="processes").run()
 
 
 def test_a_data_set_gives_what_the_tracker_gives(trials, tmp_path):

@@ -27,6 +27,7 @@ class Count:
     """Trials at whose first try the process is killed, as for want of memory."""
     broken: str = ""
     """What is wrong with all of it."""
+    on_gpu: bool = False
 
     def begin(self) -> MakePart:
         if self.broken:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from sliplens.cli.command import Source, SourceCommand, TableFile
+from sliplens.cli.command import On, RetryFailed, Source, SourceCommand, TableFile
 from sliplens.cli.console import say, wrote
 from sliplens.errors import InputError
 from sliplens.files import require_new_file
@@ -29,6 +29,8 @@ class Track(SourceCommand):
     """Also write a clip with rings and arrows, of one trial."""
     trial: str | None = None
     """Name of one trial; all if not given."""
+    on: On = "serial"
+    retry_failed: RetryFailed = False
 
     def run(self) -> None:
         """Follow and write."""
@@ -39,16 +41,19 @@ class Track(SourceCommand):
 
         profile = None if self.sensor is None else load_profile(self.sensor)
         markers = self.markers or (profile and profile.markers) or "auto"
-        trials = self.call(open_source, options=self.options, sensor=profile)
+        given = {"source": self.source, "options": self.options, "sensor": profile}
         clip = nullcontext()
         if self.video is not None:
+            trials = self.call(open_source, **given)
             if len(trials) != 1:
                 raise InputError(f"a clip shows one trial and {self.source} has {len(trials)}; name one with --trial")
+            if self.on != "serial":
+                raise InputError("a clip is drawn as its trial is followed; leave out --on, or --video")
             (trial,) = trials
             require_new_file(self.video, overwrite=self.overwrite)
             clip = clip_writer(self.video, size=trial.frame_size, frames_per_s=trial.frame_rate_hz)
         with clip as draw:
-            tracking = self.call(track, source=trials, markers=markers, out=self.output, on_tracked=draw)
+            tracking = self.call(track, **given, markers=markers, out=self.output, on_tracked=draw)
         for trial in tracking.trials:
             say(str(trial))
         count = len(tracking.trials)

@@ -2,28 +2,29 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from jaxtyping import Float
 
 from sliplens._version import __version__
-from sliplens.codec import write_tables
+from sliplens.codec import read_written, regrouped, write_tables
 from sliplens.errors import InputError
 from sliplens.extras import import_cv2
 from sliplens.files import require_new_file
 from sliplens.markers.detect import get_kind
 from sliplens.markers.tracker import Tracker
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame
-from sliplens.progress import OnProgress, note, stage
+from sliplens.progress import OnProgress, note
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.options import ReadOptions
-from sliplens.recordings.sensor import SensorProfile
-from sliplens.recordings.source import Frame, Frames, open_source
+from sliplens.recordings.sensor import SensorProfile, load_profile
+from sliplens.recordings.source import Frame, Frames, Trials, open_trials
+from sliplens.shards import MakePart, make_table
 
 OnTracked: TypeAlias = Callable[[Frame, TrackedFrame, Float[np.ndarray, "markers 2"]], None]
 """Takes a frame, its markers and where they were at rest, in pixels."""
@@ -82,7 +83,10 @@ class Tracking:
         known is null: the place of a marker that was not seen, the displacement of one that was not followed, the place
         at rest of a new one.
         """
-        return pq.read_table(self.path) if self.rows is None else self.rows
+        if self.rows is not None:
+            return self.rows
+        assert self.path is not None  # one of the two is given
+        return read_written(self.path, pa.schema(_COLUMNS))
 
 
 def track(
@@ -96,6 +100,8 @@ def track(
     format: str | None = None,
     options: ReadOptions | None = None,
     sensor: SensorProfile | Path | str | None = None,
+    on: str = "serial",
+    retry_failed: bool = False,
     out: Path | str | None = None,
     overwrite: bool = False,
     on_tracked: OnTracked | None = None,
@@ -114,8 +120,12 @@ def track(
         none, displacements count from the first frame.
     split, trial, format, options, sensor
         As `open_source` takes them.
+    on, retry_failed
+        Where the trials are followed, a row of `shards.EXECUTORS`: `serial`, `processes`, `processes=4`, `ray`; and
+        whether those are tried again that failed three times before.
     out
-        Parquet file to write, whole or not at all; rows are kept in memory if None.
+        Parquet file to write; without an ending a folder, a Parquet data set with a file a trial. Whole or not at all,
+        and interrupted it goes on after its last trial; rows are kept in memory if None.
 
     Raises
     ------
@@ -125,32 +135,45 @@ def track(
         If a reference frame shows fewer than 4 whole markers, or frames are of another size.
     RecordingError
         If the source cannot be read.
+    ShardError
+        If some of many trials failed again and again, when all others are there.
     """
     path = None if out is None else Path(out)
-    if path is not None:
+    if path is not None and path.suffix:
         require_new_file(path, suffix=".parquet", overwrite=overwrite)
     get_kind(markers)
     import_cv2()
-    if isinstance(source, Path | str | np.ndarray | Dataset):
-        source = open_source(
-            source,
-            reference=reference,
-            reference_frame=reference_frame,
-            split=split,
-            trial=trial,
-            format=format,
-            options=options,
-            sensor=sensor,
-        )
-    notes = dict.fromkeys(words for one in source for words in (*one.notes, *_require_movement(one)))
-    metadata = {"sliplens.version": __version__, "sliplens.source": source[0].opened, "sliplens.markers": markers}
-    schema = pa.schema(list(_COLUMNS.items()), metadata=metadata)
+    trials = open_trials(
+        source,
+        on=on,
+        reference=reference,
+        reference_frame=reference_frame,
+        split=split,
+        trial=trial,
+        format=format,
+        options=options,
+        sensor=None if sensor is None else load_profile(sensor),
+    )
+    for sentence in dict.fromkeys(words for one in trials.kinds for words in (*one.notes, *_require_movement(one))):
+        note(on_progress, sentence)
+    metadata = {"sliplens.source": trials.kinds[0].opened, "sliplens.markers": markers}
+    schema = pa.schema(list(_COLUMNS.items()), metadata={"sliplens.version": __version__, **metadata})
+    recipe = {**metadata, "source": trials.recipe}
     outcomes: list[TrialTracking] = []
-    with stage(on_progress, "Following markers") as count:
-        for sentence in notes:
-            note(on_progress, sentence)
-        tables = _tables(source, markers, schema=schema, outcomes=outcomes, on_tracked=on_tracked, on_progress=count)
-        rows = write_tables(tables, path, schema)
+    _, rows = make_table(
+        _Following(trials=trials, markers=markers, schema=schema, on_tracked=on_tracked),
+        # a marker is followed from the first frame on: a trial is not cut
+        partial(trials.shards, recipe, longest=None),
+        path,
+        title="Following markers",
+        recipe=recipe,
+        resumable=trials.travels and on_tracked is None,
+        on=on,
+        retry_failed=retry_failed,
+        overwrite=overwrite,
+        on_rows=lambda own: outcomes.append(_outcome(own)),
+        on_progress=on_progress,
+    )
     return Tracking(trials=tuple(outcomes), path=path, rows=rows)
 
 
@@ -166,39 +189,54 @@ def _require_movement(trial: Capture) -> Iterator[str]:
     yield f"{trial.name}: no untouched frame was named, so displacements count from the first frame."
 
 
-def _tables(
-    trials: Sequence[Capture],
-    markers: str,
-    *,
-    schema: pa.Schema,
-    outcomes: list[TrialTracking],
-    on_tracked: OnTracked | None,
-    on_progress: OnProgress,
-) -> Iterator[pa.Table]:
-    """Row groups of all trials; appends the outcome of each."""
-    total, done, waiting = sum(trial.frames for trial in trials), 0, [schema.empty_table()]
-    for trial in trials:
-        read_reference = trial.read_reference or (lambda trial=trial: next(trial.read_frames()))
-        tracker = Tracker(read_reference(), markers)
-        rest, followed, seen, lost = tracker.rest.centre_px, 0, 0, 0
-        for number, frame in enumerate(trial.read_frames()):
+@dataclass(frozen=True, kw_only=True)
+class _Following:
+    """Work on whole trials: a row for each marker of each frame, as a Parquet file."""
+
+    trials: Trials
+    markers: str
+    schema: pa.Schema
+    on_tracked: OnTracked | None
+    on_gpu: bool = False
+
+    def begin(self) -> MakePart:
+        read = self.trials.reader()
+
+        def make(item: tuple[str, int, int], path: Path, on_progress: OnProgress) -> None:
+            capture, frames = read(*item)
+            write_tables(regrouped(self._tables(capture, frames, on_progress), rows=_ROW_GROUP), path, self.schema)
+
+        return make
+
+    def _tables(
+        self, trial: Capture, frames: Iterator[tuple[int, Frame]], on_progress: OnProgress
+    ) -> Iterator[pa.Table]:
+        tracker = Tracker((trial.read_reference or (lambda: next(trial.read_frames())))(), self.markers)
+        rest = tracker.rest.centre_px
+        for number, frame in frames:
             tracked = tracker.update(frame)
             time_s = None if trial.time_s is None else float(trial.time_s[number])
-            waiting.append(_frame_table(trial.name, number, tracked, rest_px=rest, time_s=time_s))
-            if sum(map(len, waiting)) >= _ROW_GROUP:
-                yield pa.concat_tables(waiting)
-                waiting = [schema.empty_table()]
-            if on_tracked is not None:
-                on_tracked(frame, tracked, rest)
-            status = tracked.status[: len(rest)]
-            followed += int((status == MarkerStatus.FOLLOWED).sum())
-            seen += int((status != MarkerStatus.OUTSIDE).sum())
-            lost += bool((status == MarkerStatus.LOST).all())
-            done += 1
-            on_progress(done, total)
-        shown = {"trial": trial.name, "frames": trial.frames, "markers": len(rest)}
-        outcomes.append(TrialTracking(**shown, followed_share=followed / max(1, seen), lost_frames=lost))
-    yield pa.concat_tables(waiting)
+            yield _frame_table(trial.name, number, tracked, rest_px=rest, time_s=time_s)
+            if self.on_tracked is not None:
+                self.on_tracked(frame, tracked, rest)
+            on_progress(number + 1, trial.frames)
+
+
+def _outcome(rows: pa.Table) -> TrialTracking:
+    """Outcome of a trial from its rows."""
+    frame = rows["frame"].to_numpy()
+    status = rows["status"].combine_chunks().indices.to_numpy()
+    whole = rows["rest_x_px"].is_valid().to_numpy()  # a marker of the reference frame
+    frames, markers = int(frame[-1]) + 1, int(whole[frame == 0].sum())
+    followed, seen = (status == MarkerStatus.FOLLOWED) & whole, (status != MarkerStatus.OUTSIDE) & whole
+    lost = np.bincount(frame[(status == MarkerStatus.LOST) & whole], minlength=frames)
+    return TrialTracking(
+        trial=rows["trial"][0].as_py(),
+        frames=frames,
+        markers=markers,
+        followed_share=int(followed.sum()) / max(1, int(seen.sum())),
+        lost_frames=int((lost == markers).sum()),
+    )
 
 
 def _frame_table(

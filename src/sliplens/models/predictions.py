@@ -210,8 +210,8 @@ def predict(
     device
         Device of a network that is loaded here: cpu or cuda.
     on, retry_failed
-        Where the trials are read, a row of `shards.EXECUTORS`: `serial`, `processes`, `processes=4`; and whether those
-        are tried again that failed three times before.
+        Where the trials are read, a row of `shards.EXECUTORS`: `serial`, `processes`, `processes=4`, `ray`; and
+        whether those are tried again that failed three times before.
     out
         File to write, Parquet, CSV or JSON by its ending; without an ending a folder, a Parquet data set with a file a
         trial. Whole or not at all, and interrupted it goes on after its last trial; rows are kept in memory if None.
@@ -392,6 +392,10 @@ class _Reading:
     schema: pa.Schema
     friction: Friction | None
     make_engine: Callable[[], Engine]
+
+    @property
+    def on_gpu(self) -> bool:
+        return self.trained.device.type != "cpu"
 
     def begin(self) -> MakePart:
         ready, read = self.make_engine(), self.trials.reader()

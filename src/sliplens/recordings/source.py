@@ -130,18 +130,21 @@ class Trials:
         """Number of frames of all trials."""
         return sum(frames for _, frames, _ in self.rows)
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "kinds": ()}  # whoever gets it opens its own
+
     @property
     def travels(self) -> bool:
         """Whether other processes can open it."""
         return isinstance(self.source, Path | Dataset)
 
-    def shards(self, recipe: object) -> Iterator[Shard]:
-        """Shards of (trial, first frame, number of frames), whose parts are Parquet files."""
+    def shards(self, recipe: object, *, longest: int | None = LONGEST) -> Iterator[Shard]:
+        """Shards of (trial, first frame, number of frames), whose parts are Parquet files; whole trials with None."""
         recipe = hash_json(recipe)
         for trial, total, shown in self.rows:
-            for first in range(0, total, LONGEST):
-                frames, known = min(LONGEST, total - first), {"recipe": recipe, "shown": shown, "suffix": ".parquet"}
-                yield shard((trial, first, frames), trial=trial, first=first, frames=frames, **known)
+            for first in range(0, total, longest or total):
+                frames, known = min(longest or total, total - first), {"recipe": recipe, "shown": shown}
+                yield shard((trial, first, frames), trial=trial, first=first, frames=frames, suffix=".parquet", **known)
 
     @property
     def recipe(self) -> object:

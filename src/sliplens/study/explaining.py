@@ -230,6 +230,10 @@ class _Explaining:
     chosen: ChosenFrames
     explainers: Mapping[str, Explainer]
 
+    @property
+    def on_gpu(self) -> bool:
+        return self.trained.device.type != "cpu"
+
     def begin(self) -> MakePart:
         run, references = self.trained, self.chosen.references
 
