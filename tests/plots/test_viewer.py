@@ -20,11 +20,11 @@ from sliplens.plots.viewer import Beside, open_viewer, view_capture, view_explai
 from sliplens.recordings import ContactState, Dataset, Recording, load_dataset
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.importing import import_trial
 from sliplens.recordings.labels import LabelSettings
 from sliplens.recordings.source import open_source
 from sliplens.recordings.store import forces_path, read_header, save_recording
 from sliplens.recordings.trial import SIGNALS
+from sliplens.recordings.trial_writer import import_trial
 from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 

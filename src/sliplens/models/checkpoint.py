@@ -138,7 +138,7 @@ class Run:
             raise ImageError(
                 f"{what} are {size[0]} x {size[1]} pixels but the network was trained on "
                 f"{self.manifest.frame_size[0]} x {self.manifest.frame_size[1]}; use frames of "
-                "its sensor, or bring these to that size with a profile (`sliplens sensor new --from VIDEO -o tip.toml`, "
+                "its sensor, or fit these to it with a profile (`sliplens sensor new --from VIDEO -o tip.toml`, "
                 "--sensor tip.toml)"
             )
 

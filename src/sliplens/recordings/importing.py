@@ -3,11 +3,9 @@
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Event, Lock
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -17,23 +15,20 @@ from threadpoolctl import threadpool_limits
 from sliplens.errors import InputError, RecordingError, SliplensError
 from sliplens.files import output_folder
 from sliplens.progress import OnProgress, note, stage, wrote
-from sliplens.recordings.capture import Capture, Frame
+from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import (
     Dataset,
     LeftOut,
-    TrialInfo,
     keep_profile,
     load_dataset,
     tell_flags,
-    trial_info,
     trial_path,
     write_dataset_table,
 )
 from sliplens.recordings.edits import EDITS_FILE, apply_edits, edits_in_force, read_edits, undo_command
 from sliplens.recordings.formats.stored import read_stored, read_stored_trial
-from sliplens.recordings.labelling import Edit, EditKind, Labelling, ReferenceChoice
-from sliplens.recordings.labels import Reason, choose_reference, label_trial, measure_motion, require_inside, soften
-from sliplens.recordings.labels.lag import Soft
+from sliplens.recordings.labelling import Edit
+from sliplens.recordings.labels import measure_motion, require_inside, soften
 from sliplens.recordings.manifest import ManifestRow, find_rows
 from sliplens.recordings.options import LabelSettings, ReadOptions
 from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, is_profile, load_profile
@@ -47,19 +42,12 @@ from sliplens.recordings.splits import (
     write_split_record,
 )
 from sliplens.recordings.store import (
-    ROW_GROUP,
-    Spool,
-    decode_pixels,
-    encode_pixels,
-    forces_path,
-    in_turn,
     read_first_reference,
     read_header,
-    save_forces,
     stream_frames,
-    write_trial,
 )
 from sliplens.recordings.trial import Labels
+from sliplens.recordings.trial_writer import Footage, TrialJob, label_footage, require_forces, write_trials
 
 
 def import_recordings(
@@ -177,7 +165,7 @@ def import_recordings(
                 _keep_words(Path(out), output.folder, (EDITS_FILE,))
             for one in {job.profile.name: job.profile for job in jobs if job.profile}.values():
                 keep_profile(output.folder, one)
-            table, failed = _write_trials(output.folder, jobs, on_progress, title="Importing frames", first=len(known))
+            table, failed = write_trials(output.folder, jobs, on_progress, title="Importing frames", first=len(known))
             written = [job.capture for job in jobs if job.capture.trial in {info.trial for info in table}]
             left_out = [*left_out, *failed]
             if not written:
@@ -196,22 +184,6 @@ def import_recordings(
     if kept_edits and not output.complete and before is None:
         note(on_progress, f"the edits by hand in {out} are kept; `sliplens label {out}` makes the labels follow them")
     return _tell(load_dataset(out), on_progress, kept=output.complete)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Job:
-    """A trial to be imported."""
-
-    capture: Capture
-    settings: LabelSettings
-    edits: tuple[Edit, ...] = ()
-    """Repairs by hand that its labels follow."""
-    undo: str = ""
-    """How the last of them is taken back; empty where there is none."""
-    profile: SensorProfile | None = None
-    """What its frames went through."""
-    one_of_many: bool = False
-    """Whether it is left out where it cannot be imported, rather than stopping the others."""
 
 
 _Source: TypeAlias = tuple[Path, Sequence[ManifestRow] | None]
@@ -239,7 +211,7 @@ class _Asked:
         """Rows of a manifest or a folder of recordings; None where a path is one recording."""
         return None if self.format is not None or self.reading.forces is not None else find_rows(path)
 
-    def open(self, sources: Sequence[_Source], on_progress: OnProgress) -> tuple[list[_Job], list[LeftOut]]:
+    def open(self, sources: Sequence[_Source], on_progress: OnProgress) -> tuple[list[TrialJob], list[LeftOut]]:
         """Open what was named; of a manifest or a folder of recordings what cannot be opened is left out."""
         jobs, left_out = [], []
         for path, rows in sources:
@@ -253,7 +225,7 @@ class _Asked:
                 on_progress(number, len(rows or ()))
         return jobs, left_out
 
-    def _open(self, path: Path) -> list[_Job]:
+    def _open(self, path: Path) -> list[TrialJob]:
         profile = self.profile
         settings = self.labelling if profile is None else profile.settings(self.labelling)
         facts = {name: fact for name, fact in self.facts.items() if fact is not None}
@@ -262,9 +234,9 @@ class _Asked:
         opened = open_source(
             path, reference=self.reference, format=self.format, options=self.reading, sensor=profile, whole=True
         )
-        return [_Job(capture=replace(one, **facts), settings=settings, profile=profile) for one in opened]
+        return [TrialJob(capture=replace(one, **facts), settings=settings, profile=profile) for one in opened]
 
-    def _open_row(self, row: ManifestRow) -> list[_Job]:
+    def _open_row(self, row: ManifestRow) -> list[TrialJob]:
         """Open the recordings of a row, which says more than the command; its profile takes the place of ours."""
         own = {name: fact for name in self.facts if (fact := getattr(row, name)) is not None}
         profile = self.profile
@@ -287,7 +259,7 @@ class _Asked:
             jobs = [replace(jobs[0], capture=replace(jobs[0].capture, trial=row.trial))]
         _require_names([job.capture for job in jobs])
         for job in jobs:
-            _require_forces(job.capture)
+            require_forces(job.capture)
         return [replace(job, one_of_many=True) for job in jobs]
 
     def recipe(self, sources: Sequence[_Source]) -> dict[str, object]:
@@ -389,7 +361,7 @@ def label_dataset(
     config = {"labelling": labelling, "data_hash": data.hash, "edits": [job.edits for job in jobs]}
     with output_folder(out, stage="label", config=config, overwrite=overwrite or in_place) as output:
         if not output.complete:
-            table, _ = _write_trials(output.folder, jobs, on_progress, title="Labelling frames")
+            table, _ = write_trials(output.folder, jobs, on_progress, title="Labelling frames")
             named = [replace(row, split=info.split) for row, info in zip(table, data.trials, strict=True)]
             simulated = all(capture.simulated for capture in captures)
             write_dataset_table(output.folder, named, simulated=simulated, left_out=data.left_out)
@@ -433,12 +405,12 @@ def relabel_trial(
     rng = np.random.default_rng((job.settings.seed, data.trials.index(info)))
     path = trial_path(data.folder, trial)
     motion = measure_motion(map(soften, stream_frames(path))) if image_motion is None else image_motion
-    footage = _Footage(motion=motion, read=lambda places: stream_frames(path, set(places)))
-    with threadpool_limits(1, user_api="blas"):  # see _write_trials
-        return _label(job.capture, footage, settings=job.settings, edits=job.edits, rng=rng)[1]
+    footage = Footage(motion=motion, read=lambda places: stream_frames(path, set(places)))
+    with threadpool_limits(1, user_api="blas"):  # see write_trials
+        return label_footage(job.capture, footage, settings=job.settings, edits=job.edits, rng=rng)[1]
 
 
-def _relabelling(data: Dataset, capture: Capture, labelling: LabelSettings, edits: Sequence[Edit]) -> _Job:
+def _relabelling(data: Dataset, capture: Capture, labelling: LabelSettings, edits: Sequence[Edit]) -> TrialJob:
     """Stored trial, as it was recorded and with the image of the untouched sensor from before any edit."""
     if capture.forces is None:
         raise InputError(
@@ -455,7 +427,7 @@ def _relabelling(data: Dataset, capture: Capture, labelling: LabelSettings, edit
     capture = _without_labels(capture)
     if (first := read_first_reference(trial_path(data.folder, capture.trial))) is not None:
         capture = replace(capture, reference=first)
-    return _Job(capture=capture, settings=settings, edits=mine, undo=undo)
+    return TrialJob(capture=capture, settings=settings, edits=mine, undo=undo)
 
 
 def _tell(data: Dataset, on_progress: OnProgress | None, *, kept: bool) -> Dataset:
@@ -513,185 +485,3 @@ def _without_labels(capture: Capture) -> Capture:
         return replace(capture, labels=None)
     choice = kept.first_reference or kept.reference
     return replace(capture, labels=None, source=kept.source, notes=kept.notes, reference_choice=choice)
-
-
-def _write_trials(
-    folder: Path, jobs: Sequence[_Job], on_progress: OnProgress | None, *, title: str, first: int = 0
-) -> tuple[list[TrialInfo], list[LeftOut]]:
-    """Write the trials of a data set that are not there yet; gives their rows, and what was left out of many."""
-    total, done, lock = sum(len(job.capture) for job in jobs), [0] * len(jobs), Lock()
-
-    def write(number: int, count: OnProgress) -> TrialInfo | LeftOut:
-        job = jobs[number]
-        capture, path = job.capture, trial_path(folder, job.capture.trial)
-        samples = forces_path(folder, capture.trial)
-
-        def tell(written: int, _: int) -> None:
-            if stopped.is_set():
-                raise KeyboardInterrupt
-            with lock:
-                done[number] = written
-                count(sum(done), total)
-
-        # a trial is there whole or not at all, and the folder is of this very command
-        if not path.is_file():
-            rng = np.random.default_rng((job.settings.seed, first + number))
-            try:
-                own = {"settings": job.settings, "edits": job.edits, "rng": rng}
-                import_trial(capture, path, **own, forces_file=samples, on_progress=tell)
-            except SliplensError as error:
-                samples.unlink(missing_ok=True)
-                if job.undo:
-                    raise RecordingError(f"{error}; {job.undo}") from None
-                if not job.one_of_many:
-                    raise
-                return LeftOut(trial=capture.trial, source=capture.source, why=str(error))
-        tell(len(capture), total)
-        return trial_info(path, split="")
-
-    stopped = Event()
-    # decoding, arrays and compression run beside one another in threads; each holds one frame of its trial
-    workers = min(os.cpu_count() or 1, len(jobs))
-    # and the threads of NumPy's matrices, which are small here, would only take the cores from these while they spin
-    blas = threadpool_limits(1, user_api="blas")
-    with blas, stage(on_progress, title) as count, ThreadPoolExecutor(max_workers=workers) as pool:
-        try:
-            rows = [future.result() for future in [pool.submit(write, number, count) for number in range(len(jobs))]]
-        except BaseException:
-            stopped.set()
-            pool.shutdown(cancel_futures=True)
-            raise
-    failed = [row for row in rows if isinstance(row, LeftOut)]
-    return [row for row in rows if isinstance(row, TrialInfo)], failed
-
-
-def import_trial(
-    capture: Capture,
-    path: Path,
-    *,
-    settings: LabelSettings | None = None,
-    edits: Sequence[Edit] = (),
-    rng: np.random.Generator,
-    forces_file: Path | None = None,
-    on_progress: OnProgress | None = None,
-) -> None:
-    """Write a recording as a trial of a data set, with the labels that came with it, or found; whole or not at all.
-
-    The frames are decoded once, never all at once. The samples of the force sensor, from which labels can be made anew,
-    are kept in `forces_file`. `edits` are those by hand that the settings follow, to be kept with the trial.
-    """
-    _require_forces(capture)
-    with Spool(path.parent) as images:
-        footage = _read_footage(capture, images, on_progress)
-        try:
-            reference, labels = _label(capture, footage, settings=settings or LabelSettings(), edits=edits, rng=rng)
-        except RecordingError as error:
-            raise RecordingError(f"{capture.source}: {error}") from None
-        # before the trial, whose file tells that all of it is there
-        if forces_file is not None and capture.forces is not None:
-            save_forces(capture.forces, forces_file)
-        write_trial(
-            path,
-            images.chunks(ROW_GROUP),
-            facts=capture,
-            time_s=capture.frame_time_s,
-            labels=labels,
-            reference=reference,
-            first_reference=capture.reference if labels.labelling and labels.labelling.first_reference else None,
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Footage:
-    """Frames of a recording for whoever labels it, decoded once before."""
-
-    motion: Float[np.ndarray, " frames"]
-    """See `measure_motion`."""
-    read: Callable[[Sequence[int]], Iterator[Frame]]
-    """Gives frames of rising numbers."""
-
-
-def _read_footage(capture: Capture, images: Spool, on_progress: OnProgress | None) -> _Footage:
-    """Decode the frames of a recording and put them by, encoded as they are stored."""
-
-    def keep() -> Iterator[Soft]:
-        for image, soft in in_turn(lambda frame: (encode_pixels(frame), soften(frame)), _frames(capture)):
-            images.append(image)
-            yield soft
-            if on_progress is not None:
-                on_progress(len(images), len(capture))
-
-    def read(places: Sequence[int]) -> Iterator[Frame]:
-        for place in places:
-            where = f"frame {place} of {capture.source}"
-            yield decode_pixels(images[place], size=(*capture.frame_size, 3), where=where)
-
-    return _Footage(motion=measure_motion(keep()), read=read)
-
-
-def _require_forces(capture: Capture) -> None:
-    if capture.labels is None and capture.forces is None:
-        raise RecordingError(
-            f"{capture.source} has no forces, and without them there is no label; give the table of the force sensor"
-        )
-
-
-def _label(
-    capture: Capture, footage: _Footage, *, settings: LabelSettings, edits: Sequence[Edit], rng: np.random.Generator
-) -> tuple[Frame, Labels]:
-    """Image of the untouched sensor, and the labels that came with the recording, or are found."""
-    index = capture.reference_index if settings.reference_frame is None else settings.reference_frame
-    labels, found, image = capture.labels, None, capture.reference
-    if labels is None:
-        assert capture.forces is not None
-        labels = found = label_trial(capture.frame_time_s, footage.motion, capture.forces, settings=settings, rng=rng)
-    if image is not None and index is None:
-        method = "recorded apart from the frames" if found else "came with the recording"
-        choice = capture.reference_choice or ReferenceChoice(method=method)
-    elif found is not None:
-        untouched = np.array([reason is Reason.NO_CONTACT for reason in found.reason])
-        choice = choose_reference(footage.read, untouched, index=index, method=settings.reference_method)
-    elif index is None:
-        raise RecordingError("no frame is known to be untouched; name one with --reference-frame")
-    elif not 0 <= index < len(capture):
-        raise RecordingError(f"the reference is frame {index} of {len(capture)}; name one from 0 on that is there")
-    else:
-        choice = ReferenceChoice(index=index, method="named")
-    if image is None or index is not None:
-        assert choice.index is not None  # without an image it is one of the frames
-        (image,) = footage.read([choice.index])
-    labelling = labels.labelling or Labelling(
-        source=capture.source,
-        forces=capture.forces.source if capture.forces else None,
-        notes=capture.notes,
-        reference=choice,
-        clip=capture.clip,
-        basis=found.basis if found else None,
-        edits=tuple(edits),
-        first_reference=_first_reference(capture, edits),
-    )
-    return image, replace(labels, labelling=labelling)
-
-
-def _first_reference(capture: Capture, edits: Sequence[Edit]) -> ReferenceChoice | None:
-    """What the first image of the untouched sensor was, where an edit named another: it is kept for who undoes that."""
-    if capture.reference is None or all(one.kind is not EditKind.REFERENCE for one in edits):
-        return None
-    return capture.reference_choice or ReferenceChoice(method="came with the recording")
-
-
-def _frames(capture: Capture) -> Iterator[Frame]:
-    """Frames of a capture, which must be as many as it promised and of one size."""
-    read = 0
-    for frame in capture.read_frames():
-        if frame.shape[:2] != capture.frame_size:
-            raise RecordingError(
-                f"frame {read} of {capture.source} is {frame.shape[0]} x {frame.shape[1]} pixels, not "
-                f"{capture.frame_size[0]} x {capture.frame_size[1]} as its first; cut the recording there"
-            )
-        read += 1
-        yield frame
-    if read != len(capture):
-        raise RecordingError(
-            f"{capture.source} promised {len(capture)} frames but gave {read}; copy or export it again"
-        )

@@ -20,11 +20,11 @@ from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.formats.lerobot_export import DataFiles, number_stats, write_lerobot
 from sliplens.recordings.formats.stored import read_stored
-from sliplens.recordings.importing import import_trial
 from sliplens.recordings.labelling import Clip, ForceAxes, Found, LabelBasis, Labelling, Lag, ReferenceChoice
 from sliplens.recordings.labels import FrictionEstimate
 from sliplens.recordings.store import forces_path, load_recording, save_forces, save_recording
 from sliplens.recordings.trial import Labels
+from sliplens.recordings.trial_writer import import_trial
 
 HEIGHT, WIDTH = 24, 32
 LENGTHS = {"pressed": 19, "found": 37, "wet": 5}

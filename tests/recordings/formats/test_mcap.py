@@ -21,11 +21,11 @@ from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import Dataset, load_dataset, trial_info, trial_path, write_dataset_table
 from sliplens.recordings.exporting import export_mcap
 from sliplens.recordings.formats.stored import read_stored
-from sliplens.recordings.importing import import_trial
 from sliplens.recordings.labelling import Clip, ForceAxes, Found, LabelBasis, Labelling, Lag, ReferenceChoice
 from sliplens.recordings.labels import FrictionEstimate
 from sliplens.recordings.store import forces_path
 from sliplens.recordings.trial import LABEL_SIGNALS, ContactState, Labels
+from sliplens.recordings.trial_writer import import_trial
 
 pytest.importorskip("rosbags")
 pytest.importorskip("mcap")
