@@ -8,6 +8,7 @@ import pytest
 
 from sliplens.errors import InputError
 from sliplens.grip import CONTROLLERS, Observation, make_controller
+from sliplens.grip.controllers import MarginLaw
 from sliplens.grip.plant import PERIOD_S
 
 LATE_S = 2.0
@@ -54,6 +55,16 @@ def test_with_full_caution_the_lower_end_of_the_interval_is_what_counts():
     careful = make_controller("margin", {"caution": 1.0, "zero": 0.0, "dead_band": 0.0, "up_n_s": 1e6})
     bold = make_controller("margin", {"zero": 0.0, "dead_band": 0.0, "up_n_s": 1e6})
     assert careful.command(seen(0.5))[0] == pytest.approx(bold.command(seen(0.3))[0])
+
+
+def test_a_change_that_may_be_noise_is_followed_little_and_a_larger_one_at_once():
+    controller, acted = MarginLaw(zero=0.0), []
+    for read in (0.5, 0.53, 0.3):
+        controller.command(seen(read))
+        acted.append(float(controller.acted[0]))
+    assert acted[0] == pytest.approx(0.5)
+    assert 0.5 < acted[1] < 0.515
+    assert acted[2] == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize("name", ["margin", "proportional"])

@@ -84,13 +84,14 @@ class MarginGrip(ABC):
     """What grips on the margin share: caution, dead band, fast up and slow down, reflex, and what to do when blind.
 
     What is acted on is r = read - caution (read - low), the mean over the fingers that read; with a caution of 1 it is
-    the lower end of the interval. A network that cannot see the friction reads more than 0 of a slippery object that
-    already slides, so the margin is Gamma = (r - r_0) / (1 - r_0): r_0 is a guess until a slip, and then what was read
-    as the fingers began to slide, if that is more. After a slip nothing is loosened for a while.
+    the lower end of the interval. A reading that differs from the last one by no more than noise moves it little. A
+    network that cannot see the friction reads more than 0 of a slippery object that already slides, so the margin is
+    Gamma = (r - r_0) / (1 - r_0): r_0 is a guess until a slip, and then what was read as the fingers began to slide, if
+    that is more. After a slip nothing is loosened for a while.
     """
 
-    target: float = 0.25
-    """Margin Gamma* aimed at, as a share of the friction: 0.25 presses a third more than the least force that holds."""
+    target: float = 0.3
+    """Margin Gamma* aimed at, as a share of the friction: 0.3 presses 43 % more than the least force that holds."""
     caution: float = 0.0
     """Share of the way from the margin read to the lower end of its interval; with 1 a `zero` of 0.2 and a `target` of
     0.1 suit."""
@@ -121,7 +122,7 @@ class MarginGrip(ABC):
     acted: np.ndarray = field(init=False, repr=False, default_factory=lambda: np.ones(1))
     """Margin acted on last in each episode, a share."""
     _zero: np.ndarray = field(init=False, default_factory=lambda: np.zeros(1))
-    _last: np.ndarray = field(init=False, default_factory=lambda: np.zeros(1))
+    _last: np.ndarray = field(init=False, default_factory=lambda: np.full(1, _NOTHING_YET))
     _slipped_s: np.ndarray = field(init=False, default_factory=lambda: np.full(1, -np.inf))
     _seen_s: np.ndarray = field(init=False, default_factory=lambda: np.zeros(1))
 
@@ -136,7 +137,9 @@ class MarginGrip(ABC):
         margin = seen.margin - self.caution * (seen.margin - seen.low)
         margin = margin / (1 - self.sag_per_n * np.maximum(seen.force_n - self.trained_n, 0))[:, None]
         reads = np.isfinite(margin)
-        return np.where(reads, margin, 0).sum(axis=1) / np.where(reads.any(axis=1), reads.sum(axis=1), np.nan)
+        read = np.where(reads, margin, 0).sum(axis=1) / np.where(reads.any(axis=1), reads.sum(axis=1), np.nan)
+        change = read - self._last
+        return np.where(np.abs(change) < _NEWS, self._last + _FOLLOWS * change, read)
 
     def command(self, seen: Observation) -> Float[np.ndarray, " episodes"]:
         """Grip force in newtons."""
@@ -161,6 +164,11 @@ class MarginGrip(ABC):
         return np.maximum(told, self.start_n if seen.time_s < _SETTLED_S else self.least_n)
 
 
+_NEWS, _FOLLOWS = 0.06, 0.3
+"""A margin read that differs by less than this from what was acted on may be noise, of which two standard deviations
+are as much: it moves that by this share. As a grip tightens fast and loosens slowly, noise would press harder."""
+_NOTHING_YET = -9.0
+"""No margin: the first one is acted on as it is."""
 _HIGHEST_ZERO = 0.6
 """A slip at which more is read is taken for something else: a jolt that ended."""
 _DEAF_S = 0.15

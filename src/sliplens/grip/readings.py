@@ -17,8 +17,9 @@ from sliplens.progress import OnProgress
 
 FRICTIONS = (0.1, 0.18, 0.3, 0.5, 0.8, 1.3)
 """Coefficients of friction at which readings are measured; between them they are interpolated in the logarithm."""
-FORCES_N = (0.3, 0.7, 1.5, 2.5, 4.0)
-"""Normal forces, the same; the networks were trained from 0.5 to 2 N, and far above they read nonsense."""
+FORCES_N = (0.3, 0.7, 1.5, 2.5, 3.0, 3.25, 3.5, 3.75, 4.0)
+"""Normal forces, the same; the networks were trained from 0.5 to 2 N, and far above they read nonsense, which changes
+within a quarter of a newton."""
 MARGINS = (0.0, 0.04, 0.12, 0.3, 0.55, 0.8, 1.0)
 """Margins, interpolated as they are."""
 
@@ -114,7 +115,7 @@ def measure_readings(
 ) -> ReadingTable:
     """Measure what a network says of fingertips at every friction, force and margin of the table.
 
-    Some 3 s a fingertip on one core. The noise is that of 12 states of each fingertip, filmed twice.
+    Some 2 s a fingertip on one core. The noise is that of 12 states of each fingertip, filmed twice.
 
     Parameters
     ----------
