@@ -7,9 +7,10 @@
 `p50_ms` and `p99_ms` are from the moment a replayed frame is due to its margin, over the frames that have one, while a
 headless Chromium beside it draws the page (`--page browser`); `p99_ms_with_maps` is the same while the page shows maps,
 twice a second. `drops` are frames that were never read, `memory_growth_mb` how much more memory the process holds at
-the end than after the first 10 seconds (or a tenth of a shorter run). `of_it_ms` says where the time of the slowest
-hundredth went, on average: `network` is what a frame waits for that after its checks, `waiting` what none of them took,
-`gc_ms` the longest pause of Python's garbage collector.
+the end than after the first 10 seconds (or a tenth of a shorter run), `opens_s` the time from the browser's first visit
+to the first picture that it has drawn. `of_it_ms` says where the time of the slowest hundredth went, on average:
+`network` is what a frame waits for that after its checks, `waiting` what none of them took, `gc_ms` the longest pause
+of Python's garbage collector.
 """
 
 import argparse
@@ -63,6 +64,26 @@ class Latencies:
     pictures: int
     """Pictures that the page had drawn."""
     maps: int
+    opens_s: float
+    """From the browser's asking for the page to its having drawn the first picture; infinite without a page."""
+
+
+class TimedPage(LivePage):
+    """Page that notes when it is asked for, and what is drawn of it."""
+
+    asked_s = opens_s = np.inf
+
+    def build(self) -> None:
+        """Make the page of one viewer."""
+        self.asked_s = min(self.asked_s, time.monotonic())
+        super().build()
+
+    def look(self, *, maps: bool) -> None:
+        """Have viewers show maps or not, and see whether the first has drawn a picture."""
+        for viewer in tuple(self.feed.viewers):
+            viewer.shows_map = maps
+            if np.isinf(self.opens_s) and viewer.takes_s > 0:
+                self.opens_s = time.monotonic() - self.asked_s
 
 
 def resident_mb() -> float:
@@ -150,14 +171,13 @@ def measure(frames: np.ndarray, untouched: np.ndarray, *, seconds: float, shown:
     explained: set[int] = set()
     with ExitStack() as stack:
         stack.enter_context(reader)
-        page = stack.enter_context(LivePage(reader, port=0)) if shown else None
+        page = stack.enter_context(TimedPage(reader, port=0)) if shown else None
         if page is not None:
             stack.enter_context(browser(page.address))
         pauses = stack.enter_context(Pauses())
         for reading in reader.readings():
             if page is not None:
-                for viewer in tuple(page.feed.viewers):
-                    viewer.shows_map = maps
+                page.look(maps=maps)
                 pictures |= set() if page.feed.picture is None else {page.feed.picture.frame.number}
                 explained |= set() if page.feed.map is None else {page.feed.map.facts.number}
             if np.isinf(begins_s[0]) and (page is None or page.feed.picture is not None):
@@ -182,6 +202,7 @@ def measure(frames: np.ndarray, untouched: np.ndarray, *, seconds: float, shown:
         gc_ms=pauses.longest_ms,
         pictures=len(pictures),
         maps=len(explained),
+        opens_s=np.inf if page is None else page.opens_s,
     )
 
 
@@ -219,6 +240,7 @@ def main() -> None:
         "of_it_ms_with_maps": None if beside is None else slowest_parts_ms(beside),
         "drops_with_maps": None if beside is None else beside.drops,
         "gc_ms": round(alone.gc_ms, 1),
+        "opens_s": round(alone.opens_s, 2) if shown else None,
         "pictures": alone.pictures,
         "maps": None if beside is None else beside.maps,
         "engine": alone.engine,

@@ -1,5 +1,6 @@
 """The loop of a running sensor: one thread captures, one reads, and what is too late is dropped and counted."""
 
+import gc
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -81,6 +82,9 @@ class _SharedCores:
         # a thread that has waited for a core waits for Python too, and the usual 5 ms are a third of a frame
         later(sys.setswitchinterval, sys.getswitchinterval())
         sys.setswitchinterval(_SWITCH_S)
+        # what is there by now stays: to look through all of it for garbage takes as long as half a frame
+        later(gc.unfreeze)
+        gc.freeze()
         if not missing_packages("cv2", extra="markers"):
             cv2 = import_cv2()
             later(cv2.setNumThreads, cv2.getNumThreads())
