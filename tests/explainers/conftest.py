@@ -11,6 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torchvision import models
 
+from sliplens.explainers import IntegratedGradients
+
 SIZE = 64
 
 
@@ -131,3 +133,10 @@ def images() -> Tensor:
 def reference() -> Tensor:
     """An image to compare with, (3, height, width)."""
     return blobs(1, seed=3)[0]
+
+
+@pytest.fixture
+def short_guess(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first guess of Shapley values in few steps: of a network as rough as an untrained one it would take most."""
+    short = IntegratedGradients(steps=4, max_steps=8)
+    monkeypatch.setattr("sliplens.explainers.shapley.IntegratedGradients", lambda: short)

@@ -23,6 +23,7 @@ from sliplens.explainers.shapley import Shapley
 
 # LRP has laws of its own, in test_lrp.py; what the thesis ran is of f itself, and obeys none: test_thesis.py
 NAMES = [name for name in EXPLAINERS if name != "lrp" and not name.endswith("-thesis")]
+pytestmark = pytest.mark.usefixtures("short_guess")
 every_explainer = pytest.mark.parametrize("name", NAMES)
 # an untrained network is so rough that integrated gradients would go to their most steps in every test
 SHORT = IntegratedGradients(steps=4, max_steps=8)

@@ -8,6 +8,7 @@ import torch
 from sliplens.explainers import EXPLAINERS, ExpectedGradients, IntegratedGradients, Occlusion, PolyCam, SmoothGrad
 from sliplens.explainers.shapley import Shapley
 
+pytestmark = pytest.mark.usefixtures("short_guess")
 every_network = pytest.mark.parametrize("name", ["shufflenet", "resnet", "mobilenet", "vgg"])
 SHORT = IntegratedGradients(steps=8, max_steps=40)
 MARKERS = torch.tensor([[10.0, 12.0], [40.0, 20.0], [25.0, 50.0]])
