@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -36,6 +37,20 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     # for the processes to come, a thread each: more would only wait for each other
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, MOST_WORKERS)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A Chromium of this machine's: Playwright's own would have to be fetched from outside the package index."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="a browser is led by Playwright")
+    chromium = shutil.which("chromium") or shutil.which("google-chrome") or shutil.which("chromium-browser")
+    if chromium is None:
+        pytest.skip("there is no Chromium on this machine")
+    with sync_api.sync_playwright() as playwright:
+        # a container's root has no sandbox; the pages are our own
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        yield browser
+        browser.close()
 
 
 @pytest.fixture(scope="session")

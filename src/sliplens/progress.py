@@ -17,7 +17,7 @@ Item = TypeVar("Item")
 
 
 def visible(text: str) -> str:
-    r"""Text with what a terminal would obey written out: names and words of files may hold control characters.
+    r"""Text in one line, with all that cannot be seen written out: a terminal would obey what names in files may hold.
 
     Examples
     --------
@@ -25,7 +25,8 @@ def visible(text: str) -> str:
     >>> visible("cup" + chr(27) + "[2J")
     'cup\\x1b[2J'
     """
-    return re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", lambda found: repr(found[0])[1:-1], text)
+    seen = (one.isprintable() or one == "\N{NO-BREAK SPACE}" for one in text)
+    return "".join(one if is_seen else repr(one)[1:-1] for one, is_seen in zip(text, seen, strict=True))
 
 
 @runtime_checkable

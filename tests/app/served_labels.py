@@ -11,7 +11,7 @@ from sliplens.app import LabelPage
 
 def main() -> None:
     """Serve."""
-    with LabelPage(sys.argv[1], by="ana", port=0) as page:
+    with LabelPage(sys.argv[1], by=sys.argv[2], port=0) as page:
         sys.stdout.write(json.dumps({"address": page.address}) + "\n")
         sys.stdout.flush()
         sys.stdin.read()

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hostile_names import ATTACK, assert_inert, watch
 
 from sliplens.app import LabelPage
 from sliplens.errors import InputError, RecordingError
@@ -42,7 +43,7 @@ def data(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 @pytest.fixture(scope="module")
 def address(data: Dataset) -> Iterator[str]:
-    command = [sys.executable, str(Path(__file__).with_name("served_labels.py")), str(data.folder)]
+    command = [sys.executable, str(Path(__file__).with_name("served_labels.py")), str(data.folder), ATTACK]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
@@ -58,6 +59,7 @@ def test_edits_are_made_by_key_seen_in_the_margin_and_taken_back(browser, addres
     context = browser.new_context(viewport={"width": 320, "height": 640})
     context.set_default_timeout(30_000)
     window, said = context.new_page(), []
+    watch(window)
     window.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
     window.on("pageerror", lambda error: said.append(str(error)))
     window.goto(address)
@@ -72,10 +74,13 @@ def test_edits_are_made_by_key_seen_in_the_margin_and_taken_back(browser, addres
     window.keyboard.press("Enter")
     window.wait_for_function(f"{SUMMARY}.includes('friction 0.900')")
     (bad, friction) = read_edits(data.folder)
-    assert (bad.kind, bad.value, bad.by) == ("bad", (20, 30), "ana")
+    assert (bad.kind, bad.value, bad.by) == ("bad", (20, 30), ATTACK)
     assert (friction.kind, friction.value) == ("mu", 0.9)
     window.reload()  # a restart forgets nothing
     window.wait_for_function(f"{EDITS} === 2 && {SUMMARY}.includes('friction 0.900')")
+    assert not said
+    assert_inert(window)  # which the browser complains of
+    said.clear()
     for left in (1, 0):
         window.get_by_role("button", name="Undo").click()
         window.wait_for_function(f"{EDITS} === {left} && !{SUMMARY}.includes('labelling')")

@@ -9,9 +9,13 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from http.client import HTTPConnection
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hostile_names import FILE_NAME, assert_inert, watch
 
 import sliplens as sl
 from sliplens.app import LivePage
@@ -53,7 +57,7 @@ def served(what: str, into: Path) -> Iterator[Served]:
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """Page of a simulated fingertip that nobody presses yet."""
-    with served("fingertip", tmp_path_factory.mktemp("page") / "recorded") as page:
+    with served("fingertip", tmp_path_factory.mktemp("page") / FILE_NAME) as page:
         yield page
 
 
@@ -63,6 +67,7 @@ def seen(browser, page: Served):
     context = browser.new_context(viewport={"width": 320, "height": 640})
     context.set_default_timeout(30_000)
     window = context.new_page()
+    watch(window)
     window.asked, window.said = [], []
     window.on("request", lambda request: window.asked.append(request.url))
     window.on("websocket", lambda socket: window.asked.append(socket.url))
@@ -126,6 +131,10 @@ def test_nothing_is_asked_of_anyone_else_and_nothing_complained_of(seen, page: S
     assert not seen.said
 
 
+def test_hostile_names_do_nothing_on_the_page(seen):
+    assert_inert(seen)  # the folder of the recording
+
+
 def get(address: str, **headers: str) -> tuple[int, str]:
     """Status and text of an address, redirects followed."""
     request = urllib.request.Request(
@@ -161,6 +170,50 @@ def test_a_viewer_that_never_answers_is_sent_two_messages(page: Served):
         assert socket.recv(timeout=60)
     with pytest.raises(Exception, match=r"403|rejected"), client.connect(address, origin="http://evil.example"):
         pass
+
+
+def send_all(socket: Any, messages: list[str]) -> None:
+    """Send messages, and hear until the other side has enough."""
+    for message in messages:
+        socket.send(message)
+    while True:
+        socket.recv(timeout=60)
+
+
+def test_who_sends_too_much_is_cut_off_and_the_page_stays(page: Served):
+    client, exceptions = pytest.importorskip("websockets.sync.client"), pytest.importorskip("websockets.exceptions")
+    for messages in (["x" * 10**6], [json.dumps({"serial": -1})] * 1000):
+        [name] = set(re.findall(r"/frames/([\w-]+)", get(page.address)[1]))
+        address = page.address.replace("http", "ws") + f"frames/{name}"
+        with client.connect(address, open_timeout=60) as socket, pytest.raises(exceptions.ConnectionClosed):
+            send_all(socket, messages)
+    posted = urllib.request.Request(f"{page.address}_nicegui_ws/socket.io/?EIO=4&transport=polling", data=b"4" * 10**6)
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(posted, timeout=60)
+    assert get(page.address)[0] == 200
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "etc/passwd",
+        "../../../../etc/passwd",
+        "images/..%2F..%2F..%2Fetc%2Fpasswd/0",
+        "frames/..%2F..%2Fetc%2Fpasswd",
+        "_nicegui/{version}/static/..%2F..%2F..%2F..%2F..%2F..%2F..%2F..%2Fetc%2Fpasswd",
+        "_nicegui/{version}/static/%2Fetc%2Fpasswd",
+        "_nicegui/{version}/components/..%2F..%2F..%2Fetc%2Fpasswd",
+        "_nicegui/{version}/resources/x/..%2F..%2F..%2F..%2Fetc%2Fpasswd",
+        "_nicegui/{version}/esm/x/..%2F..%2F..%2F..%2Fetc%2Fpasswd",
+    ],
+)
+def test_no_path_of_a_request_reaches_the_disk(page: Served, path: str):
+    connection = HTTPConnection(page.address.removeprefix("http://").rstrip("/"), timeout=60)
+    connection.request("GET", "/" + path.format(version=version("nicegui")))  # as it stands: urllib would shorten it
+    answer = connection.getresponse()
+    assert answer.status in {400, 403, 404}
+    assert b"root:" not in answer.read()
+    connection.close()
 
 
 def test_one_page_at_a_time_and_a_port_that_is_taken(page: Served):

@@ -55,6 +55,25 @@ def test_brackets_in_a_table_are_text(screen: Console) -> None:
     assert "[red]" in screen.export_text()
 
 
+HOSTILE = "cup[/][red]\x1b[2J\x1b]0;owned\x07\r\n\u202egnp.tac\udc80"
+
+
+def test_names_of_files_move_no_cursor_and_paint_nothing(screen: Console) -> None:
+    terminal = Terminal()
+    with terminal.stage(f"Reading {HOSTILE}"):
+        terminal.note(f"note {HOSTILE}")
+    console.say(HOSTILE)
+    console.say(HOSTILE, aside=True)
+    console.fail(HOSTILE)
+    console.wrote(Path(HOSTILE), HOSTILE)
+    print_table(HOSTILE, [HOSTILE, "D"], [[HOSTILE, "1"]])
+
+    text = screen.export_text(styles=False)
+    told = r"cup[/][red]\x1b[2J\x1b]0;owned\x07\r\n\u202egnp.tac\udc80"
+    assert text.replace("│", "").replace("┃", "").replace("\n", "").replace(" ", "").count(told) >= 8
+    assert all(one.isprintable() or one == "\n" for one in text)
+
+
 def test_terminal_shows_stages(screen: Console) -> None:
     terminal = Terminal()
     assert isinstance(terminal, Stages)

@@ -1,31 +1,28 @@
 """The page of a study in a real browser."""
 
+import json
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+from hostile_names import ATTACK, FILE_NAME, assert_inert, watch
+from own_recording import write_forces, write_video
 
-from sliplens.report import Written
+from sliplens.cli import main
+from sliplens.plots.audit import draw_audit
+from sliplens.plots.style import save_page
+from sliplens.recordings import load_dataset
+from sliplens.recordings.dataset import trial_path
+from sliplens.recordings.store import load_recording
+from sliplens.report import Written, write_report
+from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
-playwright = pytest.importorskip(
-    "playwright.sync_api", reason="playwright is not installed: the page is not opened in a browser"
-)
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 PHONE, DESK = {"width": 320, "height": 640}, {"width": 1280, "height": 900}
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """A Chromium of this machine's: playwright's own would have to be fetched from outside the package index."""
-    path = next((found for name in BROWSERS if (found := shutil.which(name))), None)
-    if path is None:
-        pytest.skip("no Chromium on this machine: install the system's package chromium")
-    with playwright.sync_playwright() as driver:
-        # a container's root has no sandbox; the page is our own
-        opened = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        yield opened
-        opened.close()
 
 
 @pytest.fixture(scope="module", params=[PHONE, DESK], ids=["phone", "desk"])
@@ -81,3 +78,59 @@ def test_words_are_legible(opened):
         ".map(one => parseFloat(getComputedStyle(one).fontSize))"
     )
     assert min(sizes) >= 11
+
+
+@pytest.fixture
+def window(browser: Any) -> Iterator[Any]:
+    """A window that counts what runs though it should not."""
+    window = browser.new_page()
+    watch(window)
+    yield window
+    window.close()
+
+
+def test_hostile_names_do_nothing_on_the_page_of_an_import_nor_in_figures(window, tmp_path: Path, capsys):
+    trial = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=48))
+    (source := tmp_path / "source").mkdir()
+    write_video(trial, source / "cup.mkv")
+    write_forces(trial, source / "cup.csv")
+    (source / f"{FILE_NAME}.mkv").write_bytes(b"no video")
+    named = [word for option in ("object", "sensor", "condition") for word in (f"--{option}", ATTACK)]
+
+    with pytest.raises(SystemExit):  # what was left out
+        main(["import", str(source), "--output", str(tmp_path / "data"), *named, "--no-audit"])
+
+    said = capsys.readouterr()
+    assert "\x1b[2J" not in said.out + said.err
+    window.goto((tmp_path / "data" / "trials.html").as_uri())
+    assert_inert(window)
+    [info] = load_dataset(tmp_path / "data").trials
+    assert info.object == ATTACK
+    recording = load_recording(trial_path(tmp_path / "data", info.trial))
+    assert recording.labelling is not None
+    save_page(draw_audit(recording, recording.labelling), tmp_path / "audit.svg")
+    window.goto((tmp_path / "audit.svg").as_uri())
+    assert window.evaluate("document.querySelectorAll('script, img, [onerror]').length") == 0
+    assert window.evaluate("document.documentElement.tagName") == "svg"  # not the page of a parser's error
+
+
+def test_hostile_names_do_nothing_on_a_report(window, workspace: Path, tmp_path: Path):
+    for path in list(workspace.rglob("run.json")):
+        told = json.loads(path.read_text())
+        if told["stage"] in {"explain", "score"}:  # whose figures take seconds
+            shutil.rmtree(path.parent)
+            continue
+        told["versions"][ATTACK] = told["machine"]["processor"] = told["config"][ATTACK] = ATTACK
+        path.write_text(json.dumps(told))
+    for path in workspace.rglob("*.json"):
+        path.write_text(path.read_text().replace('"wet"', json.dumps(ATTACK)))
+    for path in workspace.rglob("*.parquet"):
+        if "condition" in (table := pq.read_table(path)).column_names:
+            wet = pa.array([ATTACK if one == "wet" else one for one in table["condition"].to_pylist()])
+            pq.write_table(table.set_column(table.column_names.index("condition"), "condition", wet), path)
+    hostile = workspace.rename(tmp_path / FILE_NAME)
+
+    page = write_report(hostile).page
+
+    window.goto(page.as_uri())
+    assert_inert(window)

@@ -27,7 +27,7 @@ def build_labels(page: "LabelPage") -> None:
     """Page of one viewer."""
     folder = Path(__file__).parent
     for name in ("live_view.css", "label_view.css"):
-        ui.add_css(folder / name)
+        ui.add_head_html(f"<style>{(folder / name).read_text(encoding='utf-8')}</style>")  # add_css needs a script
     ui.colors(primary=BLUE)
     ui.query(".nicegui-content").classes("sl-page")
     element = LabelView()

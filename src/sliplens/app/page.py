@@ -129,7 +129,8 @@ def build_live(page: "LivePage") -> None:
     feed.expected[name] = viewer
     ui.context.client.on_delete(lambda: feed.expected.pop(name, None))
     acts = _Acts(page, viewer)
-    ui.add_css(Path(__file__).with_name("live_view.css"))
+    style = Path(__file__).with_name("live_view.css").read_text(encoding="utf-8")
+    ui.add_head_html(f"<style>{style}</style>")  # add_css needs a script
     ui.colors(primary=BLUE)
     ui.query(".nicegui-content").classes("sl-page")
     with LiveView(page, name):

@@ -2,8 +2,10 @@
 
 import asyncio
 import errno
+import re
 import secrets
 import socket
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -13,7 +15,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, TypeVar
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, quote, urlsplit
 
 from sliplens.errors import InputError
 from sliplens.extras import require_packages
@@ -29,6 +31,13 @@ if TYPE_CHECKING:
 _PORT = 8090
 _PATIENCE_S = 10.0
 _DAY_S = 24 * 3600
+_HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[\w.-]+)(:\d+)?", re.ASCII)
+_MOST_BYTES = 2**18
+"""Of a message of a browser, and of what it posts."""
+_MESSAGES_A_SECOND = 200
+"""Of a browser: it answers pictures, and tells where sliders are."""
+_PAGES_A_SECOND, _PAGES_AT_ONCE = 2, 50
+"""Pages that may be opened: each is kept for a minute, whether somebody looks or not."""
 _ICON = (
     '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 16 16"><path d="M2 12a6 6 0 1 1 12 0" fill="none" '
     'stroke="#009E73" stroke-width="3"/><path d="M8 12 5 6" stroke="#D55E00" stroke-width="2"/></svg>'
@@ -108,6 +117,7 @@ def _application() -> "FastAPI":
     from starlette.middleware.gzip import GZipMiddleware  # noqa: PLC0415
     from starlette.websockets import WebSocket  # noqa: PLC0415
 
+    _sign_scripts()
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
 
     @app.websocket("/frames/{name}")
@@ -135,6 +145,18 @@ def _application() -> "FastAPI":
         gzip_middleware_factory=partial(GZipMiddleware, compresslevel=1),
     )
     return app
+
+
+def _sign_scripts() -> None:
+    """Have NiceGUI's own scripts carry the nonce of the answer: signed in its template, before any value is in it."""
+    from jinja2 import ChoiceLoader, DictLoader  # noqa: PLC0415 (with the page alone)
+    from nicegui.client import templates  # noqa: PLC0415 (the extra)
+
+    loader = templates.env.loader
+    assert loader is not None
+    text, *_ = loader.get_source(templates.env, "index.html")
+    signed = text.replace("<script", "<script nonce=\"{{ request.scope['nonce'] }}\"")
+    templates.env.loader = ChoiceLoader([DictLoader({"index.html": signed}), loader])
 
 
 class LivePage(Page):
@@ -218,6 +240,7 @@ def _serving(app: "ASGIApp", listening: socket.socket, page: Page) -> Iterator[N
         loop="asyncio",
         lifespan="off",
         ws="websockets-sansio",
+        ws_max_size=_MOST_BYTES,
         ws_per_message_deflate=False,  # of a JPEG it leaves what it was
         timeout_graceful_shutdown=1,
     )
@@ -274,16 +297,36 @@ def _listen(host: str, port: int | None) -> socket.socket:
     raise InputError(f"port {port} of {host} cannot be listened on ({reason}); name another with --port")
 
 
+class _Ration:
+    """Allowance that fills again with time: so many a second, and so many at once."""
+
+    def __init__(self, a_second: int, *, at_once: int) -> None:
+        self._a_second, self._most = a_second, at_once
+        self._left, self._seen_s = float(at_once), time.monotonic()
+
+    def take(self) -> bool:
+        """Take one, where one is left."""
+        now_s = time.monotonic()
+        self._left = min(self._most, self._left + (now_s - self._seen_s) * self._a_second)
+        self._seen_s = now_s
+        if self._left < 1:
+            return False
+        self._left -= 1
+        return True
+
+
 class Gate:
-    """Lets in who may see the page: ASGI middleware around everything, websockets included.
+    """Lets in who may see the page, and no more of them than it bears: ASGI middleware around everything.
 
     Without a token, who speaks to this machine by its own name: a page of another site that leads a name of its own
     here is refused. With one, who shows it, once in the address and from then on in a cookie. A page of another site
-    may in no case open a socket or send anything.
+    may in no case open a socket, send anything or load a part of this one. Who sends long messages, or many, is cut
+    off.
     """
 
     def __init__(self, app: "ASGIApp", *, token: str | None, port: int) -> None:
         self.app, self._token, self._cookie = app, token, f"sliplens-{port}"
+        self._pages = _Ration(_PAGES_A_SECOND, at_once=_PAGES_AT_ONCE)
 
     async def __call__(self, scope: "Scope", receive: "Receive", send: "Send") -> None:
         """Pass on, send to the same address without its token, or refuse."""
@@ -291,23 +334,34 @@ class Gate:
             await self.app(scope, receive, send)
             return
         headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        scope["nonce"] = nonce = secrets.token_urlsafe(16)
+        send = _guarded(send, headers.get("host", ""), nonce)
         if (why := self._refusal(headers)) is not None:
             await _refuse(scope, send, 403, why)
         elif self._token is None or self._shows(_cookie(headers.get("cookie", ""), self._cookie)):
-            await self.app(scope, receive, _guarded(send, headers.get("host", "")))
+            if scope["type"] == "http" and scope["path"] == "/" and not self._pages.take():
+                await _refuse(scope, send, 429, "too many pages are opened at once; wait some seconds")
+            else:
+                await self.app(scope, _rationed(receive, send), send)
         elif scope["type"] == "http" and self._shows(_token_of(scope)):
             kept = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict; Max-Age={_DAY_S}"
-            await _answer(send, 303, [("location", scope["path"]), ("set-cookie", kept)], "")
+            await _answer(send, 303, [("location", quote(scope["path"])), ("set-cookie", kept)], "")
         else:
             await _refuse(scope, send, 401, "open the whole address that sliplens printed, with its token")
 
     def _refusal(self, headers: dict[str, str]) -> str | None:
         host = headers.get("host", "")
+        if not _HOST.fullmatch(host):
+            return "the request names no host; open the address that sliplens printed"
         if self._token is None and not is_loopback(urlsplit(f"//{host}").hostname or ""):
             return f"this page is for this machine alone, and not at {host}; start it with --host to open it to others"
         origin = headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc != host:
-            return f"a page of {origin} may not use this one"
+        if origin is not None and origin.partition("://")[2] != host:
+            return "a page of another site may not use this one"
+        # browsers tell who asks: what others may do is to lead a person here
+        leads = headers.get("sec-fetch-mode") == "navigate" and headers.get("sec-fetch-dest") == "document"
+        if headers.get("sec-fetch-site", "none") not in {"none", "same-origin"} and not leads:
+            return "a page of another site may not load parts of this one"
         return None
 
     def _shows(self, token: str) -> bool:
@@ -326,17 +380,43 @@ def _token_of(scope: "Scope") -> str:
     return parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
 
 
-def _guarded(send: "Send", host: str) -> "Send":
-    """Add to every answer that its page may load nothing from elsewhere, nor be shown within another one."""
+def _rationed(receive: "Receive", send: "Send") -> "Receive":
+    """Take no long messages, nor many: whoever sends them is gone, as far as the page knows."""
+    ration, bytes_left = _Ration(_MESSAGES_A_SECOND, at_once=2 * _MESSAGES_A_SECOND), _MOST_BYTES
+
+    async def received() -> "Message":
+        nonlocal bytes_left
+        message = await receive()
+        if message["type"] == "http.request":
+            bytes_left -= len(message.get("body", b""))
+            return message if bytes_left >= 0 else {"type": "http.disconnect"}
+        if message["type"] == "websocket.receive":
+            size = len(message.get("bytes") or b"") + len(message.get("text") or "")
+            if size > _MOST_BYTES or not ration.take():
+                await send({"type": "websocket.close", "code": 1008, "reason": "too much was sent"})
+                return {"type": "websocket.disconnect", "code": 1008}
+        return message
+
+    return received
+
+
+def _guarded(send: "Send", host: str, nonce: str) -> "Send":
+    """Add to every answer that its page may load nothing from elsewhere, nor be shown within another one.
+
+    Of scripts in the page itself those run that carry the nonce: NiceGUI's own (`_sign_scripts`).
+    """
+    sockets = f" ws://{host} wss://{host}" if _HOST.fullmatch(host) else ""  # Safari does not take them for 'self'
     policy = (
-        "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval'; "  # Vue makes its templates in the browser
-        f"connect-src 'self' ws://{host} wss://{host}; frame-ancestors 'none'; form-action 'none'; base-uri 'self'"
+        f"default-src 'self'; script-src 'self' 'nonce-{nonce}' 'unsafe-eval'; "  # Vue makes templates in the browser
+        "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; object-src 'none'; "
+        f"connect-src 'self'{sockets}; frame-ancestors 'none'; form-action 'none'; base-uri 'none'"
     )
 
     async def sent(message: "Message") -> None:
         if message["type"] == "http.response.start":
             more = {
                 "content-security-policy": policy,
+                "cross-origin-resource-policy": "same-origin",
                 "referrer-policy": "no-referrer",
                 "x-content-type-options": "nosniff",
             }

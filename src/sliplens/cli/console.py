@@ -28,9 +28,9 @@ def fail(message: str) -> None:
     ERR.print(f"[bold red]sliplens:[/] {_shown(message)}", soft_wrap=True, highlight=False)
 
 
-def say(message: str) -> None:
-    """Print a line of plain text."""
-    OUT.print(_shown(message), soft_wrap=True, highlight=False)
+def say(message: str, *, aside: bool = False) -> None:
+    """Print a line of plain text, as a result or aside from it, where errors go."""
+    (ERR if aside else OUT).print(_shown(message), soft_wrap=True, highlight=False)
 
 
 def wrote(path: Path, what: str, *, kept: bool = False) -> None:
@@ -66,7 +66,7 @@ class Terminal:
         with self._lock:
             if not self._open:
                 self._bars.start()
-            task = self._bars.add_task(title, total=None)
+            task = self._bars.add_task(_shown(title), total=None)
             self._open.append(task)
         try:
             yield lambda done, total: self._bars.update(task, completed=done, total=total)
@@ -96,14 +96,17 @@ class Terminal:
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print a table, numbers to the right; columns that do not fit beside each other are printed below, names again."""
-    columns = [_column(name, [row[place] for row in rows], names=place == 0) for place, name in enumerate(header)]
+    columns = [
+        _column(visible(" ".join(name.split())), [visible(row[place]) for row in rows], names=place == 0)
+        for place, name in enumerate(header)
+    ]
     for number, shown in enumerate(_fitting(columns, OUT.width)):
-        table = Table(title=title if number == 0 else f"{title}, continued", title_justify="left")
+        table = Table(title=_shown(title) + (", continued" if number else ""), title_justify="left")
         for column in shown:
             numbers = column is not columns[0] and any(re.match(r"[-+]?\d", cell) for cell in column.cells)
             table.add_column(column.head, justify="right" if numbers else "left")
         for cells in zip(*(column.cells for column in shown), strict=True):
-            table.add_row(*map(_shown, cells))
+            table.add_row(*map(escape, cells))
         OUT.print(table)
 
 
@@ -121,7 +124,11 @@ def _column(name: str, cells: Sequence[str], *, names: bool) -> _Column:
     width = max(longest, min(widest, 26) if names else widest)  # names: up to a third of 80 columns
     fit = TextWrapper(width, break_long_words=False, break_on_hyphens=False).wrap
     head, *broken = map("\n".join, map(fit, (name, *cells)))
-    return _Column(escape(head), broken, max(longest, *(len(line) for cell in broken for line in cell.split("\n")), 0))
+    return _Column(
+        "\n".join(map(_shown, head.split("\n"))),
+        broken,
+        max(longest, *(len(line) for cell in broken for line in cell.split("\n")), 0),
+    )
 
 
 def _fitting(columns: Sequence[_Column], width: int) -> Iterator[list[_Column]]:

@@ -11,17 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sliplens.cli.command import Device, Friction
-from sliplens.cli.console import ERR, print_table, say
+from sliplens.cli.console import print_table, say
 
 if TYPE_CHECKING:
     from sliplens.live import LiveReader
     from sliplens.recordings import TrialFacts
 
 _SOURCE = "simulated, grip, number of a camera, address of a stream, or a video, bag, data set or growing folder."
-
-
-def _tell(message: str) -> None:
-    ERR.print(message, soft_wrap=True, highlight=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,11 +99,11 @@ class Live:
         with ExitStack() as stack:
             reader = stack.enter_context(closing(LiveReader(network=self.network or shipped, **named)))
             if reader.doubt is not None:
-                _tell(reader.doubt)
+                say(reader.doubt, aside=True)
             reader.send_to(*self.sink)
             if self.record is not None:
                 reader.record(self.record, facts=facts)
-            stack.callback(lambda: [_tell(str(state)) for state in reader.outputs])
+            stack.callback(lambda: [say(str(state), aside=True) for state in reader.outputs])
             with suppress(KeyboardInterrupt), reader, self._shown(reader, facts):  # the way to end it
                 self._watch(reader)
 
@@ -121,10 +117,10 @@ class Live:
             return
         shown = {"host": self.host, "port": self.port, "record_into": self.record or Path("recorded")}
         with LivePage(reader, facts=facts, **shown) as page:
-            _tell(f"open {page.address}")
+            say(f"open {page.address}", aside=True)
             yield
             if self.seconds is None and not self.sink:
-                _tell(f"{reader.source.name} has ended; the page stays until Ctrl-C")
+                say(f"{reader.source.name} has ended; the page stays until Ctrl-C", aside=True)
                 Event().wait()
 
     def _watch(self, reader: "LiveReader") -> None:
@@ -136,7 +132,7 @@ class Live:
                     raise error
                 for trouble in set(reader.troubles) - told:
                     told.add(trouble)
-                    _tell(trouble)
+                    say(trouble, aside=True)
                 if not self.sink:
                     say(str(reading))
 

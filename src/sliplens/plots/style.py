@@ -13,10 +13,13 @@ import matplotlib as mpl
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.ticker import FixedFormatter
 from PIL import Image
 
 from sliplens.errors import InputError
 from sliplens.intervals import Difference
+from sliplens.progress import visible
 from sliplens.results.faithfulness import CHANCE, CONTROLS, NEW_WEIGHTS, is_control
 
 # Okabe and Ito's palette, told apart under every common colour blindness
@@ -233,9 +236,25 @@ def require_picture_path(path: Path, *, example: str) -> None:
 def save_page(figure: Figure, path: Path) -> None:
     """Save a page as .png, .pdf or .svg; it appears when complete."""
     suffix = path.suffix.lower()
+    _write_out(figure)
     with written_whole(path) as part, drawing_style():
         # 150 dots an inch show frames of 224 pixels about pixel for pixel
         figure.savefig(part, format=suffix[1:], dpi=150, metadata=_METADATA[suffix])
+
+
+def _write_out(figure: Figure) -> None:
+    """Write out what cannot be seen in names of files: no font has it, and in an SVG it breaks the whole picture."""
+
+    def whole(text: str) -> str:
+        return "\n".join(map(visible, text.split("\n")))
+
+    for artist in figure.findobj(Text):
+        assert isinstance(artist, Text)
+        artist.set_text(whole(artist.get_text()))
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if isinstance(formatter := axis.get_major_formatter(), FixedFormatter):
+                formatter.seq = [whole(text) for text in formatter.seq]
 
 
 @contextmanager
@@ -288,6 +307,7 @@ class Picture:
 def figure_picture(figure: Figure, *, alt: str, pixels: bool = False) -> Picture:
     """Hold a figure as SVG, or as PNG: smaller where it is made of photographs."""
     buffer = io.BytesIO()
+    _write_out(figure)
     with drawing_style():
         if pixels:
             # as bare pixels: a PNG made only to be read again takes as long as the drawing

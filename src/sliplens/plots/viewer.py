@@ -32,7 +32,7 @@ from sliplens.plots.audit import Fact, audit_facts, end_of_ratio, force_ratio
 from sliplens.plots.contact_sheet import STATE_COLOURS, TIMES, brighten, brightening
 from sliplens.plots.saliency import full_colour, overlay_relevance
 from sliplens.plots.style import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, method_name, written_whole
-from sliplens.progress import OnProgress
+from sliplens.progress import OnProgress, visible
 from sliplens.recordings import Dataset, Recording, TrialFacts, TrialInfo
 from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.dataset import trial_path
@@ -310,7 +310,7 @@ def _facts(trial: Recording, truth: TruthHeader | None) -> list[Fact]:
 
 def _plain(words: str) -> str:
     """Escape what Markdown would read as its own."""
-    return _MARKS.sub(r"\\\1", words.removeprefix("• "))
+    return _MARKS.sub(r"\\\1", visible(words.removeprefix("• ")))
 
 
 _STATE_COLOURS = {str(state): colour for state, colour in STATE_COLOURS.items()}

@@ -1,9 +1,13 @@
 """The report: one page that needs nothing but itself, and its figures beside it."""
 
 import json
+from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import sha256
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -87,13 +91,12 @@ def _render(
     opening: Plate | None,
     waiting_for: Sequence[str],
 ) -> str:
-    """Lay a page out as HTML; every text is escaped."""
+    """Lay a report out as HTML."""
     runs = list(results.runs.values())
     versions = {tuple(sorted(run.versions.items())) for run in runs}
     mixed = "The stages were run with different versions of the libraries; see the versions of each run.json."
-    loader = PackageLoader("sliplens.report")
-    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    return pages.get_template("report.html.j2").render(
+    return render_page(
+        "report.html.j2",
         name=results.workspace.resolve().name,
         finished=runs[-1].finished[:16].replace("T", " at "),
         thesis=CITATION,
@@ -110,3 +113,19 @@ def _render(
         facts={**runs[-1].versions, **vars(runs[-1].machine)},
         interval=tell_interval,
     )
+
+
+def render_page(template: str, *, script: str = "", **values: Any) -> str:
+    """Fill a template of a page: every text is escaped, and only the style and script of the package work on it."""
+    loader = PackageLoader("sliplens.report")
+    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    folder = files("sliplens.report") / "templates"
+    inline = {"style": "report.css"} | ({"script": script} if script else {})
+    texts = {kind: (folder / name).read_text(encoding="utf-8") for kind, name in inline.items()}
+    allowed = [f"{kind}-src 'sha256-{_sha256(text)}'" for kind, text in texts.items()]
+    policy = "; ".join(["default-src 'none'", "img-src data:", *allowed, "base-uri 'none'", "form-action 'none'"])
+    return pages.get_template(template).render(policy=policy, **texts, **values)
+
+
+def _sha256(text: str) -> str:
+    return b64encode(sha256(text.encode()).digest()).decode()

@@ -2,14 +2,11 @@
 
 from base64 import b64encode
 from dataclasses import dataclass
-from hashlib import sha256
-from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
 from sliplens.plots.style import UNKNOWN, decimals, percent, written_whole
@@ -17,6 +14,7 @@ from sliplens.recordings.capture import Frame
 from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_path
 from sliplens.recordings.store import load_recording, read_frames
 from sliplens.recordings.trial import Recording
+from sliplens.report.page import render_page
 
 PAGE = "trials.html"
 _THUMBNAIL_PX = 72
@@ -65,18 +63,14 @@ def write_trials_page(data: Dataset | Path | str, out: Path | str | None = None)
     """
     data = data if isinstance(data, Dataset) else load_dataset(data)
     page = data.folder / PAGE if out is None else Path(out)
-    loader = PackageLoader("sliplens.report")
-    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    script = (files("sliplens.report") / "templates" / "trials.js").read_text(encoding="utf-8")
-    text = pages.get_template("trials.html.j2").render(
+    text = render_page(
+        "trials.html.j2",
+        script="trials.js",
         name=data.folder.resolve().name,
         rows=[_row(data, info) for info in data.trials],
         left_out=data.left_out,
         frames=f"{data.frames:,}",
         curve=_CURVE,
-        script=script,
-        # the page may run this script and no other
-        script_hash=b64encode(sha256(script.encode()).digest()).decode(),
     )
     with written_whole(page) as part:
         part.write_text(text, encoding="utf-8")
