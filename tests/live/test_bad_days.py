@@ -200,6 +200,11 @@ def test_a_folder_gives_its_newest_image_and_those_to_come(tmp_path: Path):
         assert list(frames) == []
 
 
+def test_a_folder_without_an_image_is_refused_with_what_to_wait_for(tmp_path: Path):
+    with pytest.raises(InputError, match="holds no image yet; begin when the first has been saved there"):
+        FolderSource(tmp_path).__enter__()
+
+
 def test_an_image_that_is_half_written_is_waited_for(tmp_path: Path):
     write_png(tmp_path / "1.png", IMAGE)
     whole = (tmp_path / "1.png").read_bytes()

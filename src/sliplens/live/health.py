@@ -264,7 +264,7 @@ class HealthMonitor:
         assert novelty is not None
         inputs = run.encode(frame.image[None], self._reference)
         value = float(novelty.distance(read_features(run.model, novelty.layer, inputs))[0])
-        told = f"to the network the picture is {value / novelty.limit:.2g} times as strange as what it was tested on"
+        told = f"to the network the picture is {value / novelty.limit:.2f} times as strange as what it was tested on"
         cure = "use the sensor that it was trained on, or train it on this one"
         return _judge("novelty", value, novelty.limit, told, cure)
 

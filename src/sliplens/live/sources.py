@@ -16,6 +16,7 @@ from jaxtyping import UInt8
 
 from sliplens.errors import ImageError, InputError, SourceError
 from sliplens.extras import Table
+from sliplens.files import require_folder
 from sliplens.images import is_image, list_images, natural_key
 from sliplens.live.camera import CameraSource
 from sliplens.live.contract import LiveSource, Pace, SourceKind, SourceOptions
@@ -130,6 +131,8 @@ class FolderSource(LiveSource):
 
     def __enter__(self) -> "FolderSource":
         self._closed.clear()
+        if not any(map(is_image, require_folder(self._folder, what="the folder").iterdir())):
+            raise InputError(f"{self.name} holds no image yet; begin when the first has been saved there")
         *before, newest = list_images(self._folder)
         self.size = frame_size(newest)
         self._seen = {path.name for path in before}
