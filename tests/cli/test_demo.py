@@ -94,7 +94,7 @@ def test_a_demo_of_other_settings_is_refused_with_a_cure_that_exists(
     def stop(*arguments: object, **options: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(sliplens.demo, "simulate", stop)
+    monkeypatch.setattr(sliplens.demo, "_to_look_at", stop)
     assert run("demo", tmp_path / "demo") == 130
     assert run("demo", tmp_path / "demo") == 130  # the same goes on
     capsys.readouterr()
