@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command line does; before torch is imported
@@ -26,6 +27,7 @@ from sliplens.extras import missing_packages
 from sliplens.files import hash_file, machine, versions
 from sliplens.markers.tracking import track
 from sliplens.progress import OnProgress
+from sliplens.recordings import Dataset
 from sliplens.shards import MakePart, Shard, make_parts, shard
 from sliplens.study.workspace import explain_source
 
@@ -75,6 +77,33 @@ class Empty:
             path.write_bytes(b"-")
 
         return make
+
+
+def time_predict(data: Dataset, out: Path, on: str, workers: int) -> tuple[Rate, object]:
+    """Margins of all frames."""
+    began_s = time.time()
+    predict(NETWORK, data, engine="folded", on=on, out=out)
+    return rate(out, began_s=began_s, workers=workers), content(out)
+
+
+def time_track(data: Dataset, out: Path, on: str, workers: int) -> tuple[Rate, object]:
+    """Markers of all frames."""
+    began_s = time.time()
+    track(data, markers="chromatouch", on=on, out=out)
+    return rate(out, began_s=began_s, workers=workers), content(out)
+
+
+def time_explain(data: Dataset, _: Path, on: str, workers: int) -> tuple[Rate, object]:
+    """Maps of Poly-CAM on its budget, of ten frames."""
+    made_s: list[float] = []
+    began_s, levels = time.time(), tuple(1 - number / 9 for number in range(10))
+    options = {"methods": ("poly-cam",), "levels": levels, "split": data.trials[-1].split}
+    maps = explain_source(NETWORK, data, on=on, on_progress=lambda *_: made_s.append(time.time()), **options)
+    steady = (len(made_s) - workers) / (made_s[-1] - made_s[workers - 1])
+    return Rate(start_s=made_s[workers - 1] - began_s, frames_per_s=steady), maps.relevance["poly-cam"].tobytes()
+
+
+STAGES = {"predict": time_predict, "explain": time_explain, "track": time_track}
 
 
 def weigh_driver(folder: Path) -> float:
@@ -139,7 +168,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, help="a data set; 12 trials of 60 frames are simulated without it")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--maps", type=int, default=6, help="frames that Poly-CAM explains")
+    parser.add_argument("--stages", nargs="+", choices=STAGES, default=list(STAGES))
     parser.add_argument("--kills", type=int, default=30)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true")
@@ -149,39 +178,18 @@ def main() -> None:
         places["ray"] = os.cpu_count() or 1
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
-        driver_mb = weigh_driver(scratch / "empty")
         data = options.data or scratch / "data"
         if options.data is None:
             simulate(data, dry_trials=12, wet_trials=0, frames_per_trial=60)
         found = load_dataset(data)
-        rates: dict[str, dict[str, Rate]] = {"predict": {}, "track": {}, "explain": {}}
-        bytes_of: dict[str, dict[str, object]] = {"predict": {}, "track": {}, "explain": {}}
-        for on, workers in places.items():
-            began_s, out = time.time(), scratch / f"margins-{on}"
-            predict(NETWORK, data, engine="folded", on=on, out=out)
-            rates["predict"][on] = rate(out, began_s=began_s, workers=workers)
-            bytes_of["predict"][on] = content(out)
-            began_s, out = time.time(), scratch / f"markers-{on}"
-            track(data, markers="chromatouch", on=on, out=out)
-            rates["track"][on] = rate(out, began_s=began_s, workers=workers)
-            bytes_of["track"][on] = content(out)
-            if options.maps:
-                levels = tuple(1 - number / max(1, options.maps - 1) for number in range(options.maps))
-                made_s: list[float] = []
-                began_s = time.time()
-                maps = explain_source(
-                    NETWORK,
-                    found,
-                    methods=("poly-cam",),
-                    levels=levels,
-                    on=on,
-                    on_progress=lambda *_, made_s=made_s: made_s.append(time.time()),
-                )
-                steady = len(maps.frames) - workers
-                rates["explain"][on] = Rate(
-                    start_s=made_s[workers - 1] - began_s, frames_per_s=steady / (made_s[-1] - made_s[workers - 1])
-                )
-                bytes_of["explain"][on] = maps.relevance["poly-cam"].tobytes()
+        rates: dict[str, dict[str, Rate]] = {stage: {} for stage in options.stages}
+        bytes_of: dict[str, dict[str, object]] = {stage: {} for stage in options.stages}
+        for stage, (on, workers) in product(options.stages, places.items()):
+            out = scratch / f"{stage}-{on}"
+            rates[stage][on], bytes_of[stage][on] = STAGES[stage](found, out, on, workers)
+            print(f"{stage:8s} {on:12s} {rates[stage][on]}", file=sys.stderr)
+        with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as empty:
+            driver_mb = weigh_driver(Path(empty))  # in memory: its files would each wait for the disk
         survived, killed = count_kills(data, scratch, list(places)[1:], kills=options.kills, seed=options.seed)
     by_processes = f"processes={options.workers}"
     speedups = {
@@ -202,7 +210,6 @@ def main() -> None:
         "frames_per_s": {stage: {on: one.frames_per_s for on, one in own.items()} for stage, own in rates.items()},
         "start_s": {stage: {on: one.start_s for on, one in own.items()} for stage, own in rates.items()},
         "frames": found.frames,
-        "maps": options.maps,
         "workers": options.workers,
         "load_average": os.getloadavg()[0],
         "machine": vars(machine()),

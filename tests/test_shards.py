@@ -1,6 +1,7 @@
 """Shards: present means done, a failure ends nothing but itself, and where a part was made does not show."""
 
 import os
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -116,6 +117,27 @@ def test_processes_make_the_same_bytes_and_survive_a_kill(log: Path, out: Path, 
     assert len(pids) >= 2
     make(Count(log=work.log), tmp_path / "other", retry_failed=True)
     assert content(tmp_path / "other") == content(out)
+
+
+@pytest.mark.skipif("SLIPLENS_RAY" not in os.environ, reason="takes half a minute; SLIPLENS_RAY=1 runs it")
+def test_a_cluster_of_two_nodes_makes_the_same_bytes_and_survives_a_kill(log: Path, out: Path, monkeypatch):
+    cluster_utils = pytest.importorskip("ray.cluster_utils")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path for path in sys.path if path))  # what its workers import
+    make(Count(log=log), out.with_name("serial"))
+    cluster = cluster_utils.Cluster()
+    try:
+        for _ in range(2):
+            cluster.add_node(num_cpus=1)
+        make(Count(log=log, kill=frozenset("b")), out, on=f"ray={cluster.address}")
+    finally:
+        cluster.shutdown()
+    assert content(out) == content(out.with_name("serial"))
+
+
+def test_without_ray_it_is_told_how_to_get_it(log: Path, out: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(InputError, match=r"--on ray needs ray, which is not installed.*sliplens\[ray\]"):
+        make(Count(log=log), out, on="ray")
 
 
 def test_a_place_that_is_not_known_is_told(log: Path, out: Path):

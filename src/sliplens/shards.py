@@ -4,6 +4,7 @@ What is done, doing and failed is read from the folder of the parts, and stands 
 done, one that a process holds is being made, one that failed has left a sentence.
 """
 
+import hashlib
 import json
 import logging
 import os
@@ -12,6 +13,7 @@ import re
 import shutil
 import signal
 import socket
+import sys
 import threading
 import time
 from collections import deque
@@ -108,8 +110,8 @@ class Work(Protocol):
 class Worker:
     """One that makes parts, one after another, in whatever process."""
 
-    def __init__(self, work: Work | bytes, folder: str | None = None) -> None:
-        self._work, self._folder = work, folder
+    def __init__(self, work: Work | bytes, *, folder: str | None = None, threads: int | None = None) -> None:
+        self._work, self._folder, self._threads = work, folder, threads
 
     def start(self) -> Exception | None:
         """Load what all shards need; what is wrong with it is given back."""
@@ -118,6 +120,8 @@ class Worker:
                 os.chdir(self._folder)  # paths count from there
             # bytes that this program packed for a process of its own
             work = pickle.loads(self._work) if isinstance(self._work, bytes) else self._work  # noqa: S301
+            if self._threads is not None and "torch" in sys.modules:
+                sys.modules["torch"].set_num_threads(self._threads)
             self._make = work.begin()
         except Exception as error:  # raised again where the work was asked for
             return error
@@ -190,10 +194,12 @@ class _Process:
     def __init__(self, work: bytes, *, threads: int) -> None:
         context = get_context("spawn")  # a fork would inherit locks of torch's threads
         alive, self._life = context.Pipe(duplex=False)
-        self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=_enter, initargs=(work, threads, alive))
+        self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=_enter, initargs=(alive,))
+        self._work, self._threads = work, threads
 
     def start(self) -> Future:
-        return self._pool.submit(_start)
+        # not as the process is made: that would wait until it has imported the main module, one after another
+        return self._pool.submit(_start, self._work, self._threads)
 
     def submit(self, folder: Path, given: Shard, on_progress: OnProgress) -> Future:  # noqa: ARG002 (of whole shards)
         return self._pool.submit(_attempt, folder, given)
@@ -207,12 +213,10 @@ _HERE: list[Worker] = []
 """Worker of a process that was made for one."""
 
 
-def _enter(work: bytes, threads: int, alive: Connection) -> None:
+def _enter(alive: Connection) -> None:
     # an interruption reaches every process of a terminal; the first of them ends the others
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(alive,), daemon=True).start()
-    os.environ["OMP_NUM_THREADS"] = str(threads)  # before torch is imported, which unpacking the work does
-    _HERE.append(Worker(work))
 
 
 def _end_with(alive: Connection) -> None:
@@ -220,7 +224,9 @@ def _end_with(alive: Connection) -> None:
     os._exit(1)
 
 
-def _start() -> Exception | None:
+def _start(work: bytes, threads: int) -> Exception | None:
+    os.environ["OMP_NUM_THREADS"] = str(threads)  # for what unpacking the work imports first
+    _HERE.append(Worker(work, threads=threads))
     return _HERE[0].start()
 
 
@@ -284,7 +290,7 @@ def _ray(work: Work, address: str) -> Iterator[Seats]:
         packed = ray.put(pickle.dumps(work))  # once a node, not once a worker
         kind: Any = ray.remote(num_cpus=1, num_gpus=int(work.on_gpu), scheduling_strategy="SPREAD")(Worker)
         here = os.getcwd()  # noqa: PTH109 (a worker elsewhere has another)
-        yield count, lambda: _Actor(kind.remote(packed, here), ray.kill), RayError
+        yield count, lambda: _Actor(kind.remote(packed, folder=here), ray.kill), RayError
     finally:
         if not connected:
             ray.shutdown()
@@ -410,7 +416,11 @@ def make_table(
             yield table
 
     if out is not None and not out.suffix:
-        with output_folder(out, stage=title, config=recipe, overwrite=overwrite) as output:
+        every = hashlib.sha256()
+        for one in shards():  # frames that changed make another result
+            every.update(one.part.encode())
+        config = {"recipe": recipe, "shards_sha256": every.hexdigest()}
+        with output_folder(out, stage=title, config=config, overwrite=overwrite) as output:
             schema = make(output.folder)
             if on_rows is not None:
                 deque(read(output.folder), maxlen=0)

@@ -3,6 +3,7 @@
 import shutil
 import weakref
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -334,9 +335,9 @@ def test_another_process_writes_the_same_bytes_and_a_folder_is_a_data_set_of_the
     trained: Run, small_dataset: Dataset, tmp_path: Path, elsewhere: str
 ):
     def write(path: Path, **options: object) -> Predictions:
-        given: dict[str, object] = {"split": "test", "engine": "eager", **options}
-        return predict_source(trained, small_dataset.folder, out=path, **given)  # pyright: ignore[reportArgumentType]
+        return predict_source(trained, small_dataset.folder, out=path, **own, **options)  # pyright: ignore
 
+    own: dict[str, Any] = {"split": "test", "engine": "eager"}
     serial, others = write(tmp_path / "a.parquet"), write(tmp_path / "b.parquet", on=elsewhere)
     assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
     folder = write(tmp_path / "set")
@@ -347,6 +348,9 @@ def test_another_process_writes_the_same_bytes_and_a_folder_is_a_data_set_of_the
         f"trial={TRIAL}",
     ]
     refused(small_dataset.folder, trained, InputError, "other settings", out=tmp_path / "set", engine="folded")
+    same = [replace(info, sha256="0" * 64) for info in small_dataset.trials]  # frames that changed
+    with pytest.raises(InputError, match="other settings"):
+        predict_source(trained, replace(small_dataset, trials=tuple(same)), out=tmp_path / "set", **own)
     frames = np.zeros((2, 48, 48, 3), dtype=np.uint8)
     with pytest.raises(InputError, match="frames in memory are worked on in this process"):
         predict_source(trained, frames, on="processes")
