@@ -201,7 +201,8 @@ def validate(count: int, conditions: Sequence[str], rng: np.random.Generator) ->
         friction, margins = (
             np.array([getattr(state, name)[0] for state, _ in held]) for name in ("holding_friction", "margin")
         )
-        read, *_ = READINGS.read(2 * pair + np.arange(2), force, friction=friction, margins=margins)
+        tips = np.broadcast_to(2 * pair + np.arange(2), force.shape)
+        read, *_ = READINGS.read(tips, force, friction=friction, margins=margins)
         gaps.append(np.array([margin for _, margin in held]) - read)
         forces.append(force)
     return {

@@ -25,7 +25,7 @@ NO_MODULES = (
         f"sliplens.{name}"
         for name in ("manifest", "input", "output", "recipes", "augmentations", "sources", "estimators")
     }
-    | {"sliplens.sensors", "sliplens.presets", "sliplens.pulls", "sliplens.sinks"}
+    | {"sliplens.sensors", "sliplens.presets", "sliplens.pulls", "sliplens.sinks", "sliplens.gripper_messages"}
 )
 """Groups of entry points, and keys in the metadata of an ONNX file."""
 _CODE = re.compile(r"^```(\w*)\n(.*?)^```", flags=re.MULTILINE | re.DOTALL)
