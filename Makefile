@@ -15,7 +15,7 @@ unexport PYTHONDONTWRITEBYTECODE
 export SLIPLENS_REFERENCE ?= ../shared/reference
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test fuzz check format bench docs weights lock clean
+.PHONY: help install demo test fuzz check format bench docs weights lock audit clean
 
 help: ## list these targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -78,7 +78,10 @@ weights: $(INSTALLED) ## train the networks that come with the package: some fiv
 
 lock: $(UV) ## pin the newest packages that fit, for every supported Python
 	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --extra dev --extra docs \
-		--custom-compile-command "make lock" --output-file requirements.txt pyproject.toml
+		--generate-hashes --custom-compile-command "make lock" --output-file requirements.txt pyproject.toml
+
+audit: $(INSTALLED) ## compare what is installed with requirements.txt, file by file; asks nobody
+	$(BIN)/python .ci/audit.py
 
 clean: ## remove .venv and what the tools cache
 	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis .import_linter_cache docs/_build
@@ -90,6 +93,6 @@ $(UV):
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
 
 $(INSTALLED): $(UV) requirements.txt pyproject.toml
-	$(UV) pip install --quiet --compile-bytecode --python $(BIN)/python -r requirements.txt
+	$(UV) pip install --quiet --compile-bytecode --python $(BIN)/python --require-hashes -r requirements.txt
 	$(UV) pip install --quiet --python $(BIN)/python --no-build-isolation --no-deps -e .
 	@touch $@

@@ -13,11 +13,12 @@ import pytest
 from hostile_names import ATTACK, assert_inert, watch
 
 from sliplens.app import LabelPage
+from sliplens.codec import to_builtins
 from sliplens.errors import InputError, RecordingError
 from sliplens.images import decode_png
 from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.edits import EDITS_FILE, read_edits
+from sliplens.recordings.edits import EDITS_FILE, make_edit, read_edits
 from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.importing import relabel_trial
 from sliplens.recordings.store import save_recording
@@ -112,7 +113,11 @@ def test_what_is_shown_is_what_label_will_write(data: Dataset, trial: Recording)
     assert [edit.by for edit in view.edits] == ["bo", "bo"]
     assert page.edit_counts == {trial.trial: 2}
     # a trial that cannot be labelled so is shown as it is on disk, with the reason, and can be repaired
-    page.edit(trial.trial, "slip_s", float(trial.time_s[2]))
+    early = make_edit(trial.trial, "slip_s", float(trial.time_s[2]), by="bo")
+    with pytest.raises(RecordingError, match="set the contact first"):
+        page.edit(early.trial, early.kind, early.value)
+    with (data.folder / EDITS_FILE).open("a") as file:
+        file.write(json.dumps(to_builtins(early)) + "\n")
     assert "set the contact first" in page.look(trial.trial).trouble
     page.edit(trial.trial, "undo")
     assert not page.look(trial.trial).trouble
