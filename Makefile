@@ -15,7 +15,7 @@ unexport PYTHONDONTWRITEBYTECODE
 export SLIPLENS_REFERENCE ?= ../shared/reference
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test fuzz check format bench docs weights lock audit clean
+.PHONY: help install demo test fuzz kills check format bench docs weights lock audit clean
 
 help: ## list these targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -28,8 +28,11 @@ demo: $(INSTALLED) ## have a first look, in minutes: runs/demo/report.html
 test: $(INSTALLED) ## run the tests on all cores; the last line says how long they took
 	$(BIN)/pytest --durations 10
 
-fuzz: $(INSTALLED) ## read 10,000 hostile inputs, an hour or more; given again it goes on
+fuzz: $(INSTALLED) ## read 10,000 hostile inputs, half an hour or more; given again it goes on
 	$(BIN)/python benchmarks/fuzz.py --inputs 10000 --keep runs/fuzz.jsonl
+
+kills: $(INSTALLED) ## disturb the commands that write 200 times, an hour or less; given again it goes on
+	$(BIN)/python benchmarks/kills.py --faults 200 --keep runs/kills.jsonl
 
 check: $(INSTALLED) ## lint, format, types, floors
 	$(BIN)/ruff check

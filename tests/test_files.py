@@ -1,12 +1,14 @@
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.files import hash_json, output_folder, read_json, to_builtins, write_json
+from sliplens.files import hash_json, output_folder, read_json, scratch_folder, to_builtins, whole_file, write_json
 
 
 def make(target: Path, config: dict, *, text: str = "x", overwrite: bool = False) -> bool:
@@ -133,3 +135,46 @@ def test_broken_json_is_one_sentence(tmp_path: Path):
     (tmp_path / "x.json").write_text("{")
     with pytest.raises(InputError, match=r"x\.json is not valid JSON"):
         read_json(tmp_path / "x.json")
+
+
+def test_a_file_is_written_by_one_at_a_time_and_whole_or_not_at_all(tmp_path: Path):
+    target = tmp_path / "new" / "table.csv"
+    with whole_file(target) as part:
+        part.write_text("first")
+        with pytest.raises(InputError, match="another sliplens is writing"), whole_file(target):
+            pass
+        assert not target.exists()
+    with pytest.raises(KeyboardInterrupt), whole_file(target) as part:  # noqa: PT012
+        part.write_text("second")
+        raise KeyboardInterrupt
+    assert target.read_text() == "first"
+    assert [path.name for path in target.parent.iterdir()] == ["table.csv"]
+
+
+def test_what_cannot_be_written_is_named(tmp_path: Path):
+    with pytest.raises(OSError, match="room") as raised, whole_file(tmp_path / "x"):
+        raise OSError("no room")  # as libraries raise it, without a name
+    assert raised.value.filename == str(tmp_path / "x")
+    with pytest.raises(FileNotFoundError) as raised, whole_file(tmp_path / "x"):
+        (tmp_path / "other").read_text()
+    assert raised.value.filename == str(tmp_path / "other")
+
+
+def test_a_temporary_folder_of_a_dead_process_is_cleared_and_one_of_a_living_one_is_not(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with scratch_folder() as living:
+        (dead := tmp_path / f"{living.name}-dead").mkdir()
+        (dead / "piece").write_text("x")
+        (tmp_path / "else").mkdir()
+        with scratch_folder() as other:
+            assert {path.name for path in tmp_path.iterdir()} == {living.name, other.name, "else"}
+    assert [path.name for path in tmp_path.iterdir()] == ["else"]
+
+
+def test_whatever_change_a_process_was_killed_before_the_next_one_makes_the_same_and_leaves_nothing(tmp_path: Path):
+    script = Path(__file__).parent / "helpers" / "killed.py"
+    told = subprocess.run([sys.executable, script, tmp_path], capture_output=True, text=True, timeout=120, check=False)
+    assert told.returncode == 0, told.stderr
+    tried = json.loads(told.stdout)
+    assert {name for name, _ in tried} == {"make", "replace", "file", "scratch", "split"}
+    assert len(tried) > 40

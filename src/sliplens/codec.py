@@ -24,7 +24,7 @@ from jaxtyping import AbstractArray, jaxtyped
 from numpy.lib.format import read_array_header_1_0, read_array_header_2_0, read_magic
 
 from sliplens.errors import InputError, SliplensError
-from sliplens.files import read_json, require_file, to_builtins, write_json
+from sliplens.files import read_json, require_file, to_builtins, whole_file, write_json
 
 RESULT_FILE = "result.json"
 """Record of a folder."""
@@ -152,10 +152,8 @@ def save_result(result: object, folder: Path) -> None:
         else:
             short[field.name] = value
     if arrays:
-        part = folder / f"{ARRAYS_FILE}.part"
-        with part.open("wb") as stream:
+        with whole_file(folder / ARRAYS_FILE) as part, part.open("wb") as stream:
             np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
-        part.replace(folder / ARRAYS_FILE)
     save_record(short, folder / RESULT_FILE)  # last: a folder with this file is whole
 
 
@@ -308,6 +306,10 @@ def _kind_of(hint: Any) -> str:
     return "true and false" if shown.startswith("Bool") else "whole numbers" if "Int" in shown else "numbers"
 
 
+_LARGEST = 1e12
+"""No stage measures more of anything, infinity among them; seconds since 1970 are 2e9."""
+
+
 def _load_columns(path: Path, kind: type[_Columns], cure: str) -> _Columns:
     declared = get_type_hints(kind)
     kinds = {name: _kind_of(hint) for name, hint in declared.items()}
@@ -320,6 +322,8 @@ def _load_columns(path: Path, kind: type[_Columns], cure: str) -> _Columns:
         with jaxtyped("context"):
             if _array_type(hint) is not None and not isinstance(value, hint):
                 raise InputError(f"{path} holds {column.type} as {name!r} where {_shown(hint)} belongs; {cure}")
+        if value.dtype.kind == "f" and (np.abs(value) > _LARGEST).any():
+            raise InputError(f"{path} holds {value[np.nanargmax(np.abs(value))]:g} as {name!r}; {cure}")
         values[name] = value
     return kind(**values)
 
@@ -385,24 +389,14 @@ def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schem
 
     Raises
     ------
-    InputError
+    OSError
         If the file cannot be written.
     """
     if path is None:
         return pa.concat_tables([schema.empty_table(), *tables]).replace_schema_metadata(schema.metadata)
-    part = path.with_name(f".{path.name}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        writer = _table_writer(part, schema, path.suffix)
-    except OSError as error:
-        raise InputError(f"cannot write {path} ({error.strerror or error}); choose another file") from None
-    try:
-        with writer:
-            for table in tables:
-                writer.write_table(table.replace_schema_metadata(schema.metadata))
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with whole_file(path) as part, _table_writer(part, schema, path.suffix) as writer:
+        for table in tables:
+            writer.write_table(table.replace_schema_metadata(schema.metadata))
     return None
 
 

@@ -2,9 +2,18 @@
 
 from collections.abc import Mapping
 
+_LONGEST = 1500
+
 
 class SliplensError(Exception):
-    """Base of every error that is the user's to mend; the command line prints it and exits with code 2."""
+    """Base of every error that is the user's to mend; the command line prints it and exits with code 2.
+
+    It stays a sentence whatever a file holds: of what is longer than that the middle is left out.
+    """
+
+    def __str__(self) -> str:
+        told = super().__str__()
+        return told if len(told) <= _LONGEST else f"{told[: _LONGEST - 500]}\N{HORIZONTAL ELLIPSIS}{told[-499:]}"
 
 
 class InputError(SliplensError):

@@ -9,7 +9,7 @@ import stat
 import sys
 import tempfile
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -114,10 +114,43 @@ def hash_tree(path: Path) -> str:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a value as indented JSON, beside the target first, so that no half-written file is ever seen."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps(to_builtins(value), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    part.replace(path)
+    """Write a value as indented JSON, whole or not at all."""
+    text = json.dumps(to_builtins(value), indent=2, allow_nan=False) + "\n"
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Give a file beside the target to write to; it takes the target's name when all went well, else it is gone.
+
+    Raises
+    ------
+    InputError
+        If another process is writing it.
+    OSError
+        If it cannot be written: no folder of that name can be made, or there is no room.
+    """
+    part = path.with_name(f".{path.name}.part")
+
+    def make() -> Path:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.touch()
+        return part
+
+    try:
+        with _held(make, f"another sliplens is writing {path}; wait until it is done, or choose another file"):
+            try:
+                yield part
+                part.replace(path)
+            except BaseException:
+                with suppress(OSError):
+                    part.unlink()
+                raise
+    except OSError as error:
+        if error.filename in {None, str(part)}:  # some libraries tell no name, and nobody knows the part's
+            raise OSError(error.errno, error.strerror or str(error), str(path)) from None
+        raise
 
 
 MOST_TEXT = 64 * 2**20
@@ -210,11 +243,26 @@ def find_run(run: Path) -> Path:
     raise InputError(f"the run {run} does not exist; check the path{shipped}")
 
 
+_SCRATCH = "sliplens-scratch-"
+
+
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Folder for what must lie on disk for a while; it is gone afterwards."""
-    with tempfile.TemporaryDirectory(prefix="sliplens-") as folder:
-        yield Path(folder)
+    """Folder for what must lie on disk for a while; it is gone afterwards.
+
+    One whose process was killed is removed by the next that needs one.
+    """
+    for left in Path(tempfile.gettempdir()).glob(f"{_SCRATCH}*"):
+        with suppress(OSError):  # somebody else's
+            if (held := hold(left, surely=True)) is not None:
+                shutil.rmtree(left)
+                os.close(held)
+    # an empty one may be taken for one that was left
+    with _held(lambda: Path(tempfile.mkdtemp(prefix=_SCRATCH)), "a folder of its own is held by another") as folder:
+        try:
+            yield folder
+        finally:
+            _drop(folder)
 
 
 def require_new_file(path: Path, *, suffix: str | Sequence[str] = (), overwrite: bool = False) -> None:
@@ -240,9 +288,13 @@ def partial_folder(target: Path) -> Path:
     return target.with_name(f".{target.name}.partial")
 
 
-def hold(path: Path) -> int | None:
-    """Hold a file or folder against other processes until what is given is closed; None where another one holds it."""
+def hold(path: Path, *, surely: bool = False) -> int | None:
+    """Hold a file or folder against other processes until what is given is closed; None where another one holds it.
+
+    Where there are no locks it is held as well as can be, or, if that is to be sure, not at all.
+    """
     descriptor = os.open(path if fcntl else os.devnull, os.O_RDONLY)
+    locks = fcntl is not None
     try:
         if fcntl is not None:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -250,8 +302,22 @@ def hold(path: Path) -> int | None:
         os.close(descriptor)
         return None
     except OSError:  # a file system without locks
-        pass
+        locks = False
+    if surely and not locks:
+        os.close(descriptor)
+        return None
     return descriptor
+
+
+def make_and_hold(make: Callable[[], Path]) -> tuple[Path, int | None]:
+    """Make a file or folder and `hold` it; made again where another process has moved it away meanwhile."""
+    while True:
+        path = make()
+        with suppress(FileNotFoundError):
+            held = hold(path)
+            if held is None or fcntl is None or os.path.samestat(os.fstat(held), path.stat()):
+                return path, held
+            os.close(held)
 
 
 @contextmanager
@@ -269,25 +335,22 @@ def output_folder(
     """
     recipe = to_builtins(config)
     config_hash = hash_json({"stage": stage, "config": recipe, "sliplens": __version__})
-    aside = _aside(target)
-    if aside.exists():  # whoever replaced it was killed, before or after the new one took its place
-        with held_folder(partial_folder(target), target):  # or is about to put it there
-            if aside.exists():
-                shutil.rmtree(aside) if target.exists() else aside.rename(target)
+    partial = partial_folder(target)
+    if _aside(target).exists():  # whoever replaced it was killed, before or after the new one took its place
+        with held_folder(partial, target):  # or is about to put it there
+            if _aside(target).exists():
+                shutil.rmtree(_aside(target)) if target.exists() else _aside(target).rename(target)
             with suppress(OSError):  # what was begun stays
-                partial_folder(target).rmdir()
-    empty = target.is_dir() and not any(target.iterdir())
-    if target.exists() and not (target / run_file).is_file() and not (overwrite and empty):
-        raise InputError(f"{target} exists and was not made by sliplens; choose another output folder")
-    if target.exists() and not overwrite:
-        kept = read_json(target / run_file)
-        if not (isinstance(kept, dict) and kept.get("config_hash") == config_hash):
-            raise InputError(f"{target} holds a result of other settings; choose another folder or pass --overwrite")
+                partial.rmdir()
+    if _is_made(target, config_hash, run_file=run_file, overwrite=overwrite):
         yield Output(folder=target, complete=True)
         return
-    partial = partial_folder(target)
     with held_folder(partial, target):
         state = partial / ".recipe"
+        if _is_made(target, config_hash, run_file=run_file, overwrite=overwrite):  # by another process since
+            _drop(partial)
+            yield Output(folder=target, complete=True)
+            return
         if not (resumable and state.is_file() and state.read_text() == config_hash):
             _empty(partial)
         if resumable:
@@ -297,7 +360,7 @@ def output_folder(
         except BaseException:
             # what is finished stays for the next try; where nothing is, nothing is left behind
             if not resumable or not any(path.is_file() and path != state for path in partial.rglob("*")):
-                shutil.rmtree(partial)
+                _drop(partial)
             raise
         finished = datetime.now(UTC).isoformat(timespec="seconds")
         provenance = Provenance(
@@ -308,26 +371,51 @@ def output_folder(
             machine=machine(),
             finished=finished,
         )
-        (partial / run_file).parent.mkdir(parents=True, exist_ok=True)
         write_json(partial / run_file, provenance)
         state.unlink(missing_ok=True)
         _take_place(partial, target)
 
 
+def _is_made(target: Path, config_hash: str, *, run_file: str, overwrite: bool) -> bool:
+    """Whether a target is there, of the same recipe; one that may not be replaced is an `InputError`."""
+    if not target.exists():
+        return False
+    if not (target / run_file).is_file() and not (overwrite and target.is_dir() and not any(target.iterdir())):
+        raise InputError(f"{target} exists and was not made by sliplens; choose another output folder")
+    if overwrite:
+        return False
+    kept = read_json(target / run_file)
+    if not (isinstance(kept, dict) and kept.get("config_hash") == config_hash):
+        raise InputError(f"{target} holds a result of other settings; choose another folder or pass --overwrite")
+    return True
+
+
+@contextmanager
+def _held(make: Callable[[], Path], taken: str) -> Iterator[Path]:
+    """Make a file or folder and keep other processes out of it; where one is in it, that is said."""
+    path, held = make_and_hold(make)
+    if held is None:
+        raise InputError(taken)
+    try:
+        yield path
+    finally:
+        os.close(held)
+
+
 @contextmanager
 def held_folder(partial: Path, target: Path) -> Iterator[None]:
     """Make the folder in which a target is made, and keep other processes out of it."""
-    try:
-        partial.mkdir(parents=True, exist_ok=True)
-        held = hold(partial)
-    except OSError as error:
-        raise InputError(f"cannot write to {target.parent} ({error.strerror}); choose another output folder") from None
-    if held is None:
-        raise InputError(f"another sliplens is writing {target}; wait until it is done, or choose another folder")
-    try:
+
+    def make() -> Path:
+        try:
+            partial.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            why = error.strerror
+            raise InputError(f"cannot write to {target.parent} ({why}); choose another output folder") from None
+        return partial
+
+    with _held(make, f"another sliplens is writing {target}; wait until it is done, or choose another folder"):
         yield
-    finally:
-        os.close(held)
 
 
 def _take_place(partial: Path, target: Path) -> None:
@@ -336,11 +424,15 @@ def _take_place(partial: Path, target: Path) -> None:
     if target.exists():
         target.rename(aside)
     partial.rename(target)
-    shutil.rmtree(aside, ignore_errors=True)
+    _drop(aside)
 
 
 def _aside(target: Path) -> Path:
     return target.with_name(f".{target.name}.replaced")
+
+
+def _drop(folder: Path) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _empty(folder: Path) -> None:

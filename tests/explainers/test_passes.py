@@ -6,7 +6,7 @@ from torch import nn
 
 from sliplens.errors import InputError, ModelError
 from sliplens.explainers import PolyCam
-from sliplens.models.engines import ENGINES, prepare
+from sliplens.models.engines import ENGINES, counting_passes, prepare
 
 
 class Branches(nn.Module):
@@ -57,6 +57,17 @@ def test_the_best_engine_that_pays_is_taken(float_network, images):
     # earlier calls count: frames are explained one by one
     for name in ("folded", "openvino"):
         assert ready(float_network, images[:1].float(), count=ENGINES[name].pays_after or 0)[0].name == name
+
+
+def test_an_engine_is_chosen_alike_whether_or_not_something_ran_before(float_network, images):
+    def name(count: int) -> str:
+        return ready(float_network, images[:1].float(), count=count)[0].name
+
+    fresh = name(1)
+    name(10_000)
+    with counting_passes():
+        assert [fresh, name(1)] == ["eager", "eager"]
+    assert name(1) == "openvino"
 
 
 def test_new_weights_are_converted_anew(float_network, images):

@@ -1,6 +1,7 @@
 """The command line: one frozen dataclass a subcommand."""
 
 import os
+import re
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
@@ -75,6 +76,23 @@ def _parse(words: Sequence[str]) -> Any:
     return command
 
 
+_NO_MEMORY = "allocate memory|out of memory|bad_alloc|start new thread|failed to map segment"
+"""What torch, threads and libraries say where Python says MemoryError."""
+
+
+def _sentence(error: Exception, command: object | None) -> str:
+    """What a mistake or a fault is called; whatever else it is goes on."""
+    match error:
+        case SliplensError():
+            return str(error) if command is None else in_options(str(error), command)
+        case OSError():
+            where, why = error.filename or "a file", error.strerror or error
+            return f"{where} could not be read or written ({why}); check the path, its permissions and the space left"
+        case _ if isinstance(error, MemoryError) or re.search(_NO_MEMORY, str(error)):
+            return "the memory is used up; end other programs, or name less at once, and give the same command again"
+    raise error
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
@@ -103,14 +121,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # whoever read it has seen enough, as `| head` does; what is still to be written on the way out goes nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except SliplensError as error:
-        fail(str(error) if command is None else in_options(str(error), command))
-        return 1 if isinstance(error, ShardError) else 2
-    except OSError as error:
-        fail(
-            f"{error.filename or 'a file'} could not be read or written ({error.strerror or error}); "
-            "check the path, its permissions and the space left"
-        )
+    except (SliplensError, OSError, MemoryError, RuntimeError, ImportError) as error:
+        fail(_sentence(error, command))
+        if isinstance(error, ShardError):
+            return 1
         return 2
     except KeyboardInterrupt:
         fail("interrupted; run the same command again and it goes on where it stopped")

@@ -28,7 +28,7 @@ from sliplens.faithfulness.removal import (
     tile_units,
 )
 from sliplens.models import Run
-from sliplens.models.engines import Engine, prepare
+from sliplens.models.engines import Engine, counting_passes, prepare
 from sliplens.progress import OnProgress
 from sliplens.results.explanation import require_saliency
 
@@ -380,7 +380,8 @@ def score_by_deletion(
 def prepare_passes(trained: Run, inputs: Float[Tensor, "images colours size size"], passes: int) -> Engine:
     """Make an engine ready for so many passes of a network, checked on a few of its inputs, on the network's device."""
     some = inputs[:_CHECKED_IMAGES].to(trained.device)
-    return prepare(trained.model, some, trained.predict(some).to(trained.device), passes=passes)
+    with counting_passes():
+        return prepare(trained.model, some, trained.predict(some).to(trained.device), passes=passes)
 
 
 def _influence(maps: Maps, inputs: Tensor) -> Float64[np.ndarray, "images height width"]:

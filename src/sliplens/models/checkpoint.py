@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from jaxtyping import Float, Shaped, UInt8
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from sliplens.codec import load_record, load_result, save_record
 from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.extras import require_device
-from sliplens.files import MANIFEST_FILE, find_run, hash_file, require_folder
+from sliplens.files import MANIFEST_FILE, find_run, hash_file, require_folder, whole_file
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.images import MOST_PIXELS
 from sliplens.models.backbones import Answers, bin_edges, build_model, ratio_edges
@@ -391,9 +391,9 @@ def tell_each(
 def save_checkpoint(folder: Path, model: nn.Module, manifest: Manifest) -> None:
     """Write weights and manifest into a folder; the manifest, which makes it a checkpoint, comes last."""
     weights = folder / WEIGHTS_FILE
-    part = weights.with_name(weights.name + ".part")
-    save_file({name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}, part)
-    part.replace(weights)
+    values = save({name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()})
+    with whole_file(weights) as part:
+        part.write_bytes(values)
     save_record(replace(manifest, weights_sha256=hash_file(weights)), folder / MANIFEST_FILE)
 
 

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import ContextVar
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -115,7 +116,7 @@ def prepare(
         Images of the size to come, and what the network says of them: an engine that says anything else is not used.
     passes
         How many there will be. `auto` takes no engine that would not pay for its preparation; passes of earlier calls
-        count, since frames are explained one by one.
+        count, since frames are explained one by one, unless `counting_passes` says otherwise.
     engine
         Row of `ENGINES`, or `auto` for the fastest that can be used.
     batch_size
@@ -136,7 +137,8 @@ def prepare(
     """
     known = _EXPECTED.get(model)
     if known is None:
-        _PASSES[model] = known = _PASSES.get(model, 0) + passes
+        counted = _COUNTED.get()
+        counted[model] = known = counted.get(model, 0) + passes
     paying = [name for name, kind in ENGINES.items() if kind.pays_after is not None and known >= kind.pays_after]
     paying = [name for name in ENGINES if name in paying or (onnx_file is not None and name in _CONVERTED)]
     for name in [engine] if engine != "auto" else reversed(paying):
@@ -310,10 +312,27 @@ def _hash_weights(model: nn.Module) -> str:
     return digest.hexdigest()
 
 
-_PASSES: WeakKeyDictionary[nn.Module, int] = WeakKeyDictionary()
+_Counted: TypeAlias = WeakKeyDictionary[nn.Module, int]
+_COUNTED: ContextVar[_Counted] = ContextVar("counted", default=WeakKeyDictionary())  # noqa: B039 (meant to be shared)
 """Passes that each network was asked for so far."""
 _EXPECTED: WeakKeyDictionary[nn.Module, int] = WeakKeyDictionary()
 """Passes that are expected of a network in all, wherever they are made."""
+
+
+@contextmanager
+def counting_passes() -> Iterator[None]:
+    """Count passes anew, so that what was run before, or was not as it was there already, chooses no engine.
+
+    Engines differ in the last digits: work that goes on after an interruption has the bytes of the whole only where it
+    takes the same ones.
+    """
+    token = _COUNTED.set(WeakKeyDictionary())
+    try:
+        yield
+    finally:
+        _COUNTED.reset(token)
+
+
 _BUILT: WeakKeyDictionary[nn.Module, tuple[tuple[Any, ...], RunBatches]] = WeakKeyDictionary()
 """What was built last of each network; it must not hold the network itself, which would never die."""
 

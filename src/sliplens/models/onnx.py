@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from sliplens._version import __version__
 from sliplens.errors import InputError, ModelError
 from sliplens.extras import ONNX_PACKAGES, import_onnxruntime, require_packages
-from sliplens.files import require_new_file, to_builtins
+from sliplens.files import require_new_file, to_builtins, whole_file
 from sliplens.models.backbones import Answers, answer_names, bin_edges, ratio_edges
 from sliplens.models.checkpoint import Run, load
 
@@ -73,14 +73,9 @@ def export_onnx(run: Run | Path | str, out: Path | str, *, overwrite: bool = Fal
     size = trained.manifest.image_size
     proto = convert_network(trained.model, torch.zeros(1, trained.encoding.colours, size, size))
     _describe(proto, trained)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    try:
+    with whole_file(path) as part:
         part.write_bytes(proto.SerializeToString())
         check_parity(part, trained)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
     return path
 
 

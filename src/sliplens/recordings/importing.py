@@ -13,7 +13,7 @@ from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
 from sliplens.errors import InputError, RecordingError, SliplensError
-from sliplens.files import output_folder
+from sliplens.files import output_folder, whole_file
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import (
@@ -295,8 +295,8 @@ def _link_trials(source: Path, folder: Path) -> None:
             try:
                 os.link(one, other)
             except OSError:  # another disk, or one that has no links
-                part = shutil.copyfile(one, f"{other}.part")
-                Path(part).replace(other)
+                with whole_file(Path(other)) as part:
+                    shutil.copyfile(one, part)
 
     for name in ("trials", "forces", "audit"):
         if (source / name).is_dir():

@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from sliplens.codec import from_builtins, one_line, to_builtins
 from sliplens.errors import RecordingError
-from sliplens.files import hold, parse_json
+from sliplens.files import make_and_hold, parse_json
 from sliplens.images import decode_png, encode_png
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling, ReferenceChoice
@@ -107,9 +107,13 @@ class JournalLock:
 
     def __init__(self, data: Path) -> None:
         self.folder = data / JOURNAL_FOLDER
-        self.folder.mkdir(parents=True, exist_ok=True)
-        (self.folder / _LOCK).touch()
-        self._held = hold(self.folder / _LOCK)
+
+        def make() -> Path:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            (lock := self.folder / _LOCK).touch()
+            return lock
+
+        _, self._held = make_and_hold(make)
         if self._held is None:
             raise RecordingError(f"{data} is being recorded; stop the recording first, or choose another folder")
 

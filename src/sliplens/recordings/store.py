@@ -24,7 +24,7 @@ from jaxtyping import Float, UInt8
 
 from sliplens.codec import from_builtins, open_parquet, read_parquet, telling_parquet, to_builtins
 from sliplens.errors import RecordingError
-from sliplens.files import hash_json, parse_json
+from sliplens.files import hash_json, parse_json, whole_file
 from sliplens.images import MOST_PIXELS, decode_png, encode_png
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling
@@ -256,21 +256,18 @@ def write_trial(
         metadata[_FIRST_REFERENCE] = encode_png(first_reference)
     table = pa.table(columns)
     schema = pa.schema([pa.field("frame", pa.int64()), *table.schema, pa.field("image", pa.binary())], metadata)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
     written = 0
-    # the images, nearly all of the file, neither compress further nor repeat
-    try:
-        with pq.ParquetWriter(part, schema, compression="none", use_dictionary=False) as writer:
-            for chunk in images:
-                rows = table.slice(written, len(chunk)).combine_chunks()
-                numbers = pa.array(np.arange(written, written + len(chunk)))
-                arrays = [numbers, *(column.combine_chunks() for column in rows.columns), _in_place(chunk)]
-                writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema))
-                written += len(chunk)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with (
+        whole_file(path) as part,
+        # the images, nearly all of the file, neither compress further nor repeat
+        pq.ParquetWriter(part, schema, compression="none", use_dictionary=False) as writer,
+    ):
+        for chunk in images:
+            rows = table.slice(written, len(chunk)).combine_chunks()
+            numbers = pa.array(np.arange(written, written + len(chunk)))
+            arrays = [numbers, *(column.combine_chunks() for column in rows.columns), _in_place(chunk)]
+            writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema))
+            written += len(chunk)
 
 
 def _in_place(images: list[bytes]) -> pa.ChunkedArray:
@@ -348,6 +345,8 @@ def stream_frames(path: Path, places: Collection[int] | None = None) -> Iterator
             if inside:
                 with reading(path):
                     images = file.read_row_group(group, columns=["image"]).column("image")
+                if images.null_count:
+                    raise RecordingError(f"{path} has gaps in the column 'image'; {_AGAIN}")
                 for place in inside:
                     where, size = f"frame {place} of {path}", (header.height, header.width, 3)
                     yield decode_pixels(images[place - first].as_buffer(), size=size, where=where)
@@ -416,10 +415,8 @@ def save_forces(forces: Forces, path: Path) -> None:
     """Write samples as one Parquet file, a row a sample; whole or not at all."""
     columns = {"time_s": forces.time_s, **dict(zip(_AXES, forces.force_n.T, strict=True))}
     table = pa.table(columns).replace_schema_metadata({"source": forces.source})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    pq.write_table(table, part, compression="zstd")
-    part.replace(path)
+    with whole_file(path) as part:
+        pq.write_table(table, part, compression="zstd")
 
 
 def load_forces(path: Path) -> Forces:

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import pyarrow as pa
@@ -408,9 +407,7 @@ class Study:
     """A study, stage by stage; tables are by input, and empty where a stage was not run."""
 
     folder: Path = Path()
-    """Workspace that holds the stages."""
-    scratch: TemporaryDirectory[str] | None = field(default=None, repr=False, compare=False)
-    """Keeps a temporary workspace as long as the study lives."""
+    """Workspace that holds the stages; a temporary one is there as long as the study."""
     asked: Asked | None = None
     """None where nobody tells: all that its data can tell."""
     evaluations: dict[str, Evaluation] = field(default_factory=dict)

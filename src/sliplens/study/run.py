@@ -2,8 +2,9 @@
 
 import pickle
 import shutil
-import tempfile
+import weakref
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -15,10 +16,11 @@ from sliplens.codec import load_result, save_record, save_result
 from sliplens.errors import InputError
 from sliplens.explainers import Explainer
 from sliplens.faithfulness.removal import Faithfulness
-from sliplens.files import hash_json, output_folder
+from sliplens.files import hash_json, output_folder, scratch_folder
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
+from sliplens.models.engines import counting_passes
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.results.explanation import Explained
@@ -160,9 +162,9 @@ def run_study(
     if not given:
         raise InputError("a study needs a network; leave out --difference none or --raw none")
     networks = {name: load_network(network, name, device=device) for name, network in given.items()}
-    scratch = None if out is not None else tempfile.TemporaryDirectory(prefix="sliplens-study-")
+    scratch = ExitStack()
     stages = _Stages(
-        folder=Path(out if scratch is None else scratch.name),  # pyright: ignore[reportArgumentType] (one is given)
+        folder=scratch.enter_context(scratch_folder()) if out is None else Path(out),
         data=data,
         networks=networks,
         explainers=explainers,
@@ -195,7 +197,9 @@ def run_study(
         table: {name: own[stage] for name, own in stages.found.items() if stage in own}
         for stage, table in TABLES.items()
     }
-    return Study(folder=stages.folder, scratch=scratch, asked=asked, choice=choice, states=states, **tables)
+    study = Study(folder=stages.folder, asked=asked, choice=choice, states=states, **tables)
+    weakref.finalize(study, scratch.close)
+    return study
 
 
 def load_network(network: Network, name: str, *, device: str = "cpu") -> Run:
@@ -369,10 +373,12 @@ class _Stages:
             if out.complete:
                 wrote(self.on_progress, target, what, kept=True)
                 return load_result(target, _KINDS[name], command=_COMMAND)
-            with stage(self.on_progress, title) as count:
+            with stage(self.on_progress, title) as count, counting_passes():
                 result = work(out.folder / "parts", count)
             shutil.rmtree(out.folder / "parts", ignore_errors=True)
             save_result(result, out.folder)
+        # as it was kept, whose layout in memory may differ: what follows has the same bytes when it goes on from here
+        result = load_result(target, _KINDS[name], command=_COMMAND)
         for alarm in getattr(result, "alarms", ()):
             note(self.on_progress, f"{target.name}: {alarm}")
         wrote(self.on_progress, target, what)
