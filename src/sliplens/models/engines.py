@@ -178,7 +178,7 @@ def prepare(
 def expecting(model: nn.Module, passes: int) -> Iterator[None]:
     """Choose engines for so many passes in all, however many of them are made before, here or elsewhere.
 
-    What is worked on in parts is so answered by one engine, and is the same wherever each part was made.
+    What is worked on in parts is so answered by one engine, whatever was made before.
     """
     _EXPECTED[model] = passes
     try:
