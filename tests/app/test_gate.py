@@ -105,9 +105,12 @@ def test_pages_that_are_opened_too_fast_are_refused():
     async def send(message) -> None:
         sent.append(message.get("status"))
 
+    async def receive() -> dict:
+        return {}
+
     async def many() -> None:
         for _ in range(60):
-            await gate(dict(scope), send, send)
+            await gate(dict(scope), receive, send)
 
     asyncio.run(many())
     assert set(sent) == {200, 429, None}
