@@ -42,9 +42,10 @@ class ShardError(SliplensError):
     def __init__(self, why: Mapping[str, str], *, shards: int) -> None:
         self.why = dict(why)
         """Sentence of each shard by its name."""
-        each = "".join(f"\n  {name}: {sentence}" for name, sentence in self.why.items())
         failed = f"{len(self.why)} of {shards} could not be done, all others are"
-        super().__init__(f"{failed}; mend what is wrong and give the same command with --retry-failed:{each}")
+        self.summary = f"{failed}; mend what is wrong and give the same command with --retry-failed:"
+        """What is said above these."""
+        super().__init__("\n  ".join([self.summary, *(f"{name}: {sentence}" for name, sentence in self.why.items())]))
 
 
 class ContactError(SliplensError):

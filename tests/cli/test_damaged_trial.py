@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-from command_line import refused
+from command_line import refused, run
 
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.dataset import trial_path
@@ -38,7 +38,6 @@ def test_a_damaged_page_is_told_by_every_command(
     trial = data.select(split="test")[0].trial
     commands = (
         ("train", damaged, "-o", tmp_path / "run", "--image-size", "32", "--batch-size", "4"),
-        ("predict", difference_run, damaged, "-o", tmp_path / "margins.parquet"),
         ("evaluate", difference_run, damaged, "-o", tmp_path / "scores"),
         ("export", damaged, "--mcap", "-o", tmp_path / "bags"),
         ("view", damaged, "--trial", trial, "-o", tmp_path / "trial.rrd"),
@@ -48,6 +47,19 @@ def test_a_damaged_page_is_told_by_every_command(
         assert "is not a readable Parquet file" in line
         assert line.endswith("make the data set again")
         assert not Path(words[words.index("-o") + 1]).exists()
+
+
+def test_a_damaged_page_leaves_all_other_trials_predicted(
+    capsys: pytest.CaptureFixture[str], damaged: Path, difference_run: Path, tmp_path: Path
+):
+    trial = load_dataset(damaged).select(split="test")[0].trial
+    damage_page(trial_path(damaged, trial), "image")
+    assert run("predict", difference_run, damaged, "-o", tmp_path / "margins.parquet") == 1
+    head, line = (line for line in capsys.readouterr().err.splitlines() if "note:" not in line)
+    assert "1 of 8 could not be done" in head
+    assert line.startswith(f"  {trial}: ")
+    assert "is not a readable Parquet file" in line
+    assert not (tmp_path / "margins.parquet").exists()
 
 
 @pytest.mark.parametrize("column", ["contact_map", "static_friction"])

@@ -121,10 +121,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # whoever read it has seen enough, as `| head` does; what is still to be written on the way out goes nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except ShardError as error:
+        fail(error.summary, *(f"{name}: {in_options(sentence, command)}" for name, sentence in error.why.items()))
+        return 1
     except (SliplensError, OSError, MemoryError, RuntimeError, ImportError) as error:
         fail(_sentence(error, command))
-        if isinstance(error, ShardError):
-            return 1
         return 2
     except KeyboardInterrupt:
         fail("interrupted; run the same command again and it goes on where it stopped")

@@ -23,9 +23,11 @@ def _shown(text: str) -> str:
     return escape(visible(text))
 
 
-def fail(message: str) -> None:
-    """Print an error, in one line however narrow the terminal."""
+def fail(message: str, *each: str) -> None:
+    """Print an error, in one line however narrow the terminal, and below it a line for each of what it is about."""
     ERR.print(f"[bold red]sliplens:[/] {_shown(message)}", soft_wrap=True, highlight=False)
+    for line in each:
+        ERR.print(f"  {_shown(line)}", soft_wrap=True, highlight=False)
 
 
 def say(message: str, *, aside: bool = False) -> None:

@@ -13,7 +13,7 @@ from sliplens.errors import InputError
 if TYPE_CHECKING:
     from sliplens.simulation import SimulationRecipe
 
-_CLIP_FRAMES_PER_S = 30
+_CLIP_FRAMES_PER_S = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,5 +118,5 @@ class Simulate(Command):
             recording = simulate_trial(plan, device=self.device, on_progress=count)
         with terminal.stage("Writing the clip") as count:
             write_clip(recording, path, frames_per_s=_CLIP_FRAMES_PER_S, on_progress=count)
-        rate = f"{_CLIP_FRAMES_PER_S} frames/s"
+        rate = f"{_CLIP_FRAMES_PER_S:g} frames/s"
         terminal.wrote(path, f"trial {plan.trial} at {rate}; to watch, not to train on: video is lossy")

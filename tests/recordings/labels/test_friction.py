@@ -94,7 +94,7 @@ def test_a_knock_that_the_image_does_not_see_is_no_slip(trial: Trial, rng: np.ra
 
 def test_a_trial_that_never_slips_is_refused(trial_without_slip: Trial, rng: np.random.Generator):
     # the pull ends half a second early: 0.6 * 2.5 / 3
-    with pytest.raises(RecordingError, match=r"never slips \(F_t / F_n reaches 0\.50 without .*by hand"):
+    with pytest.raises(RecordingError, match=r"never slips \(F_t / F_n reaches 0\.50 without .*--mu"):
         estimate_friction(trial_without_slip.contact(), contact_threshold_n=THRESHOLD_N, rng=rng)
 
 
