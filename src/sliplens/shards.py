@@ -272,8 +272,8 @@ class _Actor:
 def _ray(work: Work, address: str) -> Iterator[Seats]:
     require_packages("ray", extra="ray", purpose="--on ray")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # else it reports its use to its makers
-    import ray  # noqa: PLC0415 (an extra)
-    from ray.exceptions import RayError  # noqa: PLC0415
+    import ray  # noqa: PLC0415 (an extra)  # pyright: ignore[reportMissingImports]
+    from ray.exceptions import RayError  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
 
     connected = ray.is_initialized()
     if not connected:
