@@ -137,7 +137,7 @@ class Ended:
     @property
     def sentence(self) -> bool:
         """Whether it ended with a sentence, and nothing else."""
-        return self.code in {2, 130} and "Traceback" not in self.said and "sliplens: " in self.said
+        return self.code in {1, 2, 130} and "Traceback" not in self.said and "sliplens: " in self.said
 
     @property
     def fair(self) -> bool:

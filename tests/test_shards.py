@@ -165,7 +165,7 @@ def test_who_makes_a_part_is_seen_while_it_is_made(log: Path, out: Path, capsys:
     state.mkdir()
     (state / "0123456789abcdef.doing").write_text("{}")
     assert main(["status", str(out)]) == 0
-    assert "is complete" in capsys.readouterr().out
+    assert "is worked on in parts now" in capsys.readouterr().out
     with pytest.raises(InputError, match=r"nothing was begun at .*nowhere"):
         read_status(out.with_name("nowhere"))
 

@@ -246,6 +246,10 @@ def find_run(run: Path) -> Path:
 _SCRATCH = "sliplens-scratch-"
 
 
+def _make_scratch() -> Path:
+    return Path(tempfile.mkdtemp(prefix=_SCRATCH))
+
+
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
     """Folder for what must lie on disk for a while; it is gone afterwards.
@@ -255,14 +259,18 @@ def scratch_folder() -> Iterator[Path]:
     for left in Path(tempfile.gettempdir()).glob(f"{_SCRATCH}*"):
         with suppress(OSError):  # somebody else's
             if (held := hold(left, surely=True)) is not None:
-                shutil.rmtree(left)
-                os.close(held)
-    # an empty one may be taken for one that was left
-    with _held(lambda: Path(tempfile.mkdtemp(prefix=_SCRATCH)), "a folder of its own is held by another") as folder:
-        try:
-            yield folder
-        finally:
-            _drop(folder)
+                try:
+                    shutil.rmtree(left)
+                finally:
+                    os.close(held)
+    folder, held = make_and_hold(_make_scratch)
+    while held is None:  # an empty one may be taken for one that was left, and held by who clears it
+        folder, held = make_and_hold(_make_scratch)
+    try:
+        yield folder
+    finally:
+        _drop(folder)
+        os.close(held)
 
 
 def require_new_file(path: Path, *, suffix: str | Sequence[str] = (), overwrite: bool = False) -> None:

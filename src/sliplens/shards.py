@@ -10,6 +10,7 @@ import logging
 import os
 import pickle
 import re
+import secrets
 import shutil
 import signal
 import socket
@@ -36,13 +37,14 @@ from sliplens._version import __version__
 from sliplens.codec import load_record, regrouped, save_record, write_tables
 from sliplens.errors import InputError, ShardError, SliplensError
 from sliplens.extras import Table, require_packages
-from sliplens.files import hash_json, held_folder, hold, output_folder, partial_folder, scratch_folder
+from sliplens.files import hash_json, held_folder, hold, make_and_hold, output_folder, partial_folder, scratch_folder
 from sliplens.progress import OnProgress, ignore, stage
 
 TRIES = 3
 """How often a shard is tried before it is set aside."""
 LONGEST = 8192
 """Frames of a shard; a longer trial is cut."""
+_LONGEST_NAME = 200  # of a folder; file systems take 255 bytes
 _STATE = "_shards"  # readers of Parquet data sets leave out what begins so
 _PART = re.compile(r"(\d{8})-(\d+)-([0-9a-f]{16})(\.\w+)?")
 
@@ -84,7 +86,10 @@ def shard(
     part's ending, empty for one that is a folder; `name` is for people, that of the trial if None.
     """
     key = hash_json({"recipe": recipe, "shown": shown, "first": first, "frames": frames, "sliplens": __version__})
-    part = f"trial={quote(trial, safe='')}/{first:08d}-{frames}-{key}{suffix}"
+    folder = quote(trial, safe="")
+    if len(folder) > _LONGEST_NAME:
+        folder = re.sub("%[0-9A-F]?$", "", folder[:_LONGEST_NAME]) + f"~{hash_json(trial)}"
+    part = f"trial={folder}/{first:08d}-{frames}-{key}{suffix}"
     name = name or (f"{trial} from frame {first}" if first else trial)
     return Shard(item=item, name=name, frames=frames, part=part)
 
@@ -239,16 +244,16 @@ Seats: TypeAlias = tuple[int, Callable[[], Seat], type[Exception]]
 
 
 @contextmanager
-def _serial(work: Work, _: str) -> Iterator[Seats]:
+def _serial(work: Work, *_: object) -> Iterator[Seats]:
     yield 1, lambda: _Here(work), BrokenProcessPool
 
 
 @contextmanager
-def _processes(work: Work, number: str) -> Iterator[Seats]:
+def _processes(work: Work, number: str, most: int) -> Iterator[Seats]:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if number and not (number.isdigit() and int(number)):
         raise InputError(f"--on processes={number} is no number of processes; say processes or processes=2")
-    count, packed = int(number or cores), pickle.dumps(work)
+    count, packed = min(int(number or cores), most), pickle.dumps(work)
     yield count, lambda: _Process(packed, threads=max(1, cores // count)), BrokenProcessPool
 
 
@@ -269,7 +274,7 @@ class _Actor:
 
 
 @contextmanager
-def _ray(work: Work, address: str) -> Iterator[Seats]:
+def _ray(work: Work, address: str, most: int) -> Iterator[Seats]:
     require_packages("ray", extra="ray", purpose="--on ray")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # else it reports its use to its makers
     import ray  # noqa: PLC0415 (an extra)  # pyright: ignore[reportMissingImports]
@@ -290,14 +295,15 @@ def _ray(work: Work, address: str) -> Iterator[Seats]:
         packed = ray.put(pickle.dumps(work))  # once a node, not once a worker
         kind: Any = ray.remote(num_cpus=1, num_gpus=int(work.on_gpu), scheduling_strategy="SPREAD")(Worker)
         here = os.getcwd()  # noqa: PTH109 (a worker elsewhere has another)
-        yield count, lambda: _Actor(kind.remote(packed, folder=here), ray.kill), RayError
+        yield min(count, most), lambda: _Actor(kind.remote(packed, folder=here), ray.kill), RayError
     finally:
         if not connected:
             ray.shutdown()
 
 
 EXECUTORS = Table("place to work", "sliplens.executors", {"serial": _serial, "processes": _processes, "ray": _ray})
-"""Where shards are worked on: each row takes the work and what follows `=`, and opens its `Seats`."""
+"""Where shards are worked on: each row takes the work, what follows `=` and the number of shards,
+and opens its `Seats`."""
 
 
 @contextmanager
@@ -373,8 +379,8 @@ def make_parts(
         plan = _Plan(title=title, shards=count, frames=frames, started_s=time.time(), on=on)
         (folder / _STATE).mkdir(parents=True, exist_ok=True)
         save_record(plan, folder / _STATE / _PLAN)
-        with open_seats(work, argument) as (places, make_seat, lost), ExitStack() as seats:
-            _drive(first, missing, folder, tally, places=min(places, count), make_seat=make_seat, lost=lost, open=seats)
+        with open_seats(work, argument, count) as (places, make_seat, lost), ExitStack() as seats:
+            _drive(first, missing, folder, tally, places=places, make_seat=make_seat, lost=lost, open=seats)
     if failed := [failure for one in shards() if (failure := _failure(folder, one)) is not None]:
         if count == 1 and tally.error is not None:
             shutil.rmtree(folder / _STATE)
@@ -420,6 +426,8 @@ def make_table(
         for one in shards():  # frames that changed make another result
             every.update(one.part.encode())
         config = {"recipe": recipe, "shards_sha256": every.hexdigest()}
+        if not resumable:  # nobody knows whether frames in memory are those that were
+            config["made"] = secrets.token_hex(8)
         with output_folder(out, stage=title, config=config, overwrite=overwrite) as output:
             schema = make(output.folder)
             if on_rows is not None:
@@ -655,9 +663,13 @@ def _keep_failure(folder: Path, given: Shard, why: str) -> None:
 def _claim(folder: Path, given: Shard) -> Iterator[None]:
     """Hold a shard against others, who see by whom; whoever comes second waits."""
     path = _state(folder, given, "doing")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.touch()
-    while (held := hold(path)) is None:  # by a process whose driver was killed a moment ago
+
+    def make() -> Path:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        return path
+
+    while (held := make_and_hold(make)[1]) is None:  # by a process whose driver was killed a moment ago
         time.sleep(0.05)
     now = datetime.now(UTC).isoformat(timespec="seconds")
     path.write_text(

@@ -4,7 +4,7 @@ import asyncio
 import time
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -42,6 +42,7 @@ _QUALITY = 85
 _UNANSWERED = 2  # messages under way to one viewer: one is drawn while the next one travels
 _STILL_THERE_S = 1.0  # without news: the page takes a longer silence for a lost connection
 _RATE_S = 2.0
+_PATIENCE_S = 3.0  # with a thread that is to end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,6 +230,9 @@ class Feed:
         self._closed.set()
         self._end_subscription()
         self._pool.shutdown(wait=False, cancel_futures=True)
+        for thread in (self._thread, self._mapper):
+            if thread.is_alive():  # one that is in OpenCV as the interpreter ends aborts the process
+                thread.join(_PATIENCE_S)
 
     @property
     def rate_hz(self) -> float:
@@ -309,7 +313,7 @@ class Feed:
         """Time between two pictures: twice what the quickest viewer takes to draw one, on cores that may be ours."""
         takes_s = min((viewer.takes_s for viewer in tuple(self.viewers)), default=0.0)
         # frames that come as fast as pictures are drawn are never early
-        return 0.7 * min(max(1 / _PICTURES_HZ, 2 * takes_s), 1 / _LEAST_HZ)
+        return max(0.7 / _PICTURES_HZ, min(2 * takes_s, 1 / _LEAST_HZ))
 
     def _wake(self) -> None:
         loop = self._loop
@@ -342,7 +346,7 @@ class Feed:
                     self.map = None  # nothing is told, so there is nothing to explain
                 else:
                     self.map = self._pool.submit(self._explain, picture, LIVE_METHOD).result()
-            except (SliplensError, RuntimeError):
+            except (SliplensError, RuntimeError, CancelledError):
                 self.map = None
             self._wake()
 

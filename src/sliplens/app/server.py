@@ -15,7 +15,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, TypeVar
-from urllib.parse import parse_qs, quote, urlsplit
+from urllib.parse import parse_qs, quote
 
 from sliplens.errors import InputError
 from sliplens.extras import require_packages
@@ -351,9 +351,9 @@ class Gate:
 
     def _refusal(self, headers: dict[str, str]) -> str | None:
         host = headers.get("host", "")
-        if not _HOST.fullmatch(host):
+        if (named := _HOST.fullmatch(host)) is None:
             return "the request names no host; open the address that sliplens printed"
-        if self._token is None and not is_loopback(urlsplit(f"//{host}").hostname or ""):
+        if self._token is None and not is_loopback(named[1].strip("[]").lower()):
             return f"this page is for this machine alone, and not at {host}; start it with --host to open it to others"
         origin = headers.get("origin")
         if origin is not None and origin.partition("://")[2] != host:

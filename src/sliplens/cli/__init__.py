@@ -1,5 +1,6 @@
 """The command line: one frozen dataclass a subcommand."""
 
+import errno
 import os
 import re
 import sys
@@ -85,7 +86,7 @@ def _sentence(error: Exception, command: object | None) -> str:
     match error:
         case SliplensError():
             return str(error) if command is None else in_options(str(error), command)
-        case OSError():
+        case OSError() if error.errno != errno.ENOMEM:
             where, why = error.filename or "a file", error.strerror or error
             return f"{where} could not be read or written ({why}); check the path, its permissions and the space left"
         case _ if isinstance(error, MemoryError) or re.search(_NO_MEMORY, str(error)):

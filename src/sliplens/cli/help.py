@@ -37,7 +37,7 @@ EXAMPLES = {
     "score": "sliplens score runs/mine/train runs/mine/explain -o runs/mine/score",
     "diagnose": "sliplens diagnose runs/mine/train runs/mine/data -o runs/mine/why",
     "study": "sliplens study runs/mine/data --difference runs/mine/train --raw none -o runs/mine/study",
-    "status": "sliplens status runs/mine/study",
+    "status": "sliplens status runs/mine/margins",
     "grip": "sliplens grip -o runs/grip --object egg",
     "report": "sliplens report runs/mine",
     "doctor": "sliplens doctor",

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sliplens.cli.console import say
+from sliplens.files import RUN_FILE
 
 if TYPE_CHECKING:
     from sliplens.shards import Status as Progress
@@ -31,7 +32,8 @@ class Status:
 
         works = read_status(self.output)
         if not works:
-            say(f"{self.output} is complete" if self.output.exists() else f"{self.output} is begun, with no part yet")
+            whole = self.output.is_file() or (self.output / RUN_FILE).is_file()
+            say(f"{self.output} is complete" if whole else f"nothing in {self.output} is worked on in parts now")
         for work in works:
             _show(work)
 

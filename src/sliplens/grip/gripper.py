@@ -228,17 +228,22 @@ class RosGripper:
         joint: str | None = None,
         timeout_s: float = 0.1,
     ) -> None:
-        row = ROS_MESSAGES.pick(messages)
+        row, key = ROS_MESSAGES.pick(messages), key.strip("/")
         self._ros = ZenohRos(address, purpose="a gripper of ROS 2")
         self._topic, self._joint, self._timeout_s = f"{key}/{_STATE_TOPIC}", joint, timeout_s
         self._told, self._told_s, self._new = b"", -math.inf, threading.Condition()
-        self._senders = [(one, self._publisher(key, one)) for one in (row.force, row.width)]
-        self._ros.subscribe(self._topic, _STATE_KIND, self._hear)
         try:
+            self._senders = [(one, self._publisher(key, one)) for one in (row.force, row.width)]
+            self._ros.subscribe(self._topic, _STATE_KIND, self._hear)
             self._await_state(_FIRST_STATE_S)
-        except GripperError:
+        except SliplensError:
             self.close()
             raise
+        except Exception as error:  # whatever Zenoh or a package's messages say
+            self.close()
+            raise InputError(
+                f"no gripper can be told at {key!r} ({error}); check the key and the kind of messages"
+            ) from None
 
     def set_force(self, force_n: float) -> None:
         """Press with so many newtons."""

@@ -113,7 +113,7 @@ class HealthMonitor:
         self._numbers: deque[tuple[float, int]] = deque()
         self._sometimes: dict[str, tuple[float, Check]] = {}
         self._novelty: tuple[float, Check] | None = None
-        self._coming: Future[Check] | None = None
+        self._coming: tuple[float, Future[Check]] | None = None
         self.beside: Executor | None = None
         """Where the network looks for what is new to it, so that no frame waits for that but the first: a check then
         tells of a frame up to half a second ago. In the same thread, of a quarter of a second ago, if None."""
@@ -253,9 +253,9 @@ class HealthMonitor:
             if self.beside is None:
                 self._novelty = frame.time_s, self._read_novelty(frame, run)
             elif self._coming is None:
-                self._coming = self.beside.submit(self._read_novelty, frame, run)
-        if self._coming is not None and (self._novelty is None or self._coming.done()):
-            self._novelty, self._coming = (frame.time_s, self._coming.result()), None
+                self._coming = frame.time_s, self.beside.submit(self._read_novelty, frame, run)
+        if self._coming is not None and (self._novelty is None or self._coming[1].done()):
+            self._novelty, self._coming = (self._coming[0], self._coming[1].result()), None
         assert self._novelty is not None
         return self._novelty[1]
 

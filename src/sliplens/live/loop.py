@@ -62,9 +62,11 @@ class _SharedCores:
     def __call__(self) -> Iterator[None]:
         """Hold them down."""
         with self._lock:
+            if not self._readers:
+                with ExitStack() as held:
+                    self._hold(held.callback)
+                    self._restore = held.pop_all()
             self._readers += 1
-            if self._readers == 1:
-                self._hold()
         try:
             yield
         finally:
@@ -73,8 +75,7 @@ class _SharedCores:
                 if not self._readers:
                     self._restore.close()
 
-    def _hold(self) -> None:
-        later = self._restore.callback
+    def _hold(self, later: Callable[..., object]) -> None:
         later(threadpool_limits(1, user_api="blas").restore_original_limits)
         threads = torch.get_num_threads()
         later(torch.set_num_threads, threads)

@@ -135,10 +135,12 @@ def prepare(
     ModelError
         If an engine that is asked for by name cannot run the network, or answers otherwise.
     """
-    known = _EXPECTED.get(model)
-    if known is None:
+    expected = _EXPECTED.get(model)
+    if expected is None:
         counted = _COUNTED.get()
         counted[model] = known = counted.get(model, 0) + passes
+    else:
+        known = max(expected, passes)
     paying = [name for name, kind in ENGINES.items() if kind.pays_after is not None and known >= kind.pays_after]
     paying = [name for name in ENGINES if name in paying or (onnx_file is not None and name in _CONVERTED)]
     for name in [engine] if engine != "auto" else reversed(paying):

@@ -172,8 +172,19 @@ class Trials:
                 frames = following[1]
             else:
                 frames = islice(enumerate(capture.read_frames()), first, None)
-            following = (trial, first + count), frames
-            return capture, islice(frames, count)
+            following = None  # until this shard was read to its end: one that failed leaves the frames anywhere
+
+            def own() -> Iterator[tuple[int, Frame]]:
+                nonlocal following
+                number = first - 1
+                for number, frame in islice(frames, count):
+                    yield number, frame
+                if number + 1 < first + count:
+                    ends = f"ends after {number + 1} of its {first + count} frames"
+                    raise RecordingError(f"{capture.source} {ends}; make or copy it again")
+                following = (trial, first + count), frames
+
+            return capture, own()
 
         return read
 
@@ -202,6 +213,8 @@ def open_trials(
     if on != "serial" and not isinstance(source, Path):
         raise InputError("frames in memory are worked on in this process; name their file or folder, or leave out --on")
     opened = tuple(open_source(source, **named) if isinstance(source, Path | np.ndarray) else source)
+    if len({one.name for one in opened}) < len(opened):
+        raise InputError("two of the trials have one name; give each its own")
     shown = hash_tree(source) if isinstance(source, Path) else ""
     rows = [(one.name, one.frames, shown) for one in opened]
     return Trials(source=source if isinstance(source, Path) else opened, named=named, kinds=opened, rows=tuple(rows))

@@ -42,8 +42,8 @@ class TrainConfig:
     untouched_share: float = 0.05
     """Images of the untouched sensor, as full stick, for each labelled frame."""
     learns: Literal["all", "weights", "ratio"] = "all"
-    """What changes. all: weights, and the statistics of batch normalisation. weights: these statistics stay, for few
-    trials tell them badly. ratio: the rows of the last layer that answer with F_t / F_n, so that margins stay to the
+    """What changes. all: weights, and the statistics of batch normalisation. weights: these statistics stay.
+    ratio: the rows of the last layer that answer with F_t / F_n, so that margins stay to the
     bit; what that layer sees is computed once, without augmentation."""
     epoch_frames: int | None = None
     """Images of an epoch, drawn from all: few trials come again, of long ones some; each frame once if None."""
