@@ -1,6 +1,7 @@
 """Shards: present means done, a failure ends nothing but itself, and where a part was made does not show."""
 
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -14,7 +15,7 @@ from shard_work import Count, shards
 from sliplens.cli import main
 from sliplens.errors import InputError, ShardError, SliplensError
 from sliplens.files import hash_file
-from sliplens.shards import TRIES, Doing, Shard, make_parts, make_table, read_status, shard
+from sliplens.shards import TRIES, Crew, Doing, Shard, make_parts, make_table, read_status, shard
 
 TITLE = "Counting"
 Make = Callable[..., None]
@@ -31,7 +32,7 @@ def out(tmp_path: Path) -> Path:
     return tmp_path / "out"
 
 
-def make(work: Count, out: Path, *, given: Callable[[], Iterator[Shard]] = shards, **more: object) -> None:
+def make(work: Count | Crew, out: Path, *, given: Callable[[], Iterator[Shard]] = shards, **more: object) -> None:
     make_parts(work, given, out, title=TITLE, **more)  # pyright: ignore[reportArgumentType]
 
 
@@ -109,12 +110,19 @@ def test_processes_make_the_same_bytes_and_survive_a_kill(log: Path, out: Path, 
     (tmp_path / "log-2").mkdir()
     make(Count(log=log), out)
     work = Count(log=tmp_path / "log-2", kill=frozenset("b"), refuse=frozenset("e"))
-    with pytest.raises(ShardError, match="1 of 5"):
-        make(work, tmp_path / "other", on="processes=2")
-    assert work.tries() == {"a": 1, "b": 2, "c": 1, "d": 1, "e": TRIES}
-    pids = {int(path.read_text()) for path in work.log.iterdir()}
-    assert os.getpid() not in pids
-    assert len(pids) >= 2
+    with Crew(work, on="processes=2", most=5) as crew:
+        with pytest.raises(ShardError, match="1 of 5"):
+            make(crew, tmp_path / "other")
+        assert work.tries() == {"a": 1, "b": 2, "c": 1, "d": 1, "e": TRIES}
+        pids = {int(path.read_text()) for path in work.log.iterdir()}
+        assert os.getpid() not in pids
+        assert len(pids) >= 2
+        # who is there already does what comes next, and whoever was killed in between is replaced
+        last = int((work.log / "e-0").read_text())
+        make(crew, tmp_path / "more", given=partial(shards, "wx"))
+        assert last in {int((work.log / f"{name}-0").read_text()) for name in "wx"}
+        os.kill(last, signal.SIGKILL)
+        make(crew, tmp_path / "more", given=partial(shards, "wxyz"))
     make(Count(log=work.log), tmp_path / "other", retry_failed=True)
     assert content(tmp_path / "other") == content(out)
 

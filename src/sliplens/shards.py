@@ -21,9 +21,11 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from functools import partial
+from itertools import chain
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -306,6 +308,74 @@ EXECUTORS = Table("place to work", "sliplens.executors", {"serial": _serial, "pr
 and opens its `Seats`."""
 
 
+class Crew(ExitStack):
+    """Workers that stay from one call of `make_parts` to the next, so that each loads only once what its work needs.
+
+    `on` is a row of `EXECUTORS` with its argument, `most` how many workers are of use. None begins before it is needed.
+
+    Raises
+    ------
+    InputError
+        If the place to work is unknown.
+    """
+
+    def __init__(self, work: Work, *, on: str = "serial", most: int) -> None:
+        super().__init__()
+        name, _, argument = on.partition("=")
+        self.on = on
+        self._open_seats = partial(EXECUTORS.pick(name), work, argument, most)
+        self._seats: Seats | None = None
+        self._busy: dict[Future, tuple[Seat, Shard | None]] = {}
+
+    def make(self, shards: Iterator[Shard], folder: Path, tally: "_Tally", *, most: int) -> None:
+        """Hand shards to workers until none is left; a worker that is lost is replaced."""
+        if self._seats is None:
+            self._seats = self.enter_context(self._open_seats())
+        places, make_seat, lost = self._seats
+        again: list[Shard] = []
+        busy, idle, more = self._busy, [], True
+
+        def add_seat() -> None:
+            seat = make_seat()
+            self.callback(seat.close)
+            busy[seat.start()] = seat, None
+
+        while len(busy) < min(places, most):
+            add_seat()
+        # a worker that has not begun when all is done was never needed: a cluster may have lost the node for it
+        while more or again or any(given is not None for _, given in busy.values()):
+            for future in wait(busy, return_when=FIRST_COMPLETED).done:
+                seat, given = busy.pop(future)
+                try:
+                    error = future.result()
+                except lost:
+                    if given is None:
+                        raise SliplensError(
+                            "a process was ended from outside as it began, perhaps for want of memory; "
+                            "give the same command again with fewer of them"
+                        ) from None
+                    error = SliplensError("the process was ended from outside, perhaps for want of memory")
+                    _keep_failure(folder, given, str(error))
+                    add_seat()
+                    seat = None
+                if given is None and error is not None:
+                    raise error
+                if given is not None and tally.settle(given, error, _failure(folder, given)):
+                    again.append(given)
+                if seat is None:
+                    continue
+                if (given := again.pop() if again else next(shards, None)) is None:
+                    idle.append(seat)
+                    more = False
+                    continue
+                try:
+                    busy[seat.submit(folder, given, tally.within)] = seat, given
+                except lost:  # since it did its last
+                    again.append(given)
+                    add_seat()
+        busy.update((_settled(None), (seat, None)) for seat in idle)
+
+
 @contextmanager
 def parts_folder(target: Path | None) -> Iterator[Path]:
     """Folder for the parts of a file, beside it: gone when all is well, kept for the next try where something is done.
@@ -328,7 +398,7 @@ def parts_folder(target: Path | None) -> Iterator[Path]:
 
 
 def make_parts(
-    work: Work,
+    work: Work | Crew,
     shards: Callable[[], Iterable[Shard]],
     folder: Path,
     *,
@@ -346,7 +416,7 @@ def make_parts(
     Parameters
     ----------
     work
-        What is done with each shard.
+        What is done with each shard, or those who do it and other work too; `on` is then theirs.
     shards
         Gives all shards, anew at every call.
     folder
@@ -367,20 +437,19 @@ def make_parts(
     InputError
         If the place to work is unknown.
     """
-    name, _, argument = on.partition("=")
-    open_seats = EXECUTORS.pick(name)
     count = frames = 0
     for one in shards():
         count, frames = count + 1, frames + one.frames
+    crew = nullcontext(work) if isinstance(work, Crew) else Crew(work, on=on, most=count)
     tally = _Tally(total=frames, on_part=on_part, on_progress=on_progress or ignore)
     missing = _missing(shards, folder, tally, retry_failed=retry_failed)
     first = next(missing, None)
     if first is not None:
-        plan = _Plan(title=title, shards=count, frames=frames, started_s=time.time(), on=on)
-        (folder / _STATE).mkdir(parents=True, exist_ok=True)
-        save_record(plan, folder / _STATE / _PLAN)
-        with open_seats(work, argument, count) as (places, make_seat, lost), ExitStack() as seats:
-            _drive(first, missing, folder, tally, places=places, make_seat=make_seat, lost=lost, open=seats)
+        with crew as workers:
+            plan = _Plan(title=title, shards=count, frames=frames, started_s=time.time(), on=workers.on)
+            (folder / _STATE).mkdir(parents=True, exist_ok=True)
+            save_record(plan, folder / _STATE / _PLAN)
+            workers.make(chain([first], missing), folder, tally, most=count)
     if failed := [failure for one in shards() if (failure := _failure(folder, one)) is not None]:
         if count == 1 and tally.error is not None:
             shutil.rmtree(folder / _STATE)
@@ -449,6 +518,14 @@ class _Tally:
     shown: int = 0
     error: Exception | None = None
 
+    def settle(self, given: Shard, error: Exception | None, failure: "Failure | None") -> bool:
+        """Count a shard that was tried; whether it is to be tried again."""
+        if error is None:
+            self.add(given)
+            return False
+        self.error = error
+        return failure is None or len(failure.why) < TRIES
+
     def add(self, given: Shard) -> None:
         self.within(given.frames, given.frames)
         self.done += given.frames
@@ -471,59 +548,6 @@ def _missing(
             if retry_failed:
                 _state(folder, one, "failed").unlink(missing_ok=True)
             yield one
-
-
-def _drive(
-    first: Shard,
-    missing: Iterator[Shard],
-    folder: Path,
-    tally: _Tally,
-    *,
-    places: int,
-    make_seat: Callable[[], Seat],
-    lost: type[Exception],
-    open: ExitStack,
-) -> None:
-    """Hand shards to workers until none is left; a worker that is lost is replaced."""
-    again: list[Shard] = [first]
-    busy: dict[Future, tuple[Seat, Shard | None]] = {}
-    more = True
-
-    def add_seat() -> None:
-        seat = make_seat()
-        open.callback(seat.close)
-        busy[seat.start()] = seat, None
-
-    for _ in range(places):
-        add_seat()
-    # a worker that has not begun when all is done was never needed: a cluster may have lost the node for it
-    while more or again or any(given is not None for _, given in busy.values()):
-        for future in wait(busy, return_when=FIRST_COMPLETED).done:
-            seat, given = busy.pop(future)
-            try:
-                error = future.result()
-            except lost:
-                if given is None:
-                    raise SliplensError(
-                        "a process was ended from outside as it began, perhaps for want of memory; "
-                        "give the same command again with fewer of them"
-                    ) from None
-                error = SliplensError("the process was ended from outside, perhaps for want of memory")
-                _keep_failure(folder, given, str(error))
-                add_seat()
-                seat = None
-            if given is None and error is not None:
-                raise error
-            if given is not None and error is None:
-                tally.add(given)
-            elif given is not None:
-                tally.error = error
-                failure = _failure(folder, given)
-                if failure is None or len(failure.why) < TRIES:
-                    again.append(given)
-            if seat is not None and (given := again.pop() if again else next(missing, None)) is not None:
-                busy[seat.submit(folder, given, tally.within)] = seat, given
-            more = more and given is not None
 
 
 @dataclass(frozen=True, kw_only=True)
