@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import threading
 from typing import Any, cast
 
 import numpy as np
@@ -9,6 +10,7 @@ from starlette.websockets import WebSocketDisconnect
 
 import sliplens as sl
 from sliplens.app.feed import Feed, Picture, Viewer
+from sliplens.live import SimulatedSource
 from sliplens.live.reading import LiveFrame, Reading
 
 
@@ -135,3 +137,28 @@ def test_a_viewer_that_comes_back_before_its_old_connection_is_given_up_goes_on(
         assert not feed.viewers
 
     with_viewer(act)
+
+
+def test_its_threads_have_ended_when_it_is_closed():
+    class Looks:
+        wants_picture = shows_map = ready = True
+        takes_s = 0.0
+
+        def wake(self) -> None: ...
+
+    async def run() -> list[str]:
+        source = SimulatedSource(rate_hz=200.0)
+        source.load(normal_force_n=4.0, tangential_force_n=1.0)
+        with sl.LiveReader(source, "chromatouch-difference", engine="eager", health=None, slip=None) as reader:
+            feed = Feed(reader)
+            feed.viewers.add(cast("Any", Looks()))
+            before = set(threading.enumerate())
+            feed.start(asyncio.get_running_loop())
+            while feed.picture is None:
+                await asyncio.sleep(0.01)
+            begun = set(threading.enumerate()) - before
+            feed.close()
+        assert begun
+        return [thread.name for thread in begun if thread.is_alive() and thread.daemon]
+
+    assert asyncio.run(run()) == []

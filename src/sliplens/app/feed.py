@@ -42,7 +42,7 @@ _QUALITY = 85
 _UNANSWERED = 2  # messages under way to one viewer: one is drawn while the next one travels
 _STILL_THERE_S = 1.0  # without news: the page takes a longer silence for a lost connection
 _RATE_S = 2.0
-_PATIENCE_S = 3.0  # with a thread that is to end
+_PATIENCE_S = 10.0  # with a thread that is to end
 
 
 @dataclass(frozen=True, kw_only=True)
