@@ -3,6 +3,7 @@
 Writes its address as a line of JSON.
 """
 
+import faulthandler
 import json
 import sys
 
@@ -18,4 +19,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    faulthandler.enable()  # of a process that ends itself, this is all one sees
     main()

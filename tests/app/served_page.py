@@ -4,6 +4,7 @@ NiceGUI serves one page to a process, and a browser is led by another event loop
 take the tests after it along. Writes a line of JSON: the address, and what a second page and a taken port are answered.
 """
 
+import faulthandler
 import json
 import sys
 
@@ -41,4 +42,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    faulthandler.enable()  # of a process that ends itself, this is all one sees
     main()

@@ -158,7 +158,7 @@ def test_its_threads_have_ended_when_it_is_closed():
                 await asyncio.sleep(0.01)
             begun = set(threading.enumerate()) - before
             feed.close()
-        assert begun
-        return [thread.name for thread in begun if thread.is_alive() and thread.daemon]
+            assert begun
+            return [thread.name for thread in begun if thread.is_alive() and thread.daemon]
 
     assert asyncio.run(run()) == []
