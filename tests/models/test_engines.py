@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sliplens.errors import InputError, ModelError
-from sliplens.models import Manifest, Run
+from sliplens.models import Manifest, Run, load
 from sliplens.models.backbones import HistogramRegressor
 from sliplens.models.engines import ENGINES, fold_batch_norm, make_engine
 
@@ -227,3 +227,18 @@ def test_nothing_is_reported_to_anybody(tmp_path: Path):
     done = subprocess.run([sys.executable, "-c", code], check=False, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert not list(tmp_path.rglob("*"))
+
+
+def test_folded_gives_the_same_bits_on_any_number_of_threads():
+    trained = load("chromatouch-difference")  # small ones have no layer whose sums threads would share
+    images = torch.rand(19, 3, 224, 224, generator=torch.Generator().manual_seed(0))
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            engine = make_engine("folded", trained, batch_size=8)
+            found.append(engine.estimate(trained, images).margin.tobytes())
+            assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert found[1:] == found[:1] * 2

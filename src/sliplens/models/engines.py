@@ -12,7 +12,7 @@ from contextvars import ContextVar
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock, get_ident
+from threading import Barrier, Lock, get_ident
 from typing import Any, TypeAlias
 from weakref import WeakKeyDictionary
 
@@ -174,6 +174,17 @@ def prepare(
             cure = "choose another engine" if onnx_file is None else f"export {onnx_file} again"
             raise ModelError(f"the engine {name} cannot run {type(model).__name__} ({reason}); {cure}")
     raise AssertionError  # eager has no obstacle
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch work in this thread alone, so that sums do not depend on the number of cores."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 @contextmanager
@@ -388,6 +399,25 @@ def _run_in_streams(submit: Callable[[Tensor], Callable[[], tuple[Tensor, ...]]]
     return run
 
 
+def _folded(model: nn.Module, job: EngineJob) -> RunBatches:
+    run = _torch(lambda model: Answers(fold_batch_norm(model)))(model, job)
+    if job.streams == 1 or job.images.device.type != "cpu":
+        return run
+    # a sum that threads share is added in another order by each number of them: one thread a batch gives the same
+    # bits on every number of cores
+    workers = ThreadPoolExecutor(job.streams, thread_name_prefix="folded")
+    every = Barrier(job.streams)
+
+    def begin(_: int) -> None:
+        torch.get_num_threads()  # makes torch ready in this thread, which would undo what follows
+        torch.set_num_threads(1)
+        every.wait()  # so that no thread takes two of these
+
+    with one_thread():  # what was set last is also what other threads begin with
+        list(workers.map(begin, range(job.streams)))
+    return _run_in_streams(lambda batch: workers.submit(lambda: next(run([batch]))).result, job.streams)
+
+
 def _onnxruntime(model: nn.Module, job: EngineJob) -> RunBatches:
     runtime = import_onnxruntime()
     options = runtime.SessionOptions()
@@ -458,7 +488,7 @@ _ROWS = {
     # torch as it is, its batch normalisation folded into the convolutions, and torch.compile of that
     "eager": EngineKind(pays_after=0, build=_torch(Answers)),
     # it takes as long as 20 passes
-    "folded": EngineKind(pays_after=100, build=_torch(lambda model: Answers(fold_batch_norm(model)))),
+    "folded": EngineKind(pays_after=100, build=_folded),
     "compiled": EngineKind(
         pays_after=None,  # it takes minutes
         obstacle=_compiler_obstacle,

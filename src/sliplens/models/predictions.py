@@ -18,7 +18,7 @@ from sliplens.errors import InputError
 from sliplens.files import hash_file, hash_json, require_new_file
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.models.checkpoint import Estimate, Run, load, sensor_kind
-from sliplens.models.engines import Engine, make_engine
+from sliplens.models.engines import Engine, make_engine, one_thread
 from sliplens.models.novelty import read_features
 from sliplens.progress import OnProgress, note, stage
 from sliplens.recordings import Dataset, load_dataset
@@ -435,8 +435,8 @@ class _Reading:
                 else:
                     touches = [True] * len(batch)
                 inputs = self.trained.encode(np.stack(images), reference)
-                # engines answer without them
-                features = None if novelty is None else read_features(self.trained.model, novelty.layer, inputs)
+                with one_thread():  # as the engines answer, which tell no features
+                    features = None if novelty is None else read_features(self.trained.model, novelty.layer, inputs)
                 encoded.append((first, touches, features))
                 yield inputs
 
