@@ -278,8 +278,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         kept = Kept(folder=options.keep or Path(folder))
         found = load_dataset(options.data or kept.data("data", trials=12, frames=40))
+        driver_mb = kept.driver_mb()  # first: networks would hide by how much its memory peaks
         rates = kept.rates(found, options.stages, places)
-        driver_mb = kept.driver_mb()
         where = [place for place in places if place != ONE_THREAD]
         survived, killed = kept.kills(where, count=options.kills, seed=options.seed)
 
