@@ -68,6 +68,7 @@ def write_trials_page(data: Dataset | Path | str, out: Path | str | None = None)
         script="trials.js",
         name=data.folder.resolve().name,
         rows=[_row(data, info) for info in data.trials],
+        objects=any(info.object for info in data.trials),
         left_out=data.left_out,
         frames=f"{data.frames:,}",
         curve=_CURVE,
