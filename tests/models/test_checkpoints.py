@@ -9,7 +9,7 @@ import torch
 
 from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.files import hash_file
-from sliplens.models import load_checkpoint
+from sliplens.models import load_checkpoint, save_checkpoint
 
 
 @pytest.fixture
@@ -28,6 +28,19 @@ def test_a_checkpoint_comes_back_bit_for_bit(run: Path):
     first, second = load_checkpoint(run), load_checkpoint(run)
     assert torch.equal(first.predict(inputs), second.predict(inputs))
     assert not first.model.training
+
+
+def test_half_precision_weights_are_read_as_the_numbers_they_are(run: Path, tmp_path: Path):
+    trained = load_checkpoint(run)
+    halves = {
+        name: values.half() if values.is_floating_point() else values
+        for name, values in trained.model.state_dict().items()
+    }
+    trained.model.load_state_dict(halves, assign=True)
+    save_checkpoint(tmp_path, trained.model, trained.manifest)
+    for name, values in load_checkpoint(tmp_path).model.state_dict().items():
+        assert values.dtype in {torch.float32, torch.int64}
+        torch.testing.assert_close(values, halves[name].to(values.dtype), rtol=0, atol=0)
 
 
 def test_predictions_do_not_depend_on_the_batch_size(run: Path):

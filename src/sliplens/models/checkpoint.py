@@ -418,7 +418,9 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> Run:
         raise CheckpointError(
             f"{weights} does not hold a {manifest.backbone} with a {manifest.head} head ({reason})"
         ) from None
-    strange = [name for name in own if values[name].dtype != own[name].dtype or not values[name].isfinite().all()]
+    # halves are widened: networks of the package are stored as such
+    kept = {name: {tensor.dtype, torch.float16} for name, tensor in own.items()}
+    strange = [name for name in own if values[name].dtype not in kept[name] or not values[name].isfinite().all()]
     if strange:
         raise CheckpointError(f"{weights} holds what is no number in {strange[0]}; train the network again")
     if manifest.novelty is not None and manifest.novelty.layer not in dict(model.named_modules()):
