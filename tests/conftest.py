@@ -39,6 +39,14 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, MOST_WORKERS)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _no_disk_is_waited_for():
+    """Files get their names at once: nobody pulls the plug of a test, and a disk takes 8 ms a file."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
+        yield
+
+
 @pytest.fixture(scope="module")
 def browser():
     """A Chromium of this machine's: Playwright's own would have to be fetched from outside the package index."""

@@ -1,14 +1,19 @@
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pyarrow as pa
 import pytest
 from jaxtyping import Float32, Float64, Int64
+from msgspec import Meta
 
 from sliplens.codec import (
     TABLE_SUFFIXES,
+    UNKNOWN,
     Columns,
     keep_part,
     load_record,
@@ -19,6 +24,10 @@ from sliplens.codec import (
     write_tables,
 )
 from sliplens.errors import InputError
+from sliplens.results import evaluation, explanation, faithfulness, grip, study
+
+NEVER_LOADED = {faithfulness.DeletionCurve, faithfulness.RemovalCurve, study.MarkedFrame, study.StateFrame}
+"""Records of `results` that are made of tables when these have been read."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,6 +157,65 @@ def test_a_column_of_another_type_is_told(tmp_path):
     save_result(replace(found(), rows=wrong), tmp_path)
     with pytest.raises(InputError, match="'trial' where texts belong"):
         load_result(tmp_path, Found, command="sliplens x")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bounded(Columns):
+    share: Annotated[Float64[np.ndarray, " rows"], Meta(ge=0, le=1)]
+    guess: Annotated[Float64[np.ndarray, " rows"], Meta(gt=0, lt=2), UNKNOWN]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bound:
+    error: Annotated[float, Meta(ge=0)] | None
+    rows: Bounded | None
+    maps: dict[str, Annotated[Float32[np.ndarray, "frames pixels"], Meta(ge=-1)]]
+
+
+@pytest.mark.parametrize(
+    ("place", "held", "said"),
+    [
+        ("share", 1.5, "1.5 as 'share', which must be at least 0 and at most 1; make it again with `sliplens x`"),
+        ("share", np.nan, "nan as 'share', which must be at least 0"),
+        ("guess", 0.0, "0 as 'guess', which must be above 0 and below 2"),
+        ("guess", 2.0, "2 as 'guess', which"),
+        ("maps", np.inf, ""),
+        ("maps", np.nan, "nan as 'maps/a', which must be at least -1"),
+        ("error", -1e-9, "expected `float` >= 0.0 at error"),
+        ("guess", np.nan, ""),
+    ],
+)
+def test_what_lies_outside_of_the_bounds_of_its_field_is_told(tmp_path, place, held, said):
+    values = {"share": 1.0, "guess": 1.0, "maps": -1.0, "error": 0.0} | {place: held}
+    rows = {name: np.array([0.5, values[name]]) for name in ("share", "guess")}
+    maps = {"a": np.full((1, 2), values["maps"], dtype=np.float32)}
+    save_result(Bound(error=values["error"], rows=Bounded(**rows), maps=maps), tmp_path)
+    with pytest.raises(InputError, match=re.escape(said)) if said else nullcontext():
+        load_result(tmp_path, Bound, command="sliplens x")
+
+
+def test_a_table_that_may_be_missing_is_none(tmp_path):
+    save_result(bound := Bound(error=None, rows=None, maps={"a": np.zeros((1, 1), dtype=np.float32)}), tmp_path)
+    assert load_result(tmp_path, Bound, command="sliplens x") == bound
+    (tmp_path / "result.json").write_text('{"input": "x", "parts": [], "by_name": {}, "rows": null}')
+    with pytest.raises(InputError, match=r"rows\.parquet does not exist"):  # a table that each must have
+        load_result(tmp_path, Found, command="sliplens x")
+
+
+def test_every_number_in_the_tables_and_maps_of_results_has_bounds():
+    def declared(kind: type) -> Iterator[tuple[str, object]]:
+        for name, hint in get_type_hints(kind, include_extras=True).items():
+            one = get_args(hint)[1] if get_origin(hint) is dict else hint
+            if "Float" in str(one) and "ndarray" in str(one):
+                yield f"{kind.__name__}.{name}", one
+
+    records = [
+        one for module in (evaluation, explanation, faithfulness, grip, study) for one in vars(module).values()
+        if isinstance(one, type) and one.__module__ == module.__name__ and one not in NEVER_LOADED
+    ]  # fmt: skip
+    numbers = {name: hint for one in records for name, hint in declared(one)}
+    assert len(numbers) > 60
+    assert [name for name, hint in numbers.items() if not any(isinstance(one, Meta) for one in get_args(hint))] == []
 
 
 def test_maps_of_another_shape_are_told(tmp_path):

@@ -1,4 +1,5 @@
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -149,6 +150,15 @@ def test_a_file_is_written_by_one_at_a_time_and_whole_or_not_at_all(tmp_path: Pa
         raise KeyboardInterrupt
     assert target.read_text() == "first"
     assert [path.name for path in target.parent.iterdir()] == ["table.csv"]
+
+
+def test_what_is_in_a_file_is_on_the_disk_before_its_name(tmp_path: Path, monkeypatch):
+    done, replace = [], Path.replace
+    monkeypatch.setattr(os, "fsync", lambda stream: done.append(Path(stream.name).read_text()))
+    monkeypatch.setattr(Path, "replace", lambda part, to: [done.append(to.name), replace(part, to)])
+    with whole_file(tmp_path / "table.csv") as part:
+        part.write_text("all")
+    assert done == ["all", "table.csv"]
 
 
 def test_what_cannot_be_written_is_named(tmp_path: Path):

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, is_dataclass, make_dataclass
 from math import prod
 from pathlib import Path
 from types import NoneType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
@@ -35,12 +35,18 @@ Record = TypeVar("Record")
 _Columns = TypeVar("_Columns", bound="Columns")
 
 
+UNKNOWN = "NaN where it is not known"
+"""Beside the bounds of a column or an array: a number may be missing."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Columns:
     """Base of a table: a record whose fields are arrays of one length, a value a row.
 
     Text columns are declared as `Shaped[np.ndarray, " rows"]`, numbers with their jaxtyping type
-    (`Float64[np.ndarray, " rows"]`). NaN stands where a number is unknown.
+    (`Float64[np.ndarray, " rows"]`) and, where it is loaded, the bounds of what they can be:
+    `Annotated[Float64[np.ndarray, " rows"], msgspec.Meta(ge=0, le=1), UNKNOWN]`, without `UNKNOWN` where every row must
+    have a number. What such a field declares holds of arrays as well, and without `UNKNOWN` of a number in JSON.
     """
 
     def __len__(self) -> int:
@@ -169,16 +175,22 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
     values = _read_json(path, command)
     if not isinstance(values, dict):
         raise InputError(f"{path} holds no JSON object; {cure}")
-    declared = get_type_hints(kind)
+    declared = get_type_hints(kind, include_extras=True)
     arrays = {name: hint for name, hint in declared.items() if _array_type(hint) is not None}
     columns = {name: _columns_type(hint) for name, hint in declared.items()}
     # None stands in the JSON where there is no table
-    tables = {name: table for name, table in columns.items() if table and values.get(name, ...) is not None}
+    tables = {
+        name: table
+        for name, table in columns.items()
+        if table and not (NoneType in get_args(declared[name]) and values.get(name, ...) is None)
+    }
     # one dataclass of what is in the JSON, so that msgspec checks it as declared; defaults are kept
-    inside = [field for field in fields(kind) if field.name not in arrays | tables]  # pyright: ignore[reportArgumentType]
+    beside = {*arrays, *(name for name, table in columns.items() if table)}
+    inside = [field for field in fields(kind) if field.name not in beside]  # pyright: ignore[reportArgumentType]
     partial = make_dataclass(kind.__name__, [(one.name, declared[one.name], copy(one)) for one in inside])
     read = from_builtins(values, partial, where=path, command=command)
     given = {field.name: getattr(read, field.name) for field in inside}
+    given |= dict.fromkeys(beside)
     given |= {name: _load_columns(folder / f"{name}.parquet", table, cure) for name, table in tables.items()}
     given |= _load_arrays(folder / ARRAYS_FILE, arrays, cure) if arrays else {}
     try:
@@ -306,13 +318,34 @@ def _kind_of(hint: Any) -> str:
     return "true and false" if shown.startswith("Bool") else "whole numbers" if "Int" in shown else "numbers"
 
 
+_SIDES: dict[str, tuple[str, Callable[..., np.ndarray]]] = {
+    "ge": ("at least", np.less), "gt": ("above", np.less_equal), "le": ("at most", np.greater),
+    "lt": ("below", np.greater_equal),
+}  # fmt: skip
+"""Bounds of `msgspec.Meta`: their words, and what says that a number is outside."""
+
+
+def _require_possible(values: np.ndarray, hint: Any, *, name: str, path: Path, cure: str) -> None:
+    """Hold numbers against the bounds that their field declares, if it does."""
+    hint = _one_array(hint)
+    said = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+    bounds = [one for one in said if isinstance(one, msgspec.Meta)]
+    sides = {side: limit for one in bounds for side in _SIDES if (limit := getattr(one, side)) is not None}
+    wrong = np.isnan(values) if bounds and UNKNOWN not in said else np.zeros(values.shape, dtype=np.bool_)
+    for side, limit in sides.items():
+        wrong |= _SIDES[side][1](values, limit)
+    if wrong.any():
+        belong = " and ".join(f"{_SIDES[side][0]} {limit:g}" for side, limit in sides.items())
+        raise InputError(f"{path} holds {values[wrong][0]:g} as {name!r}, which must be {belong}; {cure}")
+
+
 _LARGEST = 1e12
 """No stage measures more of anything, infinity among them; seconds since 1970 are 2e9."""
 
 
 def _load_columns(path: Path, kind: type[_Columns], cure: str) -> _Columns:
-    declared = get_type_hints(kind)
-    kinds = {name: _kind_of(hint) for name, hint in declared.items()}
+    declared = get_type_hints(kind, include_extras=True)
+    kinds = {name: _kind_of(_array_type(hint)) for name, hint in declared.items()}
     table = read_parquet(path, kinds, cure=cure)
     values = {}
     for name, hint in declared.items():
@@ -320,10 +353,11 @@ def _load_columns(path: Path, kind: type[_Columns], cure: str) -> _Columns:
         value = np.array(column.to_pylist(), dtype=str) if kinds[name] == "texts" else column.to_numpy()
         # a context of its own: "rows" of one table need not be as many as "rows" of another
         with jaxtyped("context"):
-            if _array_type(hint) is not None and not isinstance(value, hint):
-                raise InputError(f"{path} holds {column.type} as {name!r} where {_shown(hint)} belongs; {cure}")
+            if not isinstance(value, plain := _array_type(hint)):
+                raise InputError(f"{path} holds {column.type} as {name!r} where {_shown(plain)} belongs; {cure}")
         if value.dtype.kind == "f" and (np.abs(value) > _LARGEST).any():
             raise InputError(f"{path} holds {value[np.nanargmax(np.abs(value))]:g} as {name!r}; {cure}")
+        _require_possible(value, hint, name=name, path=path, cure=cure)
         values[name] = value
     return kind(**values)
 
@@ -423,15 +457,16 @@ def _load_arrays(path: Path, declared: Mapping[str, Any], cure: str) -> dict[str
     given = {}
     with jaxtyped("context"):  # "frames" of one array are as many as "frames" of another
         for name, hint in declared.items():
-            kind = _array_type(hint)
-            keys = [name] if kind is hint else [key for key in arrays if key.startswith(f"{name}/")]
+            kind, alone = _array_type(hint), hint is _one_array(hint)
+            keys = [name] if alone else [key for key in arrays if key.startswith(f"{name}/")]
             for key in keys:
                 if key not in arrays:
                     raise InputError(f"{path} lacks {key!r}; {cure}")
                 if not isinstance(arrays[key], kind):
                     held = f"{arrays[key].dtype} of shape {arrays[key].shape}"
                     raise InputError(f"{path} holds {held} as {key!r} where {_shown(kind)} belongs; {cure}")
-            given[name] = arrays[name] if kind is hint else {key[len(name) + 1 :]: arrays[key] for key in keys}
+                _require_possible(arrays[key], hint, name=key, path=path, cure=cure)
+            given[name] = arrays[name] if alone else {key[len(name) + 1 :]: arrays[key] for key in keys}
     return given
 
 
@@ -441,9 +476,14 @@ def _columns_type(hint: object) -> type[Columns] | None:
     return kinds[0] if len(kinds) == 1 and isinstance(kinds[0], type) and issubclass(kinds[0], Columns) else None
 
 
+def _one_array(hint: Any) -> Any:
+    return get_args(hint)[1] if get_origin(hint) in {dict, Mapping} else hint
+
+
 def _array_type(hint: object) -> Any:
     """Type of the arrays that a field declares, `X` or `Mapping[str, X]`; None where it declares none."""
-    kind = get_args(hint)[1] if get_origin(hint) in {dict, Mapping} else hint
+    kind = _one_array(hint)
+    kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
     return kind if isinstance(kind, type) and (issubclass(kind, AbstractArray) or kind is np.ndarray) else None
 
 

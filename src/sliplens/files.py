@@ -142,6 +142,10 @@ def whole_file(path: Path) -> Iterator[Path]:
         with _held(make, f"another sliplens is writing {path}; wait until it is done, or choose another file"):
             try:
                 yield part
+                # else a machine that goes down may leave the name of an empty file; the name itself is not waited for:
+                # without it the file is absent, which it may be
+                with part.open("rb+") as stream:
+                    os.fsync(stream)
                 part.replace(path)
             except BaseException:
                 with suppress(OSError):

@@ -144,7 +144,6 @@ class Worker:
                 if not part.exists():
                     _remove(draft)
                     self._make(given.item, draft, on_progress)
-                    _flush(draft)
                     draft.replace(part)
         except Exception as error:  # a bad trial must not end the others
             why = str(error) if isinstance(error, SliplensError) else f"{type(error).__name__}: {error}"
@@ -704,13 +703,6 @@ def _claim(folder: Path, given: Shard) -> Iterator[None]:
     finally:
         path.unlink(missing_ok=True)
         os.close(held)
-
-
-def _flush(path: Path) -> None:
-    """Have what was written on the disk before it gets its name: a machine may go down between the two."""
-    for one in path.iterdir() if path.is_dir() else [path]:
-        with one.open("rb+") as stream:
-            os.fsync(stream)
 
 
 def _remove(path: Path) -> None:

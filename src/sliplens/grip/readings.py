@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
@@ -14,6 +14,7 @@ from sliplens.grip.fingertip import Fingertip, draw_film, mean_shear
 from sliplens.models import Run, make_engine
 from sliplens.models.predictions import LEVEL
 from sliplens.progress import OnProgress
+from sliplens.results.evaluation import ANSWER, MARGIN, PIXEL
 
 FRICTIONS = (0.1, 0.18, 0.3, 0.5, 0.8, 1.3)
 """Coefficients of friction at which readings are measured; between them they are interpolated in the logarithm."""
@@ -37,11 +38,11 @@ class ReadingTable:
     """Hash of the weights that were measured."""
     seed: int
     """Seed of the first fingertip; the others follow."""
-    margin: Float32[np.ndarray, "fingertips frictions forces margins"]
-    low: Float32[np.ndarray, "fingertips frictions forces margins"]
+    margin: Annotated[Float32[np.ndarray, "fingertips frictions forces margins"], ANSWER]
+    low: Annotated[Float32[np.ndarray, "fingertips frictions forces margins"], MARGIN]
     """Lower end of the 90 % interval."""
-    high: Float32[np.ndarray, "fingertips frictions forces margins"]
-    shear_px: Float32[np.ndarray, "fingertips frictions forces margins"]
+    high: Annotated[Float32[np.ndarray, "fingertips frictions forces margins"], MARGIN]
+    shear_px: Annotated[Float32[np.ndarray, "fingertips frictions forces margins"], PIXEL]
     """Mean displacement of the inner markers down the image, in pixels: the way of the pull."""
     noise: float
     """Standard deviation of the margin read anew of the same state, in margin units."""

@@ -146,6 +146,7 @@ def track(
     trials = open_trials(
         source,
         on=on,
+        resumable=path is not None,
         reference=reference,
         reference_frame=reference_frame,
         split=split,

@@ -259,6 +259,7 @@ def predict(
         trials = open_trials(
             source,
             on=on,
+            resumable=path is not None,
             reference=reference,
             reference_frame=reference_frame,
             split=split,

@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.labelling import Clip, ReferenceChoice
-from sliplens.recordings.trial import Labels, TrialFacts
+from sliplens.recordings.trial import CLOCK_S, Labels, TrialFacts
 
 Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
 """RGB image of the camera."""
@@ -144,6 +144,10 @@ def _require_rising(time_s: Float[np.ndarray, " samples"], *, what: str) -> None
         raise RecordingError(
             f"{what}: time does not rise at sample {at} ({time_s[at - 1]:.6f} s, then {time_s[at]:.6f} s); "
             "sort the samples or mend their stamps"
+        )
+    if time_s[0] < CLOCK_S[0] or time_s[-1] > CLOCK_S[1]:
+        raise RecordingError(
+            f"{what}: times run from {time_s[0]:.4g} to {time_s[-1]:.4g} s, as no clock does; give them in seconds"
         )
     if np.any(steps > _LONGEST_S):
         at = int(np.argmax(steps > _LONGEST_S)) + 1

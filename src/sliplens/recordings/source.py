@@ -123,7 +123,7 @@ class Trials:
     """A capture of each sensor and size of frames, to see whether it can be read: to open all takes as long as there
     are trials."""
     rows: tuple[tuple[str, int, str], ...]
-    """Name, number of frames, and hash of what it shows, of each trial."""
+    """Name, number of frames, and hash of what it shows, of each trial; empty where nobody asks."""
 
     @property
     def frames(self) -> int:
@@ -190,9 +190,15 @@ class Trials:
 
 
 def open_trials(
-    source: Path | str | Frames | Dataset | Sequence[Capture], *, on: str = "serial", **named: Any
+    source: Path | str | Frames | Dataset | Sequence[Capture],
+    *,
+    on: str = "serial",
+    resumable: bool = True,
+    **named: Any,
 ) -> Trials:
     """Open a source for work that may be done elsewhere; the other parameters are those of `open_source`.
+
+    Where parts are kept for another run (`resumable`), files other than a data set are read whole for their hash.
 
     Raises
     ------
@@ -215,7 +221,7 @@ def open_trials(
     opened = tuple(open_source(source, **named) if isinstance(source, Path | np.ndarray) else source)
     if len({one.name for one in opened}) < len(opened):
         raise InputError("two of the trials have one name; give each its own")
-    shown = hash_tree(source) if isinstance(source, Path) else ""
+    shown = hash_tree(source) if resumable and isinstance(source, Path) else ""
     rows = [(one.name, one.frames, shown) for one in opened]
     return Trials(source=source if isinstance(source, Path) else opened, named=named, kinds=opened, rows=tuple(rows))
 

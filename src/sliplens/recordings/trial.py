@@ -225,6 +225,8 @@ class Recording(TrialFacts, Labels):
         return len(self.frames)
 
 
+CLOCK_S = (-1e6, 1e10)
+"""Times that clocks tell: seconds from somewhere in the recording, or since 1970; others are in another unit."""
 MOST_FORCE_N = 1e4
 """No fingertip survives more; a larger number is in another unit."""
 _FORCES = (-MOST_FORCE_N, MOST_FORCE_N, "give it in newtons")

@@ -1,14 +1,40 @@
 """What a network was trained on, how well it reads the safety margin, and where and why it fails."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 import pyarrow as pa
 from jaxtyping import Float32, Float64, Int64, Shaped, UInt8
+from msgspec import Meta
 
-from sliplens.codec import Columns
+from sliplens.codec import UNKNOWN, Columns
+from sliplens.friction import MOST_FRICTION
 from sliplens.intervals import FEWEST_UNITS, Difference
 from sliplens.recordings import Dataset
+from sliplens.recordings.trial import CLOCK_S, LABEL_BOUNDS
+
+
+def _label(name: str) -> Meta:
+    low, high, _ = LABEL_BOUNDS[name]
+    return Meta(ge=low, le=high)
+
+
+MARGIN, FORCE, RATIO = map(_label, ("safety_margin", "normal_force_n", "friction_coefficient"))
+TIME = Meta(ge=CLOCK_S[0], le=CLOCK_S[1])
+"""Bounds of what a recording tells, in its units; those of this table are asked of every result that is loaded."""
+FRICTION = Meta(gt=0, le=MOST_FRICTION)
+ANSWER = Meta(ge=-1000, le=1000)
+"""Of answers that are not clipped, and of their parts and changes: a thousand times what there is to tell."""
+AMOUNT = Meta(ge=0)
+"""Of counts, sizes and squares."""
+_ROUNDED = 1 + 1e-6
+AT_MOST_ONE = Meta(le=_ROUNDED)
+SHARE, CORRELATION = Meta(ge=0, le=_ROUNDED), Meta(ge=-_ROUNDED, le=_ROUNDED)
+EXCESS = PLACE = Meta(ge=-1)
+"""Of a ratio less one, and of a number in a list, -1 for none."""
+PIXEL = Meta(ge=-1e5, le=1e5)
+"""No picture is as wide."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,12 +73,12 @@ def describe_simulation(data: Dataset) -> Simulation:
 class LearningCurve(Columns):
     """Errors after each epoch, in squared margin units, and the minutes until then."""
 
-    epoch: Float64[np.ndarray, " epochs"]
+    epoch: Annotated[Float64[np.ndarray, " epochs"], AMOUNT]
     """Passes over the training frames; the last may be cut short."""
-    train_mse: Float64[np.ndarray, " epochs"]
+    train_mse: Annotated[Float64[np.ndarray, " epochs"], AMOUNT]
     """On augmented images, while the weights change."""
-    validation_mse: Float64[np.ndarray, " epochs"]
-    minutes: Float64[np.ndarray, " epochs"]
+    validation_mse: Annotated[Float64[np.ndarray, " epochs"], AMOUNT]
+    minutes: Annotated[Float64[np.ndarray, " epochs"], AMOUNT]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,15 +94,15 @@ class Training:
     """Height and width of the network's input, in pixels."""
     frame_size: tuple[int, int]
     """Height and width of the sensor's frames, in pixels."""
-    train_frames: int
-    validation_frames: int
+    train_frames: Annotated[int, AMOUNT]
+    validation_frames: Annotated[int, AMOUNT]
     seed: int
-    epochs: float
+    epochs: Annotated[float, AMOUNT]
     """Passes over the training frames, the last maybe in part."""
-    minutes: float
+    minutes: Annotated[float, AMOUNT]
     stopped_by: str
     """`epochs` or `time limit`."""
-    best_validation_mse: float
+    best_validation_mse: Annotated[float, AMOUNT]
     """Lowest validation error of the curve, in squared margin units: that of the weights that were kept."""
     parameters: int
     processes: int
@@ -88,10 +114,10 @@ class Training:
 class BinScore:
     """Mean squared error, in margin units, of the frames with a label in [low, high); the last bin holds 1 as well."""
 
-    low: float
-    high: float
-    frames: int
-    mse: float | None
+    low: Annotated[float, MARGIN]
+    high: Annotated[float, MARGIN]
+    frames: Annotated[int, AMOUNT]
+    mse: Annotated[float, AMOUNT] | None
     """None without such frames."""
 
 
@@ -102,11 +128,11 @@ class RegressionScores:
     `r2` is None where the labels do not vary, since there is no variance to explain.
     """
 
-    frames: int
-    trials: int
-    mse: float
-    r2: float | None
-    mae: float
+    frames: Annotated[int, AMOUNT]
+    trials: Annotated[int, AMOUNT]
+    mse: Annotated[float, AMOUNT]
+    r2: Annotated[float, AT_MOST_ONE] | None
+    mae: Annotated[float, AMOUNT]
     bins: tuple[BinScore, ...]
 
 
@@ -114,9 +140,9 @@ class RegressionScores:
 class Reliability:
     """How far the network's own uncertainty can be believed, in one condition."""
 
-    coverage: dict[str, float]
+    coverage: dict[str, Annotated[float, SHARE]]
     """Share of the labels inside the interval of each level; empty without a calibration."""
-    mean_width_90: float | None
+    mean_width_90: Annotated[float, SHARE] | None
     """Mean width of the intervals that should hold 90 %, in margin units."""
 
 
@@ -132,9 +158,9 @@ class LeadTimes:
     """From the first true alarm to the slip, over the warned trials; None if there is none."""
     ideal_ms: float | None
     """The same for the true margin itself, over the trials that slip."""
-    false_per_minute: float
+    false_per_minute: Annotated[float, AMOUNT]
     """Alarms that begin while the true margin is above twice the threshold, by the minute of labelled touch."""
-    threshold: float
+    threshold: Annotated[float, MARGIN]
     """What a prediction is below at an alarm, in margin units."""
 
 
@@ -145,15 +171,15 @@ class Predictions(Columns):
     trial: Shaped[np.ndarray, " frames"]
     condition: Shaped[np.ndarray, " frames"]
     day: Int64[np.ndarray, " frames"]
-    frame: Int64[np.ndarray, " frames"]
-    time_s: Float64[np.ndarray, " frames"]
-    safety_margin: Float64[np.ndarray, " frames"]
-    prediction: Float64[np.ndarray, " frames"]
+    frame: Annotated[Int64[np.ndarray, " frames"], AMOUNT]
+    time_s: Annotated[Float64[np.ndarray, " frames"], TIME]
+    safety_margin: Annotated[Float64[np.ndarray, " frames"], MARGIN]
+    prediction: Annotated[Float64[np.ndarray, " frames"], ANSWER]
     """Not clipped to [0, 1]."""
-    sigma: Float64[np.ndarray, " frames"]
+    sigma: Annotated[Float64[np.ndarray, " frames"], AMOUNT, UNKNOWN]
     """Standard deviation of the answer; NaN for a network that answers with one number."""
-    low_90: Float64[np.ndarray, " frames"]
-    high_90: Float64[np.ndarray, " frames"]
+    low_90: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
+    high_90: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
     """Ends of the interval that should hold 90 % of the labels; NaN for a network that was not calibrated."""
 
 
@@ -161,9 +187,9 @@ class Predictions(Columns):
 class RiskCoverage:
     """Error of what is answered against the share that is: what a network gains by saying "I do not know"."""
 
-    covered: tuple[float, ...]
+    covered: tuple[Annotated[float, SHARE], ...]
     """Shares of the frames that are answered, from 1 down."""
-    error: dict[str, tuple[float, ...]]
+    error: dict[str, tuple[Annotated[float, AMOUNT], ...]]
     """Mean absolute error at each share, in margin units, by what is withheld first: `known`, what is least like the
     training (`Estimate.known`); `spread`, the widest answers; `perfect`, the largest errors, which nobody knows."""
 
@@ -219,8 +245,8 @@ class BaselinePredictions(Columns):
 
     estimator: Shaped[np.ndarray, " rows"]
     trial: Shaped[np.ndarray, " rows"]
-    frame: Int64[np.ndarray, " rows"]
-    prediction: Float64[np.ndarray, " rows"]
+    frame: Annotated[Int64[np.ndarray, " rows"], AMOUNT]
+    prediction: Annotated[Float64[np.ndarray, " rows"], ANSWER]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,13 +290,13 @@ class ErrorTable(Predictions):
     """Label and answer of frames, and what may have made the answer wrong; NaN where not known."""
 
     sensor: Shaped[np.ndarray, " frames"]
-    friction: Float64[np.ndarray, " frames"]
+    friction: Annotated[Float64[np.ndarray, " frames"], RATIO, UNKNOWN]
     """Coefficient of friction that holds."""
-    normal_force_n: Float64[np.ndarray, " frames"]
-    contact_x: Float64[np.ndarray, " frames"]
-    contact_y: Float64[np.ndarray, " frames"]
+    normal_force_n: Annotated[Float64[np.ndarray, " frames"], FORCE, UNKNOWN]
+    contact_x: Annotated[Float64[np.ndarray, " frames"], SHARE, UNKNOWN]
+    contact_y: Annotated[Float64[np.ndarray, " frames"], SHARE, UNKNOWN]
     """Middle of the contact, right and down, as shares of the image's width and height."""
-    slice: Int64[np.ndarray, " frames"]
+    slice: Annotated[Int64[np.ndarray, " frames"], PLACE]
     """Place in `Diagnosis.slices`; -1 where no held-out frame is."""
 
     @property
@@ -303,16 +329,16 @@ class ErrorSlice:
 class ExplainedErrors(ErrorTable):
     """Frames that were explained; what needs the truth of each marker is NaN without it."""
 
-    agreement: Float64[np.ndarray, " frames"]
+    agreement: Annotated[Float64[np.ndarray, " frames"], CORRELATION, UNKNOWN]
     """Signed rank correlation, marker by marker, of the Shapley values for the answer and for the best reading."""
-    reliability: Float64[np.ndarray, " frames"]
+    reliability: Annotated[Float64[np.ndarray, " frames"], SHARE, UNKNOWN]
     """Correlation that another estimate of the Shapley values from as many scenes would have with these."""
-    network_slipping: Float64[np.ndarray, " frames"]
-    reading_slipping: Float64[np.ndarray, " frames"]
+    network_slipping: Annotated[Float64[np.ndarray, " frames"], SHARE, UNKNOWN]
+    reading_slipping: Annotated[Float64[np.ndarray, " frames"], SHARE, UNKNOWN]
     """Share on slipping markers, of the sizes of these values on markers in contact."""
-    cluster: Int64[np.ndarray, " frames"]
+    cluster: Annotated[Int64[np.ndarray, " frames"], AMOUNT]
     """Kind of explanation, that of the largest error first."""
-    example: Int64[np.ndarray, " frames"]
+    example: Annotated[Int64[np.ndarray, " frames"], PLACE]
     """Place in `Diagnosis.pictures` of the frames that are most like their kind, else -1."""
 
 
@@ -324,11 +350,11 @@ class FrictionTable(Columns):
     trial: Shaped[np.ndarray, " rows"]
     condition: Shaped[np.ndarray, " rows"]
     day: Int64[np.ndarray, " rows"]
-    friction: Float64[np.ndarray, " rows"]
-    safety_margin: Float64[np.ndarray, " rows"]
+    friction: Annotated[Float64[np.ndarray, " rows"], FRICTION]
+    safety_margin: Annotated[Float64[np.ndarray, " rows"], MARGIN]
     """True margin with that friction."""
-    prediction: Float64[np.ndarray, " rows"]
-    reading_slope: Float64[np.ndarray, " rows"]
+    prediction: Annotated[Float64[np.ndarray, " rows"], ANSWER]
+    reading_slope: Annotated[Float64[np.ndarray, " rows"], ANSWER, UNKNOWN]
     """Rise of the best reading over that of the margin there (`simulation.intervention.reading_slope`)."""
 
 
@@ -361,7 +387,7 @@ class Diagnosis:
     explained: ExplainedErrors
     frictions: FrictionTable
     pictures: UInt8[np.ndarray, "examples size size 3"]
-    maps: Float32[np.ndarray, "examples size size"]
+    maps: Annotated[Float32[np.ndarray, "examples size size"], ANSWER]
     """Examples of each kind as the network saw them, and their maps in margin units."""
     shown_frame: str
     other_frictions: UInt8[np.ndarray, "shown size size 3"]

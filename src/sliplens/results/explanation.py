@@ -3,13 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Shaped, UInt8
 
-from sliplens.codec import Columns, load_record, load_result
+from sliplens.codec import UNKNOWN, Columns, load_record, load_result
 from sliplens.errors import InputError, SaliencyError
 from sliplens.files import RUN_FILE, Provenance, require_folder
+from sliplens.results.evaluation import ANSWER, MARGIN, SHARE, TIME
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,9 +21,9 @@ class ExplainedFrame:
     id: str
     trial: str
     condition: str
-    safety_margin: float | None
-    prediction: float
-    reference_prediction: float
+    safety_margin: Annotated[float, MARGIN] | None
+    prediction: Annotated[float, ANSWER]
+    reference_prediction: Annotated[float, ANSWER]
     day: int = 1
 
 
@@ -47,8 +49,8 @@ class Explained:
     """Inputs of the network before normalisation, 8 bits."""
     pictures: UInt8[np.ndarray, "frames size size 3"]
     """The normalised inputs, 8 bits, for people to look at."""
-    relevance: dict[str, Float32[np.ndarray, "frames size size"]]
-    saliency: dict[str, Float32[np.ndarray, "frames size size"]]
+    relevance: dict[str, Annotated[Float32[np.ndarray, "frames size size"], ANSWER]]
+    saliency: dict[str, Annotated[Float32[np.ndarray, "frames size size"], SHARE]]
     """By method: signed maps in margin units, and the same in [0, 1] for viewing and for ranking pixels."""
 
     def __post_init__(self) -> None:
@@ -131,34 +133,28 @@ def load_explained(folder: Path) -> Explained:
     Raises
     ------
     InputError
-        If the folder or one of its files is missing or damaged, or holds something else.
-    SaliencyError
-        If a map is not finite.
+        If the folder or one of its files is missing or damaged, or holds something else, such as a map that is not
+        finite.
     """
     require_folder(folder, what="the explanations")
     if not is_explained(folder):
         raise InputError(f"{folder} holds no explanations; make them with sliplens explain")
-    explained = load_result(folder, Explained, command="sliplens explain")
-    for kind, maps in (("map", explained.relevance), ("saliency", explained.saliency)):
-        for method, stack in maps.items():
-            for frame, values in zip(explained.frames, stack, strict=True):
-                require_saliency(values, values.shape, where=f"the {method} {kind} of {frame.id} in {folder}")
-    return explained
+    return load_result(folder, Explained, command="sliplens explain")
 
 
 @dataclass(frozen=True, kw_only=True)
 class StripReadings(Columns):
     """True and read safety margin of every frame of a trial; NaN where the sensor touches nothing."""
 
-    time_s: Float64[np.ndarray, " frames"]
+    time_s: Annotated[Float64[np.ndarray, " frames"], TIME]
     contact_state: np.ndarray
-    safety_margin: Float64[np.ndarray, " frames"]
+    safety_margin: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
     """Margin of the label."""
-    prediction: Float64[np.ndarray, " frames"]
+    prediction: Annotated[Float64[np.ndarray, " frames"], ANSWER, UNKNOWN]
     """Margin that the network reads."""
-    low: Float64[np.ndarray, " frames"]
+    low: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
     """Lower end of its 90 % interval; NaN for a network that was never calibrated."""
-    high: Float64[np.ndarray, " frames"]
+    high: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
     """Upper end of its 90 % interval."""
 
 
@@ -175,5 +171,5 @@ class Strip:
     shown: tuple[int, ...]
     """Numbers of the frames that have pictures and maps."""
     pictures: UInt8[np.ndarray, "shown height width 3"]
-    relevance: Float32[np.ndarray, "shown rows columns"]
+    relevance: Annotated[Float32[np.ndarray, "shown rows columns"], ANSWER]
     """Signed contribution of each pixel to f(x) - f(untouched sensor), in margin units."""

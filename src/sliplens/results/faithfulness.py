@@ -3,13 +3,14 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Float64, Int, Int64, Shaped
 
-from sliplens.codec import Columns
+from sliplens.codec import UNKNOWN, Columns
 from sliplens.intervals import Difference
+from sliplens.results.evaluation import AMOUNT, ANSWER, CORRELATION, MARGIN, SHARE
 
 _Rows = TypeVar("_Rows", "DeletionTable", "RemovalTable")
 Key = tuple[str, str, str]
@@ -43,10 +44,10 @@ class Lead:
 class MethodScore:
     """Deletion score D_AUC over frames: mean and standard deviation, and mean D once the last pixel is gone."""
 
-    mean: float
-    sd: float
-    last_step_mean: float
-    frames: int
+    mean: Annotated[float, AMOUNT]
+    sd: Annotated[float, AMOUNT]
+    last_step_mean: Annotated[float, AMOUNT]
+    frames: Annotated[int, AMOUNT]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,10 +58,10 @@ class DeletionTable(Columns):
     frame_id: Shaped[np.ndarray, " rows"]
     day: Int64[np.ndarray, " rows"]
     trial: Shaped[np.ndarray, " rows"]
-    step: Int64[np.ndarray, " rows"]
-    pixels_removed: Int64[np.ndarray, " rows"]
-    prediction: Float64[np.ndarray, " rows"]
-    score: Float64[np.ndarray, " rows"]
+    step: Annotated[Int64[np.ndarray, " rows"], AMOUNT]
+    pixels_removed: Annotated[Int64[np.ndarray, " rows"], AMOUNT]
+    prediction: Annotated[Float64[np.ndarray, " rows"], ANSWER]
+    score: Annotated[Float64[np.ndarray, " rows"], AMOUNT]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,10 +151,10 @@ class RemovalScore:
     gain_over_random: Difference
     lead_over_controls: Lead | None
     """Of the symmetric gain; None for a control."""
-    most_first: float
-    least_first: float
-    random: float
-    at: dict[float, float]
+    most_first: Annotated[float, ANSWER]
+    least_first: Annotated[float, ANSWER]
+    random: Annotated[float, ANSWER]
+    at: dict[float, Annotated[float, ANSWER]]
     """Mean change where a share of the image is gone, most influential first."""
 
     @property
@@ -180,7 +181,7 @@ class Agreement:
     unit: str
     first: str
     second: str
-    tau: float | None
+    tau: Annotated[float, CORRELATION] | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,11 +212,11 @@ class RemovalTable(Columns):
     frame_id: Shaped[np.ndarray, " rows"]
     day: Int64[np.ndarray, " rows"]
     trial: Shaped[np.ndarray, " rows"]
-    safety_margin: Float64[np.ndarray, " rows"]
-    area: Float64[np.ndarray, " rows"]
-    most_first: Float64[np.ndarray, " rows"]
-    least_first: Float64[np.ndarray, " rows"]
-    random: Float64[np.ndarray, " rows"]
+    safety_margin: Annotated[Float64[np.ndarray, " rows"], MARGIN, UNKNOWN]
+    area: Annotated[Float64[np.ndarray, " rows"], SHARE]
+    most_first: Annotated[Float64[np.ndarray, " rows"], ANSWER]
+    least_first: Annotated[Float64[np.ndarray, " rows"], ANSWER]
+    random: Annotated[Float64[np.ndarray, " rows"], ANSWER]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,11 +1,13 @@
 """Grips: what became of each episode, and one of them tick by tick."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
 
-from sliplens.codec import Columns
+from sliplens.codec import UNKNOWN, Columns
+from sliplens.results.evaluation import AMOUNT, ANSWER, EXCESS, FORCE, FRICTION, MARGIN
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -13,25 +15,25 @@ class EpisodeTable(Columns):
     """Episodes, a row each; forces in newtons, lengths in metres, times in seconds."""
 
     condition: Shaped[np.ndarray, " episodes"]
-    mass_kg: Float64[np.ndarray, " episodes"]
-    friction: Float64[np.ndarray, " episodes"]
+    mass_kg: Annotated[Float64[np.ndarray, " episodes"], AMOUNT]
+    friction: Annotated[Float64[np.ndarray, " episodes"], FRICTION]
     """Least static friction of the episode, mean of both fingers."""
     dropped: Bool[np.ndarray, " episodes"]
     crushed: Bool[np.ndarray, " episodes"]
-    slip_m: Float64[np.ndarray, " episodes"]
+    slip_m: Annotated[Float64[np.ndarray, " episodes"], AMOUNT]
     """Way slid by the finger that slid farther."""
-    mean_force_n: Float64[np.ndarray, " episodes"]
+    mean_force_n: Annotated[Float64[np.ndarray, " episodes"], AMOUNT, UNKNOWN]
     """Grip force, mean from the lift until the end or the drop."""
-    peak_force_n: Float64[np.ndarray, " episodes"]
-    least_force_n: Float64[np.ndarray, " episodes"]
+    peak_force_n: Annotated[Float64[np.ndarray, " episodes"], FORCE]
+    least_force_n: Annotated[Float64[np.ndarray, " episodes"], AMOUNT, UNKNOWN]
     """Least force that would have held, mean over the same time."""
-    peak_least_force_n: Float64[np.ndarray, " episodes"]
+    peak_least_force_n: Annotated[Float64[np.ndarray, " episodes"], AMOUNT]
     """The highest that was needed at any moment."""
-    force_excess: Float64[np.ndarray, " episodes"]
+    force_excess: Annotated[Float64[np.ndarray, " episodes"], EXCESS, UNKNOWN]
     """Mean force over the mean least force, less 1: a ratio."""
-    peak_excess: Float64[np.ndarray, " episodes"]
+    peak_excess: Annotated[Float64[np.ndarray, " episodes"], EXCESS, UNKNOWN]
     """The same of the peaks."""
-    under_20_s: Float64[np.ndarray, " episodes"]
+    under_20_s: Annotated[Float64[np.ndarray, " episodes"], AMOUNT]
     """Time with a true margin under 20 %."""
 
 
@@ -39,20 +41,20 @@ class EpisodeTable(Columns):
 class GripTrace(Columns):
     """One episode, a row a tick; margins are means of both fingers that read, NaN where none does."""
 
-    time_s: Float64[np.ndarray, " ticks"]
-    command_n: Float64[np.ndarray, " ticks"]
-    force_n: Float64[np.ndarray, " ticks"]
-    least_force_n: Float64[np.ndarray, " ticks"]
+    time_s: Annotated[Float64[np.ndarray, " ticks"], AMOUNT]
+    command_n: Annotated[Float64[np.ndarray, " ticks"], FORCE]
+    force_n: Annotated[Float64[np.ndarray, " ticks"], FORCE]
+    least_force_n: Annotated[Float64[np.ndarray, " ticks"], AMOUNT]
     """Least force that holds: the load over both frictions."""
-    load_n: Float64[np.ndarray, " ticks"]
+    load_n: Annotated[Float64[np.ndarray, " ticks"], FORCE]
     """Tangential force of both fingers."""
-    true_margin: Float64[np.ndarray, " ticks"]
+    true_margin: Annotated[Float64[np.ndarray, " ticks"], MARGIN, UNKNOWN]
     """Of the finger with less."""
-    margin: Float64[np.ndarray, " ticks"]
+    margin: Annotated[Float64[np.ndarray, " ticks"], ANSWER, UNKNOWN]
     """Read."""
-    low: Float64[np.ndarray, " ticks"]
-    high: Float64[np.ndarray, " ticks"]
-    slip_m: Float64[np.ndarray, " ticks"]
+    low: Annotated[Float64[np.ndarray, " ticks"], MARGIN, UNKNOWN]
+    high: Annotated[Float64[np.ndarray, " ticks"], MARGIN, UNKNOWN]
+    slip_m: Annotated[Float64[np.ndarray, " ticks"], AMOUNT]
     slip_seen: Bool[np.ndarray, " ticks"]
     """Whether the markers told of a slip."""
 
@@ -90,7 +92,7 @@ class Grip:
     moments_s: tuple[float, ...]
     """Times of the pictures; none where nothing was rendered."""
     pictures: UInt8[np.ndarray, "moments height width 3"]
-    maps: Float32[np.ndarray, "moments side side"]
+    maps: Annotated[Float32[np.ndarray, "moments side side"], ANSWER]
     """Relevance of the first finger's frames, in margin units, signed."""
 
     @property

@@ -4,14 +4,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pyarrow as pa
 from jaxtyping import Float32, Float64, Int64, Shaped, UInt8
 
-from sliplens.codec import Columns
+from sliplens.codec import UNKNOWN, Columns
 from sliplens.intervals import Difference
-from sliplens.results.evaluation import Evaluation
+from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, PIXEL, Evaluation
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionScores, Lead, Remedies, RemovalScores
 
@@ -42,9 +43,9 @@ class ChosenFrame:
 
     id: str
     trial: str
-    frame: int
-    level: float
-    safety_margin: float
+    frame: Annotated[int, AMOUNT]
+    level: Annotated[float, MARGIN]
+    safety_margin: Annotated[float, MARGIN]
     scored: bool
     """Whether it counts in the scores."""
     shown: bool
@@ -88,11 +89,11 @@ class MarkerTable(Columns):
     """Markers of each frame in camera pixels: at rest, and now (NaN where one was not followed)."""
 
     frame_id: Shaped[np.ndarray, " rows"]
-    marker: Int64[np.ndarray, " rows"]
-    rest_x_px: Float64[np.ndarray, " rows"]
-    rest_y_px: Float64[np.ndarray, " rows"]
-    x_px: Float64[np.ndarray, " rows"]
-    y_px: Float64[np.ndarray, " rows"]
+    marker: Annotated[Int64[np.ndarray, " rows"], AMOUNT]
+    rest_x_px: Annotated[Float64[np.ndarray, " rows"], PIXEL]
+    rest_y_px: Annotated[Float64[np.ndarray, " rows"], PIXEL]
+    x_px: Annotated[Float64[np.ndarray, " rows"], PIXEL, UNKNOWN]
+    y_px: Annotated[Float64[np.ndarray, " rows"], PIXEL, UNKNOWN]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,8 +109,8 @@ class ShownFrame:
     """Frame of the trial that is shown, its contact state in words."""
 
     id: str
-    level: float
-    safety_margin: float
+    level: Annotated[float, MARGIN]
+    safety_margin: Annotated[float, MARGIN]
     contact_state: str
 
 
@@ -169,7 +170,7 @@ class UntrainedMaps:
 
     input: str
     source: str
-    maps: dict[str, Float32[np.ndarray, "frames size size"]]
+    maps: dict[str, Annotated[Float32[np.ndarray, "frames size size"], ANSWER]]
     """Part of the relevance that works towards those networks' own targets, by method with `NEW_WEIGHTS`."""
 
 
@@ -238,10 +239,10 @@ class MapQuality:
 class MethodTime:
     """Seconds a frame: median over frames with the forward pass and without it, and the range."""
 
-    seconds: float
+    seconds: Annotated[float, AMOUNT]
     seconds_without_forward: float
-    low: float
-    high: float
+    low: Annotated[float, AMOUNT]
+    high: Annotated[float, AMOUNT]
     frames: int
     """Frames that were timed."""
 
@@ -314,16 +315,16 @@ class MarkerEffects(Columns):
     frame_id: Shaped[np.ndarray, " rows"]
     day: Int64[np.ndarray, " rows"]
     trial: Shaped[np.ndarray, " rows"]
-    safety_margin: Float64[np.ndarray, " rows"]
-    marker: Int64[np.ndarray, " rows"]
-    x_px: Float64[np.ndarray, " rows"]
-    y_px: Float64[np.ndarray, " rows"]
+    safety_margin: Annotated[Float64[np.ndarray, " rows"], MARGIN, UNKNOWN]
+    marker: Annotated[Int64[np.ndarray, " rows"], AMOUNT]
+    x_px: Annotated[Float64[np.ndarray, " rows"], PIXEL]
+    y_px: Annotated[Float64[np.ndarray, " rows"], PIXEL]
     """Place in pixels of the network's input."""
-    shapley: Float64[np.ndarray, " rows"]
-    shapley_error: Float64[np.ndarray, " rows"]
+    shapley: Annotated[Float64[np.ndarray, " rows"], ANSWER]
+    shapley_error: Annotated[Float64[np.ndarray, " rows"], AMOUNT, UNKNOWN]
     """Shapley value in the answer, over scenes with other markers put back, and its standard error."""
-    network: Float64[np.ndarray, " rows"]
-    margin: Float64[np.ndarray, " rows"]
+    network: Annotated[Float64[np.ndarray, " rows"], ANSWER]
+    margin: Annotated[Float64[np.ndarray, " rows"], ANSWER]
     """Answer and best reading as they are less those with the marker put back, in margin units. The reading is linear:
     these are its Shapley values too."""
     state: Int64[np.ndarray, " rows"]
@@ -353,9 +354,9 @@ class Truth:
     meta: tuple[MetaTest, ...]
     summary: str
     effects: MarkerEffects
-    shapley_maps: Float32[np.ndarray, "frames size size"]
-    network_maps: Float32[np.ndarray, "frames size size"]
-    margin_maps: Float32[np.ndarray, "frames size size"]
+    shapley_maps: Annotated[Float32[np.ndarray, "frames size size"], ANSWER]
+    network_maps: Annotated[Float32[np.ndarray, "frames size size"], ANSWER]
+    margin_maps: Annotated[Float32[np.ndarray, "frames size size"], ANSWER]
     """`effects` painted on the markers, a map a frame."""
 
     def __post_init__(self) -> None:

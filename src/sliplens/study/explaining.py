@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from itertools import groupby, islice
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import open_source
+from sliplens.results.evaluation import ANSWER, SHARE
 from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
 from sliplens.shards import MakePart, Shard, make_parts, shard
 
@@ -212,8 +213,8 @@ OnMap: TypeAlias = Callable[[str, int, UInt8[np.ndarray, "height width 3"], Floa
 class _Map:
     """Explanation of one frame by one method."""
 
-    relevance: Float32[np.ndarray, "height width"]
-    saliency: Float32[np.ndarray, "height width"]
+    relevance: Annotated[Float32[np.ndarray, "height width"], ANSWER]
+    saliency: Annotated[Float32[np.ndarray, "height width"], SHARE]
     seconds: float
     warnings: tuple[str, ...]
 

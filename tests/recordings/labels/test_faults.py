@@ -55,6 +55,7 @@ SPANS = {
     "100 ms of 70 N pull": (add(0.1, -70, 0), 0.1, Reason.STEP),
     "a soft pull": (add(0.2, 0.4, 2), 0.2, Reason.STEP),
     "no numbers": (put(0.3, lambda part: np.nan * part), 0.3, Reason.DROP_OUT),
+    "no force": (put(0.002, lambda part: 1e56 + 0 * part), 0.002, Reason.DROP_OUT),
     "zeros": (put(0.3, lambda part: 0 * part), 0.3, Reason.DROP_OUT),
     "one value": (put(0.5, lambda part: part[0]), 0.5, Reason.STUCK),
     "signs": (put(0.3, lambda part: -part), 0.3, Reason.STEP),

@@ -13,6 +13,7 @@ from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import ForceFault, Lag, Reason
 from sliplens.recordings.labels.axes import mean_force, noise_sigma, typical_step
 from sliplens.recordings.labels.lag import estimate_lag, force_changes
+from sliplens.recordings.trial import MOST_FORCE_N
 
 Times: TypeAlias = Float[np.ndarray, " times"]
 Samples: TypeAlias = Float[np.ndarray, "samples 3"]
@@ -80,10 +81,10 @@ def screen_forces(
 
     `bad_s` are the ends of spans, in seconds, that somebody knows to be wrong.
 
-    Numbers that are none; values that a noisy sensor repeats; clipped tops; spikes, which neither side of them
-    explains; and what lies between jumps from one sample to the next that the image does not see, until the force is
-    back: the jumps cancel, or one change of signs, scales or axes undoes both. Without a way back the rest of the trial
-    is marked, and moved back by the jumps to infer the friction from.
+    Numbers that are none, or of no force (`MOST_FORCE_N`); values that a noisy sensor repeats; clipped tops; spikes,
+    which neither side of them explains; and what lies between jumps from one sample to the next that the image does not
+    see, until the force is back: the jumps cancel, or one change of signs, scales or axes undoes both. Without a way
+    back the rest of the trial is marked, and moved back by the jumps to infer the friction from.
 
     References
     ----------
@@ -91,7 +92,7 @@ def screen_forces(
     the sides of a sample apart so that an edge is none (Pearson, *IEEE Trans. Control Syst. Technol.* 10 (2002) 55).
     """
     marks = np.zeros(len(forces.time_s), dtype=np.int64)
-    marks[~np.isfinite(forces.force_n).all(axis=1)] = _DROP_OUT
+    marks[~(np.abs(forces.force_n) <= MOST_FORCE_N).all(axis=1)] = _DROP_OUT  # no number, or none of a force
     for start_s, end_s in bad_s:
         marks[(forces.time_s >= start_s) & (forces.time_s <= end_s)] = MARKED
     good = marks == 0
