@@ -77,7 +77,7 @@ class Case:
 
 
 _SMALL = ("--image-size", "32", "--epochs", "2", "--batch-size", "11", "--head", "point", "--untouched-share", "0")
-_QUICK = ("--method", "grad-cam", "--trials", "1", "--random-orders", "1", "--jobs", "1")
+_QUICK = ("--method", "grad-cam", "--trials", "1", "--random-orders", "1", "--on", "serial")
 CASES = {
     "simulate": Case((
         "simulate", "out", "--dry-trials", "3", "--wet-trials", "1", "--frames-per-trial", "20", "--days", "3",
@@ -290,7 +290,7 @@ def shorten_study() -> None:
     tests = {"tests": ("score", "faithfulness", "truth"), "settings": study.SETTINGS[:1], "steps": 8}
     study.SETTINGS = study.SETTINGS[:1]
     study.run_study = partial(study.run_study, **tests)
-    study.judge_by_truth = partial(study.judge_by_truth, pairs=2)
+    study.JudgingByTruth = partial(study.JudgingByTruth, pairs=2)
     sliplens.cli.study.Report.run = lambda self: None  # noqa: ARG005
 
 

@@ -50,7 +50,7 @@ def look(networks: dict[str, str | None], folder: Path, *, days: dict[str, Any],
         out=folder / "study",
         trials=options.trials,
         tests=("truth",),
-        jobs=options.jobs,
+        on=options.on,
         on_progress=terminal,
     )
 
@@ -101,7 +101,7 @@ def main() -> None:
         parser.add_argument(f"--second-{name}", help="network of another seed")
     parser.add_argument("--trials", type=int, default=14)
     parser.add_argument("--frames-per-trial", type=int, default=80)
-    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--on", default="processes=2")
     parser.add_argument("--keep", type=Path, help="folder to keep data and studies in, and to go on from")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()

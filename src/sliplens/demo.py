@@ -56,7 +56,7 @@ def run_demo(
     image_size: int = 96,
     real_frames: Path | str | None = None,
     seed: int = DEMO_SEED,
-    jobs: int = 1,
+    on: str = "serial",
     on_page: Callable[[Path], None] | None = None,
     on_progress: OnProgress | None = None,
 ) -> Path:
@@ -77,8 +77,8 @@ def run_demo(
     real_frames
         Folder of real difference images named ..._GG.png with the safety margin in percent. The public ChromaTouch
         images where `SLIPLENS_REFERENCE` (or ../shared/reference) holds them, if None.
-    jobs
-        Networks to judge at the same time (`run_study`).
+    on
+        Where maps are made and judged (`run_study`).
     on_page
         Called with the page each time it was written.
 
@@ -116,7 +116,7 @@ def run_demo(
     for name in INPUTS:
         evaluate(networks[name], data, folder / f"evaluate-{name}", on_progress=on_progress)
     show(*later[1:])
-    _study(data, out=folder, difference=difference, raw=raw, jobs=jobs, seed=seed, on_progress=on_progress)
+    _study(data, out=folder, difference=difference, raw=raw, on=on, seed=seed, on_progress=on_progress)
     if real is not None:
         maps = folder / "explain-real"
         explain = partial(explain_source, methods=REAL_METHODS, budget=_BUDGET, labels_in_names=True)

@@ -23,7 +23,7 @@ def test_a_study_makes_every_stage_and_the_page_and_keeps_what_is_there(
     words: tuple[object, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     output = tmp_path / "study"
-    assert run(*words, "-o", output, "--jobs", 1) == 0
+    assert run(*words, "-o", output, "--on", "serial") == 0
     folders = {path.name for path in output.iterdir() if path.is_dir() and not path.name.startswith(".")}
     stages = {f"{stage}-{name}" for stage in STAGES for name in ("difference", "raw")}
     assert folders >= {"choice", "states", *stages}
@@ -35,19 +35,21 @@ def test_a_study_makes_every_stage_and_the_page_and_keeps_what_is_there(
         controls = {"edges", "change", "local-change", "weights-1", "centre", *new}
         assert {one["method"] for one in told["scores"] if one["control"]} == controls
         assert all((one["lead_over_controls"] is None) == one["control"] for one in told["scores"])
-    # as after an interruption: one stage is missing, the others stay as they are; now each network has its process
+    # as after an interruption: one stage is missing, the others stay as they are; now in processes
     before = {path: path.stat().st_mtime_ns for path in output.glob("*/result.json")}
     gone = output / "map-quality-raw"
+    kept = (gone / "result.json").read_bytes()
     for path in gone.iterdir():
         path.unlink()
     gone.rmdir()
     monkeypatch.setattr("sliplens.cli.report.Report.run", lambda _: None)  # the page was drawn above
     capsys.readouterr()
-    assert run(*words, "-o", output, "--jobs", 2) == 0
+    assert run(*words, "-o", output, "--on", "processes=2") == 0
     told = capsys.readouterr().out
     assert told.count("kept") == len(before) - 1
     after = {path: path.stat().st_mtime_ns for path in output.glob("*/result.json")}
     assert {path for path in after if after[path] != before[path]} == {gone / "result.json"}
+    assert (gone / "result.json").read_bytes() == kept
 
 
 def test_a_network_of_the_wrong_input_is_refused(
@@ -64,7 +66,7 @@ def test_a_network_of_the_wrong_input_is_refused(
         (("--difference", "none", "--raw", "none"), "a study needs a network"),
         (("--method", "guess"), "no explainer named 'guess'"),
         (("--random-orders", 0), "at least 1"),
-        (("--jobs", 0), "--jobs must be at least 1"),
+        (("--on", "cloud"), "no place to work named 'cloud'"),
         (("--preset", "thesis"), "name a data set, or --preset"),
     ],
 )

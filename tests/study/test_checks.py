@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from sliplens.explainers import Explanation, IntegratedGradients
 from sliplens.faithfulness.controls import cascade, gini, total_variation
 from sliplens.recordings import Dataset
-from sliplens.study.checks import explain_untrained, measure_maps, randomise_weights, time_explainers
+from sliplens.study.checks import Measuring, Randomising, Untrained, time_explainers
 from sliplens.study.choice import Material
-from sliplens.study.scoring import Setting, influences, score_removal
+from sliplens.study.scoring import Removal, Setting, influences
 
 
 class ShowsTheImage:
@@ -41,7 +41,7 @@ def with_image(material: Material, explainer: ShowsTheImage) -> Material:
 
 
 def test_a_map_that_ignores_the_network_is_found_out(material: Material):
-    found = randomise_weights(with_image(material, ShowsTheImage()))
+    found = Randomising(material=with_image(material, ShowsTheImage())).make()
     assert found.methods["image"].similarity == pytest.approx([1.0, 1.0, 1.0])
     assert found.methods["image"].complexity_rise == pytest.approx(0)
     assert any(alarm.startswith("image still correlates by 1.00") for alarm in found.alarms)
@@ -56,7 +56,7 @@ def test_a_map_that_only_turns_its_sign_with_the_answers_is_as_similar(material:
             found, sign = super().__call__(model, images, **options), 1 if model is material.trained.model else -1
             return replace(found, relevance=sign * found.relevance, prediction=sign * found.prediction)
 
-    found = randomise_weights(with_image(material, FollowsTheSign()))
+    found = Randomising(material=with_image(material, FollowsTheSign())).make()
     assert found.methods["image"].similarity == pytest.approx([1.0, 1.0, 1.0])
 
 
@@ -73,9 +73,9 @@ def test_the_untrained_controls_leave_the_network_as_it_is_and_go_on_after_the_l
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        explain_untrained(small, seed=1, parts=tmp_path, on_progress=stop)
+        Untrained(material=small, seed=1).make(tmp_path, on_progress=stop)
     first, again, other = (
-        explain_untrained(small, seed=seed, parts=parts).maps for seed, parts in ((1, tmp_path), (1, None), (2, None))
+        Untrained(material=small, seed=seed).make(parts).maps for seed, parts in ((1, tmp_path), (1, None), (2, None))
     )
     assert told == [(done, 6) for done in range(1, 5)]
     assert set(first) == {name, "weights-1-new-weights"}
@@ -88,7 +88,7 @@ def test_the_untrained_controls_leave_the_network_as_it_is_and_go_on_after_the_l
 
 def test_each_trial_has_a_network_of_its_own(material: Material):
     small = replace(material, explainers={"grad-cam": material.explainers["grad-cam"]})
-    found = explain_untrained(small, seed=7).maps["grad-cam-new-weights"]
+    found = Untrained(material=small, seed=7).make().maps["grad-cam-new-weights"]
     trials = material.explained.clusters[1].tolist()
     for number, trial in enumerate(dict.fromkeys(trials)):
         # no two trials of this study or the next have the same
@@ -102,9 +102,10 @@ def test_each_trial_has_a_network_of_its_own(material: Material):
 def test_a_method_that_ignores_the_weights_shows_nothing_about_the_network(material: Material):
     shows_the_image = with_image(material, ShowsTheImage())
     small = replace(shows_the_image, explainers={"image": ShowsTheImage()})
-    maps = {**influences(small), **explain_untrained(small).maps}
+    maps = {**influences(small), **Untrained(material=small).make().maps}
     np.testing.assert_allclose(maps["image-new-weights"], maps["image"], atol=1e-6)
-    scored = score_removal(small, maps=maps, settings=(Setting(fill="grey", unit="pixel"),), random_orders=1)
+    grey = (Setting(fill="grey", unit="pixel"),)
+    scored = Removal(material=small, maps=maps, settings=grey, random_orders=1).make()
     (lead,) = [score.lead_over_controls for score in scored.scores if score.method == "image"]
     assert lead is not None
     assert ends_of(lead.gap)[1] <= 0
@@ -112,7 +113,7 @@ def test_a_method_that_ignores_the_weights_shows_nothing_about_the_network(mater
 
 
 def test_looks_are_those_of_the_saved_maps(material: Material, fine_dataset: Dataset):
-    quality = measure_maps(material, fine_dataset)
+    quality = Measuring(material=material, data=fine_dataset).make()
     maps = material.explained.saliency["grad-cam"].astype(np.float64)
     found = quality.methods["grad-cam"]
     assert found.total_variation == pytest.approx(np.mean([total_variation(one) for one in maps]))

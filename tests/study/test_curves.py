@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from sliplens.codec import load_result, save_result
+from sliplens.errors import InputError
 from sliplens.faithfulness.removal import Faithfulness
 from sliplens.intervals import paired_difference
 from sliplens.results.faithfulness import RemovalScores
@@ -13,12 +14,13 @@ from sliplens.study.choice import Material
 from sliplens.study.scoring import (
     EQUAL_AREAS,
     STUDY_AREAS,
+    Influence,
+    Removal,
     Setting,
     compare_fills,
     influences,
     judge_curves,
     ranking_alarms,
-    score_removal,
 )
 
 PIXELS = Setting(fill="grey", unit="pixel")
@@ -36,7 +38,7 @@ def straight(most: float, least: float, *, frames: int = 8) -> Faithfulness:
 
 @pytest.fixture(scope="module")
 def scored(material: Material) -> RemovalScores:
-    return score_removal(material, maps=influences(material), settings=(PIXELS, MARKERS), random_orders=2)
+    return Removal(material=material, maps=influences(material), settings=(PIXELS, MARKERS), random_orders=2).make()
 
 
 def test_removing_by_hand_gives_the_same_change(material: Material, scored: RemovalScores):
@@ -81,51 +83,56 @@ def test_markers_that_are_not_known_everywhere_are_no_unit(material: Material):
     assert set(replace(material, markers={}).units()) == {"pixel", "tile"}
 
 
-def test_a_fill_that_is_unknown_is_refused_before_anything_is_made(material: Material, tmp_path: Path):
-    with pytest.raises(Exception, match="no fill named 'pink'"):
-        score_removal(material, maps={}, settings=(Setting(fill="pink", unit="pixel"),), parts=tmp_path)
-    assert not list(tmp_path.iterdir())
+def test_a_fill_that_is_unknown_is_refused_before_anything_is_made(material: Material):
+    with pytest.raises(InputError, match="no fill named 'pink'"):
+        Removal(material=material, maps={}, settings=(Setting(fill="pink", unit="pixel"),))
 
 
-def test_an_interrupted_run_goes_on_after_the_last_setting(material: Material, tmp_path: Path, scored: RemovalScores):
+def test_an_interrupted_run_goes_on_after_the_last_trial(material: Material, tmp_path: Path, scored: RemovalScores):
     calls = []
 
     def interrupt(done: int, total: int) -> None:
         calls.append((done, total))
-        if done > len(material.inputs):
+        if done > 3:  # of three frames each trial has
             raise KeyboardInterrupt
 
-    settings = {"maps": influences(material), "settings": (PIXELS, MARKERS), "random_orders": 2}
+    removal = Removal(material=material, maps=influences(material), settings=(PIXELS, MARKERS), random_orders=2)
     with pytest.raises(KeyboardInterrupt):
-        score_removal(material, parts=tmp_path, on_progress=interrupt, **settings)
-    assert {path.name for path in tmp_path.iterdir()} == {"grey-pixel"}
+        removal.make(tmp_path, on_progress=interrupt)
+    assert len(list(tmp_path.glob("trial=*/*/result.json"))) == 1
     before = len(calls)
-    again = score_removal(
-        material, parts=tmp_path, on_progress=lambda done, total: calls.append((done, total)), **settings
-    )
-    assert all(done >= len(material.inputs) for done, _ in calls[before:])
-    # the same passes in other memory may differ in the last bits of float32
-    for one, other in zip(again.scores, scored.scores, strict=True):
-        assert one.key == other.key
-        assert one.srg.estimate == pytest.approx(other.srg.estimate, abs=1e-6)
+    again = removal.make(tmp_path, on_progress=lambda done, total: calls.append((done, total)))
+    assert all(done >= 3 for done, _ in calls[before:])
+    assert calls[-1] == (12, 12)
+    assert again.scores == scored.scores
+
+
+def test_a_trial_is_scored_as_it_is_among_others(material: Material, scored: RemovalScores):
+    alone = material.take(material.explained.trials[material.explained.frames[0].trial])
+    found = Removal(material=alone, maps=influences(alone), settings=(PIXELS,), random_orders=2).make()
+    key = (PIXELS.fill, PIXELS.unit, "grad-cam")
+    one, other = found.curves[key], scored.curves[key]
+    assert other.frame_ids[:3] == one.frame_ids
+    np.testing.assert_allclose(one.most_first, other.most_first[:3], atol=1e-6)
+    np.testing.assert_allclose(one.random, other.random[:3], atol=1e-6)  # the seeds of the first trial
 
 
 def test_curves_found_in_another_way_are_kept_over_an_interruption(material: Material, tmp_path: Path):
-    count, asked = len(material.inputs), []
+    asked = []
 
-    def draw(on_progress) -> dict[str, Faithfulness]:
+    def draw(part: Material, maps: Influence, *_: object) -> dict[str, Faithfulness]:
         asked.append("drawn")
-        return {name: straight(0.2, 0.1, frames=count) for name in influences(material)}
+        return {name: straight(0.2, 0.1, frames=len(part.inputs)) for name in maps}
 
-    def stop(on_progress) -> dict[str, Faithfulness]:
+    def stop(*_: object) -> dict[str, Faithfulness]:
         raise KeyboardInterrupt
 
     true, other = Setting(fill="true", unit="marker"), Setting(fill="other", unit="marker")
-    settings = {"maps": influences(material), "settings": (), "random_orders": 2}
+    removal = Removal(material=material, maps=influences(material), settings=(), random_orders=2)
     with pytest.raises(KeyboardInterrupt):
-        score_removal(material, parts=tmp_path, further={true: draw, other: stop}, **settings)
-    found = score_removal(material, parts=tmp_path, further={true: draw, other: draw}, **settings)
-    assert asked == ["drawn", "drawn"]  # the first setting once, the second once
+        replace(removal, further={true: draw, other: stop}).make(tmp_path)
+    found = replace(removal, further={true: draw, other: draw}).make(tmp_path)
+    assert asked == ["drawn"] * 4  # two trials of the first setting once, two of the second once
     by_fill = {score.fill: score.srg.estimate for score in found.scores if score.method == "grad-cam"}
     assert by_fill == pytest.approx({"true": 0.075, "other": 0.075})
 

@@ -6,7 +6,7 @@ from sliplens.codec import load_result, save_result
 from sliplens.faithfulness import deletion_order
 from sliplens.results.faithfulness import Remedies
 from sliplens.study.choice import Material
-from sliplens.study.scoring import score_explanations, score_remedies
+from sliplens.study.scoring import RemedialDeletion, score_explanations
 
 STEPS = 8
 
@@ -14,7 +14,7 @@ STEPS = 8
 @pytest.fixture(scope="module")
 def remedies(material: Material) -> Remedies:
     grey = score_explanations(material.trained, material.explained, steps=STEPS)
-    return score_remedies(material, grey=grey, steps=STEPS)
+    return RemedialDeletion(material=material, grey=grey, steps=STEPS).make()
 
 
 def test_insertion_shows_only_the_most_salient_pixels(material: Material, remedies: Remedies):

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,8 +27,8 @@ from sliplens.study.explaining import network_inputs
 from sliplens.study.pool import _with_truth as pooled_truth
 from sliplens.study.truth import (
     FrameEffects,
+    JudgingByTruth,
     find_places,
-    judge_by_truth,
     mean_of_defined,
     meta_test,
     rank_correlation,
@@ -139,6 +140,10 @@ def maps(trained: Run, explained: Explained) -> dict[str, np.ndarray]:
     return maps_of(trained, explained)
 
 
+def judge(trained: Run, explained: Explained, data: Dataset, **more: Any) -> JudgingByTruth:
+    return JudgingByTruth(trained=trained, explained=explained, data=data, **more)
+
+
 def maps_of(trained: Run, explained: Explained) -> dict[str, np.ndarray]:
     inputs = network_inputs(trained, explained)
     towards = explained.towards[:, None, None]
@@ -149,7 +154,7 @@ def maps_of(trained: Run, explained: Explained) -> dict[str, np.ndarray]:
 @pytest.fixture(scope="module")
 def judged(trained, explained, data, maps, tmp_path_factory) -> Truth:
     folder = tmp_path_factory.mktemp("truth")
-    save_result(judge_by_truth(trained, explained, data, maps=maps, fills=("reference", "grey"), pairs=PAIRS), folder)
+    save_result(judge(trained, explained, data, maps=maps, fills=("reference", "grey"), pairs=PAIRS).make(), folder)
     return load_result(folder, Truth, command="sliplens study")
 
 
@@ -159,7 +164,7 @@ def two_signed(data) -> tuple[Run, Explained, Truth]:
     trained = run_of(Linear(two_signed=True))
     explained = explain(trained, data)
     maps = maps_of(trained, explained)
-    return trained, explained, judge_by_truth(trained, explained, data, maps=maps, fills=(), pairs=PAIRS)
+    return trained, explained, judge(trained, explained, data, maps=maps, fills=(), pairs=PAIRS).make()
 
 
 def rows_of(truth: Truth, frame: str) -> list[dict]:
@@ -360,13 +365,13 @@ def test_an_interrupted_judgement_goes_on_after_the_last_frame(
         assert total == len(LEVELS)
         raise KeyboardInterrupt
 
-    judge = partial(judge_by_truth, *given, parts=tmp_path, maps=maps, fills=("reference", "grey"), pairs=PAIRS)
+    stage = judge(*given, maps=maps, fills=("reference", "grey"), pairs=PAIRS)
     with pytest.raises(KeyboardInterrupt):
-        judge(on_progress=interrupt)
-    first = tmp_path / "00000" / "arrays.npz"
+        stage.make(tmp_path, on_progress=interrupt)
+    (first,) = tmp_path.glob("trial=*/*/arrays.npz")
     before = first.stat().st_mtime_ns
     kept = []
-    again = judge(on_progress=lambda *_: kept.append(first.stat().st_mtime_ns))
+    again = stage.make(tmp_path, on_progress=lambda *_: kept.append(first.stat().st_mtime_ns))
     assert kept == [before] * len(LEVELS)
     assert again.methods.keys() == judged.methods.keys()
     for one, other in zip(again.meta, judged.meta, strict=True):
@@ -413,21 +418,21 @@ def test_half_of_the_effects_are_shuffled(rng):
 def test_frames_of_other_data_are_refused(given, maps, small_dataset):
     trained, explained, data = given
 
-    def judge(explained: Explained, data: Dataset = data) -> None:
-        judge_by_truth(trained, explained, data, maps=maps)
+    def refuse(explained: Explained, data: Dataset = data) -> None:
+        judge(trained, explained, data, maps=maps).make()
 
     with pytest.raises(InputError, match="was recorded: what each marker does is known of simulated frames alone"):
-        judge(explained, replace(data, simulated=False))
+        refuse(explained, replace(data, simulated=False))
     with pytest.raises(InputError, match="has no trial day4-dry-001; name the data set whose frames were explained"):
-        judge(explained, small_dataset)
+        refuse(explained, small_dataset)
     with pytest.raises(InputError, match=r"is not the frame of .* that was explained; explain it again"):
-        judge(replace(explained, images=255 - explained.images))
+        refuse(replace(explained, images=255 - explained.images))
     with pytest.raises(InputError, match="one does not name a frame of trial"):
-        judge(replace(explained, frames=tuple(replace(frame, id="one") for frame in explained.frames)))
+        refuse(replace(explained, frames=tuple(replace(frame, id="one") for frame in explained.frames)))
     with pytest.raises(CheckpointError, match="made with another network"):
-        judge(replace(explained, weights_sha256="of others"))
+        refuse(replace(explained, weights_sha256="of others"))
     with pytest.raises(InputError, match="no fill named 'pink'"):
-        judge_by_truth(trained, explained, data, maps=maps, fills=("pink",))
+        judge(trained, explained, data, maps=maps, fills=("pink",))
 
 
 def test_pooled_maps_are_held_against_the_truth_as_in_a_study(two_signed):

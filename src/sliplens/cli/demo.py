@@ -53,7 +53,7 @@ class Demo:
             train_minutes=self.max_minutes if self.train else None,
             image_size=self.image_size,
             real_frames=self.real_frames,
-            jobs=2,
+            on="processes=2",
             on_page=on_page,
             on_progress=terminal,
             seed=DEMO_SEED if self.seed is None else self.seed,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from sliplens.cli.command import Command, Device, Network, Output
+from sliplens.cli.command import Command, Device, Network, On, Output, RetryFailed
 from sliplens.cli.console import print_table, say
 
 
@@ -28,6 +28,8 @@ class Score(Command):
     steps: int | None = None
     """Steps until every pixel is gone; the image's height if not given."""
     device: Device = "cpu"
+    on: On = "serial"
+    retry_failed: RetryFailed = False
     seed: int = 0
     """Seed of the random order."""
 

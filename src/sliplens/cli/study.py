@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sliplens.cli.command import Command, Device, Output
+from sliplens.cli.command import Command, Device, Output, RetryFailed
 from sliplens.cli.report import Report
 from sliplens.cli.simulate import Simulate
 from sliplens.errors import InputError
@@ -54,9 +54,9 @@ class Study(Command):
     random_orders: int = 10
     """Random orders that every method has to beat."""
     device: Device = "cpu"
-    jobs: int | None = None
-    """Networks to judge at the same time, each by a process with its share of the cores; one after the other with 1. If
-    not given, both at once where they run on a processor."""
+    on: Annotated[str | None, tyro.conf.arg(metavar="serial|processes[=N]|ray[=ADDRESS]")] = None
+    """Where maps are made and judged. If not given, in two processes where the networks run on a processor."""
+    retry_failed: RetryFailed = False
     seed: int = 0
     """Seed of the random orders, of new weights and of noise."""
 
@@ -82,7 +82,7 @@ class Study(Command):
             raw=networks.get("raw"),
             out=self.output,
             methods=methods,
-            jobs=self.jobs if self.jobs is not None else 1 if self.device != "cpu" else 2,
+            on=self.on or ("serial" if self.device != "cpu" else "processes=2"),
         )
         Report(workspace=self.output).run()
 

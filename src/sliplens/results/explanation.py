@@ -79,6 +79,14 @@ class Explained:
         """Day and trial of each frame, which an interval resamples."""
         return np.array([[str(frame.day) for frame in self.frames], [frame.trial for frame in self.frames]])
 
+    @property
+    def trials(self) -> dict[str, list[int]]:
+        """Numbers of the frames of each trial."""
+        rows: dict[str, list[int]] = {}
+        for row, frame in enumerate(self.frames):
+            rows.setdefault(frame.trial, []).append(row)
+        return rows
+
     def take(self, rows: Sequence[int]) -> "Explained":
         """Explanations of some of the frames, by their numbers."""
         chosen = list(rows)

@@ -1,19 +1,16 @@
 """What is known of maps without a score: how they look, whether they change with the weights, what they cost."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import combinations, product
-from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Float64
 from torch import Tensor, nn
 
-from sliplens.codec import keep_part
 from sliplens.errors import ModelError
 from sliplens.explainers import Explainer, Explanation, IntegratedGradients, PolyCam
 from sliplens.explainers.shapley import Shapley
@@ -30,7 +27,7 @@ from sliplens.faithfulness.controls import (
 )
 from sliplens.intervals import paired_difference
 from sliplens.models import Run
-from sliplens.progress import OnProgress, continued, counted
+from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
 from sliplens.results.faithfulness import NEW_WEIGHTS
 from sliplens.results.study import (
@@ -44,8 +41,10 @@ from sliplens.results.study import (
     Timing,
     UntrainedMaps,
 )
-from sliplens.study.choice import Material, as_the_thesis_ran
+from sliplens.shards import Shard
+from sliplens.study.choice import Material, MaterialStage, as_the_thesis_ran, trial_seed
 from sliplens.study.explaining import mean_of_known
+from sliplens.study.stages import Find, join_trials, method_shards, trial_shards
 
 _NORMAL_QUARTILE = 0.6745
 """Median size of a standard normal number."""
@@ -55,52 +54,86 @@ _REPEATED, _REDRAWN = 3, 2
 """Frames that are explained again for the stability of maps, and for networks with new weights."""
 
 
-def measure_maps(
-    material: Material, data: Dataset, *, seed: int = 0, on_progress: OnProgress | None = None
-) -> MapQuality:
-    """Measure resolution, smoothness, sparsity and stability of the maps.
+@dataclass(frozen=True, kw_only=True)
+class _Measured:
+    """Measures of a method's maps."""
+
+    measures: MapMeasures
+    roughness: Float64[np.ndarray, " frames"]
+    noise_sd: float
+    """Grey levels of the camera noise that was added."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measuring(MaterialStage[MapQuality]):
+    """Resolution, smoothness, sparsity and stability of the maps, a method a shard.
 
     Stability is the correlation with the map of the same frame under other camera noise, as large as what differs
     between frames that follow each other, and with the map of the next frame; so the first frames are explained
     twice more.
     """
-    explained, rng = material.explained, np.random.default_rng(seed)
-    noisy, following, noise_sd = _once_more(material.trained, data, material.chosen[:_REPEATED], rng=rng)
-    references = material.references[:_REPEATED]
-    methods, roughness, clusters = {}, {}, explained.clusters
-    for name, explainer in counted(material.explainers.items(), on_progress):
 
-        def again(images: Tensor, explainer: Explainer = explainer) -> Float[np.ndarray, "repeated height width"]:
-            return explainer(material.trained.model, images, reference=references).relevance.double().cpu().numpy()
+    piece = _Measured
+    title = "Measuring how maps look"
 
-        maps = explained.saliency[name].astype(np.float64)
-        before = explained.relevance[name][:_REPEATED].astype(np.float64)
-        resolutions = [
-            resolution(saliency, material.places(frame.id)[0])
-            for saliency, frame in zip(maps, explained.frames, strict=True)
-            if frame.id in material.markers
-        ]
-        roughness[name] = np.array([total_variation(saliency) for saliency in maps])
-        methods[name] = MapMeasures(
-            resolution=mean_of_known(np.array(resolutions, dtype=np.float64)),
-            total_variation=mean_of_known(roughness[name]),
-            gini=mean_of_known(np.array([gini(saliency) for saliency in maps])),
-            noise_stability=mean_of_known(stability(before, again(noisy))),
-            frame_stability=mean_of_known(stability(before, again(following))),
+    data: Dataset
+    seed: int = 0
+
+    def shards(self) -> Iterator[Shard]:
+        """All methods."""
+        return method_shards(list(self.material.explainers))
+
+    def prepare(self) -> Find:
+        """Measure the maps of a method."""
+        material, explained = self.material, self.material.explained
+        rng, references = np.random.default_rng(self.seed), material.references[:_REPEATED]
+        noisy, following, noise_sd = _once_more(material.trained, self.data, material.chosen[:_REPEATED], rng=rng)
+
+        def find(name: str, _: OnProgress) -> _Measured:
+            def again(images: Tensor) -> Float[np.ndarray, "repeated height width"]:
+                explanation = material.explainers[name](material.trained.model, images, reference=references)
+                return explanation.relevance.double().cpu().numpy()
+
+            maps = explained.saliency[name].astype(np.float64)
+            before = explained.relevance[name][:_REPEATED].astype(np.float64)
+            resolutions = [
+                resolution(saliency, material.places(frame.id)[0])
+                for saliency, frame in zip(maps, explained.frames, strict=True)
+                if frame.id in material.markers
+            ]
+            roughness = np.array([total_variation(saliency) for saliency in maps])
+            measures = MapMeasures(
+                resolution=mean_of_known(np.array(resolutions, dtype=np.float64)),
+                total_variation=mean_of_known(roughness),
+                gini=mean_of_known(np.array([gini(saliency) for saliency in maps])),
+                noise_stability=mean_of_known(stability(before, again(noisy))),
+                frame_stability=mean_of_known(stability(before, again(following))),
+            )
+            return _Measured(measures=measures, roughness=roughness, noise_sd=noise_sd)
+
+        return find
+
+    def join(self, pieces: Sequence[_Measured]) -> MapQuality:
+        """Measures of all methods, compared with each other."""
+        explained, rng = self.material.explained, np.random.default_rng(self.seed)
+        known, clusters = dict(zip(self.material.explainers, pieces, strict=True)), explained.clusters
+        return MapQuality(
+            input=explained.input,
+            source=explained.source,
+            frames=len(explained.frames),
+            repeated_frames=len(self.material.references[:_REPEATED]),
+            noise_sd=pieces[0].noise_sd,
+            methods={name: one.measures for name, one in known.items()},
+            # stability was tried on few frames: no interval would mean anything
+            comparisons=tuple(
+                Roughness(
+                    first=first,
+                    second=second,
+                    gap=paired_difference(one.roughness, other.roughness, clusters=clusters, rng=rng),
+                )
+                for (first, one), (second, other) in combinations(known.items(), 2)
+            ),
         )
-    return MapQuality(
-        input=explained.input,
-        source=explained.source,
-        frames=len(explained.frames),
-        repeated_frames=len(references),
-        noise_sd=noise_sd,
-        methods=methods,
-        # stability was tried on few frames: no interval would mean anything
-        comparisons=tuple(
-            Roughness(first=first, second=second, gap=paired_difference(one, other, clusters=clusters, rng=rng))
-            for (first, one), (second, other) in combinations(roughness.items(), 2)
-        ),
-    )
 
 
 def _once_more(
@@ -193,47 +226,61 @@ _STILL_SIMILAR = 0.5
 Maps = Float[np.ndarray, "frames height width"]
 
 
-def randomise_weights(material: Material, *, seed: int = 0, on_progress: OnProgress | None = None) -> Randomisation:
-    """Explain networks with weights drawn anew from the output on, to see how far the maps of a few frames change."""
-    inputs, references = material.inputs[:_REDRAWN], material.references[:_REDRAWN]
-    methods, alarms = {}, []
-    for name, whole in counted(material.explainers.items(), on_progress):
-        explainer = _shortened(whole)
+@dataclass(frozen=True, kw_only=True)
+class Randomising(MaterialStage[Randomisation]):
+    """Maps of a few frames while weights are drawn anew from the output on: how far they change, a method a shard."""
 
-        def explain(model: nn.Module, images: Tensor, explainer: Explainer = explainer) -> Maps:
-            return _influence(explainer(model, images, reference=references))
+    piece = RandomisedMethod
+    title = "Drawing weights anew"
 
-        started = time.perf_counter()
-        scores = randomisation_scores(
-            explain,
-            material.trained.model,
-            inputs,
-            seed=seed,
-            stages=CASCADE,
-            before=material.towards_target(name)[:_REDRAWN],
-        )
-        seconds = (time.perf_counter() - started) / CASCADE / len(inputs)
-        similarity = tuple(mean_of_known(row) for row in scores.similarity)
-        methods[name] = RandomisedMethod(
-            layers=tuple(scores.layers),
-            similarity=similarity,
-            complexity_rise=mean_of_known(scores.complexity_rise),
-            smooth_complexity_rise=_smooth_rise(material, explain, inputs, seed=seed)
-            if seconds <= _SMOOTH_WITHIN_S
-            else None,
-        )
-        if similarity[-1] is not None and similarity[-1] > _STILL_SIMILAR:
-            alarms.append(
-                f"{name} still correlates by {similarity[-1]:.2f} with its maps when all weights are new: it shows the "
-                "image rather than what the network learned"
+    seed: int = 0
+
+    def shards(self) -> Iterator[Shard]:
+        """All methods."""
+        return method_shards(list(self.material.explainers))
+
+    def prepare(self) -> Find:
+        """Explain the networks with new weights with a method."""
+        material, seed = self.material, self.seed
+        inputs, references = material.inputs[:_REDRAWN], material.references[:_REDRAWN]
+
+        def find(name: str, _: OnProgress) -> RandomisedMethod:
+            explainer = _shortened(material.explainers[name])
+
+            def explain(model: nn.Module, images: Tensor) -> Maps:
+                return _influence(explainer(model, images, reference=references))
+
+            before = material.towards_target(name)[:_REDRAWN]
+            started = time.perf_counter()
+            model = material.trained.model
+            scores = randomisation_scores(explain, model, inputs, seed=seed, stages=CASCADE, before=before)
+            seconds = (time.perf_counter() - started) / CASCADE / len(inputs)
+            return RandomisedMethod(
+                layers=tuple(scores.layers),
+                similarity=tuple(mean_of_known(row) for row in scores.similarity),
+                complexity_rise=mean_of_known(scores.complexity_rise),
+                smooth_complexity_rise=_smooth_rise(material, explain, inputs, seed=seed)
+                if seconds <= _SMOOTH_WITHIN_S
+                else None,
             )
-    return Randomisation(
-        input=material.explained.input,
-        source=material.explained.source,
-        frames=len(inputs),
-        methods=methods,
-        alarms=tuple(alarms),
-    )
+
+        return find
+
+    def join(self, pieces: Sequence[RandomisedMethod]) -> Randomisation:
+        """What was found of all methods."""
+        methods = dict(zip(self.material.explainers, pieces, strict=True))
+        return Randomisation(
+            input=self.material.explained.input,
+            source=self.material.explained.source,
+            frames=len(self.material.inputs[:_REDRAWN]),
+            methods=methods,
+            alarms=tuple(
+                f"{name} still correlates by {last:.2f} with its maps when all weights are new: it shows the image "
+                "rather than what the network learned"
+                for name, one in methods.items()
+                if (last := one.similarity[-1]) is not None and last > _STILL_SIMILAR
+            ),
+        )
 
 
 _FEW_CHANNELS, _FEW_PAIRS = 0.05, 100
@@ -266,10 +313,6 @@ def _smooth_rise(
         return mean_of_known((after - before) / before)
 
 
-_TRIALS = 1000
-"""Seeds of networks that each study has, one a trial, of which none has so many: those of no other study."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class _TrialMaps:
     """Maps of the frames of a trial by method."""
@@ -277,38 +320,48 @@ class _TrialMaps:
     maps: dict[str, Float32[np.ndarray, "frames size size"]]
 
 
-def explain_untrained(
-    material: Material, *, seed: int = 0, parts: Path | None = None, on_progress: OnProgress | None = None
-) -> UntrainedMaps:
-    """Explain networks with all weights drawn anew by each method: controls that every map has to beat.
+@dataclass(frozen=True, kw_only=True)
+class Untrained(MaterialStage[UntrainedMaps]):
+    """Maps of networks with all weights drawn anew by each method: controls that every map has to beat.
 
-    Each trial has a network of its own, so that resampled trials tell what the draw of the weights matters too.
+    Each trial, a shard, has a network of its own, so that resampled trials tell what the draw of the weights matters
+    too.
     """
-    inputs, references = material.inputs, material.references
-    controls = {name: _shortened(explainer, passes_matter=True) for name, explainer in material.explainers.items()}
 
-    def explain(number: int, frames: list[int], on_frame: OnProgress | None) -> _TrialMaps:
-        model = _untrained(material.trained.model, inputs, seed=_TRIALS * seed + number)
-        maps: dict[str, list[np.ndarray]] = {}
-        with suppress(ModelError):  # without layers that have a map
-            maps["weights-1"] = list(even_channels(model, inputs[frames], references[frames]).cpu().numpy())
-        for name, frame in counted(list(product(material.explainers, frames)), on_frame):
-            one, empty = inputs[frame, None], references[frame, None]
-            found = _influence(controls[name](model, one, reference=empty))
-            maps.setdefault(name, []).append(found[0].astype(np.float32))
-        return _TrialMaps(maps={name + NEW_WEIGHTS: np.stack(own) for name, own in maps.items()})
+    piece = _TrialMaps
+    title = "Explaining networks with new weights"
 
-    maps: dict[str, Float32[np.ndarray, "frames size size"]] = {}
-    jobs, total = 0, len(inputs) * len(material.explainers)
-    _, trials = material.explained.clusters
-    for number, trial in enumerate(dict.fromkeys(trials.tolist())):
-        frames = np.flatnonzero(trials == trial).tolist()
-        on_frame = continued(on_progress, before=jobs, total=total)
-        made = keep_part(parts and parts / trial, _TrialMaps, partial(explain, number, frames, on_frame))
-        for name, own in made.maps.items():
-            maps.setdefault(name, np.empty((len(inputs), *inputs.shape[-2:]), np.float32))[frames] = own
-        jobs += len(frames) * len(material.explainers)
-    return UntrainedMaps(input=material.explained.input, source=material.explained.source, maps=maps)
+    seed: int = 0
+
+    def shards(self) -> Iterator[Shard]:
+        """Trials, whose maps are counted."""
+        return trial_shards(self.material.explained, maps=len(self.material.explainers))
+
+    def prepare(self) -> Find:
+        """Explain the frames of a trial with its network."""
+        material, inputs, references = self.material, self.material.inputs, self.material.references
+        controls = {name: _shortened(explainer, passes_matter=True) for name, explainer in material.explainers.items()}
+        trials = material.explained.trials
+
+        def find(item: tuple[str], on_map: OnProgress) -> _TrialMaps:
+            frames, number = trials[item[-1]], list(trials).index(item[-1])
+            model = _untrained(material.trained.model, inputs, seed=trial_seed(self.seed, number))
+            maps: dict[str, list[np.ndarray]] = {}
+            with suppress(ModelError):  # without layers that have a map
+                maps["weights-1"] = list(even_channels(model, inputs[frames], references[frames]).cpu().numpy())
+            for name, frame in counted(list(product(material.explainers, frames)), on_map):
+                one, empty = inputs[frame, None], references[frame, None]
+                found = _influence(controls[name](model, one, reference=empty))
+                maps.setdefault(name, []).append(found[0].astype(np.float32))
+            return _TrialMaps(maps={name + NEW_WEIGHTS: np.stack(own) for name, own in maps.items()})
+
+        return find
+
+    def join(self, pieces: Sequence[_TrialMaps]) -> UntrainedMaps:
+        """Maps of all frames."""
+        explained = self.material.explained
+        maps = join_trials(explained, [one.maps for one in pieces])
+        return UntrainedMaps(input=explained.input, source=explained.source, maps=maps)
 
 
 def _influence(explanation: Explanation) -> Maps:

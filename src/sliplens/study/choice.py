@@ -23,6 +23,7 @@ from sliplens.results.explanation import Explained
 from sliplens.results.study import Choice, ChosenFrame, ChosenTrial, MarkedFrame, MarkerTable, ShownFrame, States
 from sliplens.study.explaining import DEFAULT_LEVELS as LEVELS
 from sliplens.study.explaining import frames_at, nearest_frame, network_inputs, require_methods
+from sliplens.study.stages import Result, Stage
 
 SCORED_LEVELS = (0.4, 0.2, 0.0)
 """Margins at which the thesis scores: near slip, where there is much to explain."""
@@ -295,6 +296,17 @@ class Material:
     explainers: Mapping[str, Explainer]
     """By name, with the options that made the maps."""
 
+    def take(self, rows: Sequence[int]) -> "Material":
+        """What belongs to some of the frames, by their numbers."""
+        chosen = list(rows)
+        return replace(
+            self,
+            explained=self.explained.take(chosen),
+            inputs=self.inputs[chosen],
+            references=self.references[chosen],
+            chosen=tuple(self.chosen[row] for row in chosen),
+        )
+
     def towards_target(self, method: str) -> Float[np.ndarray, "frames size size"]:
         """The part of a method's relevance that works towards each frame's target."""
         return self.explained.relevance[method] * self.explained.towards[:, None, None]
@@ -316,6 +328,26 @@ class Material:
         """Where the network sees the markers of a frame, and how far each one reaches (`network_places`)."""
         size = self.trained.manifest.frame_size
         return network_places(self.markers[frame], frame_size=(size[0], size[1]), image_size=self.inputs.shape[-1])
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaterialStage(Stage[Result]):
+    """A stage that judges explanations."""
+
+    material: Material
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether the network runs on a graphics card."""
+        return self.material.trained.device.type != "cpu"
+
+
+_TRIALS = 1000
+
+
+def trial_seed(seed: int, number: int) -> int:
+    """Seed of a trial of a study by its number there, of which none has a thousand: that of no other study."""
+    return _TRIALS * seed + number
 
 
 def gather(

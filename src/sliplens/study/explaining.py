@@ -3,7 +3,6 @@
 import hashlib
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from itertools import groupby, islice
 from pathlib import Path
@@ -14,11 +13,9 @@ import torch
 from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
-from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError, RecordingError
 from sliplens.explainers import EXPLAINERS, Explainer
 from sliplens.explainers.table import network_images
-from sliplens.files import scratch_folder
 from sliplens.models import Run
 from sliplens.models.engines import expecting
 from sliplens.plots.saliency import NOMINAL_MARGINS
@@ -29,7 +26,8 @@ from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import open_source
 from sliplens.results.evaluation import ANSWER, SHARE
 from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
-from sliplens.shards import MakePart, Shard, make_parts, shard
+from sliplens.shards import Shard, shard
+from sliplens.study.stages import Find, Stage
 
 DEFAULT_LEVELS = NOMINAL_MARGINS
 """Safety margins at which the thesis explains frames (section 4)."""
@@ -225,8 +223,11 @@ _FEW_MAPS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Explaining:
-    """Work on shards of (method, frame): their maps."""
+class Explaining(Stage[Explained]):
+    """Maps of chosen frames, a shard of (method, frame) each."""
+
+    piece = _Map
+    title = "Explaining frames"
 
     trained: Run
     chosen: ChosenFrames
@@ -234,30 +235,31 @@ class _Explaining:
 
     @property
     def on_gpu(self) -> bool:
+        """Whether the network runs on a graphics card."""
         return self.trained.device.type != "cpu"
 
-    def begin(self) -> MakePart:
+    def prepare(self) -> Find:
+        """Explain one frame with one method."""
         run, references = self.trained, self.chosen.references
 
-        def make(item: tuple[str, int], path: Path, _: OnProgress) -> None:
+        def find(item: tuple[str, int], _: OnProgress) -> _Map:
             method, frame = item[0], slice(item[1], item[1] + 1)
             inputs = run.encoding.normalise(self.chosen.images[frame]).to(run.device)
             maps = len(self.chosen.ids) * len(self.explainers)
             # of few maps the first is waited for: each then takes the engine that its own passes pay for
             with expecting(run.model, _PASSES_A_MAP * maps if maps > _FEW_MAPS else 0):
                 explanation = self.explainers[method](run.model, inputs, reference=references[frame].to(run.device))
-            path.mkdir()
-            explained = _Map(
+            return _Map(
                 relevance=explanation.relevance[0].cpu().numpy(),
                 saliency=explanation.saliency[0].cpu().numpy(),
                 seconds=explanation.seconds,
                 warnings=explanation.warnings,
             )
-            save_result(explained, path)
 
-        return make
+        return find
 
     def shards(self) -> Iterator[Shard]:
+        """Every frame with the first method, then with the next."""
         weights = self.trained.manifest.weights_sha256
         for method in self.explainers:
             # the folder of the parts is one of these options alone (`files.output_folder`)
@@ -266,6 +268,45 @@ class _Explaining:
                 shown = self.chosen.images[index].numpy().tobytes() + self.chosen.references[index].numpy().tobytes()
                 known = {"recipe": recipe, "shown": hashlib.sha256(shown).hexdigest(), "first": index, "frames": 1}
                 yield shard((method, index), trial=trial, name=f"{method} of {self.chosen.ids[index]}", **known)
+
+    @property
+    def inputs(self) -> Float[Tensor, "frames colours size size"]:
+        """What the network gets of the frames, in [0, 1], on its device."""
+        return self.trained.encoding.normalise(self.chosen.images).to(self.trained.device)
+
+    def pictures(self) -> UInt8[np.ndarray, "frames size size 3"]:
+        """What of that a person sees."""
+        shown = (255 * self.inputs[:, :3]).round().to(torch.uint8).permute(0, 2, 3, 1)
+        return shown.contiguous().cpu().numpy()
+
+    def join(self, pieces: Sequence[_Map]) -> Explained:
+        """Maps of all frames, with what the network reads from them."""
+        trained, chosen, frames = self.trained, self.chosen, len(self.chosen.ids)
+        maps = {method: pieces[at * frames : (at + 1) * frames] for at, method in enumerate(self.explainers)}
+        # the same answers for every method: asked once, on all frames
+        predictions, untouched = trained.predict(self.inputs).tolist(), trained.predict(chosen.references).tolist()
+        return Explained(
+            input=trained.encoding.name,
+            source=chosen.source,
+            weights_sha256=trained.manifest.weights_sha256,
+            frames=tuple(
+                ExplainedFrame(
+                    id=chosen.ids[index],
+                    trial=chosen.trial[index],
+                    day=chosen.day[index],
+                    condition=chosen.condition[index],
+                    safety_margin=float(margin) if np.isfinite(margin) else None,
+                    prediction=predictions[index],
+                    reference_prediction=untouched[index],
+                )
+                for index, margin in enumerate(chosen.safety_margin)
+            ),
+            methods={method: _note(own, chosen.ids) for method, own in maps.items()},
+            images=chosen.images.numpy(),
+            pictures=self.pictures(),
+            relevance={method: np.stack([one.relevance for one in own]) for method, own in maps.items()},
+            saliency={method: np.stack([one.saliency for one in own]) for method, own in maps.items()},
+        )
 
 
 def explain_frames(
@@ -294,48 +335,16 @@ def explain_frames(
         If some of many maps failed again and again, when all others are there.
     """
     require_methods(methods, explainers)
-    inputs = trained.encoding.normalise(chosen.images).to(trained.device)
-    pictures = (255 * inputs[:, :3]).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous().cpu().numpy()
-    work = _Explaining(trained=trained, chosen=chosen, explainers={name: explainers[name] for name in methods})
-    maps: dict[str, list[_Map]] = {method: [] for method in methods}
-    with nullcontext(parts) if parts else scratch_folder() as folder:
+    work = Explaining(trained=trained, chosen=chosen, explainers={name: explainers[name] for name in methods})
+    pictures = work.pictures() if on_map is not None else None
 
-        def read(one: Shard) -> _Map:
-            return load_result(folder / one.part, _Map, command="sliplens explain")
+    def show(item: tuple[str, int], made: _Map) -> None:
+        if on_map is not None and pictures is not None:
+            method, index = item
+            on_map(method, index, pictures[index], made.relevance)
 
-        def show(one: Shard) -> None:
-            if on_map is not None:
-                method, index = one.item
-                on_map(method, index, pictures[index], read(one).relevance)
-
-        own: dict[str, Any] = {"on": on, "retry_failed": retry_failed, "on_part": show, "on_progress": on_progress}
-        make_parts(work, work.shards, folder, title=f"Explaining frames ({trained.encoding.name})", **own)
-        for one in work.shards():
-            maps[one.item[0]].append(read(one))
-    # the same answers for every method: asked once, on all frames
-    predictions, untouched = trained.predict(inputs).tolist(), trained.predict(chosen.references).tolist()
-    return Explained(
-        input=trained.encoding.name,
-        source=chosen.source,
-        weights_sha256=trained.manifest.weights_sha256,
-        frames=tuple(
-            ExplainedFrame(
-                id=chosen.ids[index],
-                trial=chosen.trial[index],
-                day=chosen.day[index],
-                condition=chosen.condition[index],
-                safety_margin=float(margin) if np.isfinite(margin) else None,
-                prediction=predictions[index],
-                reference_prediction=untouched[index],
-            )
-            for index, margin in enumerate(chosen.safety_margin)
-        ),
-        methods={method: _note(own, chosen.ids) for method, own in maps.items()},
-        images=chosen.images.numpy(),
-        pictures=pictures,
-        relevance={method: np.stack([one.relevance for one in own]) for method, own in maps.items()},
-        saliency={method: np.stack([one.saliency for one in own]) for method, own in maps.items()},
-    )
+    shown = None if on_map is None else show
+    return work.make(parts, on=on, retry_failed=retry_failed, on_piece=shown, on_progress=on_progress)
 
 
 def _note(maps: Sequence[_Map], ids: Sequence[str]) -> MethodNotes:

@@ -1,16 +1,13 @@
 """A whole study: frames chosen, explained, and their explanations tested in every way that is known."""
 
-import pickle
 import shutil
 import weakref
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
-from functools import cache, cached_property, partial
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeAlias
-
-import torch
 
 from sliplens.codec import load_result, save_record, save_result
 from sliplens.errors import InputError
@@ -24,21 +21,20 @@ from sliplens.models.engines import counting_passes
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.results.explanation import Explained
-from sliplens.results.faithfulness import DeletionScores, RemovalScores
+from sliplens.results.faithfulness import DeletionScores
 from sliplens.results.study import (
     ASKED_FILE,
     STAGES,
     TABLES,
     Asked,
     Choice,
-    MarkedFrame,
     States,
     Study,
-    Truth,
     UntrainedMaps,
 )
+from sliplens.shards import EXECUTORS, Crew, MakePart
 from sliplens.simulation.intervention import rebuild_trial
-from sliplens.study.checks import CASCADE, explain_untrained, measure_maps, randomise_weights, time_explainers
+from sliplens.study.checks import CASCADE, Measuring, Randomising, Untrained, time_explainers
 from sliplens.study.choice import (
     STUDY_BUDGET,
     STUDY_METHODS,
@@ -52,19 +48,20 @@ from sliplens.study.choice import (
     with_markers,
     without_markers,
 )
-from sliplens.study.explaining import explain_frames, frames_at
-from sliplens.study.processes import run_together
+from sliplens.study.explaining import Explaining, frames_at
 from sliplens.study.scoring import (
     SETTINGS,
     STEPS,
     STUDY_AREAS,
+    Deletion,
+    Influence,
+    RemedialDeletion,
+    Removal,
     Setting,
     influences,
-    score_explanations,
-    score_remedies,
-    score_removal,
 )
-from sliplens.study.truth import TRUE_FILL, TRUTH_PAIRS, judge_by_truth, true_curves
+from sliplens.study.stages import Stage
+from sliplens.study.truth import TRUE_FILL, TRUTH_PAIRS, JudgingByTruth, true_curves
 from sliplens.training.evaluation import evaluate
 
 _COMMAND = "sliplens study"
@@ -98,7 +95,8 @@ def run_study(
     random_orders: int = 10,
     steps: int | None = None,
     device: str = "cpu",
-    jobs: int = 1,
+    on: str = "serial",
+    retry_failed: bool = False,
     seed: int = 0,
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
@@ -127,9 +125,10 @@ def run_study(
         many random orders every method has to beat.
     steps
         Steps of the thesis's deletion score; as many as there are rows of pixels, as in the thesis, if None.
-    jobs
-        Networks to judge at the same time, each by a process with its share of the cores. More than one needs a script
-        that starts its work under `if __name__ == "__main__":`, as all that starts processes does.
+    on, retry_failed
+        Where maps are made and judged, a row of `shards.EXECUTORS`: `serial`, `processes`, `processes=4`; and whether
+        those are tried again that failed three times before. Processes need a script that starts its work under
+        `if __name__ == "__main__":`, as all that starts processes does.
 
     Raises
     ------
@@ -137,6 +136,8 @@ def run_study(
         If a number is out of range, a method is unknown, or a network was trained on other images.
     RecordingError
         If no trial has a frame near every safety margin that is looked at.
+    ShardError
+        If part of a stage failed again and again, when all the rest of it is done.
 
     Examples
     --------
@@ -150,8 +151,7 @@ def run_study(
         raise InputError(f"{random_orders} random orders are too few; --random-orders must be at least 1")
     if unknown := sorted(set(tests) - set(TESTS)):
         raise InputError(f"a study has no test named {unknown[0]!r}; choose from {', '.join(TESTS)}")
-    if jobs < 1:
-        raise InputError(f"--jobs must be at least 1, got {jobs}")
+    EXECUTORS.pick(on.partition("=")[0])
     explainers = study_explainers(methods, budget=budget)
     data = data if isinstance(data, Dataset) else load_dataset(data)
     if (count := min(trials, len(data.select(split=split, condition=condition)))) < FEWEST_UNITS:
@@ -168,10 +168,6 @@ def run_study(
         data=data,
         networks=networks,
         explainers=explainers,
-        tests=frozenset(tests),
-        settings=tuple(settings),
-        random_orders=random_orders,
-        steps=steps,
         seed=seed,
         overwrite=overwrite,
         on_progress=on_progress,
@@ -183,16 +179,22 @@ def run_study(
     choice, states = stages.choose(split=split, condition=condition, trials=trials, tolerance=tolerance)
     asked = Asked(tests=tuple(test for test in TESTS if test in tests))
     save_record(asked, stages.folder / ASKED_FILE)
-    cores, judging = torch.get_num_threads(), stages
-    if min(jobs, len(networks), cores) > 1:
-        # they leave their stages in folders, and what is here reads them
-        work = pickle.dumps(replace(stages, on_progress=None, found={name: {} for name in networks}))
-        run_together(partial(_judge, work), list(networks), threads=cores // len(networks), on_progress=on_progress)
-        judging = replace(stages, overwrite=False, on_progress=None)
-    for name in networks:
-        judging.judge(name)
+    judging = _Judging(
+        folder=stages.folder,
+        data=data,
+        networks=networks,
+        explainers=stages.explainers,
+        settings=tuple(settings),
+        random_orders=random_orders,
+        steps=steps,
+        seed=seed,
+        redrawn="truth" in tests and stages.redrawn,
+    )
+    with Crew(judging, on=on, most=len(choice.frames)) as crew:
+        for name in networks:
+            stages.judge(name, judging, crew, tests=frozenset(tests), retry_failed=retry_failed)
     for name in networks if "timing" in tests else ():  # while nothing else runs
-        stages.time(name)
+        stages.time(name, judging)
     tables: dict[str, Any] = {
         table: {name: own[stage] for name, own in stages.found.items() if stage in own}
         for stage, table in TABLES.items()
@@ -213,6 +215,7 @@ def load_network(network: Network, name: str, *, device: str = "cpu") -> Run:
 
 
 _TITLES = {
+    "explain": "Explaining frames",
     "score": "Deleting pixels, as the thesis did",
     "remedies": "Trying the thesis's remedies",
     "control": "Explaining networks with new weights",
@@ -225,8 +228,134 @@ _NEEDED_BY = {"score": {"score", "remedies"}, "control": {"faithfulness", "truth
 """Tests that need a stage, where it is not that test alone."""
 
 
-def _judge(stages: bytes, name: str, on_progress: OnProgress) -> None:
-    replace(pickle.loads(stages), on_progress=on_progress).judge(name)  # noqa: S301 (our own, of the process before)
+@dataclass(frozen=True, kw_only=True)
+class _Judging:
+    """Work on all stages that judge explanations, on shards of ((network, stage), shard of that); paths travel."""
+
+    folder: Path
+    data: Dataset
+    networks: Mapping[str, Run]
+    explainers: Mapping[str, Explainer]
+    settings: tuple[Setting, ...]
+    random_orders: int
+    steps: int | None
+    seed: int
+    redrawn: bool
+    """Whether frames are drawn anew, with markers put back."""
+    _opened: dict[str, "_Network"] = field(default_factory=dict)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_opened": {}}  # whoever gets it opens its own
+
+    @property
+    def on_gpu(self) -> bool:
+        return any(run.device.type != "cpu" for run in self.networks.values())
+
+    def begin(self) -> MakePart:
+        opened: tuple[tuple[str, str], MakePart] | None = None
+
+        def make(item: tuple[tuple[str, str], Any], path: Path, on_progress: OnProgress) -> None:
+            nonlocal opened
+            (network, stage), own = item
+            if opened is None or opened[0] != item[0]:  # one at a time: each holds images and maps
+                opened = None
+                opened = item[0], self.open(network).stage(stage).begin()
+            opened[1](own, path, on_progress)
+
+        return make
+
+    def open(self, network: str) -> "_Network":
+        """What is known of a network; of one at a time."""
+        if network not in self._opened:
+            self._opened.clear()
+            self._opened[network] = _Network(study=self, name=network)
+        return self._opened[network]
+
+
+@dataclass(kw_only=True)
+class _Network:
+    """What the stages of a network are made of, read from the folder of the study when it is asked for."""
+
+    study: _Judging
+    name: str
+    _ready: dict[str, Stage] = field(default_factory=dict)
+
+    @property
+    def run(self) -> Run:
+        return self.study.networks[self.name]
+
+    def result(self, stage: str) -> Any:
+        """Result of a stage, of this network or of all."""
+        folder = self.study.folder / f"{stage}-{self.name}"
+        return load_result(folder if folder.is_dir() else self.study.folder / stage, _KINDS[stage], command=_COMMAND)
+
+    @cached_property
+    def material(self) -> Material:
+        """Explanations of the frames that are scored."""
+        scored = tuple(frame for frame in self.result("choice").frames if frame.scored)
+        own: dict[str, Any] = {"markers": self.result("states").markers, "explainers": self.study.explainers}
+        return gather(self.run, self.result("explain"), self.study.data, scored, **own)
+
+    @cached_property
+    def influence(self) -> Mapping[str, Any]:
+        """Maps to rank parts by, controls included."""
+        return {**influences(self.material), **self.result("control").maps}
+
+    def stage(self, name: str) -> Stage:
+        """A stage, ready to be made anywhere; of one at a time."""
+        if name not in self._ready:
+            self._ready = {name: _WORKS[name](self)}
+        return self._ready[name]
+
+    def explaining(self) -> Explaining:
+        """Explanations of all frames."""
+        run, study, chosen = self.run, self.study, self.result("choice").frames
+        frames = frames_at(run, study.data, [(frame.trial, frame.frame) for frame in chosen])
+        images, find = run.encoding.normalise(frames.images), lambda: seen_places(run, chosen, markers)
+        markers = self.result("states").markers
+        return Explaining(trained=run, chosen=frames, explainers=with_markers(study.explainers, images, find))
+
+    def removal(self) -> Removal:
+        """Removal under every setting, and in simulation of markers that are put back."""
+        study = self.study
+
+        def put_back(part: Material, maps: Influence, seed: int, count: OnProgress) -> Mapping[str, Faithfulness]:
+            own: dict[str, Any] = {"random_orders": study.random_orders, "seed": seed, "on_progress": count}
+            return true_curves(self.run, part.explained, study.data, maps=maps, **own)
+
+        return Removal(
+            material=self.material,
+            maps=self.influence,
+            settings=study.settings,
+            random_orders=study.random_orders,
+            further={Setting(fill=TRUE_FILL, unit="marker"): put_back} if study.redrawn else {},
+            seed=study.seed,
+        )
+
+    def by_truth(self) -> JudgingByTruth:
+        """What putting markers back does."""
+        return JudgingByTruth(
+            trained=self.run,
+            explained=self.material.explained,
+            data=self.study.data,
+            maps=self.influence,
+            fills=tuple(dict.fromkeys(setting.fill for setting in SETTINGS)),
+            seed=self.study.seed,
+        )
+
+
+_WORKS: dict[str, Callable[[_Network], Stage]] = {
+    "explain": _Network.explaining,
+    "score": lambda of: Deletion(
+        trained=of.run, explained=of.material.explained, steps=of.study.steps, seed=of.study.seed
+    ),
+    "remedies": lambda of: RemedialDeletion(material=of.material, grey=of.result("score"), seed=of.study.seed),
+    "control": lambda of: Untrained(material=of.material, seed=of.study.seed),
+    "faithfulness": _Network.removal,
+    "randomisation": lambda of: Randomising(material=of.material, seed=of.study.seed),
+    "map-quality": lambda of: Measuring(material=of.material, data=of.study.data, seed=of.study.seed),
+    "truth": _Network.by_truth,
+}
 
 
 @dataclass(kw_only=True)
@@ -237,10 +366,6 @@ class _Stages:
     data: Dataset
     networks: Mapping[str, Run]
     explainers: Mapping[str, Explainer]
-    tests: frozenset[str]
-    settings: tuple[Setting, ...]
-    random_orders: int
-    steps: int | None
     seed: int
     overwrite: bool
     on_progress: OnProgress | None
@@ -264,69 +389,36 @@ class _Stages:
                 note(self.on_progress, f"{what}, so that tiles are asked instead")
         return choice, states
 
-    def judge(self, name: str) -> None:
+    def judge(self, name: str, judging: _Judging, crew: Crew, *, tests: frozenset[str], retry_failed: bool) -> None:
         """Explain the frames with one network's methods, and judge the explanations in every way but by the clock."""
-        run, found, seed, chosen = self.networks[name], self.found[name], self.seed, self._choice.frames
-
-        def explain(parts: Path, count: OnProgress) -> Explained:
-            frames = frames_at(run, self.data, [(frame.trial, frame.frame) for frame in chosen])
-            images, methods = run.encoding.normalise(frames.images), list(self.explainers)
-            explainers = with_markers(self.explainers, images, lambda: seen_places(run, chosen, self._markers))
-            return explain_frames(run, frames, methods=methods, explainers=explainers, parts=parts, on_progress=count)
-
-        title = f"Explaining {len(chosen)} frames ({name})"
-        found["explain"] = self._run("explain", name, self._about(name), title, explain)
-        # gathered where a stage is missing: that takes longer than to see that all are there
-        material = cache(lambda: self._gather(name))
-        influence = cache(lambda: {**influences(material()), **found["control"].maps})
-        redrawn = "truth" in self.tests and self._redrawn
-        maps: dict[str, Any] = {"seed": seed, "random_orders": self.random_orders}
-
-        def put_back(on_progress: OnProgress | None) -> Mapping[str, Faithfulness]:
-            return true_curves(run, material().explained, self.data, maps=influence(), on_progress=on_progress, **maps)
-
-        def remove(parts: Path, count: OnProgress) -> RemovalScores:
-            further = {Setting(fill=TRUE_FILL, unit="marker"): put_back} if redrawn else {}
-            own: dict[str, Any] = {"maps": influence(), "settings": self.settings, "further": further, **maps}
-            return score_removal(material(), parts=parts, on_progress=count, **own)
-
-        def hold_against_truth(parts: Path, count: OnProgress) -> Truth:
-            fills = list(dict.fromkeys(setting.fill for setting in SETTINGS))
-            own: dict[str, Any] = {"maps": influence(), "fills": fills, "seed": seed}
-            return judge_by_truth(run, material().explained, self.data, parts=parts, on_progress=count, **own)
-
-        works: dict[str, _Work] = {
-            "score": lambda _, count: score_explanations(
-                run, material().explained, steps=self.steps, seed=seed, on_progress=count
-            ),
-            "remedies": lambda _, count: score_remedies(material(), grey=found["score"], seed=seed, on_progress=count),
-            "control": lambda parts, count: explain_untrained(material(), seed=seed, parts=parts, on_progress=count),
-            "faithfulness": remove,
-            "randomisation": lambda _, count: randomise_weights(material(), seed=seed, on_progress=count),
-            "map-quality": lambda _, count: measure_maps(material(), self.data, seed=seed, on_progress=count),
-            "truth": hold_against_truth,
-        }
-        removal = {"random_orders": self.random_orders, "areas": STUDY_AREAS, "settings": self.settings}
+        removal = {"random_orders": judging.random_orders, "areas": STUDY_AREAS, "settings": judging.settings}
         depends: dict[str, dict[str, Any]] = {
             # the report reads these of every score
             "score": {"input": name, "source": self.data.source, "fill": "grey"}
-            | ({} if self.steps is None else {"steps": self.steps}),
+            | ({} if judging.steps is None else {"steps": judging.steps}),
             "remedies": {"steps": STEPS},
             "control": _CONTROLS,
             "faithfulness": removal | _CONTROLS,
             "randomisation": {"stages": CASCADE, "statistics": "images"},
             "truth": {"pairs": TRUTH_PAIRS, **_CONTROLS},
         }
-        for test, work in works.items():
-            if not _NEEDED_BY.get(test, {test}).isdisjoint(self.tests) and (redrawn or test != "truth"):
-                config = self._about(name) | depends.get(test, {})
-                found[test] = self._run(test, name, config, f"{_TITLES[test]} ({name})", work)
+        for test in _WORKS:
+            asked = test == "explain" or not _NEEDED_BY.get(test, {test}).isdisjoint(tests)
+            if not asked or (test == "truth" and not judging.redrawn):
+                continue
 
-    def time(self, name: str) -> None:
+            def work(parts: Path, count: OnProgress, test: str = test) -> object:
+                stage, own = judging.open(name).stage(test), {"crew": crew, "name": (name, test)}
+                return stage.make(parts, **own, retry_failed=retry_failed, on_progress=count)
+
+            config, title = self._about(name) | depends.get(test, {}), f"{_TITLES[test]} ({name})"
+            self.found[name][test] = self._run(test, name, config, title, work)
+
+    def time(self, name: str, judging: _Judging) -> None:
         """Time one network's methods."""
 
         def work(_: Path, count: OnProgress) -> object:
-            return time_explainers(self._gather(name), on_progress=count)
+            return time_explainers(judging.open(name).material, on_progress=count)
 
         title = f"Timing the methods ({name})"
         self.found[name]["timing"] = self._run("timing", name, self._about(name), title, work)
@@ -334,10 +426,6 @@ class _Stages:
     @cached_property
     def _choice(self) -> Choice:
         return load_result(self.folder / "choice", Choice, command=_COMMAND)
-
-    @cached_property
-    def _markers(self) -> Mapping[str, MarkedFrame]:
-        return load_result(self.folder / "states", States, command=_COMMAND).markers
 
     @property
     def _frames(self) -> dict[str, Any]:
@@ -348,13 +436,8 @@ class _Stages:
         methods = method_options(self.explainers)
         return {**self._frames, "methods": methods, "seed": self.seed, "weights_sha256": weights}
 
-    def _gather(self, name: str) -> Material:
-        scored, explained = tuple(frame for frame in self._choice.frames if frame.scored), self.found[name]["explain"]
-        own: dict[str, Any] = {"markers": self._markers, "explainers": self.explainers}
-        return gather(self.networks[name], explained, self.data, scored, **own)
-
-    @cached_property
-    def _redrawn(self) -> bool:
+    @property
+    def redrawn(self) -> bool:
         """Whether the chosen frames can be drawn anew with markers put back; a recording never can."""
         if not self.data.simulated:
             return False

@@ -1,8 +1,8 @@
 """Scores of a study: methods and controls under several fills and units; the deletion score and its remedies."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float64, Int, Shaped
 from scipy.stats import kendalltau
+from torch import Tensor
 
-from sliplens.codec import keep_part
 from sliplens.errors import CheckpointError, InputError
-from sliplens.faithfulness import DeletionCurves, deletion_curves, deletion_score, get_fill, random_order
+from sliplens.faithfulness import deletion_curves, deletion_score, get_fill, random_order
 from sliplens.faithfulness.controls import control_maps, lead_over_controls
-from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness, Predict, answer_whole, score_maps
+from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness, Predict, Units, answer_whole, score_maps
 from sliplens.faithfulness.scoring import (
     controls_win,
     deletion_steps,
@@ -46,8 +46,10 @@ from sliplens.results.faithfulness import (
     VariantTable,
     is_control,
 )
-from sliplens.study.choice import Material
+from sliplens.shards import Shard
+from sliplens.study.choice import Material, MaterialStage, trial_seed
 from sliplens.study.explaining import network_inputs
+from sliplens.study.stages import Find, Stage, join_trials, trial_shards
 
 CONTROL = "random"
 STEPS = 28
@@ -76,115 +78,223 @@ def score_explanations(
     fill: str = "grey",
     steps: int | None = None,
     seed: int = 0,
+    parts: Path | None = None,
+    on: str = "serial",
+    retry_failed: bool = False,
     on_progress: OnProgress | None = None,
 ) -> DeletionScores:
     """Delete the most salient pixels for every method and a random order, in so many steps or the image's height.
+
+    `parts` is a folder that keeps the answers of each trial as soon as they are there; `on` says where they are made, a
+    row of `shards.EXECUTORS`, and `retry_failed` tries those again that failed before.
 
     Raises
     ------
     CheckpointError
         If the explanations are of another network.
+    ShardError
+        If some of several trials failed again and again, when all others are there.
     """
     require_same_network(trained, explained)
-    inputs = network_inputs(trained, explained)
-    orders, shape = _orders(explained, seed=seed), (inputs.shape[-2], inputs.shape[-1])
-    total = len(orders) * len(inputs)
-    predict = prepare_passes(trained, inputs, total * len(deletion_steps(shape, steps=steps)))
-    deleted = {
-        name: deletion_curves(
-            predict,
-            inputs,
-            order,
-            fill=get_fill(fill),
-            steps=steps,
-            on_progress=continued(on_progress, before=number * len(inputs), total=total),
+    work = Deletion(trained=trained, explained=explained, fill=fill, steps=steps, seed=seed)
+    return work.make(parts, on=on, retry_failed=retry_failed, on_progress=on_progress)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Answers:
+    """Answers on the frames of a trial while pixels go, by the order in which they go; the first with all of them."""
+
+    answers: dict[str, Float64[np.ndarray, "frames answers"]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deletion(Stage[DeletionScores]):
+    """Deletion of the most salient pixels by every method and in a random order, a trial a shard."""
+
+    piece = _Answers
+    title = "Deleting pixels"
+
+    trained: Run
+    explained: Explained
+    fill: str = "grey"
+    steps: int | None = None
+    """The image's height if None."""
+    seed: int = 0
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether the network runs on a graphics card."""
+        return self.trained.device.type != "cpu"
+
+    def shards(self) -> Iterator[Shard]:
+        """Trials, whose maps are counted with a random one."""
+        return trial_shards(self.explained, maps=len(self.explained.saliency) + 1)
+
+    @property
+    def _removed(self) -> Int[np.ndarray, " steps"]:
+        size = self.explained.image_size
+        return deletion_steps((size, size), steps=self.steps)
+
+    def prepare(self) -> Find:
+        """Delete the pixels of the frames of a trial."""
+        inputs, orders = network_inputs(self.trained, self.explained), _orders(self.explained, seed=self.seed)
+        predict = prepare_passes(self.trained, inputs, len(orders) * len(inputs) * len(self._removed))
+
+        def find(item: tuple[str], on_progress: OnProgress) -> _Answers:
+            rows = self.explained.trials[item[-1]]
+            delete = partial(_delete, predict, inputs[rows], fill=self.fill, steps=self.steps)
+            return _Answers(answers=_each(delete, {name: own[rows] for name, own in orders.items()}, on_progress))
+
+        return find
+
+    def join(self, pieces: Sequence[_Answers]) -> DeletionScores:
+        """Scores of all curves."""
+        explained, removed = self.explained, self._removed
+        answers = join_trials(explained, [one.answers for one in pieces])
+        curves = {name: _split(name, removed, own, explained) for name, own in answers.items()}
+        control = answers[CONTROL]
+        return DeletionScores(
+            input=explained.input,
+            source=explained.source,
+            fill=self.fill,
+            steps=len(removed),
+            pixels_per_step=int(removed[0]),
+            methods={name: _score(own) for name, own in curves.items()},
+            alarms=(
+                *flat_maps(explained.saliency),
+                # the fill decides where the filled image is answered like the whole one
+                *fill_decides(control[:, 0], control[:, -1], fill=self.fill),
+                *saturated(control[:, 0]),
+                *_method_alarms(curves),
+            ),
+            table=DeletionTable.joined([curve for own in curves.values() for curve in own]),
         )
-        for number, (name, order) in enumerate(orders.items())
-    }
-    curves, control = {name: _split(name, own, explained) for name, own in deleted.items()}, deleted[CONTROL]
-    return DeletionScores(
-        input=explained.input,
-        source=explained.source,
-        fill=fill,
-        steps=len(control.pixels_removed),
-        pixels_per_step=int(control.pixels_removed[0]),
-        methods={name: _score(own) for name, own in curves.items()},
-        alarms=(
-            *flat_maps(explained.saliency),
-            # the fill decides where the filled image is answered like the whole one
-            *fill_decides(control.base, control.predictions[:, -1], fill=fill),
-            *saturated(control.base),
-            *_method_alarms(curves),
-        ),
-        table=DeletionTable.joined([curve for own in curves.values() for curve in own]),
-    )
 
 
-def score_remedies(
-    material: Material,
+def _delete(
+    predict: Predict,
+    inputs: Float[Tensor, "frames colours size size"],
+    order: Int[np.ndarray, "frames pixels"],
     *,
-    grey: DeletionScores,
-    steps: int = STEPS,
-    seed: int = 0,
+    fill: str,
+    steps: int | None,
     on_progress: OnProgress | None = None,
-) -> Remedies:
-    """Score maps by deletion that stops at half of the saliency, by deletion to the background, and by insertion.
+) -> Float64[np.ndarray, "frames answers"]:
+    """Answers on the whole frames, and then while the pixels of an order go."""
+    deleted = deletion_curves(predict, inputs, order, fill=get_fill(fill), steps=steps, on_progress=on_progress)
+    return np.column_stack([deleted.base, deleted.predictions])
 
-    Stopping early needs no pass of its own: the same frames, scored by deletion to grey, are given.
+
+def _each(
+    delete: Callable[..., Float64[np.ndarray, "frames answers"]],
+    orders: Mapping[str, Int[np.ndarray, "frames pixels"]],
+    on_progress: OnProgress,
+    *,
+    before: int = 0,
+) -> dict[str, Float64[np.ndarray, "frames answers"]]:
+    """Answers of each order; each frame of each counts."""
+    answers = {}
+    for name, order in orders.items():
+        answers[name] = delete(order, on_progress=continued(on_progress, before=before, total=0))
+        before += len(order)
+    return answers
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Remedied:
+    """Answers on the frames of a trial while pixels become the background, and while the least salient become grey."""
+
+    background: dict[str, Float64[np.ndarray, "frames answers"]]
+    insertion: dict[str, Float64[np.ndarray, "frames answers"]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RemedialDeletion(MaterialStage[Remedies]):
+    """Deletion that stops at half of the saliency, deletion to the background, and insertion, a trial a shard.
+
+    Stopping early needs no pass of its own: the same frames, scored by deletion to `grey`, are given.
 
     Polak, discussion of the faithfulness curves: stop once all pixels with saliency above 0.5 are gone; another fill.
     """
-    explained, inputs = material.explained, material.inputs
-    orders = _orders(explained, seed=seed)
-    background = BACKGROUND.get(explained.input, "background")
-    total, done = 2 * len(orders) * len(inputs), 0
-    predict = prepare_passes(material.trained, inputs, total * steps)
 
-    def delete(name: str, fill: str, order: Int[np.ndarray, "frames pixels"]) -> list[DeletionTable]:
-        nonlocal done
-        progress = continued(on_progress, before=done, total=total)
-        done += len(inputs)
-        deleted = deletion_curves(predict, inputs, order, fill=get_fill(fill), steps=steps, on_progress=progress)
-        return _split(name, deleted, explained)
+    piece = _Remedied
+    title = "Trying the thesis's remedies"
 
-    curves: dict[str, _Curves] = {
-        "stop-at-half": _stopped(grey, explained),
-        "background": {name: delete(name, background, order) for name, order in orders.items()},
-        # inserting k pixels of an order is deleting all the others
-        "insertion": {
-            name: _inserted(delete(name, "grey", order[:, ::-1].copy()), explained) for name, order in orders.items()
-        },
-    }
-    deletion: dict[str, Any] = {"fill": "grey", "mode": "deletion", "stop": None, "better": "lower"}
-    about = {
-        "stop-at-half": deletion | {"stop": _STOP},
-        "background": deletion | {"fill": background},
-        "insertion": deletion | {"mode": "insertion", "better": "higher"},
-    }
-    summaries = {
-        "stop-at-half": "Grey fill; ends once every pixel with a saliency above 0.5 is gone, so that frames and "
-        "methods end at different areas. Random orders end at the median area of the methods.",
-        "background": f"Removed pixels become {background}, and all of them go.",
-        "insertion": "From an image of nothing but grey, the most salient pixels come first; D against the answer on "
-        "the whole image, so that a faithful map rises early.",
-    }
-    each = [(name, curve) for name, by_method in curves.items() for own in by_method.values() for curve in own]
-    tables = [VariantTable(variant=np.repeat(name, len(curve)), **vars(curve)) for name, curve in each]
-    return Remedies(
-        input=explained.input,
-        source=explained.source,
-        steps=steps,
-        variants={
-            name: Variant(
-                **about[name], summary=summaries[name], methods={method: _score(one) for method, one in own.items()}
+    grey: DeletionScores
+    steps: int = STEPS
+    seed: int = 0
+
+    def shards(self) -> Iterator[Shard]:
+        """Trials, whose maps are counted twice, and with a random one."""
+        explained = self.material.explained
+        return trial_shards(explained, maps=2 * (len(explained.saliency) + 1))
+
+    @property
+    def _background(self) -> str:
+        return BACKGROUND.get(self.material.explained.input, "background")
+
+    def prepare(self) -> Find:
+        """Delete the pixels of the frames of a trial both ways."""
+        material, inputs = self.material, self.material.inputs
+        orders = _orders(material.explained, seed=self.seed)
+        predict = prepare_passes(material.trained, inputs, 2 * len(orders) * len(inputs) * self.steps)
+
+        def find(item: tuple[str], on_progress: OnProgress) -> _Remedied:
+            rows = material.explained.trials[item[-1]]
+            own = {name: order[rows] for name, order in orders.items()}
+            # inserting k pixels of an order is deleting all the others
+            turned = {name: order[:, ::-1].copy() for name, order in own.items()}
+            delete = partial(_delete, predict, inputs[rows], steps=self.steps)
+            return _Remedied(
+                background=_each(partial(delete, fill=self._background), own, on_progress),
+                insertion=_each(partial(delete, fill="grey"), turned, on_progress, before=len(own) * len(rows)),
             )
-            for name, own in curves.items()
-        },
-        alarms=tuple(
-            f"{name}: {alarm}" for name in ("stop-at-half", "background") for alarm in _method_alarms(curves[name])
-        ),
-        table=VariantTable.joined(tables),
-    )
+
+        return find
+
+    def join(self, pieces: Sequence[_Remedied]) -> Remedies:
+        """Scores of all remedies."""
+        explained, grey, background = self.material.explained, self.grey, self._background
+        removed = deletion_steps((explained.image_size, explained.image_size), steps=self.steps)
+        deleted, inserted = (
+            {name: _split(name, removed, own, explained) for name, own in join_trials(explained, answers).items()}
+            for answers in ([one.background for one in pieces], [one.insertion for one in pieces])
+        )
+        curves: dict[str, _Curves] = {
+            "stop-at-half": _stopped(grey, explained),
+            "background": deleted,
+            "insertion": {name: _inserted(own, explained) for name, own in inserted.items()},
+        }
+        deletion: dict[str, Any] = {"fill": "grey", "mode": "deletion", "stop": None, "better": "lower"}
+        about = {
+            "stop-at-half": deletion | {"stop": _STOP},
+            "background": deletion | {"fill": background},
+            "insertion": deletion | {"mode": "insertion", "better": "higher"},
+        }
+        summaries = {
+            "stop-at-half": "Grey fill; ends once every pixel with a saliency above 0.5 is gone, so that frames and "
+            "methods end at different areas. Random orders end at the median area of the methods.",
+            "background": f"Removed pixels become {background}, and all of them go.",
+            "insertion": "From an image of nothing but grey, the most salient pixels come first; D against the answer "
+            "on the whole image, so that a faithful map rises early.",
+        }
+        each = [(name, curve) for name, by_method in curves.items() for own in by_method.values() for curve in own]
+        tables = [VariantTable(variant=np.repeat(name, len(curve)), **vars(curve)) for name, curve in each]
+        return Remedies(
+            input=explained.input,
+            source=explained.source,
+            steps=self.steps,
+            variants={
+                name: Variant(
+                    **about[name], summary=summaries[name], methods={method: _score(one) for method, one in own.items()}
+                )
+                for name, own in curves.items()
+            },
+            alarms=tuple(
+                f"{name}: {alarm}" for name in ("stop-at-half", "background") for alarm in _method_alarms(curves[name])
+            ),
+            table=VariantTable.joined(tables),
+        )
 
 
 def _orders(explained: Explained, *, seed: int) -> dict[str, Int[np.ndarray, "frames pixels"]]:
@@ -201,9 +311,14 @@ def _curve(method: str, frame: ExplainedFrame, removed: np.ndarray, answers: np.
     return DeletionTable(**columns, step=step, pixels_removed=removed, prediction=answers, score=score)
 
 
-def _split(method: str, curves: DeletionCurves, explained: Explained) -> list[DeletionTable]:
-    rows = zip(explained.frames, curves.predictions, curves.base, strict=True)
-    return [_curve(method, frame, curves.pixels_removed, answers, base) for frame, answers, base in rows]
+def _split(
+    method: str,
+    removed: Int[np.ndarray, " steps"],
+    answers: Float64[np.ndarray, "frames answers"],
+    explained: Explained,
+) -> list[DeletionTable]:
+    rows = zip(explained.frames, answers, strict=True)
+    return [_curve(method, frame, removed, own[1:], own[0]) for frame, own in rows]
 
 
 def _score(curves: Sequence[DeletionTable]) -> MethodScore:
@@ -276,8 +391,8 @@ Curves = Mapping[Setting, Mapping[str, Faithfulness]]
 """Curves by setting and method, controls included."""
 Influence = Mapping[str, Float[np.ndarray, "images height width"]]
 """Maps to rank parts by, of each method and control."""
-Scoring = Callable[..., Mapping[str, Faithfulness]]
-"""Finds the curves of every map; takes `on_progress`."""
+Scoring = Callable[[Material, Influence, int, OnProgress], Mapping[str, Faithfulness]]
+"""Finds the curves of some frames with their maps and a seed."""
 
 
 def influences(material: Material) -> dict[str, Float[np.ndarray, "frames size size"]]:
@@ -288,91 +403,125 @@ def influences(material: Material) -> dict[str, Float[np.ndarray, "frames size s
 
 @dataclass(frozen=True, kw_only=True)
 class _SettingCurves:
-    """Curves of every map under one setting (`Faithfulness.curves`)."""
+    """Curves of every map of a trial's frames under one setting (`Faithfulness.curves`)."""
 
     areas: Float64[np.ndarray, " areas"]
     curves: dict[str, Float64[np.ndarray, "3 frames areas"]]
+    whole: Float64[np.ndarray, " frames"]
+    """Answers on all of each frame."""
+    blank: Float64[np.ndarray, " frames"]
+    """Answers where all of it is gone; NaN where the setting has no fill."""
 
 
-def score_removal(
-    material: Material,
-    *,
-    maps: Influence,
-    settings: Sequence[Setting] = SETTINGS,
-    random_orders: int = RANDOM_ORDERS,
-    further: Mapping[Setting, Scoring] = {},
-    seed: int = 0,
-    parts: Path | None = None,
-    on_progress: OnProgress | None = None,
-) -> RemovalScores:
-    """Remove parts in the order of every map (`influences`), under every setting whose unit is known of every frame.
+@dataclass(frozen=True, kw_only=True)
+class Removal(MaterialStage[RemovalScores]):
+    """Removal of parts in the order of every map (`influences`), under each setting whose unit is known of every frame.
 
-    Curves that are found in another way, such as by drawing the scene anew (`further`), are judged with the others.
+    Each trial and setting is a shard. Curves that are found in another way, such as by drawing the scene anew
+    (`further`), are judged with the others.
     """
-    inputs, explained = material.inputs, material.explained
-    for setting in settings:
-        get_fill(setting.fill)
-    units = material.units()
-    known = [setting for setting in settings if setting.unit in units]
-    orders = 2 * len(maps) + random_orders
-    predict = prepare_passes(material.trained, inputs, len(known) * len(inputs) * orders * (len(STUDY_AREAS) - 2))
 
-    works: dict[Setting, Scoring] = {
-        setting: partial(
-            score_maps,
-            predict,
-            inputs,
-            dict(maps),
-            units[setting.unit],
-            fill=get_fill(setting.fill),
-            references=material.references,
-            towards=explained.towards,
-            # the same random orders under every fill
-            rng=np.random.default_rng(seed),
-            random_orders=random_orders,
+    piece = _SettingCurves
+    title = "Removing parts"
+
+    maps: Influence
+    settings: Sequence[Setting] = SETTINGS
+    random_orders: int = RANDOM_ORDERS
+    further: Mapping[Setting, Scoring] = field(default_factory=dict)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for setting in self.settings:
+            get_fill(setting.fill)
+
+    @cached_property
+    def _units(self) -> dict[str, list[Units]]:
+        return self.material.units()
+
+    @property
+    def _known(self) -> list[Setting]:
+        return [setting for setting in self.settings if setting.unit in self._units]
+
+    def shards(self) -> Iterator[Shard]:
+        """All trials under the first setting, then under the next."""
+        for setting in (*self._known, *self.further):
+            yield from trial_shards(self.material.explained, setting.fill, setting.unit)
+
+    def prepare(self) -> Find:
+        """Find the curves of a trial under one setting."""
+        inputs, orders = self.material.inputs, 2 * len(self.maps) + self.random_orders
+        passes = len(self._known) * len(inputs) * orders * (len(STUDY_AREAS) - 2)
+        predict, numbers = prepare_passes(self.material.trained, inputs, passes), list(self.material.explained.trials)
+
+        def find(item: tuple[str, str, str], on_progress: OnProgress) -> _SettingCurves:
+            fill, unit, trial = item
+            setting, rows = Setting(fill=fill, unit=unit), self.material.explained.trials[trial]
+            part, maps = self.material.take(rows), {name: values[rows] for name, values in self.maps.items()}
+            seed = trial_seed(self.seed, numbers.index(trial))
+            if setting in self.further:
+                scored, blank = self.further[setting](part, maps, seed, on_progress), np.full(len(rows), np.nan)
+            else:
+                blank = _answer_blank(predict, part, fill, seed)
+                scored = score_maps(
+                    predict,
+                    part.inputs,
+                    maps,
+                    [self._units[unit][row] for row in rows],
+                    fill=get_fill(fill),
+                    references=part.references,
+                    towards=part.explained.towards,
+                    # the same random orders under every fill
+                    rng=np.random.default_rng(seed),
+                    random_orders=self.random_orders,
+                    areas=STUDY_AREAS,
+                    seed=seed,
+                    on_progress=on_progress,
+                )
+            return _SettingCurves(
+                areas=next(iter(scored.values())).areas,
+                curves={name: own.curves for name, own in scored.items()},
+                whole=answer_whole(predict, part.inputs, batch_size=64),
+                blank=blank,
+            )
+
+        return find
+
+    def join(self, pieces: Sequence[_SettingCurves]) -> RemovalScores:
+        """Scores of all curves."""
+        explained, count = self.material.explained, len(self.material.explained.trials)
+        curves: dict[Setting, dict[str, Faithfulness]] = {}
+        answers: dict[Setting, dict[str, np.ndarray]] = {}
+        for at, setting in enumerate((*self._known, *self.further)):
+            own = pieces[at * count : (at + 1) * count]
+            joined = join_trials(explained, [one.curves for one in own], axis=1)
+            curves[setting] = {name: Faithfulness(areas=own[0].areas, curves=curve) for name, curve in joined.items()}
+            answers[setting] = join_trials(explained, [{"whole": one.whole, "blank": one.blank} for one in own])
+        whole = next(iter(answers.values()))["whole"]
+        blank = {setting.fill: answers[setting]["blank"] for setting in self._known}
+        scores, comparisons = judge_curves(curves, clusters=explained.clusters, seed=self.seed)
+        return RemovalScores(
+            input=explained.input,
+            source=explained.source,
+            frames=len(explained.frames),
+            trials=count,
+            random_orders=self.random_orders,
+            fills=tuple(dict.fromkeys(setting.fill for setting in curves)),
+            units=tuple(dict.fromkeys(setting.unit for setting in curves)),
             areas=STUDY_AREAS,
-            seed=seed,
+            scores=scores,
+            comparisons=comparisons,
+            agreement=compare_fills(curves),
+            alarms=(
+                *saturated(whole),
+                *flat_maps({name: self.maps[name] for name in explained.relevance}),
+                *(alarm for fill, gone in blank.items() for alarm in fill_decides(whole, gone, fill=fill)),
+                *ranking_alarms(curves),
+            ),
+            table=_table(curves, explained),
         )
-        for setting in known
-    }
-    works |= further
-    curves: dict[Setting, dict[str, Faithfulness]] = {}
-    for number, (setting, work) in enumerate(works.items()):
-        on_frames = continued(on_progress, before=number * len(inputs), total=len(works) * len(inputs))
-
-        def find(work: Scoring = work, on_frames: OnProgress | None = on_frames) -> _SettingCurves:
-            scored = work(on_progress=on_frames)
-            areas = next(iter(scored.values())).areas
-            return _SettingCurves(areas=areas, curves={name: own.curves for name, own in scored.items()})
-
-        kept = keep_part(parts and parts / f"{setting.fill}-{setting.unit}", _SettingCurves, find)
-        curves[setting] = {name: Faithfulness(areas=kept.areas, curves=own) for name, own in kept.curves.items()}
-    whole = answer_whole(predict, inputs, batch_size=64)
-    blank = {setting.fill: _answer_blank(predict, material, setting.fill, seed) for setting in known}
-    scores, comparisons = judge_curves(curves, clusters=explained.clusters, seed=seed)
-    return RemovalScores(
-        input=explained.input,
-        source=explained.source,
-        frames=len(inputs),
-        trials=len(set(explained.clusters[1].tolist())),
-        random_orders=random_orders,
-        fills=tuple(dict.fromkeys(setting.fill for setting in curves)),
-        units=tuple(dict.fromkeys(setting.unit for setting in curves)),
-        areas=STUDY_AREAS,
-        scores=scores,
-        comparisons=comparisons,
-        agreement=compare_fills(curves),
-        alarms=(
-            *saturated(whole),
-            *flat_maps({name: maps[name] for name in explained.relevance}),
-            *(alarm for fill, answers in blank.items() for alarm in fill_decides(whole, answers, fill=fill)),
-            *ranking_alarms(curves),
-        ),
-        table=_table(curves, explained),
-    )
 
 
-def _answer_blank(predict: Predict, material: Material, fill: str, seed: int) -> Float[np.ndarray, " frames"]:
+def _answer_blank(predict: Predict, material: Material, fill: str, seed: int) -> Float64[np.ndarray, " frames"]:
     """Answers on images of which everything is gone."""
     inputs = material.inputs
     paint = get_fill(fill)(inputs, material.references, seed)

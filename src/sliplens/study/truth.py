@@ -1,9 +1,8 @@
 """Explanations held against the truth that only a simulator knows: what each marker does to the answer."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,6 @@ from jaxtyping import Bool, Float, Float64, Int, Shaped, UInt8
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from sliplens.codec import keep_part
 from sliplens.errors import InputError
 from sliplens.explainers.shapley import shapley_values
 from sliplens.faithfulness import get_fill
@@ -35,12 +33,13 @@ from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.models import Run
 from sliplens.plots.style import tell_ends
-from sliplens.progress import OnProgress, counted
+from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset
 from sliplens.recordings.trial import SLIPS
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import is_control
 from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTest, OracleTest, Truth
+from sliplens.shards import Shard, shard
 from sliplens.simulation.intervention import (
     FilmedTrial,
     draw_with_markers_back,
@@ -51,6 +50,7 @@ from sliplens.simulation.intervention import (
 )
 from sliplens.study.explaining import mean_of_known, network_inputs
 from sliplens.study.scoring import require_same_network
+from sliplens.study.stages import Find, Stage
 
 _RIM_PX = 1.5
 """How far a marker's edge reaches on either side of its outline, in pixels of the network's input."""
@@ -326,19 +326,9 @@ def _summarise(truth: Truth) -> str:
     return summary
 
 
-def judge_by_truth(
-    trained: Run,
-    explained: Explained,
-    data: Dataset,
-    *,
-    maps: Mapping[str, Maps],
-    fills: Sequence[str] = TRUTH_FILLS,
-    pairs: int = TRUTH_PAIRS,
-    seed: int = 0,
-    parts: Path | None = None,
-    on_progress: OnProgress | None = None,
-) -> Truth:
-    """Put the markers of every frame back, alone and in company, and hold maps against what that does.
+@dataclass(frozen=True, kw_only=True)
+class JudgingByTruth(Stage[Truth]):
+    """Markers of every frame, a shard, put back alone and in company, and maps held against what that does.
 
     There are two truths: what putting a marker back alone changes, and its Shapley value, the mean of what it changes
     over all the company of markers that may be put back already. The latter add up to the change of the answer.
@@ -346,51 +336,135 @@ def judge_by_truth(
     A map's mass and rank are those of its positive part, what works towards the answer: a share of a sum needs one
     sign. Marker by marker the mean of the map is compared with the effect along the answer's change, both signed: a map
     of what supports the answer alone ties the markers that oppose it.
-
-    `maps` are influences by method, controls included; `fills` those under which a map that knows the effects is held
-    against one that knows half of them; `pairs` how many pairs of scenes the Shapley values of a frame rest on.
     """
-    for fill in fills:
-        get_fill(fill)
-    frames = stage_frames(trained, explained, data)
-    places = [find_places(frame, image_size=trained.manifest.image_size) for frame in frames]
-    pairs = max([pairs, *(2 * len(frame.markers) for frame in frames)])
-    effects = _find_effects(
-        trained, explained, frames, places, fills=fills, pairs=pairs, seed=seed, parts=parts, on_progress=on_progress
-    )
-    size = trained.manifest.image_size
-    # along the answer's change, as the maps are
-    along = [
-        {name: sign * getattr(own, name) for name in (*_EFFECTS, "shuffled")}
-        for sign, own in zip(explained.towards, effects, strict=True)
-    ]
-    judged = dict(maps) | {
-        RANDOM: np.random.default_rng(seed).random((len(frames), size, size)),
-        ORACLE: _paint(places, [own["shapley"] for own in along]),
-        DEGRADED: _paint(places, [own["shuffled"] for own in along]),
-    }
-    change = np.array([frame.prediction - frame.reference_prediction for frame in explained.frames])
-    painted = {name: _paint(places, [getattr(one, name) for one in effects]) for name in _EFFECTS}
-    interval = partial(mean_of_defined, clusters=explained.clusters, seed=seed)
-    alike = partial(interval, limits=(-1.0, 1.0))
-    truth = Truth(
-        input=explained.input,
-        source=explained.source,
-        frames=len(frames),
-        # the mass of a map of chance
-        areas=_by_region(places, lambda _, region: float(region.mean())),
-        methods=_judge(judged, places, along, explained.clusters, seed=seed),
-        pairs=pairs,
-        reliability=interval((reliability_of(one.shapley, one.shapley_error) for one in effects), limits=(0.0, 1.0)),
-        sums={name: _sum_over_change(effects, change, name) for name in ("shapley", "network")},
-        shapley_against_margin=alike(rank_correlation(one.shapley, one.margin) for one in effects),
-        network_against_margin=alike(rank_correlation(one.network, one.margin) for one in effects),
-        meta=meta_test(effects, interval),
-        summary="",
-        effects=_table(frames, places, effects),
-        **{f"{name}_maps": values.astype(np.float32) for name, values in painted.items()},
-    )
-    return replace(truth, summary=_summarise(truth))
+
+    piece = FrameEffects
+    title = "Putting markers back"
+
+    trained: Run
+    explained: Explained
+    data: Dataset
+    maps: Mapping[str, Maps]
+    """Influences by method, controls included."""
+    fills: Sequence[str] = TRUTH_FILLS
+    """Those under which a map that knows the effects is held against one that knows half of them."""
+    pairs: int = TRUTH_PAIRS
+    """How many pairs of scenes the Shapley values of a frame rest on; at least two a marker are taken."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for fill in self.fills:
+            get_fill(fill)
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether the network runs on a graphics card."""
+        return self.trained.device.type != "cpu"
+
+    def shards(self) -> Iterator[Shard]:
+        """All frames."""
+        for index, frame in enumerate(self.explained.frames):
+            known = {"recipe": "truth", "shown": "", "first": index, "frames": 1}
+            yield shard(index, trial=frame.trial, name=frame.id, **known)
+
+    @cached_property
+    def _staged(self) -> tuple[tuple[StagedFrame, ...], list[Places], int]:
+        """Frames, where the network sees their markers, and the number of pairs."""
+        frames = stage_frames(self.trained, self.explained, self.data)
+        places = [find_places(frame, image_size=self.trained.manifest.image_size) for frame in frames]
+        return frames, places, max([self.pairs, *(2 * len(frame.markers) for frame in frames)])
+
+    def prepare(self) -> Find:
+        """Put the markers of a frame back, and see which fills tell a map that knows their effects from half of one."""
+        trained, explained, fills, seed = self.trained, self.explained, self.fills, self.seed
+        frames, places, pairs = self._staged
+        inputs, redraw = network_inputs(trained, explained), redrawing(trained, frames)
+        # each marker alone, pairs of scenes, and under each fill five maps both ways
+        passes = len(frames) * (len(frames[0].markers) + 2 * pairs + 10 * len(SHARES) * (len(fills) + 1))
+        predict = prepare_passes(trained, inputs, passes)
+
+        def find(index: int, _: OnProgress) -> FrameEffects:
+            frame, place, towards = frames[index], places[index], float(explained.towards[index])
+            count, answer = len(frame.markers), answer_scenes(predict, partial(redraw, index))
+            # the whole image first
+            answers = answer(np.eye(count + 1, count, k=-1, dtype=bool))
+            # a run that goes on draws the same; a first guess would lean the truth towards the map that gave it
+            rng = np.random.default_rng((seed, index))
+            found = shapley_values(lambda stay: answer(~stay), count, pairs=pairs, rng=rng)
+            shuffled = shuffle_half(found.values, rng=rng)
+            empty = trained.encoding.empty(frame.reference, image_size=trained.manifest.image_size)
+            change = (inputs[index].cpu() - empty).abs().mean(dim=0).double().numpy()
+            oracles = [towards * found.values, towards * shuffled]
+            known = [*oracles, unit_means(change, place.units)[:count], *map(np.abs, oracles)]
+            orders = [
+                unit_order(place.paint(one), place.units, least_first=least) for one in known for least in (False, True)
+            ]
+            curves = {
+                name: removal_curves(
+                    predict,
+                    inputs[index : index + 1],
+                    np.stack(orders)[:, None],
+                    fill=get_fill(name),
+                    references=empty[None].to(trained.device),
+                    areas=SHARES,
+                )
+                for name in fills
+            }
+            curves[TRUE_FILL] = marker_curves(
+                predict,
+                lambda _, back: redraw(index, back),
+                np.concatenate([influence_orders(one[None]) for one in known]),
+            )
+            return FrameEffects(
+                shapley=found.values,
+                shapley_error=found.standard_errors,
+                network=answers[0] - answers[1:],
+                margin=marker_readings(frame.scene, frame.number)[1],
+                shuffled=shuffled,
+                gains={name: _gains(own, towards) for name, own in curves.items()},
+            )
+
+        return find
+
+    def join(self, pieces: Sequence[FrameEffects]) -> Truth:
+        """Hold the maps against what putting the markers back does."""
+        trained, explained, seed, effects = self.trained, self.explained, self.seed, pieces
+        frames, places, pairs = self._staged
+        size = trained.manifest.image_size
+        # along the answer's change, as the maps are
+        along = [
+            {name: sign * getattr(own, name) for name in (*_EFFECTS, "shuffled")}
+            for sign, own in zip(explained.towards, effects, strict=True)
+        ]
+        judged = dict(self.maps) | {
+            RANDOM: np.random.default_rng(seed).random((len(frames), size, size)),
+            ORACLE: _paint(places, [own["shapley"] for own in along]),
+            DEGRADED: _paint(places, [own["shuffled"] for own in along]),
+        }
+        change = np.array([frame.prediction - frame.reference_prediction for frame in explained.frames])
+        painted = {name: _paint(places, [getattr(one, name) for one in effects]) for name in _EFFECTS}
+        interval = partial(mean_of_defined, clusters=explained.clusters, seed=seed)
+        alike = partial(interval, limits=(-1.0, 1.0))
+        truth = Truth(
+            input=explained.input,
+            source=explained.source,
+            frames=len(frames),
+            # the mass of a map of chance
+            areas=_by_region(places, lambda _, region: float(region.mean())),
+            methods=_judge(judged, places, along, explained.clusters, seed=seed),
+            pairs=pairs,
+            reliability=interval(
+                (reliability_of(one.shapley, one.shapley_error) for one in effects), limits=(0.0, 1.0)
+            ),
+            sums={name: _sum_over_change(effects, change, name) for name in ("shapley", "network")},
+            shapley_against_margin=alike(rank_correlation(one.shapley, one.margin) for one in effects),
+            network_against_margin=alike(rank_correlation(one.network, one.margin) for one in effects),
+            meta=meta_test(effects, interval),
+            summary="",
+            effects=_table(frames, places, effects),
+            **{f"{name}_maps": values.astype(np.float32) for name, values in painted.items()},
+        )
+        return replace(truth, summary=_summarise(truth))
 
 
 def _judge(
@@ -475,66 +549,3 @@ def true_curves(
 
 def _paint(places: Sequence[Places], values: Sequence[Float[np.ndarray, " markers"]]) -> Maps:
     return np.stack([place.paint(own) for place, own in zip(places, values, strict=True)])
-
-
-def _find_effects(
-    trained: Run,
-    explained: Explained,
-    frames: Sequence[StagedFrame],
-    places: Sequence[Places],
-    *,
-    fills: Sequence[str],
-    pairs: int,
-    seed: int,
-    parts: Path | None,
-    on_progress: OnProgress | None,
-) -> list[FrameEffects]:
-    """Put markers back, and see which fills can tell a map that knows their effects from half of one."""
-    inputs, redraw = network_inputs(trained, explained), redrawing(trained, frames)
-    # each marker alone, pairs of scenes, and under each fill five maps both ways
-    passes = len(frames) * (len(frames[0].markers) + 2 * pairs + 10 * len(SHARES) * (len(fills) + 1))
-    predict = prepare_passes(trained, inputs, passes)
-
-    def find(index: int) -> FrameEffects:
-        frame, place, towards = frames[index], places[index], float(explained.towards[index])
-        count, answer = len(frame.markers), answer_scenes(predict, partial(redraw, index))
-        # the whole image first
-        answers = answer(np.eye(count + 1, count, k=-1, dtype=bool))
-        # a run that goes on draws the same; a first guess would lean the truth towards the map that gave it
-        rng = np.random.default_rng((seed, index))
-        found = shapley_values(lambda stay: answer(~stay), count, pairs=pairs, rng=rng)
-        shuffled = shuffle_half(found.values, rng=rng)
-        empty = trained.encoding.empty(frame.reference, image_size=trained.manifest.image_size)
-        change = (inputs[index].cpu() - empty).abs().mean(dim=0).double().numpy()
-        oracles = [towards * found.values, towards * shuffled]
-        known = [*oracles, unit_means(change, place.units)[:count], *map(np.abs, oracles)]
-        orders = [
-            unit_order(place.paint(one), place.units, least_first=least) for one in known for least in (False, True)
-        ]
-        curves = {
-            name: removal_curves(
-                predict,
-                inputs[index : index + 1],
-                np.stack(orders)[:, None],
-                fill=get_fill(name),
-                references=empty[None].to(trained.device),
-                areas=SHARES,
-            )
-            for name in fills
-        }
-        curves[TRUE_FILL] = marker_curves(
-            predict, lambda _, back: redraw(index, back), np.concatenate([influence_orders(one[None]) for one in known])
-        )
-        return FrameEffects(
-            shapley=found.values,
-            shapley_error=found.standard_errors,
-            network=answers[0] - answers[1:],
-            margin=marker_readings(frame.scene, frame.number)[1],
-            shuffled=shuffled,
-            gains={name: _gains(own, towards) for name, own in curves.items()},
-        )
-
-    return [
-        keep_part(parts and parts / f"{index:05d}", FrameEffects, partial(find, index))
-        for index in counted(range(len(frames)), on_progress)
-    ]

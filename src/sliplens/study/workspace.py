@@ -168,6 +168,8 @@ def score_explained(
     steps: int | None = None,
     seed: int = 0,
     device: str = "cpu",
+    on: str = "serial",
+    retry_failed: bool = False,
     out: Path | None = None,
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
@@ -175,7 +177,9 @@ def score_explained(
     """Score explanations by deletion, as the thesis does, beside a random order.
 
     `run` is the network that was explained, `fill` a row of `FILLS`; as in the thesis every pixel is gone after as many
-    steps as the image is high if `steps` is None. Curves and scores are written to the folder `out`, if it is named.
+    steps as the image is high if `steps` is None. Curves and scores are written to the folder `out`, if it is named;
+    interrupted, it goes on after the last trial. `on` says where trials are scored, a row of `shards.EXECUTORS`:
+    `serial`, `processes`, `processes=4`; `retry_failed` tries those again that failed three times before.
 
     Raises
     ------
@@ -183,13 +187,16 @@ def score_explained(
         If there is no such fill or folder, or the folder to write holds something else.
     CheckpointError
         If the explanations are of another network.
+    ShardError
+        If some of several trials failed again and again, when all others are there.
     """
     get_fill(fill)
     trained = open_run(run, device=device)
     explained = explanations if isinstance(explanations, Explained) else load_explained(explanations)
     require_same_network(trained, explained)
     title = f"Deleting pixels ({explained.input}, {explained.source})"
-    score = partial(score_explanations, trained, explained, fill=fill, steps=steps, seed=seed)
+    own: dict[str, Any] = {"fill": fill, "steps": steps, "seed": seed, "on": on, "retry_failed": retry_failed}
+    score = partial(score_explanations, trained, explained, **own)
     if out is None:
         with stage(on_progress, title) as count:
             return score(on_progress=count)
@@ -199,7 +206,9 @@ def score_explained(
     with output_folder(out, stage="score", config=recipe, overwrite=overwrite) as output:
         if not output.complete:
             with stage(on_progress, title) as count:
-                save_result(score(on_progress=count), output.folder)
+                scores = score(parts=output.folder / "parts", on_progress=count)
+            shutil.rmtree(output.folder / "parts")
+            save_result(scores, output.folder)
     wrote(on_progress, out, "curves and scores", kept=output.complete)
     return load_result(out, DeletionScores, command="sliplens score")
 

@@ -1,0 +1,114 @@
+"""Stages of a study: work on shards whose parts are records, and the result that these make together."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
+
+import numpy as np
+
+from sliplens.codec import load_result, save_result
+from sliplens.files import scratch_folder
+from sliplens.models.engines import counting_passes
+from sliplens.progress import OnProgress
+from sliplens.results.explanation import Explained
+from sliplens.shards import Crew, MakePart, Shard, make_parts, shard
+
+Result = TypeVar("Result")
+Find: TypeAlias = Callable[[Any, OnProgress], Any]
+"""From what a shard is of to its record."""
+
+
+class Stage(ABC, Generic[Result]):
+    """Work on the shards of a stage; it travels, so that it holds no more than its shards need."""
+
+    piece: ClassVar[type]
+    """Record of a shard."""
+    title: ClassVar[str]
+    """What is done, for `read_status`."""
+
+    @property
+    @abstractmethod
+    def on_gpu(self) -> bool:
+        """Whether the network of the stage runs on a graphics card."""
+
+    @abstractmethod
+    def shards(self) -> Iterator[Shard]:
+        """All shards, in the order in which `join` takes their records."""
+
+    @abstractmethod
+    def prepare(self) -> Find:
+        """Make ready what all shards need; once in each process that takes part."""
+
+    @abstractmethod
+    def join(self, pieces: Sequence[Any]) -> Result:
+        """Make the result of the records of all shards."""
+
+    def begin(self) -> MakePart:
+        """Make records, and write each as the folder of its shard."""
+        with counting_passes():
+            find = self.prepare()
+
+        def make(item: Any, path: Path, on_progress: OnProgress) -> None:
+            with counting_passes():  # whatever was made before here, or elsewhere
+                piece = find(item, on_progress)
+            path.mkdir()
+            save_result(piece, path)
+
+        return make
+
+    def make(
+        self,
+        parts: Path | None = None,
+        *,
+        crew: Crew | None = None,
+        name: Any = None,
+        on_piece: Callable[[Any, Any], None] | None = None,
+        on_progress: OnProgress | None = None,
+        **how: Any,
+    ) -> Result:
+        """Make the records that `parts` does not keep yet, and the result.
+
+        A `crew` does other stages too, and gets each item with the `name` of this one. `on_piece` is called with the
+        item of each record and the record, as soon as it is there; `how` are other parameters of `make_parts`.
+        """
+
+        def shards() -> Iterator[Shard]:
+            for one in self.shards():
+                yield one if crew is None else replace(one, item=(name, one.item))
+
+        with nullcontext(parts) if parts else scratch_folder() as folder:
+
+            def read(one: Shard) -> Any:
+                return load_result(folder / one.part, self.piece, command="the interrupted command")
+
+            def show(one: Shard) -> None:
+                if on_piece is not None:
+                    on_piece(one.item if crew is None else one.item[1], read(one))
+
+            make_parts(crew or self, shards, folder, title=self.title, on_part=show, on_progress=on_progress, **how)
+            return self.join([read(one) for one in shards()])
+
+
+def trial_shards(explained: Explained, *about: str, maps: int = 1) -> Iterator[Shard]:
+    """A shard of (*about, trial) for each trial of explained frames, of so many maps a frame."""
+    for number, (trial, rows) in enumerate(explained.trials.items()):
+        # the folder of the parts is one of these explanations and options alone (`files.output_folder`)
+        known = {"recipe": about, "shown": "", "first": number, "frames": maps * len(rows)}
+        yield shard((*about, trial), trial=trial, name=" ".join((*about, trial)), **known)
+
+
+def method_shards(methods: Sequence[str]) -> Iterator[Shard]:
+    """A shard for each method."""
+    for method in methods:
+        yield shard(method, trial=method, frames=1, recipe="method", shown="")
+
+
+def join_trials(
+    explained: Explained, pieces: Sequence[Mapping[str, np.ndarray]], *, axis: int = 0
+) -> dict[str, np.ndarray]:
+    """Arrays of all frames, whose axis is named, from those of each trial (`trial_shards`)."""
+    order = np.argsort([row for rows in explained.trials.values() for row in rows])
+    return {name: np.concatenate([own[name] for own in pieces], axis=axis).take(order, axis) for name in pieces[0]}
