@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from sliplens.faithfulness.scoring import score
     from sliplens.friction import Friction
     from sliplens.grip.episodes import run_episodes
+    from sliplens.grip.hold import hold_grip
     from sliplens.live.loop import LiveReader, read_live
     from sliplens.markers.tracking import track
     from sliplens.models.checkpoint import load
@@ -46,6 +47,7 @@ _MODULES = {
     "export_lerobot": "sliplens.recordings.exporting",
     "export_mcap": "sliplens.recordings.exporting",
     "export_onnx": "sliplens.models.onnx",
+    "hold_grip": "sliplens.grip.hold",
     "import_recordings": "sliplens.recordings.importing",
     "label_dataset": "sliplens.recordings.importing",
     "load": "sliplens.models.checkpoint",
@@ -78,6 +80,7 @@ __all__ = [
     "export_lerobot",
     "export_mcap",
     "export_onnx",
+    "hold_grip",
     "import_recordings",
     "label_dataset",
     "load",

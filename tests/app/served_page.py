@@ -9,8 +9,9 @@ import json
 import sys
 
 import sliplens as sl
-from sliplens.app import GripSource, LivePage
+from sliplens.app import LivePage
 from sliplens.errors import InputError
+from sliplens.grip import GripSource
 from sliplens.live import LiveSource, SimulatedSource
 
 

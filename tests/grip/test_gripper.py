@@ -5,10 +5,10 @@ import os
 import socket
 import threading
 import time
-from contextlib import suppress
 
 import numpy as np
 import pytest
+from fake_gripper import FakeGripper
 from zenoh_router import open_router
 
 from sliplens.errors import InputError
@@ -23,35 +23,6 @@ from sliplens.grip.gripper import (
 )
 
 SOON_S = 0.03
-
-
-class FakeGripper:
-    """A gripper on a port of this machine that speaks the line protocol, or as badly as it is told to."""
-
-    def __init__(self) -> None:
-        self.answer: bytes | None = b"OK 1.000 0.0400\n"
-        self.heard: list[str] = []
-        self._server = socket.create_server(("127.0.0.1", 0))
-        self.address = f"tcp://127.0.0.1:{self._server.getsockname()[1]}"
-        self._thread = threading.Thread(target=self._serve, daemon=True)
-        self._thread.start()
-
-    def _serve(self) -> None:
-        self._connection, _ = self._server.accept()
-        # whoever hangs up in the middle of an answer resets the connection
-        with suppress(ConnectionError), self._connection, self._connection.makefile("rwb") as stream:
-            for line in stream:
-                self.heard.append(line.decode().strip())
-                if self.answer is not None:
-                    stream.write(self.answer)
-                    stream.flush()
-
-    def send(self, answer: bytes) -> None:
-        """Say something unasked."""
-        self._connection.sendall(answer)
-
-    def close(self) -> None:
-        self._server.close()
 
 
 @pytest.fixture

@@ -17,12 +17,12 @@ import torch
 from PIL import Image
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from sliplens.app.gripper import GripSource, Held
 from sliplens.errors import SliplensError
 from sliplens.explainers.explanation import CLOSE, Explanation
 from sliplens.explainers.occlusion import marker_regions, to_network_px
 from sliplens.explainers.table import explain
 from sliplens.files import to_builtins
+from sliplens.grip.source import GripSource, Held
 from sliplens.images import encode_jpeg
 from sliplens.live.loop import LiveReader
 from sliplens.live.reading import LiveFrame, Reading

@@ -10,10 +10,10 @@ from nicegui import binding, run, ui
 from nicegui.events import KeyEventArguments
 
 from sliplens.app.feed import CHART_S, LIVE_METHOD, Viewer
-from sliplens.app.gripper import GripSource
 from sliplens.errors import InputError, SliplensError
 from sliplens.explainers.table import EXPLAINERS
 from sliplens.grip.controllers import CONTROLLERS
+from sliplens.grip.source import GripSource
 from sliplens.live.sources import SimulatedSource
 from sliplens.plots.saliency import LOWERS, RAISES
 from sliplens.plots.style import BLUE, METHOD_NAMES

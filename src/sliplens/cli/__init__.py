@@ -22,6 +22,7 @@ from sliplens.cli.explain import Explain
 from sliplens.cli.export import Export
 from sliplens.cli.grip import Grip
 from sliplens.cli.help import EXAMPLES, OPTIONAL, Help, HelpText, describe_options, overview, print_help, tell_unknown
+from sliplens.cli.hold import Hold
 from sliplens.cli.import_ import Import
 from sliplens.cli.label import Label
 from sliplens.cli.live import Live
@@ -41,9 +42,9 @@ from sliplens.recordings.options import LabelSettings, ReadOptions
 
 _Recordings = Sensor | Simulate | Import | Label | Split | Check | View | Track
 _Networks = Train | Evaluate | Predict | Export
-Command = (
-    Demo | Live | _Recordings | _Networks | Explain | Score | Diagnose | Study | Status | Grip | Report | Doctor | Help
-)
+_Holds = Grip | Hold
+_Why = Explain | Score | Diagnose | Study
+Command = Demo | Live | _Recordings | _Networks | _Why | Status | _Holds | Report | Doctor | Help
 
 _DESCRIPTION = """sliplens tells how close a soft robotic fingertip is to losing its grip, from the images of the camera
 inside it, and shows why the network says so. Start with `sliplens demo runs/demo`; `sliplens help` tells which commands

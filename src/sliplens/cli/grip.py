@@ -73,7 +73,7 @@ class Grip(Command):
             run_episodes,
             rendered=rendered,
             script={name: value for name, value in script.items() if value is not None},
-            settings=dict(map(_constant, self.set)),
+            settings=dict(map(constant, self.set)),
             friction=self.told_friction,
             latency_s=self.latency,
             method=self.method if rendered and self.method != "none" else None,
@@ -92,7 +92,7 @@ class Grip(Command):
         Report(workspace=self.output).run()
 
 
-def _constant(text: str) -> tuple[str, float]:
+def constant(text: str) -> tuple[str, float]:
     """Name and value of a constant."""
     name, _, value = text.partition("=")
     try:

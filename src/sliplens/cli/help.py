@@ -39,6 +39,7 @@ EXAMPLES = {
     "study": "sliplens study runs/mine/data --difference runs/mine/train --raw none -o runs/mine/study",
     "status": "sliplens status runs/mine/margins",
     "grip": "sliplens grip -o runs/grip --object egg",
+    "hold": "sliplens hold grip:cup --gripper simulated",
     "report": "sliplens report runs/mine",
     "doctor": "sliplens doctor",
     "help": "sliplens help teach",
@@ -50,7 +51,7 @@ TASKS = {
     "explain": ("See which parts of an image a margin comes from", ("explain", "score")),
     "teach": ("Teach a network your own sensor", ("sensor", "import", "check", "label", "train", "evaluate")),
     "judge": ("Find out where a network fails, and which explanation can be believed", ("diagnose", "study")),
-    "live": ("Read a running camera, and hold what it feels", ("live", "grip")),
+    "live": ("Read a running camera, and hold what it feels", ("live", "grip", "hold")),
 }
 """What users come for, and the commands that do it, in their order."""
 

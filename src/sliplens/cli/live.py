@@ -77,7 +77,7 @@ class Live:
 
     def run(self) -> None:
         """Read until the source ends."""
-        from sliplens.app.gripper import open_grip
+        from sliplens.grip.source import open_grip
         from sliplens.live import LiveReader
         from sliplens.live.contract import SourceOptions, parse_size
         from sliplens.recordings import TrialFacts

@@ -1,8 +1,10 @@
 """Controllers of the grip force: what to press with, told from what the fingertips read."""
 
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from threading import Lock
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -11,6 +13,7 @@ from jaxtyping import Bool, Float
 from sliplens.errors import InputError
 from sliplens.extras import Table
 from sliplens.grip.plant import PERIOD_S
+from sliplens.live.reading import Reading, SlipState
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +40,8 @@ class Observation:
     """Whether the markers of a finger jumped back, as they do when it begins to slide."""
     true_margin: Float[np.ndarray, "episodes 2"] | None = None
     """Margin as it is, for the oracle; None outside a simulation."""
+    since_s: float = PERIOD_S
+    """Time since the command before, which bounds how far the force may go from it."""
 
 
 @runtime_checkable
@@ -157,7 +162,7 @@ class MarginGrip(ABC):
         calm = (seen.time_s - self._slipped_s < self.calm_s) | (seen.time_s < _SETTLED_S)
         wanted = np.where(calm, np.maximum(wanted, seen.command_n), wanted)
         wanted = np.where(seen.time_s - self._seen_s > self.blind_s, np.maximum(wanted, self.safe_n), wanted)
-        up, down = self.up_n_s * PERIOD_S, self.down_n_s * PERIOD_S
+        up, down = self.up_n_s * seen.since_s, self.down_n_s * seen.since_s
         told = np.clip(wanted, seen.command_n - down, seen.command_n + up)
         # a reflex knows no rate
         told = np.where(slip, np.maximum(told, self.boost * seen.force_n), told)
@@ -279,3 +284,160 @@ def make_controller(name: str, settings: Mapping[str, float] | None = None, *, t
     if settings.get("target", 0) >= 1 or settings.get("zero", 0) >= 1:
         raise InputError("margins are shares of the friction: give a target and a zero below 1")
     return kind(**settings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """What is commanded, and why."""
+
+    command_n: float
+    """Grip force to press with."""
+    margin: float
+    """Margin read, the mean of the fingertips that read; NaN where none does."""
+    low: float
+    """Lower end of its interval, in margin units."""
+    slip: bool
+    """Whether the markers told a slip since the command before."""
+    why: str
+
+
+class Holder:
+    """Answers the readings of one or two running fingertips with a grip force, command after command.
+
+    A reading counts for half a second, with the grip force of the moment in which its frame was taken. A slip that the
+    markers tell counts once; while the fingers close, or the grip is loosened, skin that springs back looks the same,
+    and does not count. Without a margin nothing is loosened, whatever the controller says, and a controller that says
+    no number holds. The controller's time begins at the first touch. Readings may be heard in other threads.
+
+    Parameters
+    ----------
+    controller
+        Row of `CONTROLLERS`, made to suit what the readings know of the friction, or a controller of your own.
+    settings
+        Constants of a row to change, in its units (newtons, seconds, shares).
+    ceiling_n
+        Grip force that is never passed.
+    command_n
+        Grip force that was told before.
+    fingers
+        How many fingertips read: 1 or 2.
+    """
+
+    def __init__(
+        self,
+        controller: str | Controller,
+        *,
+        settings: Mapping[str, float] | None = None,
+        ceiling_n: float,
+        command_n: float = 0.0,
+        fingers: int = 1,
+    ) -> None:
+        self._settings, self._ceiling, self._command = settings, ceiling_n, command_n
+        self._lock, self._knows_friction = Lock(), False
+        self._heard: list[tuple[Reading, float] | None] = [None] * fingers
+        self._slipping, self._slip = [False] * fingers, False
+        self._past: deque[tuple[float, float, float]] = deque(maxlen=_MEMORY)
+        """Times of the last commands, with the grip force and the load that were measured then."""
+        self._touched_s: float | None = None
+        self.choose(controller)
+
+    def choose(self, controller: str | Controller) -> None:
+        """Have another controller answer from now on."""
+        self._chosen = controller
+        self._controller = (
+            make_controller(controller, self._settings, told=self._knows_friction)
+            if isinstance(controller, str)
+            else controller
+        )
+
+    def hear(self, reading: Reading, *, taken_s: float, finger: int = 0) -> None:
+        """Take what a fingertip read of a frame that was taken at a time, on the clock of the commands."""
+        with self._lock:
+            # a reading that is withheld tells no friction either
+            if reading.margin is not None and self._knows_friction != (reading.friction is not None):
+                self._knows_friction = not self._knows_friction
+                self.choose(self._chosen)
+            closed = self._touched_s is not None and taken_s - self._touched_s > _CLOSING_S
+            slips = reading.slip is SlipState.SLIP and closed
+            if slips and not self._slipping[finger]:
+                (force_n, _), (earlier_n, _) = self._measured(taken_s), self._measured(taken_s - _SPRINGS_BACK_S)
+                self._slip |= not force_n < 0.99 * earlier_n
+            self._slipping[finger], self._heard[finger] = slips, (reading, taken_s)
+
+    def answer(self, time_s: float, force_n: float, *, load_n: float = np.nan) -> Answer:
+        """Grip force to command at a time, from the force measured now; NaN where nothing is measured."""
+        with self._lock:
+            before_s = self._past[-1][0] if self._past else time_s - PERIOD_S
+            self._past.append((time_s, force_n, load_n))
+            if self._touched_s is None and force_n > _TOUCH_N:
+                self._touched_s = time_s
+            slip, self._slip = self._slip, False
+            heard = [one if one and time_s - one[1] <= _STALE_S else None for one in self._heard]
+            measured = [self._measured(one[1]) for one in heard if one]
+            then_n, load_n = np.mean(measured, axis=0).tolist() if measured else (force_n, load_n)
+            paired = not np.isnan(then_n)
+            margin, low, true_margin = (
+                np.resize([_value(one[0], name) if one and paired else np.nan for one in heard], (1, 2))
+                for name in ("margin", "low", "true_margin")
+            )
+            seen = Observation(
+                time_s=0.0 if self._touched_s is None else time_s - self._touched_s,
+                force_n=np.array([then_n if paired else self._command]),
+                command_n=np.array([self._command]),
+                load_n=np.array([load_n]),
+                margin=margin,
+                low=np.where(np.isnan(low), margin, low),
+                slip=np.array([slip]),
+                true_margin=true_margin,
+                since_s=min(time_s - before_s, _LONGEST_S),
+            )
+            command_n = float(np.asarray(self._controller.command(seen))[0])
+            blind = bool(np.isnan(margin).all())
+            if np.isnan(command_n) or (blind and command_n < self._command):
+                command_n = self._command
+            command_n = min(max(command_n, 0.0), self._ceiling)
+            change, self._command = command_n - self._command, command_n
+            return Answer(
+                command_n=command_n,
+                margin=np.nan if blind else float(np.nanmean(seen.margin)),
+                low=np.nan if blind else float(np.nanmean(seen.low)),
+                slip=slip,
+                why=self._why(change, slip=slip, blind=blind),
+            )
+
+    def _measured(self, time_s: float) -> tuple[float, float]:
+        """Grip force and load at a time; NaN where none was measured."""
+        if not self._past or np.isnan(time_s):
+            return np.nan, np.nan
+        times, forces, loads = np.array(self._past).T
+        return float(np.interp(time_s, times, forces)), float(np.interp(time_s, times, loads))
+
+    def _why(self, change_n: float, *, slip: bool, blind: bool) -> str:
+        does = "holds" if abs(change_n) < 1e-3 else "tightens" if change_n > 0 else "loosens"
+        does = "presses as hard as it may" if self._command == self._ceiling else does
+        if slip:
+            return "the markers told a slip: tightens at once"
+        if blind:
+            return f"no margin is read: {does}"
+        if isinstance(self._controller, MarginGrip):
+            acted, target = float(self._controller.acted[0]), self._controller.target
+            return f"acts on a margin of {max(acted, 0):.0%}, and aims at {target:.0%}: {does}"
+        return does
+
+
+def _value(reading: Reading, name: str) -> float:
+    value = getattr(reading, name)
+    return np.nan if value is None else value
+
+
+_STALE_S = 0.5
+"""Age from which a reading says nothing of now."""
+_CLOSING_S = 0.5
+"""Time after the first touch in which the markers move because the fingers close."""
+_SPRINGS_BACK_S = 0.25
+"""Time within which the markers tell of skin that springs back."""
+_TOUCH_N = 0.02
+"""Grip force that is a touch."""
+_LONGEST_S = 3 * PERIOD_S
+"""Time that the force may change for at once: what a slow gripper missed is not made up for."""
+_MEMORY = 240

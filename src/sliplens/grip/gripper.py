@@ -439,10 +439,14 @@ class GuardedGripper:
         with self._lock:
             return self._gripper.read_state()
 
-    def close(self) -> None:
-        """Stop guarding and let go of the connection; the gripper keeps the last force it was told."""
+    def stop(self) -> None:
+        """Stop guarding; the gripper keeps the last force it was told."""
         self._stop.set()
         self._watch.join()
+
+    def close(self) -> None:
+        """Stop guarding, and let go of the connection."""
+        self.stop()
         self._gripper.close()
 
     def __enter__(self) -> "GuardedGripper":

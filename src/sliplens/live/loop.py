@@ -247,6 +247,20 @@ class LiveReader:
         troubles = [state.trouble for state in self.outputs] + [self._forces.trouble if self._forces else None]
         return tuple(trouble for trouble in troubles if trouble is not None)
 
+    @property
+    def ended(self) -> str | None:
+        """Why no more readings come; None while they may."""
+        if not self._over.is_set():
+            return None
+        return (
+            f"{self.source.name} has ended" if self._error is None else str(self._error) or type(self._error).__name__
+        )
+
+    @property
+    def failed(self) -> bool:
+        """Whether it ended because the source or a frame failed."""
+        return self._over.is_set() and self._error is not None
+
     def __enter__(self) -> "LiveReader":
         if self._threads:
             raise InputError("a reader reads once; make another one of the same source")
@@ -263,7 +277,8 @@ class LiveReader:
                 engine = self._make_engine(self.network)
             self._reader.begin(engine, self.source.reference if self._named is None else self._named)
             self._stack = stack.pop_all()
-        self._threads = [Thread(target=self._run, args=(job,), daemon=True) for job in (self._capture, self._infer)]
+        jobs = (self._capture, self._frames.close), (self._infer, self._finish)
+        self._threads = [Thread(target=self._run, args=job, daemon=True) for job in jobs]
         for thread in self._threads:
             thread.start()
         return self
@@ -385,32 +400,30 @@ class LiveReader:
         self.source.close()
         self._frames.close()
 
-    def _run(self, job: Callable[[], None]) -> None:
+    def _run(self, job: Callable[[], None], end: Callable[[], None]) -> None:
         try:
             job()
         except BaseException as error:
             self._error = self._error or error
-            self._end()
+        finally:  # whoever is woken by the end asks for the error
+            end()
 
     def _capture(self) -> None:
         """Capture until the source ends; one that is lost is opened again until it is back."""
-        try:
-            while not self._stopped.is_set():
-                try:
-                    for frame in self.source.frames():
-                        if self._stopped.is_set():
-                            return
-                        self._trouble = None
-                        self._take(frame)
-                except SourceError as error:
-                    if not self.source.reconnects:
-                        raise
-                    self._trouble = str(error)
-                    self._reconnect()
-                else:
-                    return
-        finally:
-            self._frames.close()
+        while not self._stopped.is_set():
+            try:
+                for frame in self.source.frames():
+                    if self._stopped.is_set():
+                        return
+                    self._trouble = None
+                    self._take(frame)
+            except SourceError as error:
+                if not self.source.reconnects:
+                    raise
+                self._trouble = str(error)
+                self._reconnect()
+            else:
+                return
 
     def _take(self, frame: LiveFrame) -> None:
         if self._forces is not None:
@@ -436,20 +449,20 @@ class LiveReader:
     def _infer(self) -> None:
         ends_s = np.inf if self._seconds is None else time.monotonic() + self._seconds
         silent = f"{self.source.name} has given no frame for {self._stall_s:g} s; {self.source.cure}"
-        try:
-            while (left_s := ends_s - time.monotonic()) > 0:
-                frame = self._frames.take(min(self._stall_s, left_s))
-                if frame is not None:
-                    self._tell(self._reader.read(frame), frame)
-                elif self._frames.closed:
-                    break
-                elif time.monotonic() < ends_s:
-                    self._tell(self._reader.missing(self._trouble or silent), None)
-        finally:
-            self._end()
-            self._over.set()
-            for place in tuple(self._listening):
-                place.close()
+        while (left_s := ends_s - time.monotonic()) > 0:
+            frame = self._frames.take(min(self._stall_s, left_s))
+            if frame is not None:
+                self._tell(self._reader.read(frame), frame)
+            elif self._frames.closed:
+                break
+            elif time.monotonic() < ends_s:
+                self._tell(self._reader.missing(self._trouble or silent), None)
+
+    def _finish(self) -> None:
+        self._end()
+        self._over.set()
+        for place in tuple(self._listening):
+            place.close()
 
     def _tell(self, reading: Reading, frame: LiveFrame | None) -> None:
         self.source.hear(reading)

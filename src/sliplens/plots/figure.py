@@ -15,7 +15,7 @@ from sliplens.codec import Columns
 from sliplens.errors import InputError
 from sliplens.intervals import Difference
 from sliplens.plots.errors import plot_answers, plot_faithfulness, plot_learning_curves
-from sliplens.plots.margins import column, plot_grip_force, plot_margins, plot_readings
+from sliplens.plots.margins import column, plot_grip_force, plot_hold, plot_margins, plot_readings
 from sliplens.plots.saliency import full_colour, overlay_relevance, overlay_saliency, stretch_saliency
 from sliplens.plots.style import (
     BLACK,
@@ -43,7 +43,8 @@ def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
     An evaluation shows answers against labels; a training its learning curve; an explanation the map over the image;
     scores of explanations their curves or gains; predictions the margin over time; tracked markers how far they moved;
     a study the gain of each method with its 95 % interval; a diagnosis where the error is larger than elsewhere;
-    a grip the force over the least that holds. Margins are in percent, gains in margin units.
+    a grip the force over the least that holds; a hold the force that was told. Margins are in percent, gains in margin
+    units.
 
     Parameters
     ----------
@@ -225,6 +226,7 @@ DRAWERS: dict[str, Callable[[Any, Axes, int], object]] = {
     "Predictions": _predictions,
     "Tracking": _tracking,
     "Grip": lambda result, ax, _: plot_grip_force(result.trace, ax=ax).set_title(result.setup.controller),
+    "Hold": lambda result, ax, _: plot_hold(result.steps, ax=ax).set_title(result.controller),
     "Strip": lambda result, ax, _: plot_readings(result, ax=ax),
 }
 """What draws a record, by the name of its class."""

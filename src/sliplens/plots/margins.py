@@ -33,7 +33,7 @@ from sliplens.plots.style import (
     save_page,
 )
 from sliplens.results.explanation import Strip
-from sliplens.results.grip import GripTrace
+from sliplens.results.grip import GripTrace, HoldSteps
 
 MOST_TRIALS = 6
 """Trials on one page."""
@@ -194,6 +194,17 @@ def plot_grip_force(trace: GripTrace, *, ax: Axes) -> Axes:
         ax.axvline(time_s, color=VERMILLION, linewidth=1, linestyle=":", label="slip seen" if number == 0 else None)
     # room for the legend above what is drawn
     ax.set(xlabel="Time (s)", ylabel="Force (N)", ylim=(0, 1.4 * float(trace.force_n.max()) or 1.0))
+    ax.legend(loc="upper right", ncols=2)
+    return ax
+
+
+def plot_hold(steps: HoldSteps, *, ax: Axes) -> Axes:
+    """Draw the grip force that a gripper was told and that it measured, and when it failed or a slip was told."""
+    ax.plot(steps.time_s, steps.command_n, color=BLACK, linestyle="--", label="told")
+    ax.plot(steps.time_s, steps.force_n, color=BLUE, label="measured")
+    for marked, colour, label in ((steps.slip, VERMILLION, "slip seen"), (steps.failed, GREY, "gripper failed")):
+        ax.plot(steps.time_s[marked], steps.command_n[marked], color=colour, marker="x", linestyle="", label=label)
+    ax.set(xlabel="Time (s)", ylabel="Grip force (N)", ylim=(0, 1.4 * float(steps.command_n.max(initial=0.0)) or 1.0))
     ax.legend(loc="upper right", ncols=2)
     return ax
 

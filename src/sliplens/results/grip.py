@@ -1,9 +1,10 @@
-"""Grips: what became of each episode, and one of them tick by tick."""
+"""Grips: what became of each episode, one of them tick by tick, and what a real gripper was told."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
+import pyarrow as pa
 from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
 
 from sliplens.codec import UNKNOWN, Columns
@@ -99,3 +100,48 @@ class Grip:
     def drop_rate(self) -> float:
         """Share of the episodes in which the object fell."""
         return float(self.episodes.dropped.mean())
+
+
+@dataclass(frozen=True, kw_only=True)
+class HoldSteps(Columns):
+    """Commands to a gripper, a row each; NaN where nothing was measured or read."""
+
+    time_s: Annotated[Float64[np.ndarray, " steps"], AMOUNT]
+    command_n: Annotated[Float64[np.ndarray, " steps"], AMOUNT]
+    """Grip force that was told."""
+    force_n: Annotated[Float64[np.ndarray, " steps"], ANSWER, UNKNOWN]
+    """Grip force that the gripper measured before."""
+    margin: Annotated[Float64[np.ndarray, " steps"], MARGIN, UNKNOWN]
+    """Read, the mean of the fingertips that read."""
+    low: Annotated[Float64[np.ndarray, " steps"], MARGIN, UNKNOWN]
+    slip: Bool[np.ndarray, " steps"]
+    """Whether the markers told of a slip."""
+    failed: Bool[np.ndarray, " steps"]
+    """Whether the gripper failed to take the command, or to tell its force."""
+    why: Shaped[np.ndarray, " steps"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hold:
+    """What a gripper was told while something was held, and how that ended."""
+
+    sources: tuple[str, ...]
+    """What was read: a fingertip each."""
+    gripper: str
+    """Its address, or the name of its class."""
+    controller: str
+    settings: dict[str, float]
+    """Constants of the controller that were changed."""
+    ceiling_n: float
+    watchdog_s: float
+    ended: Literal["time", "source", "failed", "interrupted"]
+    """The time was over, a source ended or failed, or a person interrupted it."""
+    why: str
+    """The same in a sentence, with what the gripper goes on doing."""
+    troubles: tuple[str, ...]
+    """What the gripper failed at, each once."""
+    steps: HoldSteps
+
+    def frame(self) -> pa.Table:
+        """Table with a row a command."""
+        return self.steps.table()

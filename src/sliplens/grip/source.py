@@ -8,27 +8,26 @@ from threading import Event, Lock
 import numpy as np
 
 from sliplens.errors import InputError
-from sliplens.grip.controllers import Controller, MarginGrip, Observation, make_controller
+from sliplens.grip.controllers import Holder
 from sliplens.grip.fingertip import Fingertip
+from sliplens.grip.gripper import GripperError, GripperState
 from sliplens.grip.plant import PERIOD_S, GripperModel, Plant, PlantState, World, least_force, pick_object
 from sliplens.grip.scripts import LIFT_S, hand_motion
 from sliplens.live.contract import LiveSource, Pace, SourceOptions
-from sliplens.live.reading import LiveFrame, Reading, SlipState
+from sliplens.live.reading import LiveFrame, Reading
 from sliplens.recordings.capture import Forces
 
 OPEN_S = 1.5
 """Time that the fingers stay open before they close, so that the sensor is seen untouched, and after a drop."""
-_STALE_S = 0.5
-"""Age from which a reading says nothing of now."""
 _CEILING_N = 2.8
 """Force that the gripper never passes: beyond, the network of the package sees frames that it does not know, its margin
 is withheld, and a grip that is never loosened blindly would stay there."""
 _MEMORY = 120
-_SPRINGS_BACK = 8
-"""Frames within which the markers tell of skin that springs back."""
 _POURS_KG_S, _PULLS_N_S = 0.03, 2.0
 """How fast a person pours and pulls."""
 _FAINTEST_N = 0.02
+_WIDTHS_M = (0.09, 0.07)
+"""Opening of the fingers, and what is between them when they touch (assumed)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +52,8 @@ class GripSource(LiveSource):
 
     Its frames are those of one fingertip. Who reads them says what was read (`hear`, as `LiveReader` does), and the
     controller answers that: the loop is closed through pixels, by the network at hand, with its true latency and what
-    its health withholds. A gripper that hears nothing goes to its safe force. What has fallen is gripped anew.
+    its health withholds. A gripper that hears nothing goes to its safe force. What has fallen is gripped anew. Told
+    forces from outside (`set_force`), it is a `Gripper` without a controller of its own.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class GripSource(LiveSource):
 
     Examples
     --------
-    >>> from sliplens.app import GripSource
+    >>> from sliplens.grip import GripSource
     >>> with GripSource("cup", rate_hz=200.0) as source:
     ...     source.act(water_kg=0.05, wet=True)
     ...     frame = next(source.frames())
@@ -98,7 +98,7 @@ class GripSource(LiveSource):
         self.water_kg, self.pull_n, self.wet = 0.0, 0.0, False
         self.controller = controller
         """Row of `CONTROLLERS` that grips."""
-        self._told_friction = False
+        self._outside_n: float | None = None
         self._told: dict[int, tuple[PlantState, Held]] = {}
         self._begin(0.0)
 
@@ -109,13 +109,7 @@ class GripSource(LiveSource):
         self._told.clear()
         self._ended_s: float | None = None
         self._poured_kg = self._pulled_n = 0.0
-        self._choose(self.controller)
-        self._command, self._reading, self._why = 0.0, None, ""
-        self._slip = self._slipping = False
-
-    def _choose(self, controller: str) -> None:
-        self._hand: Controller = make_controller(controller, told=self._told_friction)
-        self.controller = controller
+        self._holder, self._why = Holder(self.controller, ceiling_n=_CEILING_N), ""
 
     def act(
         self,
@@ -134,7 +128,8 @@ class GripSource(LiveSource):
             self.pull_n = self.pull_n if pull_n is None else pull_n
             self.wet = self.wet if wet is None else wet
             if controller is not None and controller != self.controller:
-                self._choose(controller)
+                self._holder.choose(controller)
+                self.controller = controller
 
     def grip_again(self) -> None:
         """Put the object down, and grip it anew."""
@@ -145,18 +140,23 @@ class GripSource(LiveSource):
         """Take what was read of a frame."""
         with self._lock:
             known = self._told.get(reading.number)
-            if known is None:
-                return
-            # a reading that is withheld tells no friction either
-            if reading.margin is not None and self._told_friction != (reading.friction is not None):
-                self._told_friction = not self._told_friction
-                self._choose(self.controller)
-            # skin that springs back as the grip is loosened looks the same
-            earlier = self._told.get(reading.number - _SPRINGS_BACK, known)[0]
-            loosened = known[0].force_n[0] < 0.99 * earlier.force_n[0]
-            slips = reading.slip is SlipState.SLIP and known[0].time_s > LIFT_S
-            self._slip |= bool(slips and not self._slipping and not loosened)
-            self._reading, self._slipping = reading, slips
+            if known is not None:
+                self._holder.hear(reading, taken_s=known[0].time_s)
+
+    def set_force(self, force_n: float) -> None:
+        """Press with so many newtons from now on: who tells forces is the controller."""
+        with self._lock:
+            self._outside_n, self._why = force_n, "presses as it is told from outside"
+
+    def set_width(self, width_m: float) -> None:
+        """Refused: it opens by itself."""
+        raise GripperError(f"the simulated gripper cannot be opened to {width_m:g} m; tell it forces")
+
+    def read_state(self) -> GripperState:
+        """Grip force, and a width that is assumed."""
+        with self._lock:
+            force_n = float(self._plant.state.force_n[0])
+        return GripperState(force_n=force_n, width_m=_WIDTHS_M[force_n > 0])
 
     def held(self, number: int) -> Held | None:
         """What the gripper did at a frame; None where that was long ago."""
@@ -211,8 +211,7 @@ class GripSource(LiveSource):
             self._poured_kg = _towards(self._poured_kg, self.water_kg, _POURS_KG_S * PERIOD_S)
             self._pulled_n = _towards(self._pulled_n, self.pull_n, _PULLS_N_S * PERIOD_S)
             world = self._world()
-            self._command = self._answer(plant.state)
-            plant.step(np.array([self._command]), world)
+            plant.step(np.array([self._answer(plant.state)]), world)
         return plant.state
 
     def _world(self) -> World:
@@ -229,37 +228,11 @@ class GripSource(LiveSource):
 
     def _answer(self, now: PlantState) -> float:
         """Grip force that the controller tells, in newtons."""
-        reading, slip, self._slip = self._reading, self._slip, False
-        known = None if reading is None else self._told.get(reading.number)
-        if known is None or now.time_s - known[0].time_s > _STALE_S:
-            known = reading = None
-        then = now if known is None else known[0]
-        margin = np.nan if reading is None or reading.margin is None else reading.margin
-        low = margin if reading is None or reading.low is None else reading.low
-        seen = Observation(
-            time_s=now.time_s,
-            force_n=then.force_n,
-            command_n=np.array([self._command]),
-            load_n=then.load_n,
-            margin=np.full((1, 2), margin),
-            low=np.full((1, 2), low),
-            slip=np.array([slip]),
-            true_margin=np.nan_to_num(now.margin, nan=1.0),
-        )
-        told = min(float(np.asarray(self._hand.command(seen))[0]), _CEILING_N)
-        change = told - self._command
-        does = "holds" if abs(change) < 1e-3 else "tightens" if change > 0 else "loosens"
-        does = "presses as hard as it may" if told == _CEILING_N else does
-        if slip:
-            self._why = "the markers told a slip: tightens at once"
-        elif reading is None or reading.margin is None:
-            self._why = f"no margin is read: {does}"
-        elif isinstance(self._hand, MarginGrip):
-            acted, target = float(self._hand.acted[0]), self._hand.target
-            self._why = f"acts on a margin of {max(acted, 0):.0%}, and aims at {target:.0%}: {does}"
-        else:
-            self._why = does
-        return told
+        if self._outside_n is not None:
+            return self._outside_n
+        answer = self._holder.answer(now.time_s, float(now.force_n[0]), load_n=float(now.load_n[0]))
+        self._why = answer.why
+        return answer.command_n
 
     def _describe(self, state: PlantState, time_s: float) -> Held:
         world = self._world()
@@ -275,7 +248,7 @@ class GripSource(LiveSource):
             least_force_n=float(least[0]) if state.time_s > LIFT_S else 0.0,
             slip_m=float(state.slipped_m[0]),
             phase=phase,
-            controller=self.controller,
+            controller=self.controller if self._outside_n is None else "outside",
             why=self._why,
         )
 

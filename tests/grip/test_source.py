@@ -5,10 +5,9 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from sliplens.app import GripSource
-from sliplens.app.gripper import Held, open_grip
 from sliplens.errors import InputError
 from sliplens.grip.controllers import MarginLaw
+from sliplens.grip.source import GripSource, Held, open_grip
 from sliplens.live.contract import Pace, SourceOptions
 from sliplens.live.reading import Reading, SlipState
 

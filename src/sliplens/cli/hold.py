@@ -1,0 +1,134 @@
+"""`sliplens hold`."""
+
+import time
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import msgspec
+import tyro
+
+from sliplens.cli.command import Command, Device, Friction
+from sliplens.cli.console import say, wrote
+from sliplens.cli.grip import constant
+from sliplens.errors import InputError, SliplensError
+from sliplens.files import to_builtins
+
+if TYPE_CHECKING:
+    from sliplens.grip.hold import HoldStep
+    from sliplens.live import LiveReader
+
+_SOURCES = "One source or two, a fingertip each: grip (simulated), number of a camera, address of a stream, or a video."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hold(Command):
+    """Hold with a real gripper: its force answers what its fingertips read, and nothing is loosened blindly.
+
+    Ends with Ctrl-C, after --seconds or with the source; the gripper keeps the force that it was told last.
+    """
+
+    sources: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE [SOURCE]", help=_SOURCES)]
+    gripper: str | None = None
+    """tcp://HOST:PORT or /dev/ttyUSB0 (lines of ASCII), zenoh:KEY (ROS 2), or simulated (that of the source grip)."""
+    dry_run: bool = False
+    """Send nothing: show what would be sent, as if it were obeyed at once."""
+    controller: str = "margin"
+    """margin, proportional, reflex or fixed, or one of an installed package."""
+    set: tuple[str, ...] = ()
+    """Constants of the controller to change, such as --set target=0.4 least_n=1."""
+    ceiling: float = 4.0
+    """Grip force that is never passed, in newtons."""
+    watchdog: float = 0.2
+    """Time without a command after which the gripper is told the last force again, in seconds."""
+    messages: str = "gripper-command"
+    """What a gripper of ROS 2 takes: gripper-command, numbers or controllers."""
+    joint: str | None = None
+    """Joint of a gripper of ROS 2 that tells width and force; the first if not given."""
+    network: str | None = None
+    """Folder or name of a trained network. If not given, chromatouch-difference for what is simulated, else none."""
+    reference: tuple[Path, ...] = ()
+    """Image of each untouched sensor; taken when the picture is still at first if not given."""
+    friction: Friction = None
+    sensor: str | None = None
+    """Profile of the sensors, a file or a name such as digit."""
+    seconds: float | None = None
+    """Time after which it ends."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None
+    """Folder to keep what was told, measured and read in; its steps.parquet has a row a command."""
+    json: bool = False
+    """Print a line of JSON a command, with all that was read; else a line a second is printed."""
+    engine: Literal["auto", "eager", "folded", "compiled", "onnxruntime", "openvino"] = "auto"
+    """What runs the network; auto is the fastest at hand."""
+    device: Device = "cpu"
+
+    def run(self) -> None:
+        """Hold until it ends."""
+        from sliplens.grip.controllers import make_controller
+        from sliplens.grip.gripper import open_gripper
+        from sliplens.grip.hold import GRIPPERS, hold_grip
+
+        gripper = "dry-run" if self.dry_run else self.gripper
+        if gripper is None:
+            raise InputError("no gripper is named; name one with --gripper, or see what is sent with --dry-run")
+        settings = dict(map(constant, self.set))
+        make_controller(self.controller, settings)  # refused before a network is made ready
+        with ExitStack() as stack:
+            if gripper not in GRIPPERS:
+                opened = open_gripper(gripper, messages=self.messages, joint=self.joint)
+                gripper = stack.enter_context(closing(opened))
+            hold = self.call(
+                hold_grip,
+                source=[stack.enter_context(reader) for reader in self._readers()],
+                gripper=gripper,
+                network=None,
+                settings=settings,
+                ceiling_n=self.ceiling,
+                watchdog_s=self.watchdog,
+                out=self.output,
+                on_step=_Steps(json=self.json),
+            )
+        say(hold.why, aside=True)
+        if self.output is not None:
+            wrote(self.output, f"{len(hold.steps):,} commands")
+        if hold.ended == "failed":
+            raise SliplensError(hold.why)
+
+    def _readers(self) -> "list[LiveReader]":
+        from sliplens.grip.source import open_grip
+        from sliplens.live import LiveReader
+        from sliplens.live.contract import SourceOptions
+        from sliplens.models import load
+
+        if self.reference and len(self.reference) != len(self.sources):
+            raise InputError(f"--reference takes an image a source, {len(self.sources)}, got {len(self.reference)}")
+        shipped = all(source.partition(":")[0] in {"grip", "simulated"} for source in self.sources)
+        name = self.network or ("chromatouch-difference" if shipped else None)
+        common = {name: getattr(self, name) for name in ("friction", "sensor", "engine", "device")}
+        common["network"] = None if name is None else load(name, device=self.device)
+        return [
+            LiveReader(
+                open_grip(source, SourceOptions()) if source.partition(":")[0] == "grip" else source,
+                reference=reference,
+                **common,
+            )
+            for source, reference in zip(self.sources, self.reference or [None] * len(self.sources), strict=True)
+        ]
+
+
+class _Steps:
+    """Prints each command as a line of JSON, or one a second, and each trouble once."""
+
+    def __init__(self, *, json: bool) -> None:
+        self._json, self._told_s, self._told = json, -1.0, set[str]()
+
+    def __call__(self, step: "HoldStep") -> None:
+        if step.trouble is not None and step.trouble not in self._told:
+            self._told.add(step.trouble)
+            say(step.trouble, aside=True)
+        if self._json:
+            print(msgspec.json.encode(to_builtins(step)).decode(), flush=True)
+        elif time.monotonic() - self._told_s >= 1:
+            self._told_s = time.monotonic()
+            say(str(step))

@@ -1,0 +1,42 @@
+"""`sliplens hold`: what it prints and keeps, and what is said to mistakes."""
+
+import json
+from pathlib import Path
+
+import pytest
+from command_line import refused, run
+
+from sliplens.codec import load_result
+from sliplens.recordings import Dataset
+from sliplens.results.grip import Hold
+
+
+def test_a_line_of_json_a_command_and_a_table_of_all(small_dataset: Dataset, tmp_path: Path, capsys):
+    words = ("hold", small_dataset.folder, "--dry-run", "--controller", "fixed", "--set", "force_n=9", "--json")
+    assert run(*words, "--ceiling", "3.5", "-o", tmp_path / "held") == 0
+    captured = capsys.readouterr()
+    steps = [json.loads(line) for line in captured.out.splitlines() if line.startswith("{")]
+    assert {step["command_n"] for step in steps} == {3.5}
+    assert 0 <= steps[-1]["readings"][0]["number"] <= 11
+    assert "has ended; nothing was sent" in captured.err
+    hold = load_result(tmp_path / "held", Hold, command="sliplens hold")
+    assert (hold.gripper, hold.controller, hold.settings) == ("dry-run", "fixed", {"force_n": 9.0})
+    assert hold.steps.time_s.tolist() == [step["time_s"] for step in steps]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("grip",), "name one with --gripper"),
+        (("grip", "--gripper", "tcp://nowhere"), "is no address of a gripper"),
+        (("nowhere", "--dry-run"), "nowhere is no source that is known"),
+        (("grip:anvil", "--dry-run"), "there is no object named 'anvil'"),
+        (
+            ("simulated", "--dry-run", "--reference", "one.png", "two.png"),
+            "an image a source, 1, got 2",
+        ),
+        (("simulated", "--dry-run", "--controller", "fixed", "--set", "speed=3"), "has no constant 'speed'"),
+    ],
+)
+def test_mistakes_are_one_sentence(capsys, words, told):
+    assert told in refused(capsys, "hold", *words)

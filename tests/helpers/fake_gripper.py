@@ -1,0 +1,36 @@
+"""A gripper that misbehaves."""
+
+import socket
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+
+
+class FakeGripper:
+    """A gripper on a port of this machine that speaks the line protocol, or as badly as it is told to."""
+
+    def __init__(self) -> None:
+        self.answer: bytes | Callable[[str], bytes | None] | None = b"OK 1.000 0.0400\n"
+        self.heard: list[str] = []
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.address = f"tcp://127.0.0.1:{self._server.getsockname()[1]}"
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        self._connection, _ = self._server.accept()
+        # whoever hangs up in the middle of an answer resets the connection
+        with suppress(ConnectionError), self._connection, self._connection.makefile("rwb") as stream:
+            for line in stream:
+                self.heard.append(line.decode().strip())
+                answer = self.answer(self.heard[-1]) if callable(self.answer) else self.answer
+                if answer is not None:
+                    stream.write(answer)
+                    stream.flush()
+
+    def send(self, answer: bytes) -> None:
+        """Say something unasked."""
+        self._connection.sendall(answer)
+
+    def close(self) -> None:
+        self._server.close()
