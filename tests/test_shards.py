@@ -94,6 +94,15 @@ def test_what_fails_three_times_is_set_aside_until_it_is_asked_for(log: Path, ou
     assert read_status(out) == []
 
 
+def test_a_full_disk_ends_all_and_sets_nothing_aside(log: Path, out: Path):
+    for _ in range(TRIES):
+        with pytest.raises(OSError, match="No space left"):
+            make(Count(log=log, no_room=frozenset("b")), out)
+    assert Count(log=log).tries() == {"a": 1, "b": TRIES}
+    make(Count(log=log), out)
+    assert sorted(content(out)) == [one.part for one in shards()]
+
+
 def test_a_single_shard_fails_with_its_own_error_and_leaves_nothing(log: Path, out: Path):
     with pytest.raises(InputError, match=r"^a is damaged; record it again$"):
         make(Count(log=log, refuse=frozenset("a")), out, given=partial(shards, "a"))

@@ -365,10 +365,11 @@ def output_folder(
             return
         if not (resumable and state.is_file() and state.read_text() == config_hash):
             _empty(partial)
-        if resumable:
-            state.write_text(config_hash)
+        state.write_text(config_hash)
         try:
             yield Output(folder=partial, complete=False)
+            if not state.exists():
+                raise InputError(f"{partial} was removed while {target} was being made; give the command again")
         except BaseException:
             # what is finished stays for the next try; where nothing is, nothing is left behind
             if not resumable or not any(path.is_file() and path != state for path in partial.rglob("*")):

@@ -4,6 +4,7 @@ What is done, doing and failed is read from the folder of the parts, and stands 
 done, one that a process holds is being made, one that failed has left a sentence.
 """
 
+import errno
 import hashlib
 import json
 import logging
@@ -146,13 +147,19 @@ class Worker:
                     self._make(given.item, draft, on_progress)
                     draft.replace(part)
         except Exception as error:  # a bad trial must not end the others
-            why = str(error) if isinstance(error, SliplensError) else f"{type(error).__name__}: {error}"
-            _keep_failure(folder, given, why)
+            if not _is_of_disk(error):
+                why = str(error) if isinstance(error, SliplensError) else f"{type(error).__name__}: {error}"
+                _keep_failure(folder, given, why)
             return error
         finally:
             _remove(draft)
         _state(folder, given, "failed").unlink(missing_ok=True)
         return None
+
+
+def _is_of_disk(error: Exception) -> bool:
+    """Whether there is no room, or none to write: no fault of a trial, and no other part could be written either."""
+    return isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
 
 @runtime_checkable
@@ -357,7 +364,7 @@ class Crew(ExitStack):
                     _keep_failure(folder, given, str(error))
                     add_seat()
                     seat = None
-                if given is None and error is not None:
+                if error is not None and (given is None or _is_of_disk(error)):
                     raise error
                 if given is not None and tally.settle(given, error, _failure(folder, given)):
                     again.append(given)

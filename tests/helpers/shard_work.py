@@ -1,5 +1,6 @@
 """Work on shards, for processes that import it by this module's name."""
 
+import errno
 import os
 import signal
 from collections.abc import Iterator
@@ -25,6 +26,8 @@ class Count:
     """Trials that fail."""
     kill: frozenset[str] = frozenset()
     """Trials at whose first try the process is killed, as for want of memory."""
+    no_room: frozenset[str] = frozenset()
+    """Trials for which the disk has no room."""
     broken: str = ""
     """What is wrong with all of it."""
     on_gpu: bool = False
@@ -41,6 +44,8 @@ class Count:
                 os.kill(os.getpid(), signal.SIGKILL)
             if item in self.refuse:
                 raise InputError(f"{item} is damaged; record it again")
+            if item in self.no_room:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             on_progress(2, 3)
             rows = {"trial": [item] * 3, "value": [ord(item[-1]) + number for number in range(3)]}
             write_tables([pa.table(rows, SCHEMA)], path, SCHEMA)

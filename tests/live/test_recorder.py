@@ -19,8 +19,8 @@ from sliplens.errors import InputError, RecordingError
 from sliplens.live import ForceStream, LiveFrame, Recorder, SimulatedSource, SourceOptions, open_live
 from sliplens.recordings import Dataset, Recording, TrialFacts, load_dataset
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.dataset import begin_recording
-from sliplens.recordings.journal import JOURNAL_FOLDER, Journal, JournalHeader
+from sliplens.recordings.dataset import begin_recording, finish_recording
+from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, Journal, JournalHeader
 from sliplens.recordings.store import forces_path, load_forces
 
 FACTS = TrialFacts(trial="cup", sensor="tip", object="a cup", condition="wet", day=3)
@@ -160,6 +160,20 @@ def test_a_process_that_is_killed_loses_no_frame_that_was_written(tmp_path: Path
     notes = data.read_labels(data.trials[0]).labelling
     assert notes is not None
     assert "the first frame stands for it" in notes.notes[0]
+
+
+def test_a_recording_that_was_killed_before_it_wrote_its_table_is_begun_anew(tmp_path: Path):
+    (tmp_path / "recording").mkdir()
+    (tmp_path / "recording" / LOCK_FILE).touch()
+    (tmp_path / ".dataset.json.part").touch()
+    lock, trials = begin_recording(tmp_path, simulated=False)
+    assert trials == ()
+    finish_recording(tmp_path, lock)
+    # somebody's own folder of that name is nothing of ours
+    (tmp_path / "recording").mkdir(parents=True)
+    (tmp_path / "recording" / "mine.png").touch()
+    with pytest.raises(RecordingError, match="is no data set of sliplens"):
+        begin_recording(tmp_path, simulated=False)
 
 
 @contextmanager

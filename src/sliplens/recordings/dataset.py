@@ -10,7 +10,7 @@ from sliplens.codec import from_builtins, save_record
 from sliplens.errors import RecordingError
 from sliplens.files import hash_file, hash_json, read_json, require_folder
 from sliplens.progress import OnProgress, fold_equal, note
-from sliplens.recordings.journal import JOURNAL_FOLDER, JournalLock, finish_journal, journals_of
+from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, JournalLock, finish_journal, journals_of
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, load_profile, profile_text
 from sliplens.recordings.store import SCHEMA_VERSION, forces_path, load_recording, read_header, require_stored
@@ -166,11 +166,13 @@ def begin_recording(folder: Path, *, simulated: bool) -> tuple[JournalLock, tupl
     RecordingError
         If the folder is something else, is being recorded, or holds trials of the other kind, real or simulated.
     """
-    if folder.exists() and not (folder / DATASET_FILE).is_file() and (not folder.is_dir() or any(folder.iterdir())):
+    known = (folder / DATASET_FILE).is_file()
+    if folder.exists() and not known and not (folder.is_dir() and _is_hardly_begun(folder)):
         raise RecordingError(f"{folder} exists and is no data set of sliplens; choose another folder")
-    if (folder / JOURNAL_FOLDER).is_dir():
+    if known and (folder / JOURNAL_FOLDER).is_dir():
         finish_recording(folder)
-    table = _read_table(folder) if (folder / DATASET_FILE).is_file() else _Table(trials=(), simulated=simulated)
+        known = (folder / DATASET_FILE).is_file()  # gone where nothing had been recorded
+    table = _read_table(folder) if known else _Table(trials=(), simulated=simulated)
     if table.simulated != simulated:
         kinds = ("simulated", "real") if table.simulated else ("real", "simulated")
         raise RecordingError(f"{folder} holds {kinds[0]} trials, these are {kinds[1]}; choose another folder")
@@ -178,6 +180,12 @@ def begin_recording(folder: Path, *, simulated: bool) -> tuple[JournalLock, tupl
     # also where it lists no trial yet: whoever opens the folder sees a data set, and finishes it if it was cut off
     write_dataset_table(folder, table.trials, simulated=simulated, left_out=table.left_out)
     return lock, tuple(info.trial for info in table.trials)
+
+
+def _is_hardly_begun(folder: Path) -> bool:
+    """Whether nothing is in a folder but what a recording leaves that was killed before it wrote its table."""
+    left = {folder / JOURNAL_FOLDER, folder / JOURNAL_FOLDER / LOCK_FILE, folder / f".{DATASET_FILE}.part"}
+    return set(folder.rglob("*")) <= left
 
 
 def finish_recording(folder: Path, lock: JournalLock | None = None) -> None:

@@ -33,7 +33,7 @@ from sliplens.recordings.trial import TrialFacts, labels_of_margins
 
 JOURNAL_FOLDER = "recording"
 """Folder beside the trials of a data set that holds what is being recorded, or was when it was cut off."""
-_LOCK = "lock"
+LOCK_FILE = "lock"
 _HEADER, _REFERENCE = b"sliplens", b"reference"
 _SCHEMA = pa.schema(
     {
@@ -110,7 +110,7 @@ class JournalLock:
 
         def make() -> Path:
             self.folder.mkdir(parents=True, exist_ok=True)
-            (lock := self.folder / _LOCK).touch()
+            (lock := self.folder / LOCK_FILE).touch()
             return lock
 
         _, self._held = make_and_hold(make)
