@@ -72,7 +72,7 @@ def test_a_folder_that_another_is_writing_is_refused_and_left_alone(tmp_path: Pa
 @pytest.mark.parametrize("resumable", [True, False])
 def test_what_is_removed_while_it_is_made_is_not_called_complete(tmp_path: Path, resumable: bool):
     target = tmp_path / "result"
-    with (
+    with (  # noqa: PT012
         pytest.raises(InputError, match=r"was removed while .*result was being made; give the command again"),
         output_folder(target, stage="test", config={}, resumable=resumable) as out,
     ):
@@ -80,9 +80,7 @@ def test_what_is_removed_while_it_is_made_is_not_called_complete(tmp_path: Path,
         shutil.rmtree(out.folder)
         out.folder.mkdir()
         (out.folder / "second").write_text("x")
-    assert not target.exists()
-    with output_folder(target, stage="test", config={}, resumable=resumable) as out:
-        assert not (out.folder / "second").exists()  # nobody knows what it was made with
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_was_killed_while_it_replaced_a_folder_leaves_it_whole(tmp_path: Path):

@@ -368,13 +368,14 @@ def output_folder(
         state.write_text(config_hash)
         try:
             yield Output(folder=partial, complete=False)
-            if not state.exists():
-                raise InputError(f"{partial} was removed while {target} was being made; give the command again")
         except BaseException:
             # what is finished stays for the next try; where nothing is, nothing is left behind
             if not resumable or not any(path.is_file() and path != state for path in partial.rglob("*")):
                 _drop(partial)
             raise
+        if not state.exists():
+            _drop(partial)
+            raise InputError(f"{partial} was removed while {target} was being made; give the command again")
         finished = datetime.now(UTC).isoformat(timespec="seconds")
         provenance = Provenance(
             stage=stage,
