@@ -1,0 +1,49 @@
+"""
+The same frame by every method
+==============================
+
+Every explainer answers one question: why does the network read this margin rather than that of the untouched sensor?
+Each map is signed and in margin units: orange lowers the margin, blue raises it.
+"""
+
+import matplotlib.pyplot as plt
+
+import sliplens as sl
+
+data = sl.simulate(dry_trials=4, wet_trials=1, days=4, frames_per_trial=40)
+trial = data.load(data.trials[0])
+frame = trial.frames[24:25]
+
+# %%
+# Coarse tiles and few steps keep this page quick. ``budget=0.05`` measures a twentieth of Poly-CAM's channels, and
+# ``likeness=None`` stops there; leave both out for a map that is as good as the exact one.
+options = {
+    "grad-cam": {},
+    "layer-cam": {},
+    "integrated-gradients": {"steps": 16},
+    "smooth-grad": {},
+    "occlusion": {"tile_px": 28},
+    "shapley": {"tile_px": 28},
+    "poly-cam": {"budget": 0.05, "likeness": None},
+    "grad-cam-thesis": {},
+}
+maps = {
+    method: sl.explain("chromatouch-difference", frame, reference=trial.reference, method=method, **chosen)
+    for method, chosen in options.items()
+}
+
+# %%
+figure, axes = plt.subplots(2, 4, figsize=(11, 6.4), layout="constrained")
+for ax, (method, explanation) in zip(axes.flat, maps.items(), strict=True):
+    sl.plot(explanation, ax)
+    ax.set_title(method, loc="left", fontsize=10)
+plt.show()
+
+# %%
+# They do not agree, and that alone tells none of them true. What else an explanation says of itself:
+for method, explanation in maps.items():
+    for warning in explanation.warnings:
+        print(f"{method}: {warning}")
+
+# %%
+# See :doc:`plot_06_does_the_map_tell_the_truth` for a test that asks no map.
