@@ -194,7 +194,7 @@ def _stamp_offset_s(capture: Capture) -> int:
     series = [capture.frame_time_s, *([capture.forces.time_s] if capture.forces else [])]
     first, last = min(times[0].item() for times in series), max(times[-1].item() for times in series)
     offset_s = 0 if first >= 1 else 1 - math.floor(first)
-    if first < -_LAST_S or last + offset_s >= _LAST_S:
+    if last + offset_s >= _LAST_S:
         raise RecordingError(
             f"trial {capture.trial} goes from {first:.6g} s to {last:.6g} s, and stamps of ROS end at {_LAST_S} s; "
             "import it with times in seconds"
