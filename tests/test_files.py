@@ -69,12 +69,11 @@ def test_a_folder_that_another_is_writing_is_refused_and_left_alone(tmp_path: Pa
     assert (target / "piece").exists()
 
 
-@pytest.mark.parametrize("resumable", [True, False])
-def test_what_is_removed_while_it_is_made_is_not_called_complete(tmp_path: Path, resumable: bool):
+def test_what_is_removed_while_it_is_made_is_not_called_complete(tmp_path: Path):
     target = tmp_path / "result"
     with (  # noqa: PT012
         pytest.raises(InputError, match=r"was removed while .*result was being made; give the command again"),
-        output_folder(target, stage="test", config={}, resumable=resumable) as out,
+        output_folder(target, stage="test", config={}) as out,
     ):
         (out.folder / "first").write_text("x")
         shutil.rmtree(out.folder)

@@ -365,7 +365,8 @@ def output_folder(
             return
         if not (resumable and state.is_file() and state.read_text() == config_hash):
             _empty(partial)
-        state.write_text(config_hash)
+        if resumable:
+            state.write_text(config_hash)
         try:
             yield Output(folder=partial, complete=False)
         except BaseException:
@@ -373,7 +374,7 @@ def output_folder(
             if not resumable or not any(path.is_file() and path != state for path in partial.rglob("*")):
                 _drop(partial)
             raise
-        if not state.exists():
+        if resumable and not state.exists():
             _drop(partial)
             raise InputError(f"{partial} was removed while {target} was being made; give the command again")
         finished = datetime.now(UTC).isoformat(timespec="seconds")

@@ -121,8 +121,8 @@ def hold_grip(
     >>> import sliplens as sl
     >>> with sl.LiveReader("simulated", "chromatouch-difference", engine="eager") as reader:
     ...     hold = sl.hold_grip(reader, "dry-run", ceiling_n=3.0, seconds=0.2)
-    >>> hold.steps.command_n.min() >= 2, hold.steps.command_n.max() <= 3  # lifted with 2 N, whatever is read
-    (True, True)
+    >>> bool((hold.steps.command_n >= 2).all())  # lifted with 2 N, whatever is read
+    True
     >>> hold.why
     'the time is over; nothing was sent'
     """
