@@ -24,7 +24,7 @@ from jaxtyping import AbstractArray, jaxtyped
 from numpy.lib.format import read_array_header_1_0, read_array_header_2_0, read_magic
 
 from sliplens.errors import InputError, SliplensError
-from sliplens.files import read_json, require_file, to_builtins, whole_file, write_json
+from sliplens.files import StoredPath, read_json, require_file, to_builtins, whole_file, write_json
 
 RESULT_FILE = "result.json"
 """Record of a folder."""
@@ -241,6 +241,11 @@ def telling_parquet(path: Path, *, cure: str, error: type[InputError] = InputErr
         raise error(f"{path} is not a readable Parquet file ({one_line(raised)}); {cure}") from None
 
 
+def open_table(path: Path, **how: Any) -> pq.ParquetFile:
+    """Open a Parquet file on disk or in a store; `read_table` would import pandas."""
+    return pq.ParquetFile(path.open() if isinstance(path, StoredPath) else path, memory_map=True, **how)
+
+
 def open_parquet(
     path: Path, columns: Mapping[str, str], *, cure: str, error: type[InputError] = InputError
 ) -> pq.ParquetFile:
@@ -256,7 +261,7 @@ def open_parquet(
     except InputError as raised:
         raise error(str(raised)) from None
     with telling_parquet(path, cure=cure, error=error):
-        file = pq.ParquetFile(path, memory_map=True)
+        file = open_table(path)
         schema, rows = file.schema_arrow, file.metadata.num_rows
         names = schema.names
         groups = [file.metadata.row_group(group) for group in range(file.num_row_groups)]
@@ -296,7 +301,7 @@ def read_parquet(
     texts = [name for name, kind in columns.items() if kind == "texts"]
     with telling_parquet(path, cure=cure, error=error):
         # a text that is repeated is held once until its length is known
-        with pq.ParquetFile(path, memory_map=True, read_dictionary=texts) as file:
+        with open_table(path, read_dictionary=texts) as file:
             table = file.read(columns=list(columns))
         for name in texts:
             chunks = table.column(name).chunks
@@ -407,12 +412,12 @@ def regrouped(tables: Iterable[pa.Table], *, rows: int) -> Iterator[pa.Table]:
 def read_written(path: Path, schema: pa.Schema) -> pa.Table:
     """Read a table that `write_tables` wrote, or a data set of such, a folder a trial."""
     if path.is_dir():
-        return pa.concat_tables([pq.ParquetFile(part).read() for part in sorted(path.glob("*=*/*.parquet"))])
+        return pa.concat_tables([open_table(part).read() for part in sorted(path.glob("*=*/*.parquet"))])
     if path.suffix == ".csv":
-        return pa_csv.read_csv(path, convert_options=pa_csv.ConvertOptions(column_types=schema))
+        return pa_csv.read_csv(path.open("rb"), convert_options=pa_csv.ConvertOptions(column_types=schema))
     if path.suffix == ".json":
         return pa.Table.from_pylist(msgspec.json.decode(path.read_bytes()), schema)
-    return pq.ParquetFile(path).read()  # not read_table, which imports pandas
+    return open_table(path).read()
 
 
 def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schema) -> pa.Table | None:

@@ -1,5 +1,6 @@
-"""Files and folders that are whole or absent, and where they come from."""
+"""Files and folders that are whole or absent, on disk or in an object store, and where they come from."""
 
+import errno
 import hashlib
 import json
 import os
@@ -10,12 +11,13 @@ import sys
 import tempfile
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from importlib import metadata
 from importlib.resources import files
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import msgspec
@@ -31,6 +33,176 @@ except ImportError:  # Windows: nothing keeps two commands from one folder there
 
 RUN_FILE = "run.json"
 """Provenance of a folder."""
+
+
+@lru_cache
+def _open_store(bucket: str, _: str | None) -> Any:
+    from pyarrow.fs import FileSystem  # noqa: PLC0415 (most commands need no store)
+
+    return FileSystem.from_uri(f"s3://{bucket}")[0]
+
+
+class StoredPath(type(Path())):
+    """Path in an object store, `s3://bucket/key`, which is read as any other is.
+
+    What is written there appears whole: an upload that is not finished is no object. There are no folders without
+    files, and no locks. Endpoint and credentials are those of the environment (`AWS_ENDPOINT_URL`,
+    `AWS_ACCESS_KEY_ID`, `AWS_PROFILE`, ...).
+    """
+
+    _info: Any = None  # what a listing told
+
+    def __str__(self) -> str:
+        return f"s3://{self._key}"
+
+    @property
+    def _key(self) -> str:
+        return "/".join(self.parts[1:])
+
+    @contextmanager
+    def _reaching(self) -> Iterator[Any]:
+        """Give the file system; what goes wrong is told in one sentence."""
+        if not self._key:
+            raise InputError("s3:// names no bucket; write s3://BUCKET/NAME")
+        bucket = self.parts[1]
+        try:
+            yield _open_store(bucket, os.environ.get("AWS_ENDPOINT_URL"))
+        except FileNotFoundError:
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self)) from None
+        except OSError as error:
+            why = " ".join(str(error).split())
+            if "NO_SUCH_BUCKET" in why or "Bucket '" in why:
+                raise InputError(f"there is no bucket {bucket} for {self}; check its name, or make it") from None
+            if any(word in why for word in ("DENIED", "ACCESS_KEY", "SIGNATURE", "AUTH", "status 403", "credentials")):
+                raise InputError(
+                    f"the store refuses {self}; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE, to "
+                    "those of somebody who may use it"
+                ) from None
+            raise InputError(
+                f"{self} cannot be reached ({why[:200]}); check the network, and AWS_ENDPOINT_URL if it is set"
+            ) from None
+
+    def _list(self, *, recursive: bool) -> Iterator["StoredPath"]:
+        from pyarrow.fs import FileSelector  # noqa: PLC0415
+
+        with self._reaching() as store:
+            found = store.get_file_info(FileSelector(self._key, recursive=recursive, allow_not_found=True))
+        for info in found:
+            path = type(self)("s3:", info.path)
+            path._info = info
+            yield path
+
+    def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:  # noqa: ARG002 (there are none)
+        """Kind, size and time of an object; a folder is what has files."""
+        info = self._info
+        if info is None:
+            with self._reaching() as store:
+                info = store.get_file_info(self._key)
+        if info.is_file:
+            time_s = int((info.mtime_ns or 0) // 10**9)
+            return os.stat_result((stat.S_IFREG, 0, 0, 1, 0, 0, info.size, time_s, time_s, time_s))
+        if not any(True for _ in self._list(recursive=False)):  # one that lost its files may be left as a name
+            with self._reaching() as store:
+                if not store.get_file_info(self.parts[1]).type:
+                    raise OSError("NO_SUCH_BUCKET")
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self))
+        return os.stat_result((stat.S_IFDIR, 0, 0, 1, 0, 0, 0, 0, 0, 0))
+
+    def rglob(self, pattern: str) -> Iterator["StoredPath"]:
+        """Files below whose path ends as the pattern has it."""
+        return (
+            path
+            for path in self._list(recursive=True)
+            if path._info.is_file and PurePosixPath(path._key).match(pattern)
+        )
+
+    def glob(self, pattern: str) -> Iterator["StoredPath"]:
+        """Files below, as deep as the pattern, that match it."""
+        depth = len(self.parts) + len(PurePosixPath(pattern).parts)
+        return (path for path in self.rglob(pattern) if len(path.parts) == depth)
+
+    def relative_to(self, other: Path, *_: object) -> PurePosixPath:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Path from a folder above."""
+        return PurePosixPath(*self.parts).relative_to(PurePosixPath(*other.parts))
+
+    def iterdir(self) -> Iterator["StoredPath"]:
+        """Files and folders in it."""
+        return self._list(recursive=False)
+
+    def mkdir(self, *_: object, **__: object) -> None:
+        """Do nothing: a folder is there when a file is in it."""
+
+    def open(self, mode: str = "rb", *_: object) -> Any:
+        """Open for reading bytes, from anywhere in the file."""
+        assert mode == "rb"
+        with self._reaching() as store:
+            return store.open_input_file(self._key)
+
+    def read_bytes(self) -> bytes:
+        """All bytes."""
+        with self._reaching(), self.open() as stream:
+            return stream.read()
+
+    def read_text(self, encoding: str | None = None, *_: object) -> str:
+        """All text."""
+        return self.read_bytes().decode(encoding or "utf-8")
+
+    def write_bytes(self, data: Any) -> int:
+        """Write an object, which is there when all of it is."""
+        with self._reaching() as store:
+            stream = store.open_output_stream(self._key)
+            stream.write(data)
+            stream.close()  # in no `with`: what failed before this must not be completed
+        return len(data)
+
+    def write_text(self, text: str, encoding: str | None = None, *_: object) -> int:
+        """Write a text."""
+        return self.write_bytes(text.encode(encoding or "utf-8"))
+
+    def upload(self, source: Path, *, last: str = RUN_FILE) -> None:
+        """Write a file of this machine, or all files below a folder, the one of a name after all others."""
+        import pyarrow as pa  # noqa: PLC0415
+
+        if source.is_dir():
+            for path in sorted(source.rglob("*"), key=lambda path: path == source / last):
+                if path.is_file():
+                    (self / path.relative_to(source)).upload(path)
+            return
+        with pa.OSFile(str(source)) if not source.stat().st_size else pa.memory_map(str(source)) as stream:
+            self.write_bytes(stream.read_buffer())
+
+    def unlink(self, missing_ok: bool = False) -> None:
+        """Remove an object."""
+        with suppress(FileNotFoundError) if missing_ok else nullcontext(), self._reaching() as store:
+            store.delete_file(self._key)
+
+    def are_files(self, paths: Sequence[str]) -> list[bool]:
+        """Which of some paths below are files, asked at once."""
+        with self._reaching() as store:
+            return [info.is_file for info in store.get_file_info([f"{self._key}/{path}" for path in paths])]
+
+    def remove(self) -> None:
+        """Remove an object, or all below it."""
+        with suppress(FileNotFoundError), self._reaching() as store:
+            (store.delete_file if self.is_file() else store.delete_dir)(self._key)
+
+
+def as_path(path: Path | str) -> Path:
+    """Path on disk, or in an object store where it begins with `s3://`."""
+    path = Path(path)
+    return StoredPath(*path.parts) if path.parts[:1] == ("s3:",) else path
+
+
+def remove(path: Path) -> None:
+    """Remove a file, or a folder with all in it, if it is there."""
+    if isinstance(path, StoredPath):
+        path.remove()
+    elif path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
 MANIFEST_FILE = "manifest.json"
 """What a network is; its folder is one that holds this."""
 _PACKAGES = ("numpy", "torch", "torchvision", "lightning", "captum", "matplotlib", "pyarrow", "pillow")
@@ -131,6 +303,12 @@ def whole_file(path: Path) -> Iterator[Path]:
     OSError
         If it cannot be written: no folder of that name can be made, or there is no room.
     """
+    if isinstance(path, StoredPath):
+        with scratch_folder() as folder:
+            (folder / path.name).touch()
+            yield folder / path.name
+            path.upload(folder / path.name)
+        return
     part = path.with_name(f".{path.name}.part")
 
     def make() -> Path:
@@ -291,6 +469,9 @@ class Output:
     """A folder being written: `folder` lies beside the target until everything is in it."""
 
     folder: Path
+    """On this machine."""
+    parts: Path
+    """Where parts that are whole or absent lie until then: the same, but for a target in a store the target itself."""
     complete: bool
     """True when the target was already made by the same recipe; then there is nothing to do."""
 
@@ -347,6 +528,11 @@ def output_folder(
     """
     recipe = to_builtins(config)
     config_hash = hash_json({"stage": stage, "config": recipe, "sliplens": __version__})
+    if isinstance(target, StoredPath):
+        named = {"stage": stage, "recipe": recipe, "config_hash": config_hash}
+        with _stored_output(target, **named, overwrite=overwrite, run_file=run_file) as output:
+            yield output
+        return
     partial = partial_folder(target)
     if _aside(target).exists():  # whoever replaced it was killed, before or after the new one took its place
         with held_folder(partial, target):  # or is about to put it there
@@ -355,20 +541,20 @@ def output_folder(
             with suppress(OSError):  # what was begun stays
                 partial.rmdir()
     if _is_made(target, config_hash, run_file=run_file, overwrite=overwrite):
-        yield Output(folder=target, complete=True)
+        yield Output(folder=target, parts=target, complete=True)
         return
     with held_folder(partial, target):
         state = partial / ".recipe"
         if _is_made(target, config_hash, run_file=run_file, overwrite=overwrite):  # by another process since
             _drop(partial)
-            yield Output(folder=target, complete=True)
+            yield Output(folder=target, parts=target, complete=True)
             return
         if not (resumable and state.is_file() and state.read_text() == config_hash):
             _empty(partial)
         if resumable:
             state.write_text(config_hash)
         try:
-            yield Output(folder=partial, complete=False)
+            yield Output(folder=partial, parts=partial, complete=False)
         except BaseException:
             # what is finished stays for the next try; where nothing is, nothing is left behind
             if not resumable or not any(path.is_file() and path != state for path in partial.rglob("*")):
@@ -377,18 +563,36 @@ def output_folder(
         if resumable and not state.exists():
             _drop(partial)
             raise InputError(f"{partial} was removed while {target} was being made; give the command again")
-        finished = datetime.now(UTC).isoformat(timespec="seconds")
-        provenance = Provenance(
-            stage=stage,
-            config=recipe,
-            config_hash=config_hash,
-            versions=versions(),
-            machine=machine(),
-            finished=finished,
-        )
-        write_json(partial / run_file, provenance)
+        _write_provenance(partial / run_file, stage, recipe, config_hash)
         state.unlink(missing_ok=True)
         _take_place(partial, target)
+
+
+@contextmanager
+def _stored_output(
+    target: StoredPath, *, stage: str, recipe: Any, config_hash: str, overwrite: bool, run_file: str
+) -> Iterator[Output]:
+    """Write a folder in a store, where nothing can be renamed: it is complete when `run.json`, the last, is there."""
+    state = target / ".recipe"
+    begun = state.is_file()
+    if not begun and _is_made(target, config_hash, run_file=run_file, overwrite=overwrite):
+        yield Output(folder=target, parts=target, complete=True)
+        return
+    if not (begun and state.read_text() == config_hash):
+        (target / run_file).unlink(missing_ok=True)  # first: what is left is nobody's result
+        target.remove()
+        state.write_text(config_hash)
+    with scratch_folder() as folder:
+        yield Output(folder=folder, parts=target, complete=False)
+        _write_provenance(folder / run_file, stage, recipe, config_hash)
+        target.upload(folder, last=run_file)
+    state.unlink()
+
+
+def _write_provenance(path: Path, stage: str, recipe: Any, config_hash: str) -> None:
+    finished = datetime.now(UTC).isoformat(timespec="seconds")
+    own = {"stage": stage, "config": recipe, "config_hash": config_hash, "finished": finished}
+    write_json(path, Provenance(**own, versions=versions(), machine=machine()))
 
 
 def _is_made(target: Path, config_hash: str, *, run_file: str, overwrite: bool) -> bool:

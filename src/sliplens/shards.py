@@ -12,35 +12,44 @@ import os
 import pickle
 import re
 import secrets
-import shutil
 import signal
 import socket
 import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
-from itertools import chain
+from itertools import chain, islice
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 from urllib.parse import quote
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from sliplens._version import __version__
-from sliplens.codec import load_record, regrouped, save_record, write_tables
+from sliplens.codec import RESULT_FILE, load_record, open_table, regrouped, save_record, write_tables
 from sliplens.errors import InputError, ShardError, SliplensError
 from sliplens.extras import Table, require_packages
-from sliplens.files import hash_json, held_folder, hold, make_and_hold, output_folder, partial_folder, scratch_folder
+from sliplens.files import (
+    StoredPath,
+    as_path,
+    hash_json,
+    held_folder,
+    hold,
+    make_and_hold,
+    output_folder,
+    partial_folder,
+    remove,
+    scratch_folder,
+)
 from sliplens.progress import OnProgress, ignore, stage
 
 TRIES = 3
@@ -137,22 +146,16 @@ class Worker:
 
     def attempt(self, folder: Path, given: Shard, on_progress: OnProgress = ignore) -> Any:
         """Make a part unless it is there; why that failed is kept beside the parts, and given back."""
-        part = folder / given.part
-        draft = part.with_name(f".{part.name}.draft")
         try:
-            part.parent.mkdir(parents=True, exist_ok=True)
-            with _claim(folder, given):
-                if not part.exists():
-                    _remove(draft)
+            with _claim(folder, given), _draft(folder / given.part) as draft:
+                if not all(_are_made(folder, [given])):
                     self._make(given.item, draft, on_progress)
-                    draft.replace(part)
+                    _publish(draft, folder / given.part)
         except Exception as error:  # a bad trial must not end the others
             if not _is_of_disk(error):
                 why = str(error) if isinstance(error, SliplensError) else f"{type(error).__name__}: {error}"
                 _keep_failure(folder, given, why)
             return error
-        finally:
-            _remove(draft)
         _state(folder, given, "failed").unlink(missing_ok=True)
         return None
 
@@ -366,7 +369,7 @@ class Crew(ExitStack):
                     seat = None
                 if error is not None and (given is None or _is_of_disk(error)):
                     raise error
-                if given is not None and tally.settle(given, error, _failure(folder, given)):
+                if given is not None and not tally.settle(given, error) and len(_failure(folder, given).why) < TRIES:
                     again.append(given)
                 if seat is None:
                     continue
@@ -393,14 +396,15 @@ def parts_folder(target: Path | None) -> Iterator[Path]:
             yield folder
         return
     folder = partial_folder(target)
-    with held_folder(folder, target):
+    # a store has no locks; who comes second makes the same parts
+    with nullcontext() if isinstance(folder, StoredPath) else held_folder(folder, target):
         try:
             yield folder
         except BaseException:
             if not any(path.is_file() for path in folder.rglob("*")):
-                shutil.rmtree(folder)
+                remove(folder)
             raise
-        shutil.rmtree(folder)
+        remove(folder)
 
 
 def make_parts(
@@ -456,12 +460,14 @@ def make_parts(
             (folder / _STATE).mkdir(parents=True, exist_ok=True)
             save_record(plan, folder / _STATE / _PLAN)
             workers.make(chain([first], missing), folder, tally, most=count)
-    if failed := [failure for one in shards() if (failure := _failure(folder, one)) is not None]:
+    failed_keys = _failed_keys(folder)
+    if failed := [_failure(folder, one) for one in shards() if one.key in failed_keys]:
         if count == 1 and tally.error is not None:
-            shutil.rmtree(folder / _STATE)
+            remove(folder / _STATE)
             raise tally.error
         raise ShardError({failure.name: failure.why[-1] for failure in failed}, shards=count)
-    shutil.rmtree(folder / _STATE, ignore_errors=True)
+    with suppress(OSError):
+        remove(folder / _STATE)
 
 
 def make_table(
@@ -487,11 +493,11 @@ def make_table(
     def make(folder: Path) -> pa.Schema:
         with stage(on_progress, title) as count:
             make_parts(work, shards, folder, title=title, on=on, retry_failed=retry_failed, on_progress=count)
-        return pq.read_schema(folder / next(iter(shards())).part)
+        return open_table(folder / next(iter(shards())).part).schema_arrow
 
     def read(folder: Path) -> Iterator[pa.Table]:
         for one in shards():
-            table = pq.ParquetFile(folder / one.part).read()  # not read_table, which imports pandas
+            table = open_table(folder / one.part).read()
             if on_rows is not None:
                 on_rows(table)
             yield table
@@ -504,9 +510,9 @@ def make_table(
         if not resumable:  # nobody knows whether frames in memory are those that were
             config["made"] = secrets.token_hex(8)
         with output_folder(out, stage=title, config=config, overwrite=overwrite) as output:
-            schema = make(output.folder)
+            schema = make(output.parts)
             if on_rows is not None:
-                deque(read(output.folder), maxlen=0)
+                deque(read(output.parts), maxlen=0)
             return schema, None
     with parts_folder(out if resumable else None) as parts:
         schema = make(parts)
@@ -524,13 +530,13 @@ class _Tally:
     shown: int = 0
     error: Exception | None = None
 
-    def settle(self, given: Shard, error: Exception | None, failure: "Failure | None") -> bool:
-        """Count a shard that was tried; whether it is to be tried again."""
+    def settle(self, given: Shard, error: Exception | None) -> bool:
+        """Count a shard that was tried; whether it is done."""
         if error is None:
             self.add(given)
-            return False
-        self.error = error
-        return failure is None or len(failure.why) < TRIES
+        else:
+            self.error = error
+        return error is None
 
     def add(self, given: Shard) -> None:
         self.within(given.frames, given.frames)
@@ -547,13 +553,17 @@ class _Tally:
 def _missing(
     shards: Callable[[], Iterable[Shard]], folder: Path, tally: _Tally, *, retry_failed: bool
 ) -> Iterator[Shard]:
-    for one in shards():
-        if (folder / one.part).exists():
-            tally.add(one)
-        elif retry_failed or (failure := _failure(folder, one)) is None or len(failure.why) < TRIES:
-            if retry_failed:
-                _state(folder, one, "failed").unlink(missing_ok=True)
-            yield one
+    failed_keys, every = _failed_keys(folder), iter(shards())
+    while group := list(islice(every, _ASKED if isinstance(folder, StoredPath) else 1)):
+        for one, made in zip(group, _are_made(folder, group), strict=True):
+            if made:
+                tally.add(one)
+            elif one.key in failed_keys and not retry_failed and len(_failure(folder, one).why) >= TRIES:
+                continue
+            else:
+                if retry_failed and one.key in failed_keys:
+                    _state(folder, one, "failed").unlink(missing_ok=True)
+                yield one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -603,7 +613,8 @@ class Status:
     frames: int
     """Frames of all shards, or maps where each is a shard."""
     frames_done: int
-    doing: tuple[Doing, ...]
+    doing: tuple[Doing, ...] | None
+    """None where the parts lie in a store, which has no locks to tell."""
     failed: tuple[Failure, ...]
     frames_per_s: float | None
     """Since it was begun last; None where no part is newer."""
@@ -629,7 +640,7 @@ def read_status(out: Path | str) -> list[Status]:
     ...     print(work.title, work.done, work.shards, work.ends)
     Predicting frames (difference) 812 1404 2026-11-23T18:20:11+00:00
     """
-    out = Path(out)
+    out = as_path(out)
     places = [place for place in (out, partial_folder(out)) if place.exists()]
     if not places:
         raise InputError(f"nothing was begun at {out}; name the file or folder that a command writes")
@@ -646,9 +657,11 @@ def _read_status(state: Path) -> Status:
             done, frames_done = done + 1, frames_done + int(found[2])
             if (made_s := path.stat().st_mtime) >= plan.started_s:
                 new_frames, last_s = new_frames + int(found[2]), max(last_s, made_s)
-    doing = tuple(one for path in sorted(state.glob("*.doing")) if (one := _doing(path)) is not None)
+    doing = None
+    if not isinstance(state, StoredPath):
+        doing = tuple(one for path in sorted(state.glob("*.doing")) if (one := _doing(path)) is not None)
     rate = new_frames / (last_s - plan.started_s) if new_frames and last_s > plan.started_s else None
-    left_s = None if rate is None or not doing else (plan.frames - frames_done) / rate
+    left_s = None if rate is None or doing == () else (plan.frames - frames_done) / rate
     return Status(
         title=plan.title,
         on=plan.on,
@@ -678,20 +691,29 @@ def _state(folder: Path, given: Shard, kind: str) -> Path:
     return folder / _STATE / f"{given.key}.{kind}"
 
 
-def _failure(folder: Path, given: Shard) -> Failure | None:
+def _failed_keys(folder: Path) -> set[str]:
+    return {path.stem for path in (folder / _STATE).glob("*.failed")}
+
+
+def _failure(folder: Path, given: Shard) -> Failure:
+    """Why a shard failed so far."""
     path = _state(folder, given, "failed")
-    return load_record(path, Failure, command=_COMMAND) if path.is_file() else None
+    if not path.is_file():
+        return Failure(name=given.name, why=())
+    return load_record(path, Failure, command=_COMMAND)
 
 
 def _keep_failure(folder: Path, given: Shard, why: str) -> None:
     known = _failure(folder, given)
-    kept = Failure(name=given.name, why=(*(known.why if known else ()), why))
-    save_record(kept, _state(folder, given, "failed"))
+    save_record(replace(known, why=(*known.why, why)), _state(folder, given, "failed"))
 
 
 @contextmanager
 def _claim(folder: Path, given: Shard) -> Iterator[None]:
     """Hold a shard against others, who see by whom; whoever comes second waits."""
+    if isinstance(folder, StoredPath):  # no locks: two that make a part write the same bytes
+        yield
+        return
     path = _state(folder, given, "doing")
 
     def make() -> Path:
@@ -712,8 +734,40 @@ def _claim(folder: Path, given: Shard) -> Iterator[None]:
         os.close(held)
 
 
-def _remove(path: Path) -> None:
-    shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+@contextmanager
+def _draft(part: Path) -> Iterator[Path]:
+    """Where a part is written: beside its place, or on this machine if that is in a store."""
+    if isinstance(part, StoredPath):
+        with scratch_folder() as folder:
+            yield folder / part.name
+        return
+    part.parent.mkdir(parents=True, exist_ok=True)
+    draft = part.with_name(f".{part.name}.draft")
+    remove(draft)  # of one that was killed
+    try:
+        yield draft
+    finally:
+        remove(draft)
+
+
+def _publish(draft: Path, part: Path) -> None:
+    """Give a part its name when all of it is there."""
+    if isinstance(part, StoredPath):
+        part.upload(draft, last=RESULT_FILE)
+        return
+    draft.replace(part)
+
+
+_ASKED = 256
+"""Parts that a store is asked for at once."""
+
+
+def _are_made(folder: Path, shards: Sequence[Shard]) -> list[bool]:
+    """Which parts are there."""
+    if isinstance(folder, StoredPath):  # a part that is a folder has its record last
+        paths = (PurePosixPath(one.part) for one in shards)
+        return folder.are_files([str(path if path.suffix else path / RESULT_FILE) for path in paths])
+    return [(folder / one.part).exists() for one in shards]
 
 
 __all__ = ["Doing", "Failure", "Shard", "Status", "make_parts", "read_status"]

@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
+from pathlib import Path
 from typing import Any, get_args
 
 import tyro
@@ -38,6 +39,7 @@ from sliplens.cli.track import Track
 from sliplens.cli.train import Train
 from sliplens.cli.view import View
 from sliplens.errors import InputError, ShardError, SliplensError
+from sliplens.files import StoredPath, as_path
 from sliplens.recordings.options import LabelSettings, ReadOptions
 
 _Recordings = Sensor | Simulate | Import | Label | Split | Check | View | Track
@@ -75,9 +77,16 @@ def _parse(words: Sequence[str]) -> Any:
         raise
     if unknown:
         raise InputError(tell_unknown(unknown[0], option_names(command), what="option", help_of=f"sliplens {words[0]}"))
+    for name, value in vars(command).items():
+        if isinstance(value, Path) and isinstance(stored := as_path(value), StoredPath):
+            if not isinstance(command, _STORED):
+                raise InputError(f"sliplens {words[0]} reads and writes no {stored}; copy it to this machine first")
+            object.__setattr__(command, name, stored)
     return command
 
 
+_STORED = Predict, Track, Explain, Status
+"""Commands that read and write an object store."""
 _NO_MEMORY = "allocate memory|out of memory|bad_alloc|start new thread|failed to map segment"
 """What torch, threads and libraries say where Python says MemoryError."""
 

@@ -43,9 +43,9 @@ def _show(work: "Progress") -> None:
     say(f"{work.title}, --on {work.on}: {work.done:,} of {work.shards:,} shards, {frames}")
     if work.frames_per_s is not None:
         say(f"  {work.frames_per_s:.3g} a second" + (f", done at {work.ends}" if work.ends else ""))
-    for one in work.doing[:_SHOWN]:
+    for one in (work.doing or ())[:_SHOWN]:
         say(f"  {one.name}: process {one.process} of {one.host}, since {one.since}")
-    if not work.doing and work.done + len(work.failed) < work.shards:
+    if work.doing == () and work.done + len(work.failed) < work.shards:
         say("  nobody works on it; give the same command again and it goes on")
     for one in work.failed[:_SHOWN]:
         say(f"  failed, {len(one.why)} times: {one.name}: {one.why[-1]}")

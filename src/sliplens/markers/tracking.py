@@ -14,7 +14,7 @@ from sliplens._version import __version__
 from sliplens.codec import read_written, regrouped, write_tables
 from sliplens.errors import InputError
 from sliplens.extras import import_cv2
-from sliplens.files import require_new_file
+from sliplens.files import as_path, require_new_file
 from sliplens.markers.detect import get_kind
 from sliplens.markers.tracker import Tracker
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame
@@ -138,7 +138,7 @@ def track(
     ShardError
         If some of many trials failed again and again, when all others are there.
     """
-    path = None if out is None else Path(out)
+    path = None if out is None else as_path(out)
     if path is not None and path.suffix:
         require_new_file(path, suffix=".parquet", overwrite=overwrite)
     get_kind(markers)

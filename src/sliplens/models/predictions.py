@@ -15,7 +15,7 @@ from torch import Tensor
 from sliplens._version import __version__
 from sliplens.codec import TABLE_SUFFIXES, read_written, write_tables
 from sliplens.errors import InputError
-from sliplens.files import hash_file, hash_json, require_new_file
+from sliplens.files import as_path, hash_file, hash_json, require_new_file
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.models.checkpoint import Estimate, Run, load, sensor_kind
 from sliplens.models.engines import Engine, make_engine, one_thread
@@ -236,7 +236,7 @@ def predict(
     >>> predictions.frame().column_names[:4]
     ['trial', 'frame', 'time_s', 'prediction']
     """
-    path = None if out is None else Path(out)
+    path = None if out is None else as_path(out)
     if path is not None and path.suffix:
         require_new_file(path, suffix=TABLE_SUFFIXES, overwrite=overwrite)
     if batch_size < 1:
@@ -303,7 +303,7 @@ def predict(
 def _find_network(source: object, sensor: SensorProfile | Path | str | None) -> tuple[str, str]:
     """Network for a source where none is named, and who names it."""
     profile = None if sensor is None else load_profile(sensor)
-    if profile is None and isinstance(source, Path | str) and (Path(source) / DATASET_FILE).is_file():
+    if profile is None and isinstance(source, Path | str) and (as_path(source) / DATASET_FILE).is_file():
         source = load_dataset(source)
     if profile is None and isinstance(source, Dataset):
         profile = source.profile(source.trials[0].sensor)

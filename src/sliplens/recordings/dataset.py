@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sliplens.codec import from_builtins, save_record
 from sliplens.errors import RecordingError
-from sliplens.files import hash_file, hash_json, read_json, require_folder
+from sliplens.files import as_path, hash_file, hash_json, read_json, require_folder
 from sliplens.progress import OnProgress, fold_equal, note
 from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, JournalLock, finish_journal, journals_of
 from sliplens.recordings.labelling import Labelling
@@ -136,7 +136,7 @@ def load_dataset(folder: Path | str) -> Dataset:
     InputError
         If the folder or its table is missing, damaged or of another schema, or lists no trial.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     require_folder(folder, what="the data set")
     if (folder / JOURNAL_FOLDER).is_dir():
         finish_recording(folder)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from sliplens.errors import ImageError, InputError, RecordingError
-from sliplens.files import hash_file, hash_json, hash_tree
+from sliplens.files import as_path, hash_file, hash_json, hash_tree
 from sliplens.images import list_images, read_image
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import DATASET_FILE, Dataset, load_dataset
@@ -77,7 +77,7 @@ def open_source(
         raise InputError("the untouched sensor is named twice; give --reference or --reference-frame, not both")
     options = ReadOptions() if options is None else options
     profile = None if sensor is None else load_profile(sensor)
-    source = Path(source) if isinstance(source, str) else source
+    source = as_path(source) if isinstance(source, Path | str) else source
     if isinstance(source, Path) and format in {None, "sliplens"} and (source / DATASET_FILE).is_file():
         source = load_dataset(source)
     if isinstance(source, Dataset):
@@ -206,7 +206,7 @@ def open_trials(
         As `open_source`, and if frames in memory are to be worked on elsewhere than in this process.
     """
     if isinstance(source, Path | str):
-        source = Path(source)
+        source = as_path(source)
         if named.get("format") in {None, "sliplens"} and (source / DATASET_FILE).is_file():
             source = load_dataset(source)
     if isinstance(source, Dataset):

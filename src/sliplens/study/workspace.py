@@ -1,7 +1,6 @@
 """Explanations of one network and their deletion scores, as records, and as folders of a workspace."""
 
 import hashlib
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,7 +19,7 @@ from sliplens.explainers import EXPLAINERS, ExpectedGradients, Explainer, get_ex
 from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
 from sliplens.explainers.table import open_run
 from sliplens.faithfulness import get_fill
-from sliplens.files import output_folder
+from sliplens.files import as_path, output_folder, remove
 from sliplens.images import write_png
 from sliplens.models import Run
 from sliplens.plots.saliency import SIGN_COLOURS, draw_panel, full_colour, overlay_jet, overlay_relevance
@@ -108,6 +107,7 @@ def explain_source(
         If some of many maps failed again and again, when all others are there.
     """
     require_methods(methods or ())
+    out = None if out is None else as_path(out)
     if trials < 1:
         raise InputError(f"--trials must be at least 1, got {trials}")
     trained = open_run(run, device=device)
@@ -148,12 +148,12 @@ def explain_source(
         if not output.complete:
             with stage(on_progress, title) as count:
                 show = _show_first(output.folder, chosen.ids, on_progress) if colours == "signed" else None
-                explained = explain(parts=output.folder / "parts", on_map=show, on_progress=count)
+                explained = explain(parts=output.parts / "parts", on_map=show, on_progress=count)
                 # while the stage is open: what differs in numbers alone is then shown once
                 for warning in dict.fromkeys(one for notes in explained.methods.values() for one in notes.warnings):
                     warned = [method for method, notes in explained.methods.items() if warning in notes.warnings]
                     note(on_progress, f"{', '.join(warned)}: {warning}")
-            shutil.rmtree(output.folder / "parts", ignore_errors=True)
+            remove(output.parts / "parts")
             draw_explained(explained, output.folder, colours=colours)
             save_result(explained, output.folder)
     wrote(on_progress, out, what, kept=output.complete)
