@@ -214,6 +214,7 @@ def test_what_is_wrong_with_a_store_is_one_sentence(
     assert main(["view", data]) == 2
     assert f"sliplens view reads and writes no {data}" in " ".join(capsys.readouterr().err.split())
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")  # where nobody listens
-    assert "cannot be reached" in told(data)
-    assert "check the network" in told(data)
+    sentence = told(data)
+    assert f"{data} cannot be reached" in sentence
+    assert "check the network" in sentence
     assert not Path("s3:").exists()

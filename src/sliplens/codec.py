@@ -414,7 +414,8 @@ def read_written(path: Path, schema: pa.Schema) -> pa.Table:
     if path.is_dir():
         return pa.concat_tables([open_table(part).read() for part in sorted(path.glob("*=*/*.parquet"))])
     if path.suffix == ".csv":
-        return pa_csv.read_csv(path.open("rb"), convert_options=pa_csv.ConvertOptions(column_types=schema))
+        with path.open("rb") as stream:
+            return pa_csv.read_csv(stream, convert_options=pa_csv.ConvertOptions(column_types=schema))
     if path.suffix == ".json":
         return pa.Table.from_pylist(msgspec.json.decode(path.read_bytes()), schema)
     return open_table(path).read()

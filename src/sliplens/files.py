@@ -36,10 +36,11 @@ RUN_FILE = "run.json"
 
 
 @lru_cache
-def _open_store(bucket: str, _: str | None) -> Any:
-    from pyarrow.fs import FileSystem  # noqa: PLC0415 (most commands need no store)
+def _open_store(bucket: str, endpoint: str | None) -> Any:
+    from pyarrow.fs import FileSystem, S3FileSystem  # noqa: PLC0415 (most commands need no store)
 
-    return FileSystem.from_uri(f"s3://{bucket}")[0]
+    found, _ = FileSystem.from_uri(f"s3://{bucket}")  # which asks for the bucket's region, but tries ten times
+    return S3FileSystem(region=found.region, endpoint_override=endpoint)
 
 
 class StoredPath(type(Path())):

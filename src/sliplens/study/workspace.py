@@ -1,6 +1,7 @@
 """Explanations of one network and their deletion scores, as records, and as folders of a workspace."""
 
 import hashlib
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
