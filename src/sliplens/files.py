@@ -109,7 +109,7 @@ class StoredPath(type(Path())):
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self))
         return os.stat_result((stat.S_IFDIR, 0, 0, 1, 0, 0, 0, 0, 0, 0))
 
-    def rglob(self, pattern: str) -> Iterator["StoredPath"]:
+    def rglob(self, pattern: str) -> Iterator["StoredPath"]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Files below whose path ends as the pattern has it."""
         return (
             path
@@ -117,7 +117,7 @@ class StoredPath(type(Path())):
             if path._info.is_file and PurePosixPath(path._key).match(pattern)
         )
 
-    def glob(self, pattern: str) -> Iterator["StoredPath"]:
+    def glob(self, pattern: str) -> Iterator["StoredPath"]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Files below, as deep as the pattern, that match it."""
         depth = len(self.parts) + len(PurePosixPath(pattern).parts)
         return (path for path in self.rglob(pattern) if len(path.parts) == depth)
@@ -126,14 +126,14 @@ class StoredPath(type(Path())):
         """Path from a folder above."""
         return PurePosixPath(*self.parts).relative_to(PurePosixPath(*other.parts))
 
-    def iterdir(self) -> Iterator["StoredPath"]:
+    def iterdir(self) -> Iterator["StoredPath"]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Files and folders in it."""
         return self._list(recursive=False)
 
     def mkdir(self, *_: object, **__: object) -> None:
         """Do nothing: a folder is there when a file is in it."""
 
-    def open(self, mode: str = "rb", *_: object) -> Any:
+    def open(self, mode: str = "rb", *_: object) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Open for reading bytes, from anywhere in the file."""
         assert mode == "rb"
         with self._reaching() as store:
@@ -144,7 +144,7 @@ class StoredPath(type(Path())):
         with self._reaching(), self.open() as stream:
             return stream.read()
 
-    def read_text(self, encoding: str | None = None, *_: object) -> str:
+    def read_text(self, encoding: str | None = None, *_: object) -> str:  # pyright: ignore[reportIncompatibleMethodOverride]
         """All text."""
         return self.read_bytes().decode(encoding or "utf-8")
 
@@ -156,7 +156,7 @@ class StoredPath(type(Path())):
             stream.close()  # in no `with`: what failed before this must not be completed
         return len(data)
 
-    def write_text(self, text: str, encoding: str | None = None, *_: object) -> int:
+    def write_text(self, text: str, encoding: str | None = None, *_: object) -> int:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Write a text."""
         return self.write_bytes(text.encode(encoding or "utf-8"))
 
