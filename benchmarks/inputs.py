@@ -1,0 +1,177 @@
+"""Which input reads the margin best at equal compute: networks of several inputs and seeds, on sensors none has seen.
+
+Each network is trained by the same command but for its input and its seed:
+
+    sliplens simulate DATA --preset varied --dry-trials 1230 --days 410 --frames-per-trial 20 --seed 2
+    sliplens train DATA -o RUNS/pair-0 --input pair --image-size 112 --epochs 5 --seed 0
+
+The sets are fresh days of pieces of the ChromaTouch's kind, and the three sensors of `adapt.py`, which no network was
+shown: a dome with other markers, the flat gel, another lens. Their seeds share nothing with any training. R2 of each
+input is a mean over its networks; differences to the first input are those of networks with the same seed, with
+intervals that hold 95 % over networks, then days.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from adapt import SENSORS
+from networks import r2, require_disjoint
+from sliplens.errors import SliplensError
+from sliplens.models import Run
+from sliplens.models.checkpoint import load
+from sliplens.simulation import PRESETS, SimulationRecipe
+from sliplens.simulation.plan import plan_trials
+from sliplens.simulation.trials import prepare_trial
+
+DAYS, TRIALS, FRAMES, DRAWN = 20, 3, 40, 10
+"""Days; trials of a day and condition; frames of a trial, and how many of them with contact are drawn."""
+RESAMPLES = 2000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Read:
+    """What every network answers to the frames of a set, and the truth."""
+
+    margin: Float[np.ndarray, " frames"]
+    day: Int[np.ndarray, " frames"]
+    wet: np.ndarray
+    answers: dict[str, Float[np.ndarray, " frames"]]
+
+
+def recipes() -> dict[str, SimulationRecipe]:
+    """The sets: days, sensors and trials of a series of their own."""
+    days = DAYS + 1  # the first trains, as a recipe wants it, and is not used
+    varied = replace(
+        PRESETS["varied"],
+        series="inputs, test",
+        frames_per_trial=FRAMES,
+        days=days,
+        test_days=DAYS,
+        dry_trials=TRIALS * days,
+        wet_trials=TRIALS * DAYS,
+        nuisances=PRESETS["thesis"].nuisances,
+    )
+    return {"chromatouch": varied} | {name: replace(varied, sensor=sensor) for name, sensor in SENSORS.items()}
+
+
+def read(runs: dict[str, Run], recipe: SimulationRecipe, *, trials: int | None) -> Read:
+    """Draw a few frames of each trial, and have every network read them."""
+    rng = np.random.default_rng(0)
+    plans = [plan for plan in plan_trials(recipe) if plan.split == "test"]
+    require_disjoint(plans)
+    plans = plans[:: max(1, len(plans) // trials)] if trials else plans
+    margin, day, wet = [], [], []
+    answers: dict[str, list[np.ndarray]] = {name: [] for name in runs}
+    for plan in plans:
+        loading, film = prepare_trial(plan)
+        contact = np.flatnonzero(np.isfinite(loading.safety_margin))
+        at = np.sort(rng.choice(contact, min(DRAWN, len(contact)), replace=False))
+        frames = np.concatenate([film.draw(slice(one, one + 1)).numpy() for one in at.tolist()])
+        reference = film.draw_reference().numpy()
+        for name, run in runs.items():
+            answers[name].append(run.estimate(run.encode(frames, reference)).margin)
+        margin.append(loading.safety_margin[at])
+        day.append(np.full(len(at), plan.day))
+        wet.append(np.full(len(at), plan.condition == "wet"))
+    return Read(
+        margin=np.concatenate(margin),
+        day=np.concatenate(day),
+        wet=np.concatenate(wet),
+        answers={name: np.concatenate(one) for name, one in answers.items()},
+    )
+
+
+def by_input(runs: dict[str, Run]) -> dict[str, dict[int, str]]:
+    """Names of the networks, by input and seed.
+
+    Raises
+    ------
+    SystemExit
+        If inputs were not trained with the same seeds, on the same images and as long.
+    """
+    found: dict[str, dict[int, str]] = {}
+    for name, run in runs.items():
+        if run.training is None:
+            raise SystemExit(f"inputs.py: nothing tells how {name} was trained")
+        found.setdefault(run.manifest.input, {})[run.training.seed] = name
+    first = next(iter(found.values()))
+    if any(one.keys() != first.keys() for one in found.values()):
+        raise SystemExit("inputs.py: name networks of the same seeds for each input")
+    costs = {(one.image_size, one.epochs, one.train_frames) for run in runs.values() if (one := run.training)}
+    if len(costs) > 1 or len({run.manifest.data_hash for run in runs.values()}) > 1:
+        raise SystemExit("inputs.py: the networks saw other data, sizes of image or numbers of epochs")
+    return found
+
+
+def resampled(seeds: list[int], days: Int[np.ndarray, " _"]) -> Iterator[tuple[list[int], Int[np.ndarray, " _"]]]:
+    """Seeds of networks, and rows of days, drawn with replacement."""
+    rng = np.random.default_rng(0)
+    rows = [np.flatnonzero(days == day) for day in np.unique(days)]
+    for _ in range(RESAMPLES):
+        some = np.concatenate([rows[at] for at in rng.integers(len(rows), size=len(rows))])
+        yield [seeds[at] for at in rng.integers(len(seeds), size=len(seeds))], some
+
+
+def compare(found: dict[str, dict[int, str]], seen: Read, *, wet: bool) -> dict[str, Any]:
+    """R2 of each input by seed, and what each is ahead of the first."""
+    rows = seen.wet == wet
+    margin, day = seen.margin[rows], seen.day[rows]
+    answers = {name: answer[rows] for name, answer in seen.answers.items()}
+    told: dict[str, Any] = {"frames": int(rows.sum())}
+    for name, networks in found.items():
+        told[name] = [r2(margin, answers[network]) for _, network in sorted(networks.items())]
+    first, *others = found
+    for name in others:
+        drawn = [
+            float(np.mean([
+                r2(margin[some], answers[found[name][seed]][some]) - r2(margin[some], answers[found[first][seed]][some])
+                for seed in seeds
+            ]))
+            for seeds, some in resampled(sorted(found[first]), day)
+        ]  # fmt: skip
+        told[f"{name}_minus_{first}"] = {
+            "mean": float(np.mean(told[name]) - np.mean(told[first])),
+            "low": float(np.quantile(drawn, 0.025)),
+            "high": float(np.quantile(drawn, 0.975)),
+        }
+    return told
+
+
+def main() -> None:
+    """Print what was measured, as a table or as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", type=Path, help="trained networks; the input of the first is compared with")
+    parser.add_argument("--sets", nargs="+", default=list(recipes()), choices=list(recipes()))
+    parser.add_argument("--trials", type=int, help="about so many trials of each set, for a quick look")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    try:
+        runs = {str(path): load(path) for path in options.runs}
+    except SliplensError as error:
+        sys.exit(f"{Path(__file__).name}: {error}")
+    found, told = by_input(runs), {}
+    for name in options.sets:
+        seen = read(runs, recipes()[name], trials=options.trials)
+        told[name] = {"wet" if wet else "dry": compare(found, seen, wet=wet) for wet in (False, True)}
+    if options.json:
+        print(json.dumps(told))
+        return
+    for name, condition in product(told, ("dry", "wet")):
+        for one, value in told[name][condition].items():
+            words = " ".join(f"{number:.3f}" for number in value) if isinstance(value, list) else value
+            if isinstance(value, dict):
+                words = "{mean:+.3f} ({low:+.3f} to {high:+.3f})".format(**value)
+            print(f"{name:12} {condition} {one:24} {words}")
+
+
+if __name__ == "__main__":
+    main()
