@@ -169,7 +169,7 @@ def test_who_makes_a_part_is_seen_while_it_is_made(log: Path, out: Path, capsys:
 
     def look(done: int, _: int) -> None:
         if done == 5:
-            seen.extend(read_status(out)[0].doing)
+            seen.extend(read_status(out)[0].doing or ())
             assert main(["status", str(out)]) == 0
 
     make(Count(log=log), out, on_progress=look)

@@ -229,6 +229,11 @@ def test_nothing_is_reported_to_anybody(tmp_path: Path):
     assert not list(tmp_path.rglob("*"))
 
 
+def test_frames_that_were_read_before_choose_no_engine():
+    trained = small_network(head="histogram")
+    assert [make_engine("auto", trained, frames=40).name for _ in range(4)] == ["eager"] * 4
+
+
 def test_folded_gives_the_same_bits_on_any_number_of_threads():
     trained = load("chromatouch-difference")  # small ones have no layer whose sums threads would share
     images = torch.rand(19, 3, 224, 224, generator=torch.Generator().manual_seed(0))

@@ -193,11 +193,15 @@ def expecting(model: nn.Module, passes: int) -> Iterator[None]:
 
     What is worked on in parts is so answered by one engine, whatever was made before.
     """
+    before = _EXPECTED.get(model)
     _EXPECTED[model] = passes
     try:
         yield
     finally:
-        del _EXPECTED[model]
+        if before is None:
+            del _EXPECTED[model]
+        else:
+            _EXPECTED[model] = before
 
 
 def make_engine(
@@ -244,16 +248,17 @@ def make_engine(
     if onnx_file is not None:
         require_file_of(onnx_file, trained)
     *_, images = trial_inputs(trained)
-    return prepare(
-        trained.model,
-        images.to(trained.device),
-        trained.predict(images).to(trained.device),
-        passes=frames,
-        engine=name,
-        batch_size=batch_size,
-        streams=streams,
-        onnx_file=onnx_file,
-    )
+    with expecting(trained.model, frames):  # frames that were read before shape no answer
+        return prepare(
+            trained.model,
+            images.to(trained.device),
+            trained.predict(images).to(trained.device),
+            passes=frames,
+            engine=name,
+            batch_size=batch_size,
+            streams=streams,
+            onnx_file=onnx_file,
+        )
 
 
 def fold_batch_norm(model: nn.Module) -> nn.Module:
