@@ -44,9 +44,7 @@ def client(server: str, monkeypatch: pytest.MonkeyPatch):
     """Another client of the store."""
     for name, value in (SETTINGS | {"AWS_ENDPOINT_URL": server}).items():
         monkeypatch.setenv(name, value)
-    import boto3  # noqa: PLC0415 (it comes with moto)
-
-    return boto3.client("s3")
+    return pytest.importorskip("boto3", reason="it comes with moto").client("s3")
 
 
 @pytest.fixture
