@@ -146,6 +146,5 @@ def print_help(text: str, words: Iterable[str]) -> None:
     width = shutil.get_terminal_size().columns
     # what stands in boxes is as wide already
     lines = [line if len(line) <= width else fill(line, width, break_on_hyphens=False) for line in text.splitlines()]
-    command = next((word for word in words if word in EXAMPLES), None)
-    tail = [] if command is None else ["", "Example:", f"  {EXAMPLES[command]}"]
+    tail = next((["", "Example:", f"  {EXAMPLES[word]}"] for word in words if word in EXAMPLES), [])
     print("\n".join([*lines, *tail]), flush=True)
