@@ -94,6 +94,18 @@ def test_what_fails_three_times_is_set_aside_until_it_is_asked_for(log: Path, ou
     assert read_status(out) == []
 
 
+def test_what_was_made_after_all_is_no_failure(log: Path, out: Path):
+    with pytest.raises(ShardError):
+        make(Count(log=log, refuse=frozenset("b")), out)
+    [failed] = out.rglob("*.failed")
+    note = failed.read_bytes()
+    make(Count(log=log), out, retry_failed=True)
+    failed.parent.mkdir()  # as if killed before the note of the failure was gone
+    failed.write_bytes(note)
+    make(Count(log=log), out)
+    assert sorted(content(out)) == [one.part for one in shards()]
+
+
 def test_a_full_disk_ends_all_and_sets_nothing_aside(log: Path, out: Path):
     for _ in range(TRIES):
         with pytest.raises(OSError, match="No space left"):

@@ -527,6 +527,8 @@ def output_folder(
     `InputError`. A folder of another format begins empty every time (not `resumable`), and has its `run_file` where
     that format's readers do not look.
     """
+    if target.parts[:1] == ("s3:",) and not isinstance(target, StoredPath):
+        raise InputError(f"{as_path(target)} is in a store, where this writes nothing; name a folder of this machine")
     recipe = to_builtins(config)
     config_hash = hash_json({"stage": stage, "config": recipe, "sliplens": __version__})
     if isinstance(target, StoredPath):
@@ -575,13 +577,16 @@ def _stored_output(
 ) -> Iterator[Output]:
     """Write a folder in a store, where nothing can be renamed: it is complete when `run.json`, the last, is there."""
     state = target / ".recipe"
-    begun = state.is_file()
+    begun = state.is_file() and not (target / run_file).is_file()  # both: it is whole, and only the mark was left
     if not begun and _is_made(target, config_hash, run_file=run_file, overwrite=overwrite):
         yield Output(folder=target, parts=target, complete=True)
         return
     if not (begun and state.read_text() == config_hash):
-        (target / run_file).unlink(missing_ok=True)  # first: what is left is nobody's result
-        target.remove()
+        state.write_text("")  # of no recipe: whoever comes next clears what is left
+        (target / run_file).unlink(missing_ok=True)  # before all others: what is left is nobody's result
+        for path in target.rglob("*"):
+            if path != state:
+                path.unlink(missing_ok=True)
         state.write_text(config_hash)
     with scratch_folder() as folder:
         yield Output(folder=folder, parts=target, complete=False)

@@ -557,6 +557,8 @@ def _missing(
     while group := list(islice(every, _ASKED if isinstance(folder, StoredPath) else 1)):
         for one, made in zip(group, _are_made(folder, group), strict=True):
             if made:
+                if one.key in failed_keys:  # whoever made it after all was ended before it could say so
+                    _state(folder, one, "failed").unlink(missing_ok=True)
                 tally.add(one)
             elif one.key in failed_keys and not retry_failed and len(_failure(folder, one).why) >= TRIES:
                 continue

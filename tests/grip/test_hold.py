@@ -268,7 +268,12 @@ def test_a_gripper_that_never_answers_is_told_on_and_its_failure_noted():
         def set_force(self, force_n: float) -> None:
             raise GripperError(f"no motor for {force_n:g} N")
 
+        reads = 0
+
         def read_state(self):
+            self.reads += 1
+            if self.reads == 2:  # the first time it answers, and then never
+                return super().read_state()
             raise RuntimeError("no sensor")
 
     with plain_reader(Frames()) as reader:
@@ -276,6 +281,27 @@ def test_a_gripper_that_never_answers_is_told_on_and_its_failure_noted():
     assert hold.troubles == ("no motor for 1.5 N",)
     assert hold.steps.failed.all()
     assert np.isnan(hold.steps.force_n).all()
+
+
+def test_who_does_not_know_what_is_held_tells_nothing():
+    class Mute(DryRun):
+        told: tuple[float, ...] = ()
+
+        def set_force(self, force_n: float) -> None:
+            self.told += (force_n,)
+
+        def read_state(self):
+            raise RuntimeError("no sensor")
+
+    gripper = Mute()
+    with plain_reader(Frames()) as reader, pytest.raises(GripperError, match=r"tells no force .*no sensor"):
+        sl.hold_grip(reader, gripper, controller="fixed", settings={"force_n": 1.5}, seconds=0.1)
+    assert gripper.told == ()
+
+
+def test_a_reader_that_was_not_entered_is_refused():
+    with pytest.raises(InputError, match="enter the reader first"):
+        sl.hold_grip(plain_reader(Frames()), "dry-run", controller="fixed", seconds=0.1)
 
 
 def test_a_hold_is_kept_and_no_other_takes_its_place(tmp_path: Path):

@@ -334,6 +334,7 @@ class Holder:
     ) -> None:
         self._settings, self._ceiling, self._command = settings, ceiling_n, command_n
         self._lock, self._knows_friction = Lock(), False
+        self._told = [False] * fingers  # whether the readings of each know a friction
         self._heard: list[tuple[Reading, float] | None] = [None] * fingers
         self._slipping, self._slip = [False] * fingers, False
         self._past: deque[tuple[float, float, float]] = deque(maxlen=_MEMORY)
@@ -354,9 +355,11 @@ class Holder:
         """Take what a fingertip read of a frame that was taken at a time, on the clock of the commands."""
         with self._lock:
             # a reading that is withheld tells no friction either
-            if reading.margin is not None and self._knows_friction != (reading.friction is not None):
-                self._knows_friction = not self._knows_friction
-                self.choose(self._chosen)
+            if reading.margin is not None:
+                self._told[finger] = reading.friction is not None
+                if self._knows_friction != all(self._told):
+                    self._knows_friction = not self._knows_friction
+                    self.choose(self._chosen)
             closed = self._touched_s is not None and taken_s - self._touched_s > _CLOSING_S
             slips = reading.slip is SlipState.SLIP and closed
             if slips and not self._slipping[finger]:
@@ -369,7 +372,8 @@ class Holder:
         with self._lock:
             before_s = self._past[-1][0] if self._past else time_s - PERIOD_S
             self._past.append((time_s, force_n, load_n))
-            if self._touched_s is None and force_n > _TOUCH_N:
+            # a force that is not measured is taken for the one that was told
+            if self._touched_s is None and (self._command if np.isnan(force_n) else force_n) > _TOUCH_N:
                 self._touched_s = time_s
             slip, self._slip = self._slip, False
             heard = [one if one and time_s - one[1] <= _STALE_S else None for one in self._heard]
@@ -416,7 +420,7 @@ class Holder:
         does = "holds" if abs(change_n) < 1e-3 else "tightens" if change_n > 0 else "loosens"
         does = "presses as hard as it may" if self._command == self._ceiling else does
         if slip:
-            return "the markers told a slip: tightens at once"
+            return f"the markers told a slip: {does}"
         if blind:
             return f"no margin is read: {does}"
         if isinstance(self._controller, MarginGrip):

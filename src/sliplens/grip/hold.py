@@ -16,7 +16,7 @@ from sliplens.codec import save_result
 from sliplens.errors import InputError
 from sliplens.files import output_folder
 from sliplens.grip.controllers import Answer, AssumedFriction, Controller, Holder, MarginGrip, Oracle, make_controller
-from sliplens.grip.gripper import DryRun, Gripper, GuardedGripper, open_gripper
+from sliplens.grip.gripper import DryRun, Gripper, GripperError, GuardedGripper, open_gripper
 from sliplens.grip.plant import PERIOD_S
 from sliplens.grip.source import GripSource, open_grip
 from sliplens.live.contract import LiveSource, Pace, SourceOptions
@@ -30,6 +30,8 @@ GRIPPERS = {
     "dry-run": "none: what would be sent is noted",
 }
 """Names of grippers that are no address, and what they are."""
+
+_TRIES = 30  # at the first force, for half a second: a driver may not have heard of it yet
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,7 +185,7 @@ class _Holding:
         self._rows: list[tuple[float, Answer, float, bool]] = []
         self.troubles: dict[str, None] = {}
         """What the gripper failed at, in the order in which it first did."""
-        force_n, self._trouble = self._measure()
+        force_n = self._first_force()
         self._holder = Holder(
             controller,
             settings=settings,
@@ -261,6 +263,19 @@ class _Holding:
             readings=tuple(self._readings),
         )
 
+    def _first_force(self) -> float:
+        """Grip force before anything is told: who does not know it would let go of what is held."""
+        trouble = None
+        for _ in range(_TRIES):
+            force_n, trouble = self._measure()
+            if not math.isnan(force_n):
+                return force_n
+            time.sleep(PERIOD_S)
+        raise GripperError(
+            f"the gripper tells no force to begin with ({trouble or 'no number'}); check its connection: it was told "
+            "nothing"
+        )
+
     def _measure(self) -> tuple[float, str | None]:
         """Grip force that the gripper tells; NaN and what it failed at where it tells none."""
         try:
@@ -286,6 +301,8 @@ def _readers(
         raise InputError(f"a gripper has one or two fingertips that are read, got {len(readers)}")
     if network is not None:
         raise InputError("a reader has its own network; name it where the reader is made")
+    if not all(reader.entered for reader in readers):
+        raise InputError("nothing is read yet; enter the reader first, with `with reader:`")
     return readers
 
 

@@ -248,6 +248,11 @@ class LiveReader:
         return tuple(trouble for trouble in troubles if trouble is not None)
 
     @property
+    def entered(self) -> bool:
+        """Whether it reads, or has read."""
+        return bool(self._threads)
+
+    @property
     def ended(self) -> str | None:
         """Why no more readings come; None while they may."""
         if not self._over.is_set():

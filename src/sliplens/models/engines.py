@@ -418,8 +418,13 @@ def _folded(model: nn.Module, job: EngineJob) -> RunBatches:
         torch.set_num_threads(1)
         every.wait()  # so that no thread takes two of these
 
-    with one_thread():  # what was set last is also what other threads begin with
-        list(workers.map(begin, range(job.streams)))
+    try:
+        with one_thread():  # what was set last is also what other threads begin with
+            list(workers.map(begin, range(job.streams)))
+    except BaseException:  # a thread that could not start: the others would wait for it at the end of the process
+        every.abort()
+        workers.shutdown(wait=False, cancel_futures=True)
+        raise
     return _run_in_streams(lambda batch: workers.submit(lambda: next(run([batch]))).result, job.streams)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sliplens.codec import from_builtins, save_record
 from sliplens.errors import RecordingError
-from sliplens.files import as_path, hash_file, hash_json, read_json, require_folder
+from sliplens.files import StoredPath, as_path, hash_file, hash_json, read_json, require_folder
 from sliplens.progress import OnProgress, fold_equal, note
 from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, JournalLock, finish_journal, journals_of
 from sliplens.recordings.labelling import Labelling
@@ -139,6 +139,8 @@ def load_dataset(folder: Path | str) -> Dataset:
     folder = as_path(folder)
     require_folder(folder, what="the data set")
     if (folder / JOURNAL_FOLDER).is_dir():
+        if isinstance(folder, StoredPath):
+            raise RecordingError(f"{folder} holds a recording that was cut off; open it on a disk, and copy it again")
         finish_recording(folder)
     table = _read_table(folder)
     if not table.trials:

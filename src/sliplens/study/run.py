@@ -398,7 +398,7 @@ class _Stages:
             | ({} if judging.steps is None else {"steps": judging.steps}),
             "remedies": {"steps": STEPS},
             "control": _CONTROLS,
-            "faithfulness": removal | _CONTROLS,
+            "faithfulness": removal | _CONTROLS | ({"further": TRUE_FILL} if judging.redrawn else {}),
             "randomisation": {"stages": CASCADE, "statistics": "images"},
             "truth": {"pairs": TRUTH_PAIRS, **_CONTROLS},
         }

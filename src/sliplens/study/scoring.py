@@ -85,8 +85,9 @@ def score_explanations(
 ) -> DeletionScores:
     """Delete the most salient pixels for every method and a random order, in so many steps or the image's height.
 
-    `parts` is a folder that keeps the answers of each trial as soon as they are there; `on` says where they are made, a
-    row of `shards.EXECUTORS`, and `retry_failed` tries those again that failed before.
+    `parts` is a folder, of this network, these explanations and options alone, that keeps the answers of each trial as
+    soon as they are there; `on` says where they are made, a row of `shards.EXECUTORS`, and `retry_failed` tries those
+    again that failed before.
 
     Raises
     ------
