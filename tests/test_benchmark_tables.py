@@ -1,0 +1,95 @@
+"""The figures of benchmarks/results.toml are whole, and the tables drawn from them are theirs."""
+
+import importlib.util
+import re
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+NO_FIGURES = {"fairness"}
+"""What the scripts share; it measures nothing."""
+
+
+def load_tables() -> ModuleType:
+    """Load the script that draws the tables."""
+    spec = importlib.util.spec_from_file_location("benchmark_tables", ROOT / "docs" / "benchmark_tables.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+TABLES = load_tables()
+SECTIONS: dict[str, dict[str, Any]] = TABLES.load_sections()
+ROWS = [(section, row) for section in SECTIONS.values() for row in section["rows"]]
+
+
+def test_every_script_has_its_figures():
+    scripts = {path.stem for path in (ROOT / "benchmarks").glob("*.py")} - NO_FIGURES
+    assert set(SECTIONS) == scripts
+
+
+@pytest.mark.parametrize(("section", "row"), ROWS, ids=[f"{own['script']}-{row['figure'][:30]}" for own, row in ROWS])
+def test_a_row_is_whole(section: dict[str, Any], row: dict[str, Any]):
+    facts = section | row
+    assert set(facts) <= {"script", "title", "rows", "command", "date", "machine"} | {
+        "figure", "value", "unit", "low", "high", "spread", "goal"
+    }  # fmt: skip
+    assert section["script"] in facts["command"] or facts["command"].startswith("make ")
+    assert facts["machine"] in TABLES.MACHINES
+    if row["value"] == "not measured":
+        assert not {"low", "high", "spread"} & set(row)
+    else:
+        assert isinstance(row["value"], int | float)
+        assert re.fullmatch(r"20\d\d-\d\d(-\d\d)?", facts["date"])
+        assert facts["machine"] != "gpu"
+        assert row.get("low", row["value"]) <= row["value"] <= row.get("high", row["value"])
+    if "goal" in row:
+        direction, bound = row["goal"].split()
+        assert direction in {"<=", ">=", "="}
+        assert bound in {"true", "false"} if direction == "=" else float(bound) >= 0
+
+
+def test_the_page_of_results_has_the_tables_of_the_file():
+    page = (ROOT / "benchmarks" / "RESULTS.md").read_text(encoding="utf-8")
+    assert re.findall(r"<!-- figures: (\w+) -->", page) == list(SECTIONS)
+    assert re.findall(r"^## (.*)$", page, re.MULTILINE) == [section["title"] for section in SECTIONS.values()]
+    assert page == TABLES.fill_in(page), "run python docs/benchmark_tables.py"
+
+
+@pytest.mark.parametrize(
+    ("row", "verdict"),
+    [
+        ({"value": 8, "goal": "<= 8"}, "reached"),
+        ({"value": 8.1, "goal": "<= 8"}, "**missed**"),
+        ({"value": 0.9, "goal": ">= 0.9", "low": 0.9, "high": 1.2}, "reached"),
+        ({"value": 0.9, "goal": ">= 0.9", "low": 0.8, "high": 1.2}, "not for sure"),
+        ({"value": 0.3, "goal": "<= 0.33", "low": 0.2, "high": 0.4}, "not for sure"),
+        ({"value": True, "goal": "= true"}, "reached"),
+        ({"value": False, "goal": "= true"}, "**missed**"),
+        ({"value": "not measured", "goal": "<= 8"}, ""),
+        ({"value": 3}, ""),
+    ],
+)
+def test_a_goal_is_judged_in_its_direction(row: dict[str, Any], verdict: str):
+    assert TABLES.judge(row) == verdict
+
+
+def test_machines_are_told_where_they_differ():
+    section = {
+        "command": "python x.py",
+        "machine": "quiet",
+        "date": "2026-11",
+        "rows": [
+            {"figure": "`a`", "value": 1200, "unit": "ms", "goal": "<= 1000"},
+            {"figure": "`b`", "value": "not measured", "machine": "gpu"},
+        ],
+    }
+    lines = TABLES.draw_table(section).splitlines()
+    assert lines[2] == "| `a` | at most 1000 | 1,200 ms | **missed** |"
+    assert lines[3] == "| `b` |  | not measured | a GPU |"
+    assert lines[5] == "`python x.py`; two quiet cores; 2026-11."
