@@ -83,6 +83,22 @@ def test_a_late_answer_is_forgotten_and_the_next_one_counts(fake):
     gripper.close()
 
 
+def test_a_connection_that_breaks_is_opened_again_with_the_next_line(fake):
+    gripper = open_gripper(fake.address, timeout_s=2.0)
+    gripper.set_force(1.0)
+    fake.hang_up()
+    with pytest.raises(GripperError, match="cannot be reached"):
+        gripper.set_force(1.5)
+    gripper.set_force(2.0)
+    assert (fake.heard[0], fake.heard[-1]) == ("F 1.000", "F 2.000")
+    fake.close()
+    fake.hang_up()
+    for told in ("cannot be reached", "no gripper answers"):
+        with pytest.raises(GripperError, match=told):
+            gripper.set_force(2.5)
+    gripper.close()
+
+
 def test_a_serial_line_is_spoken_as_tcp_is():
     gripper_end, ours = os.openpty()
     gripper = open_gripper(os.ttyname(ours), timeout_s=2.0)

@@ -255,6 +255,33 @@ def test_however_it_ends_the_gripper_keeps_what_it_holds_with(source, given, end
     assert hold.sources == ("a finger",)
 
 
+def test_what_was_told_is_kept_though_who_hears_of_it_fails(tmp_path: Path):
+    def fail(step: HoldStep) -> None:
+        raise BrokenPipeError("nobody listens")
+
+    with plain_reader(Frames()) as reader, pytest.raises(BrokenPipeError):
+        sl.hold_grip(reader, DryRun(), controller=Says(force_n=1.0), on_step=fail, out=tmp_path / "hold")
+    hold = load_result(tmp_path / "hold", Hold, command="sliplens hold")
+    assert (hold.ended, len(hold.steps)) == ("failed", 1)
+    assert hold.why == (
+        "who is told of each step failed (nobody listens); the gripper keeps the 1.00 N that it was told last"
+    )
+
+
+def test_a_force_that_was_told_is_noted_though_ctrl_c_comes_before_its_answer():
+    class Interrupted(DryRun):
+        def set_force(self, force_n: float) -> None:
+            super().set_force(force_n)
+            raise KeyboardInterrupt
+
+    hand = Interrupted()
+    with plain_reader(Frames()) as reader:
+        hold = sl.hold_grip(reader, hand, controller=Says(force_n=1.0))
+    assert hand.sent == ["F 1.000"]
+    assert hold.why == "interrupted; the gripper keeps the 1.00 N that it was told last"
+    assert hold.steps.command_n.tolist() == [1.0]
+
+
 def test_one_of_two_readers_suffices():
     with plain_reader(Frames(frames=2)) as one, plain_reader(Frames(frames=12)) as other:
         hold = sl.hold_grip([one, other], "dry-run", controller="fixed")

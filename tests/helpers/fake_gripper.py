@@ -18,19 +18,27 @@ class FakeGripper:
         self._thread.start()
 
     def _serve(self) -> None:
-        self._connection, _ = self._server.accept()
-        # whoever hangs up in the middle of an answer resets the connection
-        with suppress(ConnectionError), self._connection, self._connection.makefile("rwb") as stream:
-            for line in stream:
-                self.heard.append(line.decode().strip())
-                answer = self.answer(self.heard[-1]) if callable(self.answer) else self.answer
-                if answer is not None:
-                    stream.write(answer)
-                    stream.flush()
+        with suppress(OSError):  # until it is closed
+            while True:
+                self._connection, _ = self._server.accept()
+                # whoever hangs up in the middle of an answer resets the connection
+                with suppress(ConnectionError), self._connection, self._connection.makefile("rwb") as stream:
+                    for line in stream:
+                        self.heard.append(line.decode().strip())
+                        answer = self.answer(self.heard[-1]) if callable(self.answer) else self.answer
+                        if answer is not None:
+                            stream.write(answer)
+                            stream.flush()
 
     def send(self, answer: bytes) -> None:
         """Say something unasked."""
         self._connection.sendall(answer)
 
+    def hang_up(self) -> None:
+        """End the connection; another one may be made."""
+        self._connection.shutdown(socket.SHUT_RDWR)
+
     def close(self) -> None:
+        with suppress(OSError):  # closed already
+            self._server.shutdown(socket.SHUT_RDWR)
         self._server.close()

@@ -2,6 +2,7 @@
 
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,8 +20,9 @@ from sliplens.errors import InputError, RecordingError
 from sliplens.live import ForceStream, LiveFrame, Recorder, SimulatedSource, SourceOptions, open_live
 from sliplens.recordings import Dataset, Recording, TrialFacts, load_dataset
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.dataset import begin_recording, finish_recording
+from sliplens.recordings.dataset import begin_recording, finish_recording, keep_profile
 from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, Journal, JournalHeader
+from sliplens.recordings.sensor import SENSORS_FOLDER, load_profile
 from sliplens.recordings.store import forces_path, load_forces
 
 FACTS = TrialFacts(trial="cup", sensor="tip", object="a cup", condition="wet", day=3)
@@ -254,6 +256,22 @@ def test_trials_are_added_to_a_data_set_that_is_there(recording: Recording, tmp_
 
 
 def test_nothing_recorded_leaves_nothing_behind(tmp_path: Path):
+    assert Recorder(tmp_path / "data").close() is None
+    assert not (tmp_path / "data").exists()
+
+
+def test_nothing_recorded_by_a_profile_leaves_its_folder_free_whenever_it_was_killed(tmp_path: Path, monkeypatch):
+    def killed(folder: Path, **options: object) -> None:
+        if folder.name == SENSORS_FOLDER:
+            raise KeyboardInterrupt
+        remove(folder, **options)
+
+    recorder, remove = Recorder(tmp_path / "data"), shutil.rmtree
+    keep_profile(tmp_path / "data", load_profile("digit"))
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", killed)
+        with pytest.raises(KeyboardInterrupt):
+            recorder.close()
     assert Recorder(tmp_path / "data").close() is None
     assert not (tmp_path / "data").exists()
 

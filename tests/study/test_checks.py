@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,12 @@ def test_a_map_that_ignores_the_network_is_found_out(material: Material):
     assert found.methods["image"].complexity_rise == pytest.approx(0)
     assert any(alarm.startswith("image still correlates by 1.00") for alarm in found.alarms)
     assert found.methods["grad-cam"].similarity[-1] != pytest.approx(1.0)
+
+
+def test_no_clock_decides_which_figures_a_method_gets(material: Material, monkeypatch):
+    monkeypatch.setattr("time.perf_counter", count(step=60.0).__next__)  # every look at the clock is a minute later
+    found = Randomising(material=with_image(material, ShowsTheImage())).make().methods
+    assert found["grad-cam"].smooth_complexity_rise is not None
 
 
 def test_a_map_that_only_turns_its_sign_with_the_answers_is_as_similar(material: Material):

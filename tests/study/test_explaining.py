@@ -1,13 +1,15 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from sliplens.codec import load_result, save_result
-from sliplens.errors import CheckpointError, InputError
+from sliplens.errors import CheckpointError, InputError, SliplensError
+from sliplens.explainers import EXPLAINERS, Explanation
 from sliplens.files import output_folder
 from sliplens.models import Run, load_checkpoint
 from sliplens.recordings import Dataset
@@ -97,6 +99,18 @@ def test_maps_are_the_same_in_another_process(
     for method in METHODS:
         np.testing.assert_array_equal(first.relevance[method], second.relevance[method])
         np.testing.assert_array_equal(first.saliency[method], second.saliency[method])
+
+
+def test_a_map_that_is_not_finite_is_told_and_not_kept(trained: Run, small_dataset: Dataset, tmp_path: Path):
+    def holes(*given: Any, **options: Any) -> Explanation:
+        found = EXPLAINERS["grad-cam"](*given, **options)
+        found.relevance[:, :2, 0] = torch.nan
+        return found
+
+    chosen = frames_from_dataset(trained, small_dataset, levels=(1.0,))
+    with pytest.raises(SliplensError, match=r"the map of .* by holes holds NaN or infinity in 2 of \d+ pixels"):
+        explain_frames(trained, chosen, methods=["holes"], explainers={"holes": holes}, parts=tmp_path)
+    assert not list(tmp_path.glob("trial=*/*"))
 
 
 def test_an_unknown_method_lists_those_there_are(trained: Run, small_dataset: Dataset):

@@ -87,7 +87,7 @@ def _parse(words: Sequence[str]) -> Any:
 
 _STORED = Predict, Track, Explain, Status
 """Commands that read and write an object store."""
-_NO_MEMORY = "allocate memory|out of memory|bad_alloc|start new thread|failed to map segment"
+_NO_MEMORY = "allocate memory|out of memory|bad_alloc|start new thread|failed to map segment|create a primitive"
 """What torch, threads and libraries say where Python says MemoryError."""
 
 

@@ -100,7 +100,7 @@ class SourceCommand(Command):
     """Topic of the images; the only one if not given."""
     camera_key: str | None = None
     """Feature of a LeRobot data set with the images."""
-    allow_large: Annotated[tuple[Budget, ...], tyro.conf.arg(metavar="LIMIT")] = ()
+    allow_large: tuple[Budget, ...] = ()
     """Limits that do not hold, where a recording really is so large: frames, pixels, samples or span (of time)."""
     sensor: Path | None = None
     """Profile of the sensor: a file that `sliplens sensor new` made, or chromatouch, digit, gelsight-mini or tactip."""

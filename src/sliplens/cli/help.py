@@ -9,7 +9,7 @@ from difflib import get_close_matches
 from functools import cache
 from textwrap import fill
 from types import UnionType
-from typing import Annotated, Any, Union, get_args
+from typing import Annotated, Union, get_args
 
 import docstring_parser
 import tyro
@@ -54,6 +54,11 @@ TASKS = {
     "live": ("Read a running camera, and hold what it feels", ("live", "grip", "hold")),
 }
 """What users come for, and the commands that do it, in their order."""
+_SEVERAL = {
+    "allow_large": "LIMIT ...",
+    "force_columns": "NAME ...",
+    "bad_frames": "FIRST LAST ...",
+}  # their help
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,11 +123,9 @@ def describe_options(*commands: type) -> None:
             elif one.default is MISSING and one.default_factory is MISSING:
                 hints[one.name] = "(required)"
         for name, annotation in list(vars(kind).get("__annotations__", {}).items()):
-            words = said.get(name) or ""
-            settings: dict[str, Any] = {"help": " ".join(words.split())} if words else {}
-            settings |= {"help_behavior_hint": hints[name]} if name in hints else {}
-            if settings:
-                kind.__annotations__[name] = Annotated[annotation, tyro.conf.arg(**settings)]
+            words = " ".join((said.get(name) or "").split()) or None
+            told = tyro.conf.arg(help=words, help_behavior_hint=hints.get(name), metavar=_SEVERAL.get(name))
+            kind.__annotations__[name] = Annotated[annotation, told]
 
 
 def overview(description: str, commands: Iterable[type]) -> str:

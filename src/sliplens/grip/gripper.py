@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from io import FileIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -68,18 +69,20 @@ class LineGripper:
 
     `F 1.250` sets the force in newtons, `W 0.0400` the width in metres, `S` asks; each is answered by one line,
     `OK force_n width_m` or `ERR reason`. A late, broken or foreign answer is a `GripperError`; what comes later than
-    that is thrown away before the next line is sent, and answers nothing.
+    that is thrown away before the next line is sent, and answers nothing. A connection that breaks is a `GripperError`
+    too, and is opened again with the next line.
 
     Parameters
     ----------
-    wire
-        Socket, or file of a serial device, that carries the lines; see `open_gripper`.
+    connect
+        Opens the socket, or file of a serial device, that carries the lines; see `open_gripper`.
     timeout_s
         Time, in seconds, within which an answer has to come.
     """
 
-    def __init__(self, wire: socket.socket | FileIO, *, timeout_s: float = 0.1) -> None:
-        self._wire, self._timeout_s = wire, timeout_s
+    def __init__(self, connect: Callable[[], socket.socket | FileIO], *, timeout_s: float = 0.1) -> None:
+        self._connect, self._timeout_s = connect, timeout_s
+        self._wire, self._broken = connect(), False
 
     def set_force(self, force_n: float) -> None:
         """Press with so many newtons."""
@@ -98,6 +101,9 @@ class LineGripper:
         self._wire.close()
 
     def _ask(self, line: str) -> GripperState:
+        if self._broken:
+            self._wire = self._connect()
+            self._broken = False
         try:
             while self._ready(0.0):
                 self._read()
@@ -106,6 +112,8 @@ class LineGripper:
             while b"\n" not in answer and len(answer) < _ANSWER_BYTES and self._ready(ends_s - time.monotonic()):
                 answer += self._read()
         except (OSError, ValueError) as error:
+            self._broken = True
+            self._wire.close()
             raise GripperError(f"the gripper cannot be reached ({error}); check its cable and power") from None
         told, end, _ = answer.partition(b"\n")
         text = told.decode("ascii", errors="replace").strip()
@@ -326,15 +334,18 @@ def open_gripper(
         key, where = parse_zenoh(address.removeprefix("zenoh:"), purpose="zenoh")
         return RosGripper(key, where, messages=messages, joint=joint, timeout_s=timeout_s)
     if not address.startswith("tcp://"):
-        return LineGripper(_open_serial(Path(address)), timeout_s=timeout_s)
+        return LineGripper(partial(_open_serial, Path(address)), timeout_s=timeout_s)
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     if not host or not port.isdigit():
         raise InputError(f"{address} is no address of a gripper; write tcp://HOST:PORT")
-    try:
-        connection = socket.create_connection((host.strip("[]"), int(port)), timeout=timeout_s)
-    except (OSError, OverflowError) as error:
-        raise GripperError(f"no gripper answers at {address} ({error}); check its power and the port") from None
-    return LineGripper(connection, timeout_s=timeout_s)
+
+    def connect() -> socket.socket:
+        try:
+            return socket.create_connection((host.strip("[]"), int(port)), timeout=timeout_s)
+        except (OSError, OverflowError) as error:
+            raise GripperError(f"no gripper answers at {address} ({error}); check its power and the port") from None
+
+    return LineGripper(connect, timeout_s=timeout_s)
 
 
 def _open_serial(path: Path) -> FileIO:

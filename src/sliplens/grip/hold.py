@@ -105,7 +105,8 @@ def hold_grip(
     seconds
         Time after which it ends; with the source if None.
     on_step
-        Called after each command; what takes long delays the next.
+        Called after each command; what takes long delays the next, and what it raises ends the hold and is raised
+        again once the result is kept.
     out
         Folder to keep the result in; in memory alone if None.
     overwrite
@@ -151,7 +152,7 @@ def hold_grip(
         holding = _Holding(guard, readers, controller, settings, ceiling_n)
         for finger, reader in enumerate(readers):
             stack.callback(reader.subscribe(partial(holding.hear, finger)))
-        ended, why = holding.run(seconds, on_step)
+        ended, why, error = holding.run(seconds, on_step)
         hold = Hold(
             sources=tuple(reader.source.name for reader in readers),
             gripper=address,
@@ -166,6 +167,8 @@ def hold_grip(
         )
         if output is not None:
             save_result(hold, output.folder)
+    if error is not None:
+        raise error
     return hold
 
 
@@ -201,8 +204,8 @@ class _Holding:
 
     def run(
         self, seconds: float | None, on_step: Callable[[HoldStep], None] | None
-    ) -> tuple[Literal["time", "source", "failed", "interrupted"], str]:
-        """Hold until it ends; tells how."""
+    ) -> tuple[Literal["time", "source", "failed", "interrupted"], str, Exception | None]:
+        """Hold until it ends; tells how, and what `on_step` raised."""
         begun_s = time.monotonic()
         pace, number = Pace(Event()), 0
         try:
@@ -211,15 +214,18 @@ class _Holding:
                 ends = [reader.ended for reader in self._readers]
                 if None not in ends:
                     failed = any(reader.failed for reader in self._readers)
-                    return "failed" if failed else "source", ", ".join(map(str, ends))
+                    return "failed" if failed else "source", ", ".join(map(str, ends)), None
                 if seconds is not None and time.monotonic() - begun_s >= seconds:
                     break
                 step = self._step(begun_s)
                 if on_step is not None:
-                    on_step(step)
+                    try:
+                        on_step(step)
+                    except Exception as error:  # whoever is told no more: what was held is kept none the less
+                        return "failed", f"who is told of each step failed ({error or type(error).__name__})", error
         except KeyboardInterrupt:
-            return "interrupted", "interrupted"
-        return "time", "the time is over"
+            return "interrupted", "interrupted", None
+        return "time", "the time is over", None
 
     @property
     def kept(self) -> str:
@@ -246,11 +252,13 @@ class _Holding:
         force_n, trouble = self._measure()
         now_s = time.monotonic()
         answer = self._holder.answer(now_s, force_n)
-        self._guard.set_force(answer.command_n)
-        trouble = self._guard.failure or trouble
-        if trouble is not None:
-            self.troubles[trouble] = None
-        self._rows.append((now_s - begun_s, answer, force_n, trouble is not None))
+        try:
+            self._guard.set_force(answer.command_n)
+        finally:  # interrupted, it was told none the less
+            trouble = self._guard.failure or trouble
+            if trouble is not None:
+                self.troubles[trouble] = None
+            self._rows.append((now_s - begun_s, answer, force_n, trouble is not None))
         return HoldStep(
             time_s=now_s - begun_s,
             command_n=answer.command_n,

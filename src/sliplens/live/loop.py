@@ -373,15 +373,15 @@ class LiveReader:
             facts = replace(facts, sensor=self._profile.name)
         if self.network is not None and not facts.sensor:
             facts = replace(facts, sensor=self.network.manifest.sensor)
-        self.recorder = self._recorded = Recorder(
-            folder,
-            facts=facts,
-            source=self.source.name,
-            simulated=self.source.simulated,
-        )
+        recorder = Recorder(folder, facts=facts, source=self.source.name, simulated=self.source.simulated)
         if self._profile is not None:
-            keep_profile(Path(folder), self._profile)
-        return self.recorder
+            try:
+                keep_profile(Path(folder), self._profile)
+            except BaseException:
+                recorder.close()
+                raise
+        self.recorder = self._recorded = recorder
+        return recorder
 
     def stop_recording(self) -> Dataset | None:
         """End the recording; gives its data set, None where there is none, or no frame of it."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sliplens.codec import from_builtins, save_record
 from sliplens.errors import RecordingError
-from sliplens.files import StoredPath, as_path, hash_file, hash_json, read_json, require_folder
+from sliplens.files import StoredPath, as_path, hash_file, hash_json, read_json, require_folder, whole_file
 from sliplens.progress import OnProgress, fold_equal, note
 from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, JournalLock, finish_journal, journals_of
 from sliplens.recordings.labelling import Labelling
@@ -209,8 +209,8 @@ def finish_recording(folder: Path, lock: JournalLock | None = None) -> None:
     finally:
         held.release()
     if not found:
-        (folder / DATASET_FILE).unlink()
         shutil.rmtree(folder / SENSORS_FOLDER, ignore_errors=True)
+        (folder / DATASET_FILE).unlink()  # without it the rest would be nobody's
         with suppress(OSError):  # where something else is in it
             folder.rmdir()
 
@@ -225,8 +225,8 @@ def tell_flags(trials: Iterable[tuple[str, Labelling | None]], on_progress: OnPr
 def keep_profile(folder: Path, profile: SensorProfile) -> None:
     """Keep, in the folder of a data set, the profile that frames went through."""
     path = folder / SENSORS_FOLDER / f"{profile.name}.toml"
-    path.parent.mkdir(exist_ok=True)
-    path.write_text(profile_text(profile), encoding="utf-8")
+    with whole_file(path) as part:
+        part.write_text(profile_text(profile), encoding="utf-8")
 
 
 def trial_path(folder: Path, trial: str) -> Path:

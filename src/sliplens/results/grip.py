@@ -135,7 +135,7 @@ class Hold:
     ceiling_n: float
     watchdog_s: float
     ended: Literal["time", "source", "failed", "interrupted"]
-    """The time was over, a source ended or failed, or a person interrupted it."""
+    """The time was over, a source ended, that or who was told of each step failed, or a person interrupted it."""
     why: str
     """The same in a sentence, with what the gripper goes on doing."""
     troubles: tuple[str, ...]

@@ -219,8 +219,6 @@ def _seconds(
 
 CASCADE = 3
 """Parts of the network that get new weights one after another."""
-_SMOOTH_WITHIN_S = 1.0
-"""Methods that take longer a frame are not explained sixteen times over."""
 _STILL_SIMILAR = 0.5
 
 Maps = Float[np.ndarray, "frames height width"]
@@ -251,17 +249,15 @@ class Randomising(MaterialStage[Randomisation]):
                 return _influence(explainer(model, images, reference=references))
 
             before = material.towards_target(name)[:_REDRAWN]
-            started = time.perf_counter()
             model = material.trained.model
             scores = randomisation_scores(explain, model, inputs, seed=seed, stages=CASCADE, before=before)
-            seconds = (time.perf_counter() - started) / CASCADE / len(inputs)
             return RandomisedMethod(
                 layers=tuple(scores.layers),
                 similarity=tuple(mean_of_known(row) for row in scores.similarity),
                 complexity_rise=mean_of_known(scores.complexity_rise),
-                smooth_complexity_rise=_smooth_rise(material, explain, inputs, seed=seed)
-                if seconds <= _SMOOTH_WITHIN_S
-                else None,
+                smooth_complexity_rise=None
+                if _asks_often(explainer)
+                else _smooth_rise(material, explain, inputs, seed=seed),
             )
 
         return find
@@ -299,6 +295,11 @@ def _shortened(explainer: Explainer, *, passes_matter: bool = False) -> Explaine
     if isinstance(explainer, Shapley) and passes_matter:
         return replace(explainer, pairs=_FEW_PAIRS)
     return explainer
+
+
+def _asks_often(explainer: Explainer) -> bool:
+    """Whether a map takes so many passes that no frame is explained sixteen times over; no matter how fast they are."""
+    return isinstance(explainer, Shapley) or (isinstance(explainer, PolyCam) and explainer.score != "thesis")
 
 
 def _smooth_rise(

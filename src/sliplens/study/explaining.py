@@ -25,7 +25,7 @@ from sliplens.recordings.capture import Capture
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import open_source
 from sliplens.results.evaluation import ANSWER, SHARE
-from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
+from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes, require_saliency
 from sliplens.shards import Shard, shard
 from sliplens.study.stages import Find, Stage
 
@@ -249,8 +249,10 @@ class Explaining(Stage[Explained]):
             # of few maps the first is waited for: each then takes the engine that its own passes pay for
             with expecting(run.model, _PASSES_A_MAP * maps if maps > _FEW_MAPS else 0):
                 explanation = self.explainers[method](run.model, inputs, reference=references[frame].to(run.device))
+            relevance = explanation.relevance[0].cpu().numpy()
+            where = f"the map of {self.chosen.ids[item[1]]} by {method}"
             return _Map(
-                relevance=explanation.relevance[0].cpu().numpy(),
+                relevance=require_saliency(relevance, inputs.shape[-2:], where=where),
                 saliency=explanation.saliency[0].cpu().numpy(),
                 seconds=explanation.seconds,
                 warnings=explanation.warnings,
