@@ -1,14 +1,14 @@
 """Many trials serially, by processes and by Ray: how fast, with which bytes, in what memory, and what a kill costs.
 
-Rates are of steady work: from the part on by which every worker has made one, to the last; what comes before is told
-apart as the start. `serial` is what users get, its batches in as many threads as there are cores; `one thread` is the
-same in one, for processes share the cores out. Kills are `SIGKILL` at random moments, of the command or of a process
-below it: a worker, an actor, a node of Ray. The same command must then end with the bytes of a serial run, no part
-twice and none missing.
+Rates are of steady work: of the later half of the parts. The start is what the whole took beyond its frames at that
+rate. `serial` is what users get, its batches in as many threads as there are cores; `one thread` is the same in one,
+for processes share the cores out. Kills are `SIGKILL` at random moments, of the command or of a process that works for
+it: a worker, an actor, a node of Ray, of one or, as `cluster`, of two of them. The same command must then end with the
+bytes of a serial run, no part twice and none missing.
 
-With `--keep FOLDER` each piece is kept as soon as it is measured, and the next call goes on from there, so that hours
-can be had in minutes: `--stages predict --kills 0`, then `--stages --kills 10`, then `--kills 30`. With `--json` the
-last line is one object.
+With `--keep FOLDER` each piece is kept as soon as it is measured, by the hash of its data, and the next call goes on
+from there, so that hours can be had in minutes: `--stages predict --kills 0`, then `--stages --kills 10`, then
+`--kills 30`. With `--json` the last line is one object.
 """
 
 import argparse
@@ -24,7 +24,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
@@ -34,7 +34,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command line does;
 
 from sliplens import load_dataset, predict, simulate
 from sliplens.extras import missing_packages
-from sliplens.files import hash_file, hash_json, machine, versions, write_json
+from sliplens.files import hash_file, hash_json, machine, partial_folder, versions, write_json
 from sliplens.markers.tracking import track
 from sliplens.models.engines import one_thread
 from sliplens.progress import OnProgress
@@ -45,8 +45,13 @@ from sliplens.study.workspace import explain_source
 NETWORK = "chromatouch-difference"
 EMPTY = 10_000
 """Shards whose driver is weighed."""
+MAPS = 12
+"""Frames that are explained."""
 ONE_THREAD = "one thread"
 """Serial work of one thread; every other place is named as `--on` takes it."""
+CLUSTER = "cluster"
+"""A cluster of Ray of two nodes, a core each; it is killed, and not timed."""
+NOBODY = "nobody"
 _PATIENCE_S = 240.0  # with a command that was hit; Ray takes a minute to see that a node is gone
 
 
@@ -55,7 +60,7 @@ class Rate:
     """Speed of a stage, and what it made."""
 
     start_s: float
-    """Until every worker has made a part."""
+    """What the whole took beyond its frames at that speed."""
     frames_per_s: float
     sha256: str
 
@@ -70,12 +75,19 @@ def content(folder: Path) -> str:
     return hash_json({name: hash_file(path) for name, path in parts(folder).items() if path.is_file()})
 
 
-def rate(folder: Path, *, began_s: float, workers: int) -> Rate:
-    """Speed from when the parts were made."""
-    made = sorted((path.stat().st_mtime, int(path.name.split("-")[1])) for path in parts(folder).values())
-    first_s = made[workers - 1][0]
-    steady = sum(frames for _, frames in made[workers:]) / (made[-1][0] - first_s)
-    return Rate(start_s=first_s - began_s, frames_per_s=steady, sha256=content(folder))
+def rate(made: list[tuple[float, int]], began_s: float, sha256: str) -> Rate:
+    """Speed from when parts were made, and of how many frames: of the later half, when all workers are long there."""
+    made = sorted(made)
+    half, last_s = len(made) // 2, made[-1][0]
+    steady = sum(frames for _, frames in made[half:]) / (last_s - made[half - 1][0])
+    start_s = last_s - began_s - sum(frames for _, frames in made) / steady
+    return Rate(start_s=start_s, frames_per_s=steady, sha256=sha256)
+
+
+def rate_of_parts(folder: Path, began_s: float) -> Rate:
+    """Speed of what left a file a part."""
+    made = [(path.stat().st_mtime, int(path.name.split("-")[1])) for path in parts(folder).values()]
+    return rate(made, began_s, content(folder))
 
 
 class Empty:
@@ -92,29 +104,27 @@ class Empty:
         return make
 
 
-def time_predict(data: Dataset, out: Path, on: str, workers: int) -> Rate:
+def time_predict(data: Dataset, out: Path, on: str) -> Rate:
     """Margins of all frames."""
     began_s = time.time()
     predict(NETWORK, data, engine="folded", on=on, out=out)
-    return rate(out, began_s=began_s, workers=workers)
+    return rate_of_parts(out, began_s)
 
 
-def time_track(data: Dataset, out: Path, on: str, workers: int) -> Rate:
+def time_track(data: Dataset, out: Path, on: str) -> Rate:
     """Markers of all frames."""
     began_s = time.time()
     track(data, markers="chromatouch", on=on, out=out)
-    return rate(out, began_s=began_s, workers=workers)
+    return rate_of_parts(out, began_s)
 
 
-def time_explain(data: Dataset, _: Path, on: str, workers: int) -> Rate:
-    """Maps of Poly-CAM on its budget, of eight frames."""
-    made_s: list[float] = []
-    began_s, levels = time.time(), tuple(1 - number / 7 for number in range(8))
+def time_explain(data: Dataset, _: Path, on: str) -> Rate:
+    """Maps of Poly-CAM on its budget."""
+    made: list[tuple[float, int]] = []
+    began_s, levels = time.time(), tuple(1 - number / (MAPS - 1) for number in range(MAPS))
     options = {"methods": ("poly-cam",), "levels": levels, "split": data.trials[-1].split}
-    maps = explain_source(NETWORK, data, on=on, on_progress=lambda *_: made_s.append(time.time()), **options)
-    steady = (len(made_s) - workers) / (made_s[-1] - made_s[workers - 1])
-    relevance = hashlib.sha256(maps.relevance["poly-cam"].tobytes()).hexdigest()
-    return Rate(start_s=made_s[workers - 1] - began_s, frames_per_s=steady, sha256=relevance)
+    maps = explain_source(NETWORK, data, on=on, on_progress=lambda *_: made.append((time.time(), 1)), **options)
+    return rate(made, began_s, hashlib.sha256(maps.relevance["poly-cam"].tobytes()).hexdigest())
 
 
 STAGES = {"predict": time_predict, "explain": time_explain, "track": time_track}
@@ -154,19 +164,19 @@ def kind_of(process: int) -> str:
 
 
 def kill_at_random(words: list[str], rng: random.Random, *, within_s: float) -> str:
-    """Give a command and kill it, or a process below it, each kind as often; tells which."""
+    """Give a command and kill it, or a process that works for it, each kind as often; tells which."""
     command = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     time.sleep(rng.uniform(0.2, 1.0) * within_s)
     victims: dict[str, list[int]] = {"driver": [command.pid]}
-    for process in below(command.pid):
+    for process in set(below(os.getpid())) - {command.pid}:
         victims.setdefault(kind_of(process), []).append(process)
     kind = rng.choice(sorted(victims))
     if command.poll() is not None:
-        return "nobody"
+        return NOBODY
     try:
         os.kill(rng.choice(victims[kind]), signal.SIGKILL)
     except ProcessLookupError:
-        kind = "nobody"
+        kind = NOBODY
     try:
         command.wait(_PATIENCE_S)
     except subprocess.TimeoutExpired:
@@ -176,13 +186,38 @@ def kill_at_random(words: list[str], rng: random.Random, *, within_s: float) -> 
     return kind
 
 
-def survive(data: Path, on: str, *, wanted: str, within_s: float, rng: random.Random) -> tuple[str, bool]:
-    """What was killed of a command, and whether the same command then ended with the same parts."""
+@contextmanager
+def ready(on: str) -> Iterator[str]:
+    """A place to work as `--on` takes it; of a cluster, while its two nodes of Ray are there."""
+    if on != CLUSTER:
+        yield on
+        return
+    from ray.cluster_utils import Cluster  # noqa: PLC0415 (an extra)  # pyright: ignore[reportMissingImports]
+
+    cluster = Cluster()
+    try:
+        for _ in range(2):
+            cluster.add_node(num_cpus=1)
+        yield f"ray={cluster.address}"
+    finally:
+        cluster.shutdown()
+
+
+def survive(data: Path, on: str, *, wanted: str, within_s: float, rng: random.Random) -> dict[str, Any]:
+    """What was killed of a command, with how many parts there, and whether the same command then ended with all."""
     with tempfile.TemporaryDirectory() as folder:
-        words = kill_words(data, Path(folder) / "out", on)
-        killed = kill_at_random(words, rng, within_s=within_s)
-        ended = subprocess.run(words, check=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        return f"{killed}, {on}", ended.returncode == 0 and content(Path(folder) / "out") == wanted
+        out = Path(folder) / "out"
+        with ready(on) as place:
+            killed = kill_at_random(kill_words(data, out, place), rng, within_s=within_s)
+        there = len(parts(out) or parts(partial_folder(out)))
+        with ready(on) as place, suppress(subprocess.TimeoutExpired):
+            again = subprocess.run(
+                kill_words(data, out, place), check=False, capture_output=True, text=True, timeout=_PATIENCE_S
+            )
+            same = again.returncode == 0 and content(out) == wanted
+            told = "" if same else again.stderr[-2000:]
+            return {"killed": killed, "on": on, "parts": there, "survived": same, "told": told}
+        return {"killed": killed, "on": on, "parts": there, "survived": False, "told": "the second command hung"}
 
 
 def kill_words(data: Path, out: Path, on: str) -> list[str]:
@@ -193,8 +228,8 @@ def kill_words(data: Path, out: Path, on: str) -> list[str]:
 
 def time_whole(data: Path, on: str) -> tuple[float, str]:
     """Seconds that a command takes that nobody kills, and what it makes."""
-    with tempfile.TemporaryDirectory() as folder:
-        began_s, words = time.perf_counter(), kill_words(data, Path(folder) / "out", on)
+    with tempfile.TemporaryDirectory() as folder, ready(on) as place:
+        began_s, words = time.perf_counter(), kill_words(data, Path(folder) / "out", place)
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         return time.perf_counter() - began_s, content(Path(folder) / "out")
 
@@ -218,18 +253,18 @@ class Kept:
             simulate(self.folder / name, dry_trials=trials, wet_trials=0, frames_per_trial=frames)
         return self.folder / name
 
-    def rates(self, data: Dataset, stages: list[str], places: dict[str, int]) -> dict[str, dict[str, Any]]:
+    def rates(self, data: Dataset, stages: list[str], places: list[str]) -> dict[str, dict[str, Any]]:
         """Speed of each stage at each place."""
         found: dict[str, dict[str, Any]] = {stage: {} for stage in stages}
-        for stage, (place, workers) in product(stages, places.items()):
+        for stage, place in product(stages, places):
 
-            def measure(stage: str = stage, place: str = place, workers: int = workers) -> dict[str, Any]:
+            def measure(stage: str = stage, place: str = place) -> dict[str, Any]:
                 alone = place == ONE_THREAD
                 with tempfile.TemporaryDirectory() as folder, one_thread() if alone else nullcontext():
-                    own = STAGES[stage](data, Path(folder) / "out", "serial" if alone else place, workers)
+                    own = STAGES[stage](data, Path(folder) / "out", "serial" if alone else place)
                 return asdict(own) | {"load_average": os.getloadavg()[0]}
 
-            found[stage][place] = self.once(f"{stage}-{place}", measure)
+            found[stage][place] = self.once(f"{stage}-{place}-{data.hash[:16]}", measure)
             print(f"{stage:8s} {place:12s} {found[stage][place]}", file=sys.stderr, flush=True)
         return found
 
@@ -242,23 +277,27 @@ class Kept:
 
         return self.once("driver", weigh)
 
-    def kills(self, where: list[str], *, count: int, seed: int) -> tuple[int, Counter[str]]:
-        """Kills after which the same command ended with the same parts, and what was killed."""
-        killed: Counter[str] = Counter()
-        survived = 0
-        if not count:
-            return survived, killed
-        data = self.data("few", trials=6, frames=10)
-        whole = {on: self.once(f"whole-{on}", lambda on=on: time_whole(data, on)) for on in where}
-        for number in range(count):
+    def kills(self, data: Dataset, where: list[str], *, count: int, seed: int) -> list[dict[str, Any]]:
+        """Each kill, of whom, and whether the same command then ended with the same parts."""
+        found: list[dict[str, Any]] = []
+
+        def whole(on: str) -> tuple[float, str]:
+            return self.once(f"whole-{on}-{data.hash[:16]}", lambda: time_whole(data.folder, on))
+
+        for number in range(2 * count):  # a command that was over when its moment came was not killed
             on, rng = where[number % len(where)], random.Random(f"{seed}-{number}")
-            told: dict[str, Any] = {"wanted": whole["serial"][1], "within_s": whole[on][0], "rng": rng}
-            what, same = self.once(f"kill-{seed}-{number}", lambda on=on, told=told: survive(data, on, **told))
-            print(f"kill {number}: {what}: {'survived' if same else 'NOT SURVIVED'}", file=sys.stderr, flush=True)
-            if not what.startswith("nobody"):  # the command was over
-                killed[what] += 1
-                survived += same
-        return survived, killed
+
+            def kill(on: str = on, rng: random.Random = rng) -> dict[str, Any]:
+                wanted = whole("serial")[1]
+                return survive(data.folder, on, wanted=wanted, within_s=whole(on)[0], rng=rng)
+
+            one = self.once(f"kill-{seed}-{number}-{data.hash[:16]}", kill)
+            print(f"kill {number}: {one}", file=sys.stderr, flush=True)
+            if NOBODY not in one["killed"]:
+                found.append(one)
+            if len(found) == count:
+                break
+        return found
 
 
 def main() -> None:
@@ -274,16 +313,18 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     by_processes = f"processes={options.workers}"
-    places = {"serial": 1, ONE_THREAD: 1, by_processes: options.workers}
-    if not options.without_ray and missing_packages("ray", extra="ray") is None:
-        places["ray"] = os.cpu_count() or 1
+    places = ["serial", ONE_THREAD, by_processes]
+    if with_ray := not options.without_ray and missing_packages("ray", extra="ray") is None:
+        places.append("ray")
     with tempfile.TemporaryDirectory() as folder:
         kept = Kept(folder=options.keep or Path(folder))
+        driver_mb = kept.driver_mb()  # first: whatever else is done would hide by how much its memory peaks
         found = load_dataset(options.data or kept.data("data", trials=12, frames=40))
-        driver_mb = kept.driver_mb()  # first: networks would hide by how much its memory peaks
         rates = kept.rates(found, options.stages, places)
-        where = [place for place in places if place != ONE_THREAD]
-        survived, killed = kept.kills(where, count=options.kills, seed=options.seed)
+        where = ["serial", by_processes, *(["ray", CLUSTER] if with_ray else [])]
+        kills = kept.kills(found, where, count=options.kills, seed=options.seed)
+        killed = Counter(f"{one['killed']}, {one['on']}" for one in kills)
+        survived = sum(one["survived"] for one in kills)
 
     def over(place: str, rival: str) -> dict[str, float]:
         both = {stage: own for stage, own in rates.items() if {place, rival} <= set(own)}
@@ -301,6 +342,7 @@ def main() -> None:
         "kills": killed.total(),
         "kills_survived": survived,
         "killed": dict(killed),
+        "parts_there_when_killed": sorted(one["parts"] for one in kills),
         **{name: each(name) for name in ("frames_per_s", "start_s", "load_average")},
         "frames": found.frames,
         "workers": options.workers,
