@@ -1,10 +1,12 @@
 """Many trials serially, by processes and by Ray: how fast, with which bytes, in what memory, and what a kill costs.
 
 Rates are of steady work: of the later half of the parts. The start is what the whole took beyond its frames at that
-rate. `serial` is what users get, its batches in as many threads as there are cores; `one thread` is the same in one,
-for processes share the cores out. Kills are `SIGKILL` at random moments, of the command or of a process that works for
-it: a worker, an actor, a node of Ray, of one or, as `cluster`, of two of them. The same command must then end with the
-bytes of a serial run, no part twice and none missing.
+rate. `serial` is what users get, its batches in as many threads as there are cores; `one core` is the same on one of
+them. From the rates of processes the plan is drawn, of what a million and a hundred million frames take.
+
+Kills are `SIGKILL` at random moments, of the command or of a process that works for it: a worker, an actor, a node of
+Ray, of one or, as `cluster`, of two of them. The same command must then end with the bytes of a serial run, no part
+twice and none missing.
 
 With `--keep FOLDER` each piece is kept as soon as it is measured, by the hash of its data, and the next call goes on
 from there, so that hours can be had in minutes: `--stages predict --kills 0`, then `--stages --kills 10`, then
@@ -22,10 +24,11 @@ import subprocess
 import sys
 import tempfile
 import time
+import tracemalloc
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -38,7 +41,7 @@ from sliplens.files import hash_file, hash_json, machine, partial_folder, versio
 from sliplens.markers.tracking import track
 from sliplens.models.engines import one_thread
 from sliplens.progress import OnProgress
-from sliplens.recordings import Dataset
+from sliplens.recordings import Dataset, TrialInfo
 from sliplens.shards import MakePart, Shard, make_parts, shard
 from sliplens.study.workspace import explain_source
 
@@ -47,8 +50,12 @@ EMPTY = 10_000
 """Shards whose driver is weighed."""
 MAPS = 12
 """Frames that are explained."""
-ONE_THREAD = "one thread"
-"""Serial work of one thread; every other place is named as `--on` takes it."""
+PLANNED = (1_000_000, 100_000_000)
+"""Frames of the plan, in trials of so many, 20 s of a usual camera, on so many cores."""
+TRIAL = 600
+MACHINES = {"a laptop of 8 cores": 8, "100 nodes of 16 cores": 1600}
+ONE_CORE = "one core"
+"""Serial work on one core; every other place is named as `--on` takes it."""
 CLUSTER = "cluster"
 """A cluster of Ray of two nodes, a core each; it is killed, and not timed."""
 NOBODY = "nobody"
@@ -63,6 +70,10 @@ class Rate:
     """What the whole took beyond its frames at that speed."""
     frames_per_s: float
     sha256: str
+    bytes_per_frame: float
+    """Of what was made."""
+    held_per_frame: float = 0.0
+    """Bytes in the driver's memory."""
 
 
 def parts(folder: Path) -> dict[str, Path]:
@@ -75,19 +86,59 @@ def content(folder: Path) -> str:
     return hash_json({name: hash_file(path) for name, path in parts(folder).items() if path.is_file()})
 
 
-def rate(made: list[tuple[float, int]], began_s: float, sha256: str) -> Rate:
+def rate(made: list[tuple[float, int]], began_s: float, out: Path, sha256: str) -> Rate:
     """Speed from when parts were made, and of how many frames: of the later half, when all workers are long there."""
     made = sorted(made)
-    half, last_s = len(made) // 2, made[-1][0]
+    half, last_s, frames = len(made) // 2, made[-1][0], sum(frames for _, frames in made)
     steady = sum(frames for _, frames in made[half:]) / (last_s - made[half - 1][0])
-    start_s = last_s - began_s - sum(frames for _, frames in made) / steady
-    return Rate(start_s=start_s, frames_per_s=steady, sha256=sha256)
+    start_s = last_s - began_s - frames / steady
+    return Rate(start_s=start_s, frames_per_s=steady, sha256=sha256, bytes_per_frame=size_of(out) / frames)
 
 
-def rate_of_parts(folder: Path, began_s: float) -> Rate:
+def rate_of_parts(out: Path, began_s: float) -> Rate:
     """Speed of what left a file a part."""
-    made = [(path.stat().st_mtime, int(path.name.split("-")[1])) for path in parts(folder).values()]
-    return rate(made, began_s, content(folder))
+    made = [(path.stat().st_mtime, int(path.name.split("-")[1])) for path in parts(out).values()]
+    return rate(made, began_s, out, content(out))
+
+
+def size_of(folder: Path) -> int:
+    """Bytes of all files."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Leave this thread, and those that it begins, the last core alone."""
+    every = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(every)})
+    try:
+        with one_thread():
+            yield
+    finally:
+        os.sched_setaffinity(0, every)
+
+
+def plan(
+    rates: dict[str, dict[str, Any]], *, workers: int, driver: dict[str, float], data: Dataset
+) -> list[dict[str, str | int | float]]:
+    """What each stage would take of many frames, from its cost a core while all cores work."""
+    stored = size_of(data.folder) / data.frames
+    rows: list[dict[str, str | int | float]] = []
+    for (stage, own), frames, (machines, cores) in product(rates.items(), PLANNED, MACHINES.items()):
+        rate_per_s, trials = own["frames_per_s"] * cores / workers, frames / TRIAL
+        shards = frames if stage == "explain" else trials
+        held = driver["bytes_a_trial"] * trials + own["held_per_frame"] * frames
+        rows.append({
+            "stage": stage,
+            "frames": frames,
+            "on": machines,
+            "hours": max(own["start_s"] + frames / rate_per_s, driver["s_a_shard"] * shards) / 3600,
+            "read_tb": stored * frames / 1e12,
+            "read_gb_per_s": stored * rate_per_s / 1e9,
+            "written_gb": own["bytes_per_frame"] * frames / 1e9,
+            "driver_gb": held / 1e9,
+        })  # fmt: skip
+    return rows
 
 
 class Empty:
@@ -118,30 +169,42 @@ def time_track(data: Dataset, out: Path, on: str) -> Rate:
     return rate_of_parts(out, began_s)
 
 
-def time_explain(data: Dataset, _: Path, on: str) -> Rate:
+def time_explain(data: Dataset, out: Path, on: str) -> Rate:
     """Maps of Poly-CAM on its budget."""
     made: list[tuple[float, int]] = []
     began_s, levels = time.time(), tuple(1 - number / (MAPS - 1) for number in range(MAPS))
-    options = {"methods": ("poly-cam",), "levels": levels, "split": data.trials[-1].split}
+    options = {"methods": ("poly-cam",), "levels": levels, "split": data.trials[-1].split, "out": out}
     maps = explain_source(NETWORK, data, on=on, on_progress=lambda *_: made.append((time.time(), 1)), **options)
-    return rate(made, began_s, hashlib.sha256(maps.relevance["poly-cam"].tobytes()).hexdigest())
+    kept = (maps.images, maps.pictures, *maps.relevance.values(), *maps.saliency.values())
+    held = sum(array.nbytes for array in kept) + 4 * maps.images.nbytes  # the references, in 32 bits
+    found = rate(made, began_s, out, hashlib.sha256(maps.relevance["poly-cam"].tobytes()).hexdigest())
+    return replace(found, held_per_frame=held / MAPS)
 
 
 STAGES = {"predict": time_predict, "explain": time_explain, "track": time_track}
 
 
-def weigh_driver(folder: Path) -> float:
-    """Megabytes by which the driver grows from a hundred empty shards to ten thousand."""
+def weigh_driver(folder: Path) -> dict[str, float]:
+    """What the driver takes: for ten thousand empty shards, more than for a hundred, and for a long list of trials."""
 
     def shards(count: int) -> Iterator[Shard]:
         for number in range(count):
             yield shard(number, trial=f"t{number}", frames=1, recipe=0, shown=str(number))
 
-    peaks_mb = []
+    peaks_mb, took_s = [], 0.0
     for count in (100, EMPTY):
+        began_s = time.perf_counter()
         make_parts(Empty(), lambda count=count: shards(count), folder / str(count), title="Nothing")
+        took_s = time.perf_counter() - began_s
         peaks_mb.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
-    return peaks_mb[1] - peaks_mb[0]
+    tracemalloc.start()
+    own = {"sensor": "a", "day": 1, "condition": "dry", "object": "", "split": "test", "height": 224, "width": 224}
+    held = [TrialInfo(trial=f"trial-{row:06d}", frames=TRIAL, sha256=f"{row:064x}", **own) for row in range(EMPTY)]
+    rows = [(info.trial, info.frames, info.sha256) for info in held]  # as `open_trials` has them
+    bytes_a_trial = tracemalloc.get_traced_memory()[0] / EMPTY
+    tracemalloc.stop()
+    assert len(rows) == EMPTY
+    return {"grew_mb": peaks_mb[1] - peaks_mb[0], "s_a_shard": took_s / EMPTY, "bytes_a_trial": bytes_a_trial}
 
 
 def below(process: int) -> list[int]:
@@ -259,8 +322,8 @@ class Kept:
         for stage, place in product(stages, places):
 
             def measure(stage: str = stage, place: str = place) -> dict[str, Any]:
-                alone = place == ONE_THREAD
-                with tempfile.TemporaryDirectory() as folder, one_thread() if alone else nullcontext():
+                alone = place == ONE_CORE
+                with tempfile.TemporaryDirectory() as folder, one_core() if alone else nullcontext():
                     own = STAGES[stage](data, Path(folder) / "out", "serial" if alone else place)
                 return asdict(own) | {"load_average": os.getloadavg()[0]}
 
@@ -268,10 +331,10 @@ class Kept:
             print(f"{stage:8s} {place:12s} {found[stage][place]}", file=sys.stderr, flush=True)
         return found
 
-    def driver_mb(self) -> float:
-        """What `weigh_driver` weighs, in memory: its files would each wait for the disk."""
+    def driver(self) -> dict[str, float]:
+        """What `weigh_driver` weighs, its files in memory: on a disk each would wait for it."""
 
-        def weigh() -> float:
+        def weigh() -> dict[str, float]:
             with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as empty:
                 return weigh_driver(Path(empty))
 
@@ -313,12 +376,12 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     by_processes = f"processes={options.workers}"
-    places = ["serial", ONE_THREAD, by_processes]
+    places = ["serial", ONE_CORE, by_processes]
     if with_ray := not options.without_ray and missing_packages("ray", extra="ray") is None:
         places.append("ray")
     with tempfile.TemporaryDirectory() as folder:
         kept = Kept(folder=options.keep or Path(folder))
-        driver_mb = kept.driver_mb()  # first: whatever else is done would hide by how much its memory peaks
+        driver = kept.driver()  # first: whatever else is done would hide by how much its memory peaks
         found = load_dataset(options.data or kept.data("data", trials=12, frames=40))
         rates = kept.rates(found, options.stages, places)
         where = ["serial", by_processes, *(["ray", CLUSTER] if with_ray else [])]
@@ -333,17 +396,20 @@ def main() -> None:
     def each(name: str) -> dict[str, dict[str, Any]]:
         return {stage: {on: one[name] for on, one in own.items()} for stage, own in rates.items()}
 
+    costs = {stage: own[by_processes] for stage, own in rates.items()}
+    planned = plan(costs, workers=options.workers, driver=driver, data=found)
     result = {
         "speedup_processes": over(by_processes, "serial"),
-        "speedup_processes_one_thread": over(by_processes, ONE_THREAD),
+        "speedup_processes_one_core": over(by_processes, ONE_CORE),
         "ray_over_processes": over("ray", by_processes),
         "same_bytes": {stage: len(set(own.values())) == 1 for stage, own in each("sha256").items()},
-        "driver_mb_10k_shards": driver_mb,
+        "driver_mb_10k_shards": driver["grew_mb"],
         "kills": killed.total(),
         "kills_survived": survived,
         "killed": dict(killed),
         "parts_there_when_killed": sorted(one["parts"] for one in kills),
         **{name: each(name) for name in ("frames_per_s", "start_s", "load_average")},
+        "plan": planned,
         "frames": found.frames,
         "workers": options.workers,
         "machine": vars(machine()),
@@ -352,8 +418,10 @@ def main() -> None:
     for stage, own in rates.items():
         for on, one in own.items():
             print(f"{stage:8s} {on:12s} {one['frames_per_s']:9.2f} frames/s after a start of {one['start_s']:.1f} s")
-    print(f"the same bytes: {result['same_bytes']}; driver + {driver_mb:.1f} MB from 100 to {EMPTY:,} shards")
+    print(f"the same bytes: {result['same_bytes']}; driver + {driver['grew_mb']:.1f} MB from 100 to {EMPTY:,} shards")
     print(f"{survived} of {killed.total()} kills survived: {dict(killed)}")
+    for row in planned:
+        print("  ".join(f"{name}: {told:,.3g}" if isinstance(told, float) else f"{told}" for name, told in row.items()))
     if options.json:
         print(json.dumps(result))
 

@@ -5,7 +5,9 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import SimpleNamespace
 
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
@@ -166,6 +168,17 @@ def test_a_cluster_of_two_nodes_makes_the_same_bytes_and_survives_a_kill(log: Pa
 def test_without_ray_it_is_told_how_to_get_it(log: Path, out: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"--on ray needs ray, which is not installed.*sliplens\[ray\]"):
+        make(Count(log=log), out, on="ray")
+
+
+def test_a_cluster_that_does_not_start_is_told(log: Path, out: Path, monkeypatch: pytest.MonkeyPatch):
+    def init(**_: object) -> None:
+        raise Exception("The current node timed out during startup.")  # noqa: TRY002 (as Ray does)
+
+    fake = SimpleNamespace(is_initialized=lambda: False, init=init, __spec__=ModuleSpec("ray", None))
+    monkeypatch.setitem(sys.modules, "ray", fake)
+    monkeypatch.setitem(sys.modules, "ray.exceptions", SimpleNamespace(RayError=OSError))
+    with pytest.raises(InputError, match=r"^--on ray has no cluster of Ray \(The current node timed out.*try again$"):
         make(Count(log=log), out, on="ray")
 
 

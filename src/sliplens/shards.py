@@ -296,9 +296,9 @@ def _ray(work: Work, address: str, most: int) -> Iterator[Seats]:
         where: dict[str, Any] = {"address": address} if address else {"include_dashboard": False}
         try:
             ray.init(**where, log_to_driver=False, logging_level=logging.ERROR)
-        except (ConnectionError, ValueError, RuntimeError) as error:
-            told = " ".join(str(error).split())[:200]
-            raise InputError(f"--on ray={address} reaches no cluster of Ray ({told}); start it, or check it") from None
+        except Exception as error:  # it raises just that of a node that takes more than 30 s to start
+            told, named = " ".join(str(error).split())[:200], f"ray={address}" if address else "ray"
+            raise InputError(f"--on {named} has no cluster of Ray ({told}); start it, check it, or try again") from None
     try:
         unit = "GPU" if work.on_gpu else "CPU"
         if (count := int(ray.cluster_resources().get(unit, 0))) < 1:
