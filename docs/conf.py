@@ -1,6 +1,8 @@
 """Sphinx configuration."""
 
 import os
+import sys
+from pathlib import Path
 
 from docutils import nodes
 from docutils.utils.math import MathError
@@ -17,7 +19,9 @@ author = "The sliplens developers"
 copyright = "2026, the sliplens developers"
 release = version = __version__
 
+sys.path.insert(0, str(Path(__file__).parent))
 extensions = [
+    "benchmark_tables",
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.intersphinx",

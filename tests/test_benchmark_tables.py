@@ -61,6 +61,11 @@ def test_the_page_of_results_has_the_tables_of_the_file():
     assert page == TABLES.fill_in(page), "run python docs/benchmark_tables.py"
 
 
+def test_the_site_shows_every_table():
+    page = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    assert sorted(re.findall(r"<!-- figures: (\w+) -->", page)) == sorted(SECTIONS)
+
+
 @pytest.mark.parametrize(
     ("row", "verdict"),
     [
