@@ -50,7 +50,7 @@ import sliplens.cli.study  # noqa: E402
 import sliplens.files  # noqa: E402
 import sliplens.study.run as study  # noqa: E402
 from sliplens.cli import main as command  # noqa: E402
-from sliplens.cli.console import Terminal  # noqa: E402
+from sliplens.cli.console import say  # noqa: E402
 from sliplens.recordings import load_dataset  # noqa: E402
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table  # noqa: E402
 from sliplens.recordings.journal import journals_of  # noqa: E402
@@ -141,8 +141,13 @@ class Ended:
 
     @property
     def fair(self) -> bool:
-        """Whether it ended well, by a signal (libraries of C++ abort where memory ends), or with a sentence."""
-        return self.code in {0, *(-one for one in signal.Signals)} - {-signal.SIGALRM} or self.sentence
+        """Whether it ended well, by a signal, or with a sentence; libraries may end the process where memory ends."""
+        ended = self.code in {0, *(-one for one in signal.Signals)} - {-signal.SIGALRM} or _BLAS_ENDS in self.said
+        return ended or self.sentence
+
+
+_BLAS_ENDS = "OpenBLAS error: Memory allocation still failed"
+"""What OpenBLAS says before it ends the process by itself."""
 
 
 def _size_of_addresses() -> int:
@@ -445,19 +450,19 @@ def run(count: int, seed: int, only: list[str], keep: Path | None, bench: Bench)
             known[Fault(**row["fault"])] = row["outcome"], row["said"]
     wholes: dict[str, tuple[Ended, dict[str, str]]] = {}
     drawn = [one for one in faults(count, seed=seed) if not only or one.case in only or one.kind in only]
-    with Terminal().stage("Disturbing commands") as told:
-        for number, fault in enumerate(drawn):
-            told(number, len(drawn))
-            if fault not in known:
-                if fault.case not in wholes:
-                    wholes[fault.case] = bench.undisturbed(fault.case)
-                known[fault] = bench.outcome(fault, *wholes[fault.case])
-                if keep is not None:
-                    keep.parent.mkdir(parents=True, exist_ok=True)
-                    with keep.open("a") as stream:
-                        outcome, said = known[fault]
-                        stream.write(json.dumps({"fault": asdict(fault), "outcome": outcome, "said": said}) + "\n")
-            yield fault, *known[fault]
+    for number, fault in enumerate(drawn, start=1):
+        if fault not in known:
+            # no bar: its thread may hold a lock at the moment of a fork, which the child would wait for in vain
+            say(f"{number} of {len(drawn)}: {fault.case}, {fault.kind}", aside=True)
+            if fault.case not in wholes:
+                wholes[fault.case] = bench.undisturbed(fault.case)
+            known[fault] = bench.outcome(fault, *wholes[fault.case])
+            if keep is not None:
+                keep.parent.mkdir(parents=True, exist_ok=True)
+                with keep.open("a") as stream:
+                    outcome, said = known[fault]
+                    stream.write(json.dumps({"fault": asdict(fault), "outcome": outcome, "said": said}) + "\n")
+        yield fault, *known[fault]
 
 
 def main() -> None:
