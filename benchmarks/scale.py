@@ -42,7 +42,7 @@ from sliplens.markers.tracking import track
 from sliplens.models.engines import one_thread
 from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset, TrialInfo
-from sliplens.shards import MakePart, Shard, make_parts, shard
+from sliplens.shards import MakePart, Shard, Work, make_parts, shard
 from sliplens.study.workspace import explain_source
 
 NETWORK = "chromatouch-difference"
@@ -141,10 +141,8 @@ def plan(
     return rows
 
 
-class Empty:
+class Empty(Work):
     """Work that does nothing."""
-
-    on_gpu = False
 
     def begin(self) -> MakePart:
         """Write a byte a part."""

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
-from shard_work import Count, shards
+from shard_work import Count, CountInThreads, shards
 
 from sliplens.cli import main
 from sliplens.errors import InputError, ShardError, SliplensError
@@ -115,6 +115,47 @@ def test_a_full_disk_ends_all_and_sets_nothing_aside(log: Path, out: Path):
     assert Count(log=log).tries() == {"a": 1, "b": TRIES}
     make(Count(log=log), out)
     assert sorted(content(out)) == [one.part for one in shards()]
+
+
+def test_what_a_kind_of_shards_lacks_ends_all_and_sets_nothing_aside(log: Path, out: Path):
+    with pytest.raises(InputError, match=r"^the network of b is gone$"):
+        make(Count(log=log, unready=frozenset("b")), out)
+    assert Count(log=log).tries() == {"a": 1, "b": 1}
+    make(Count(log=log), out)
+    assert sorted(content(out)) == [one.part for one in shards()]
+
+
+def test_a_damaged_recording_is_tried_once(log: Path, out: Path):
+    with pytest.raises(ShardError) as raised:
+        make(Count(log=log, damaged=frozenset("b")), out)
+    assert list(raised.value.why) == ["b"]
+    for _ in range(2):  # and not again before it is asked for
+        assert Count(log=log).tries() == dict.fromkeys("abcde", 1)
+        with pytest.raises(ShardError):
+            make(Count(log=log), out)
+    make(Count(log=log), out, retry_failed=True)
+    assert sorted(content(out)) == [one.part for one in shards()]
+
+
+def test_threads_make_the_same_bytes_and_an_interruption_ends_them(log: Path, out: Path, tmp_path: Path):
+    make(Count(log=log), out)
+    (tmp_path / "log-2").mkdir()
+    seen: list[int] = []
+    work = CountInThreads(log=tmp_path / "log-2", refuse=frozenset("b"))
+
+    def interrupt(done: int, _: int) -> None:
+        seen.append(done)
+        if done >= 8:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make(work, tmp_path / "other", on_progress=interrupt)
+    assert work.tries().keys() < set("abcde")
+    with pytest.raises(ShardError, match="1 of 5"):
+        make(work, tmp_path / "other", on_progress=lambda done, _: seen.append(done))
+    assert seen[-1] == 12
+    make(Count(log=work.log), tmp_path / "other", retry_failed=True)
+    assert content(tmp_path / "other") == content(out)
 
 
 def test_a_single_shard_fails_with_its_own_error_and_leaves_nothing(log: Path, out: Path):

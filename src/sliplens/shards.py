@@ -17,26 +17,27 @@ import socket
 import sys
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from itertools import chain, islice
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 from urllib.parse import quote
 
 import pyarrow as pa
 
 from sliplens._version import __version__
 from sliplens.codec import RESULT_FILE, load_record, open_table, regrouped, save_record, write_tables
-from sliplens.errors import InputError, ShardError, SliplensError
+from sliplens.errors import InputError, RecordingError, ShardError, SliplensError
 from sliplens.extras import Table, require_packages
 from sliplens.files import (
     StoredPath,
@@ -53,7 +54,7 @@ from sliplens.files import (
 from sliplens.progress import OnProgress, ignore, stage
 
 TRIES = 3
-"""How often a shard is tried before it is set aside."""
+"""How often a shard is tried before it is set aside; once where its recording is at fault."""
 LONGEST = 8192
 """Frames of a shard; a longer trial is cut."""
 _LONGEST_NAME = 200  # of a folder; file systems take 255 bytes
@@ -110,18 +111,24 @@ MakePart: TypeAlias = Callable[[Any, Path, OnProgress], None]
 """Takes the item of a shard, the path where its part is to be written, and what is told the frames done."""
 
 
-@runtime_checkable
-class Work(Protocol):
+class Work(ABC):
     """What is done with every shard; it travels to other processes, so that it holds paths and settings."""
+
+    in_threads: ClassVar[bool] = False
+    """Whether one process does best with a shard for each of its cores at a time, in threads."""
 
     @property
     def on_gpu(self) -> bool:
         """Whether each worker needs a graphics card."""
-        ...
+        return False
 
+    @abstractmethod
     def begin(self) -> MakePart:
-        """Load what all shards need; called once in each process that takes part."""
-        ...
+        """Load what all shards need; called once for each worker."""
+
+
+class WorkError(Exception):
+    """What shards need cannot be loaded, for the error that is given: none of them is at fault, and all would fail."""
 
 
 class Worker:
@@ -152,17 +159,18 @@ class Worker:
                     self._make(given.item, draft, on_progress)
                     _publish(draft, folder / given.part)
         except Exception as error:  # a bad trial must not end the others
-            if not _is_of_disk(error):
+            if not _is_of_all(error):
                 why = str(error) if isinstance(error, SliplensError) else f"{type(error).__name__}: {error}"
-                _keep_failure(folder, given, why)
+                _keep_failure(folder, given, why, final=isinstance(error, RecordingError))
             return error
         _state(folder, given, "failed").unlink(missing_ok=True)
         return None
 
 
-def _is_of_disk(error: Exception) -> bool:
-    """Whether there is no room, or none to write: no fault of a trial, and no other part could be written either."""
-    return isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
+def _is_of_all(error: Exception) -> bool:
+    """Whether no other part could be made either: for the work's sake, or since there is no room, or none to write."""
+    full = isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
+    return full or isinstance(error, WorkError)
 
 
 @runtime_checkable
@@ -196,6 +204,28 @@ class _Here:
 
     def close(self) -> None:
         """Nothing is left behind."""
+
+
+class _Thread:
+    """A thread of the process that asks for the work."""
+
+    def __init__(self, work: Work) -> None:
+        self._worker, self._pool, self._ended = Worker(work), ThreadPoolExecutor(1), threading.Event()
+
+    def start(self) -> Future:
+        return self._pool.submit(self._worker.start)
+
+    def submit(self, folder: Path, given: Shard, on_progress: OnProgress) -> Future:
+        def tell(done: int, total: int) -> None:
+            if self._ended.is_set():
+                raise KeyboardInterrupt
+            on_progress(done, total)
+
+        return self._pool.submit(self._worker.attempt, folder, given, tell)
+
+    def close(self) -> None:
+        self._ended.set()
+        self._pool.shutdown(cancel_futures=True)
 
 
 def _settled(result: Exception | None) -> Future:
@@ -241,7 +271,7 @@ def _end_with(alive: Connection) -> None:
 
 
 def _start(work: bytes, threads: int) -> Exception | None:
-    os.environ["OMP_NUM_THREADS"] = str(threads)  # for what unpacking the work imports first
+    os.environ["OMP_NUM_THREADS"] = str(threads)  # also for what unpacking the work imports first
     _HERE.append(Worker(work, threads=threads))
     return _HERE[0].start()
 
@@ -255,13 +285,18 @@ Seats: TypeAlias = tuple[int, Callable[[], Seat], type[Exception]]
 
 
 @contextmanager
-def _serial(work: Work, *_: object) -> Iterator[Seats]:
-    yield 1, lambda: _Here(work), BrokenProcessPool
+def _serial(work: Work, _: str, most: int) -> Iterator[Seats]:
+    kind, places = (_Thread, min(_cores(), most)) if work.in_threads else (_Here, 1)
+    yield places, lambda: kind(work), BrokenProcessPool
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
 def _processes(work: Work, number: str, most: int) -> Iterator[Seats]:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = _cores()
     if number and not (number.isdigit() and int(number)):
         raise InputError(f"--on processes={number} is no number of processes; say processes or processes=2")
     count, packed = min(int(number or cores), most), pickle.dumps(work)
@@ -367,9 +402,9 @@ class Crew(ExitStack):
                     _keep_failure(folder, given, str(error))
                     add_seat()
                     seat = None
-                if error is not None and (given is None or _is_of_disk(error)):
-                    raise error
-                if given is not None and not tally.settle(given, error) and len(_failure(folder, given).why) < TRIES:
+                if error is not None and (given is None or _is_of_all(error)):
+                    raise error.args[0] if isinstance(error, WorkError) else error
+                if given is not None and not tally.settle(given, error) and not _failure(folder, given).set_aside:
                     again.append(given)
                 if seat is None:
                     continue
@@ -378,7 +413,7 @@ class Crew(ExitStack):
                     more = False
                     continue
                 try:
-                    busy[seat.submit(folder, given, tally.within)] = seat, given
+                    busy[seat.submit(folder, given, partial(tally.within, given))] = seat, given
                 except lost:  # since it did its last
                     again.append(given)
                     add_seat()
@@ -420,8 +455,8 @@ def make_parts(
 ) -> None:
     """Make the parts that are not there yet.
 
-    A shard that fails three times is set aside with its sentence, and the rest goes on. The driver holds as many shards
-    as there are workers, however many come.
+    A shard that fails three times, or once for a `RecordingError`, is set aside with its sentence, and the rest goes
+    on. The driver holds as many shards as there are workers, however many come.
 
     Parameters
     ----------
@@ -526,9 +561,12 @@ class _Tally:
     total: int
     on_part: Callable[[Shard], None] | None
     on_progress: OnProgress
-    done: int = 0
     shown: int = 0
     error: Exception | None = None
+    done: int = 0
+    within_key: dict[str, int] = field(default_factory=dict)
+    """Frames of the shards that are being made, by their keys."""
+    lock: threading.Lock = field(default_factory=threading.Lock)
 
     def settle(self, given: Shard, error: Exception | None) -> bool:
         """Count a shard that was tried; whether it is done."""
@@ -536,18 +574,26 @@ class _Tally:
             self.add(given)
         else:
             self.error = error
+            self.within_key.pop(given.key, None)
         return error is None
 
     def add(self, given: Shard) -> None:
-        self.within(given.frames, given.frames)
-        self.done += given.frames
+        with self.lock:
+            self.within_key.pop(given.key, None)
+            self.done += given.frames
+            self._show()
         if self.on_part is not None:
             self.on_part(given)
 
-    def within(self, done: int, _: int) -> None:
-        if self.done + done != self.shown:
-            self.shown = self.done + done
-            self.on_progress(self.shown, self.total)
+    def within(self, given: Shard, done: int, _: int) -> None:
+        with self.lock:
+            self.within_key[given.key] = done
+            self._show()
+
+    def _show(self) -> None:
+        if (done := self.done + sum(self.within_key.values())) != self.shown:
+            self.shown = done
+            self.on_progress(done, self.total)
 
 
 def _missing(
@@ -560,7 +606,7 @@ def _missing(
                 if one.key in failed_keys:  # whoever made it after all was ended before it could say so
                     _state(folder, one, "failed").unlink(missing_ok=True)
                 tally.add(one)
-            elif one.key in failed_keys and not retry_failed and len(_failure(folder, one).why) >= TRIES:
+            elif one.key in failed_keys and not retry_failed and _failure(folder, one).set_aside:
                 continue
             else:
                 if retry_failed and one.key in failed_keys:
@@ -575,6 +621,13 @@ class Failure:
     name: str
     why: tuple[str, ...]
     """A sentence of each try."""
+    final: bool = False
+    """Whether its recording is at fault, so that no other try can go better."""
+
+    @property
+    def set_aside(self) -> bool:
+        """Whether it is not tried again before somebody asks for it."""
+        return self.final or len(self.why) >= TRIES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -705,9 +758,9 @@ def _failure(folder: Path, given: Shard) -> Failure:
     return load_record(path, Failure, command=_COMMAND)
 
 
-def _keep_failure(folder: Path, given: Shard, why: str) -> None:
+def _keep_failure(folder: Path, given: Shard, why: str, *, final: bool = False) -> None:
     known = _failure(folder, given)
-    save_record(replace(known, why=(*known.why, why)), _state(folder, given, "failed"))
+    save_record(replace(known, why=(*known.why, why), final=final), _state(folder, given, "failed"))
 
 
 @contextmanager

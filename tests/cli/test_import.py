@@ -14,6 +14,7 @@ from sliplens.images import write_png
 from sliplens.recordings import Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import read_header, save_recording, write_trial
+from sliplens.shards import read_status
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 
@@ -103,7 +104,7 @@ def test_bad_samples_of_the_force_sensor_cost_their_frames_and_are_told(
     assert {reason for time, reason in reasons.items() if 2.5 <= time <= 2.7} == {"drop-out of the force"}
     assert "spike of the force" in {reason for time, reason in reasons.items() if 3.95 <= time <= 4.05}
     error = (labels.safety_margin - trial.safety_margin)[labels.valid]
-    assert len(error) > 170
+    assert len(error) > 150  # the random draws behind the uncertainty decide about some
     assert np.sqrt(np.mean(error**2)) < 0.03
 
 
@@ -199,10 +200,15 @@ def test_an_interrupted_import_goes_on_where_it_stopped(
         patch.setattr("sliplens.recordings.trial_writer.write_trial", write)
         assert run(*broken) == 130
     assert not (tmp_path / "b").exists()
-    kept = written[0].stat().st_mtime_ns
-    assert run(*broken) == 0
-    assert (tmp_path / "b" / "trials" / written[0].name).stat().st_mtime_ns == kept
-    assert load_dataset(tmp_path / "b").hash == load_dataset(tmp_path / "w").hash
+    [kept] = (tmp_path / ".b.partial" / "parts").glob("trial=*/0*/trials/*.parquet")
+    made_ns = kept.stat().st_mtime_ns
+    (status,) = read_status(tmp_path / "b")
+    assert (status.title, status.done, status.shards) == ("Importing frames", 1, 2)
+    assert run(*broken, "--on", "processes=1") == 0  # wherever it goes on
+    assert (tmp_path / "b" / "trials" / kept.name).stat().st_mtime_ns == made_ns
+    assert {path.name for path in (tmp_path / "b").iterdir()} == {path.name for path in (tmp_path / "w").iterdir()}
+    for name in ("dataset.json", "trials/a.parquet", "trials/b.parquet"):
+        assert (tmp_path / "b" / name).read_bytes() == (tmp_path / "w" / name).read_bytes()
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,15 @@ from sliplens.recordings import ContactState, LabelSettings, Recording, load_dat
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.edits import EDITS_FILE, edits_in_force, keep_edit, make_edit, read_edits
 from sliplens.recordings.importing import relabel_trial
-from sliplens.recordings.store import forces_path, load_forces, load_recording, read_header, save_recording
+from sliplens.recordings.store import (
+    forces_path,
+    load_forces,
+    load_recording,
+    read_header,
+    save_forces,
+    save_recording,
+)
+from sliplens.shards import read_status
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 
@@ -281,6 +289,28 @@ def test_edits_give_the_labels_of_their_settings_and_undone_those_of_before(
     np.testing.assert_array_equal(after.reference, before.reference)
     assert after.labelling == before.labelling
     assert len(read_edits(folder)) == 2 * len(edits)
+
+
+def test_what_cannot_be_labelled_is_listed_and_the_data_set_is_as_it_was(
+    tmp_path: Path, relabelled: Path, trial: Recording, capsys: pytest.CaptureFixture[str]
+):
+    data, name = shutil.copytree(relabelled, tmp_path / "data"), trial.trial
+    short = load_recording(trial_path(relabelled, name), truth=False)
+    samples = load_forces(forces_path(relabelled, name))
+    for other, force_n in (("cup", samples.force_n), ("jar", 0 * samples.force_n)):  # nothing touches it
+        save_recording(replace(short, trial=other), trial_path(data, other))
+        save_forces(replace(samples, force_n=force_n), forces_path(data, other))
+    infos = [trial_info(trial_path(data, other), split="train") for other in ("cup", "jar")]
+    write_dataset_table(data, infos, simulated=True)
+    before = {path: path.read_bytes() for path in data.rglob("*") if path.is_file()}
+    assert run("label", data, "--mu", 1.6, "--no-audit") == 1
+    told = capsys.readouterr().err
+    assert "1 of 2 could not be done" in told
+    assert told.count("jar: ") == 1
+    assert {path: path.read_bytes() for path in data.rglob("*") if path.is_file()} == before
+    (status,) = read_status(data)
+    assert status.done == 1
+    assert [(one.name, len(one.why)) for one in status.failed] == [("jar", 1)]  # it cannot go better
 
 
 def test_edits_that_do_not_fit_their_data_set_are_told(

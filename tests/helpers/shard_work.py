@@ -10,15 +10,15 @@ from pathlib import Path
 import pyarrow as pa
 
 from sliplens.codec import write_tables
-from sliplens.errors import InputError
+from sliplens.errors import InputError, RecordingError
 from sliplens.progress import OnProgress
-from sliplens.shards import MakePart, Shard, shard
+from sliplens.shards import MakePart, Shard, Work, WorkError, shard
 
 SCHEMA = pa.schema({"trial": pa.string(), "value": pa.int64()})
 
 
 @dataclass(frozen=True, kw_only=True)
-class Count:
+class Count(Work):
     """Writes numbers, and remembers in a folder how often each shard was begun."""
 
     log: Path
@@ -28,9 +28,12 @@ class Count:
     """Trials at whose first try the process is killed, as for want of memory."""
     no_room: frozenset[str] = frozenset()
     """Trials for which the disk has no room."""
+    damaged: frozenset[str] = frozenset()
+    """Trials whose recording is at fault."""
+    unready: frozenset[str] = frozenset()
+    """Trials that need what cannot be loaded."""
     broken: str = ""
     """What is wrong with all of it."""
-    on_gpu: bool = False
 
     def begin(self) -> MakePart:
         if self.broken:
@@ -44,6 +47,10 @@ class Count:
                 os.kill(os.getpid(), signal.SIGKILL)
             if item in self.refuse:
                 raise InputError(f"{item} is damaged; record it again")
+            if item in self.damaged:
+                raise RecordingError(f"{item} ends in its midst; record it again")
+            if item in self.unready:
+                raise WorkError(InputError(f"the network of {item} is gone"))
             if item in self.no_room:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             on_progress(2, 3)
@@ -56,6 +63,12 @@ class Count:
         """How often each trial was begun."""
         names = [path.name.rpartition("-")[0] for path in self.log.iterdir()]
         return {name: names.count(name) for name in sorted(set(names))}
+
+
+class CountInThreads(Count):
+    """The same, several shards side by side."""
+
+    in_threads = True
 
 
 def shards(names: str = "abcde", *, recipe: object = 1) -> Iterator[Shard]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from sliplens.cli.command import Command, Output
+from sliplens.cli.command import Command, On, Output, RetryFailed
 from sliplens.cli.console import Terminal, print_table, say, wrote
 from sliplens.progress import fold_equal
 from sliplens.recordings.options import LabelSettings, ReadOptions
@@ -62,6 +62,8 @@ class Import(Command):
     labelling: Annotated[LabelSettings, tyro.conf.OmitArgPrefixes] = field(default_factory=LabelSettings)
     audit: bool = True
     """Draw a page for each trial, in `audit/` of the folder, from which to judge its labels."""
+    on: On = "serial"
+    retry_failed: RetryFailed = False
 
     def run(self) -> None:
         """Read, label, write, and show what was found."""

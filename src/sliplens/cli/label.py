@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from sliplens.cli.command import Command, Data
+from sliplens.cli.command import Command, Data, On, RetryFailed
 from sliplens.cli.console import Terminal, say
 from sliplens.cli.import_ import draw_audits, show_labelling, show_trials
 from sliplens.errors import InputError
@@ -39,6 +39,8 @@ class Label(Command):
     """Change no label: take back the last edit by hand of this trial."""
     by: str | None = None
     """Who edits on the page, or takes an edit back; who is logged in if not given."""
+    on: On = "serial"
+    retry_failed: RetryFailed = False
 
     def check(self) -> None:
         """Refuse what does not go together."""

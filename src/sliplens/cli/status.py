@@ -48,4 +48,5 @@ def _show(work: "Progress") -> None:
     if work.doing == () and work.done + len(work.failed) < work.shards:
         say("  nobody works on it; give the same command again and it goes on")
     for one in work.failed[:_SHOWN]:
-        say(f"  failed, {len(one.why)} times: {one.name}: {one.why[-1]}")
+        tried = "once" if len(one.why) == 1 else f"{len(one.why)} times"
+        say(f"  failed, {tried}: {one.name}: {one.why[-1]}")

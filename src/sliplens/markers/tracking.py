@@ -24,7 +24,7 @@ from sliplens.recordings.capture import Capture
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import Frame, Frames, Trials, open_trials
-from sliplens.shards import MakePart, make_table
+from sliplens.shards import MakePart, Work, make_table
 
 OnTracked: TypeAlias = Callable[[Frame, TrackedFrame, Float[np.ndarray, "markers 2"]], None]
 """Takes a frame, its markers and where they were at rest, in pixels."""
@@ -191,14 +191,13 @@ def _require_movement(trial: Capture) -> Iterator[str]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Following:
+class _Following(Work):
     """Work on whole trials: a row for each marker of each frame, as a Parquet file."""
 
     trials: Trials
     markers: str
     schema: pa.Schema
     on_tracked: OnTracked | None
-    on_gpu: bool = False
 
     def begin(self) -> MakePart:
         read = self.trials.reader()

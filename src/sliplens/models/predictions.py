@@ -29,7 +29,7 @@ from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import Frame, Frames, Trials, open_trials
 from sliplens.recordings.trial import ContactState
-from sliplens.shards import MakePart, make_table
+from sliplens.shards import MakePart, Work, make_table
 
 LEVEL = 0.9
 """Confidence of the intervals."""
@@ -385,7 +385,7 @@ def _states(trial: Capture) -> tuple[ContactState, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Reading:
+class _Reading(Work):
     """Work on shards of (trial, first frame, number of frames): their rows, as a Parquet file."""
 
     trained: Run

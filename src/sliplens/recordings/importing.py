@@ -4,13 +4,13 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
-from threadpoolctl import threadpool_limits
 
 from sliplens.errors import InputError, RecordingError, SliplensError
 from sliplens.files import output_folder, whole_file
@@ -19,6 +19,7 @@ from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import (
     Dataset,
     LeftOut,
+    TrialInfo,
     keep_profile,
     load_dataset,
     tell_flags,
@@ -26,7 +27,7 @@ from sliplens.recordings.dataset import (
     write_dataset_table,
 )
 from sliplens.recordings.edits import EDITS_FILE, apply_edits, edits_in_force, read_edits, undo_command
-from sliplens.recordings.formats.stored import read_stored, read_stored_trial
+from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.labelling import Edit
 from sliplens.recordings.labels import measure_motion, require_inside, soften
 from sliplens.recordings.manifest import ManifestRow, find_rows
@@ -47,7 +48,17 @@ from sliplens.recordings.store import (
     stream_frames,
 )
 from sliplens.recordings.trial import Labels
-from sliplens.recordings.trial_writer import Footage, TrialJob, label_footage, require_forces, write_trials
+from sliplens.recordings.trial_writer import (
+    Footage,
+    TrialJob,
+    TrialWork,
+    label_footage,
+    leave_cores,
+    require_forces,
+    trial_rng,
+    write_trials,
+)
+from sliplens.shards import EXECUTORS
 
 
 def import_recordings(
@@ -67,6 +78,8 @@ def import_recordings(
     reading: ReadOptions | None = None,
     labelling: LabelSettings | None = None,
     add: bool = False,
+    on: str = "serial",
+    retry_failed: bool = False,
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
 ) -> Dataset:
@@ -106,6 +119,9 @@ def import_recordings(
     add
         Add to the data set that `out` is; trials that are there already stay as they are, and so do their splits
         unless `splits` deals all of them anew.
+    on, retry_failed
+        Where trials are made, a row of `shards.EXECUTORS`: `serial` (several side by side in threads), `processes`,
+        `processes=4`, `ray`; and whether those are tried again that failed before.
 
     Raises
     ------
@@ -113,7 +129,10 @@ def import_recordings(
         If a source is missing, damaged or of no known format, or `out` holds something else.
     RecordingError
         If a trial has neither labels nor forces, nothing touches, or it never slips and no friction is given.
+    ShardError
+        If some of several failed that may not be left out, when all others are done.
     """
+    EXECUTORS.pick(on.partition("=")[0])
     paths = [Path(source) for source in ([sources] if isinstance(sources, Path | str) else sources)]
     profile = load_profile(sensor) if sensor is not None and is_profile(sensor) else None
     asked = _Asked(
@@ -130,55 +149,50 @@ def import_recordings(
         raise InputError("splits come from a file or from numbers of trials, not from both; leave one out")
     before, kept_edits = load_dataset(out) if add else None, read_edits(Path(out))
     with stage(on_progress, "Opening the recordings") as count:
-        found = [(path, asked.find_rows(path)) for path in paths]
-        jobs, left_out = asked.open(found, count)
-    known = {info.trial for info in before.trials} if before else set()
-    if kept := [job.capture.trial for job in jobs if job.capture.trial in known]:
+        work = _Importing(asked=asked, sources=[(path, asked.find_rows(path)) for path in paths])
+        left_out = work.open_all(count)
+    old = () if before is None else before.trials
+    known = {info.trial for info in old}
+    if kept := [job.capture.trial for job in work.opened.values() if job.capture.trial in known]:
         note(on_progress, f"{len(kept)} trials are in {out} already and stay as they are, such as {kept[0]}")
-    jobs = [job for job in jobs if job.capture.trial not in known]
+    jobs = {item: job for item, job in work.opened.items() if job.capture.trial not in known}
+    captures = [job.capture for job in jobs.values()]
     if before is not None and not jobs:
         return _tell(replace(before, left_out=tuple(left_out)), on_progress, kept=True)
-    _require_names([job.capture for job in jobs], left_out)
+    _require_names(captures, left_out)
     plan = splits if splits is None or isinstance(splits, SplitPlan) else read_splits(Path(splits))
     config = {
-        **asked.recipe(found),
+        **asked.recipe(work.sources),
         "validation_trials": validation_trials,
         "test_trials": test_trials,
         "splits": None if plan is None else plan.rules,
         **({} if before is None else {"added_to": before.hash}),
     }
 
-    def deal(captures: Sequence[Capture]) -> tuple[list[str], SplitResult | None]:
-        """Splits of all trials, those that were there before first."""
-        old = () if before is None else before.trials
-        if plan is None:
-            return [info.split for info in old] + _deal(captures, validation_trials, test_trials), None
-        dealt = assign_splits(plan, [*old, *captures])
-        return list(dealt.splits), dealt
-
-    _, dealt = deal([job.capture for job in jobs])  # a mistake in the rules is told before anything slow
+    deal = partial(_deal, old, plan=plan, validation_trials=validation_trials, test_trials=test_trials)
+    _, dealt = deal(captures)  # a mistake in the rules is told before anything slow
     with output_folder(Path(out), stage="import", config=config, overwrite=overwrite or add) as output:
         if not output.complete:
             if before is not None:
                 _link_trials(before.folder, output.folder)
             elif kept_edits:
                 _keep_words(Path(out), output.folder, (EDITS_FILE,))
-            for one in {job.profile.name: job.profile for job in jobs if job.profile}.values():
-                keep_profile(output.folder, one)
-            table, failed = write_trials(output.folder, jobs, on_progress, title="Importing frames", first=len(known))
-            written = [job.capture for job in jobs if job.capture.trial in {info.trial for info in table}]
-            left_out = [*left_out, *failed]
-            if not written:
-                raise RecordingError(f"no trial could be imported; the first: {left_out[0].why}")
-            names, dealt = deal(written)
-            old = () if before is None else before.trials
-            table = [replace(info, split=split) for info, split in zip([*old, *table], names, strict=True)]
-            if plan is not None and dealt is not None:
-                write_split_record(output.folder, plan, [*old, *written], dealt)
-            told = {row.trial for row in table} | {one.trial for one in left_out}
-            left_out = [*(one for one in (before.left_out if before else ()) if one.trial not in told), *left_out]
-            simulated = all(one.simulated for one in written) and (before is None or before.simulated)
-            write_dataset_table(output.folder, table, simulated=simulated, left_out=left_out)
+            given = [(item, job.capture.trial, len(job.capture)) for item, job in jobs.items()]
+            how = {"on": on, "retry_failed": retry_failed, "on_progress": on_progress}
+            with write_trials(work, given, output.folder, title="Importing frames", **how) as (rows, failed):
+                for one in {job.profile.name: job.profile for job in jobs.values() if job.profile}.values():
+                    keep_profile(output.folder, one)
+                names = {info.trial for info in rows}
+                written = [capture for capture in captures if capture.trial in names]
+                dealt_to, dealt = deal(written)
+                table = [replace(info, split=split) for info, split in zip([*old, *rows], dealt_to, strict=True)]
+                if plan is not None and dealt is not None:
+                    write_split_record(output.folder, plan, [*old, *written], dealt)
+                left_out = [*left_out, *failed]
+                told = {row.trial for row in table} | {one.trial for one in left_out}
+                left_out = [*(one for one in (before.left_out if before else ()) if one.trial not in told), *left_out]
+                simulated = all(one.simulated for one in written) and (before is None or before.simulated)
+                write_dataset_table(output.folder, table, simulated=simulated, left_out=left_out)
     for message in dealt.notes if dealt else ():
         note(on_progress, message)
     if kept_edits and not output.complete and before is None:
@@ -211,21 +225,8 @@ class _Asked:
         """Rows of a manifest or a folder of recordings; None where a path is one recording."""
         return None if self.format is not None or self.reading.forces is not None else find_rows(path)
 
-    def open(self, sources: Sequence[_Source], on_progress: OnProgress) -> tuple[list[TrialJob], list[LeftOut]]:
-        """Open what was named; of a manifest or a folder of recordings what cannot be opened is left out."""
-        jobs, left_out = [], []
-        for path, rows in sources:
-            if rows is None:
-                jobs += self._open(path)
-            for number, row in enumerate(rows or (), start=1):
-                try:
-                    jobs += self._open_row(row)
-                except SliplensError as error:
-                    left_out.append(LeftOut(trial=row.trial, source=str(row.video), why=str(error)))
-                on_progress(number, len(rows or ()))
-        return jobs, left_out
-
-    def _open(self, path: Path) -> list[TrialJob]:
+    def open(self, path: Path) -> list[TrialJob]:
+        """Open a recording."""
         profile = self.profile
         settings = self.labelling if profile is None else profile.settings(self.labelling)
         facts = {name: fact for name, fact in self.facts.items() if fact is not None}
@@ -236,7 +237,7 @@ class _Asked:
         )
         return [TrialJob(capture=replace(one, **facts), settings=settings, profile=profile) for one in opened]
 
-    def _open_row(self, row: ManifestRow) -> list[TrialJob]:
+    def open_row(self, row: ManifestRow) -> list[TrialJob]:
         """Open the recordings of a row, which says more than the command; its profile takes the place of ours."""
         own = {name: fact for name in self.facts if (fact := getattr(row, name)) is not None}
         profile = self.profile
@@ -254,7 +255,7 @@ class _Asked:
             profile=profile,
             facts={**self.facts, **own},
         )
-        jobs = said._open(row.video)
+        jobs = said.open(row.video)
         if len(jobs) == 1:
             jobs = [replace(jobs[0], capture=replace(jobs[0].capture, trial=row.trial))]
         _require_names([job.capture for job in jobs])
@@ -277,6 +278,47 @@ class _Asked:
             "reading": {name: told(getattr(self.reading, name)) for name in self.reading.given()},
             "labelling": self.labelling,
         }
+
+
+_Item: TypeAlias = tuple[int, int | None, int]
+"""Places of a source, of its row if it has rows, and of a trial in that."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Importing(TrialWork):
+    """Work on recordings; paths travel."""
+
+    asked: _Asked
+    sources: Sequence[_Source]
+    opened: dict[_Item, TrialJob] = field(default_factory=dict)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "opened": {}}  # whoever gets it opens its own
+
+    def open_all(self, on_progress: OnProgress) -> list[LeftOut]:
+        """Open what was named; of a manifest or a folder of recordings what cannot be opened is left out."""
+        left_out = []
+        for place, (_, rows) in enumerate(self.sources):
+            if rows is None:
+                self._open(place, None)
+            for number, row in enumerate(rows or ()):
+                try:
+                    self._open(place, number)
+                except SliplensError as error:
+                    left_out.append(LeftOut(trial=row.trial, source=str(row.video), why=str(error)))
+                on_progress(number + 1, len(rows or ()))
+        return left_out
+
+    def _open(self, place: int, number: int | None) -> None:
+        path, rows = self.sources[place]
+        jobs = self.asked.open(path) if rows is None or number is None else self.asked.open_row(rows[number])
+        self.opened.update({(place, number, index): job for index, job in enumerate(jobs)})
+
+    def open(self, item: _Item) -> TrialJob:
+        if item not in self.opened:
+            self.opened.clear()  # of another source
+            self._open(*item[:2])
+        return self.opened[item]
 
 
 def _parts(path: Path, rows: Sequence[ManifestRow] | None) -> list[Path]:
@@ -318,6 +360,8 @@ def label_dataset(
     *,
     out: Path | str,
     labelling: LabelSettings | None = None,
+    on: str = "serial",
+    retry_failed: bool = False,
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
 ) -> Dataset:
@@ -334,6 +378,8 @@ def label_dataset(
         Folder to make. The data set's own gets the new labels once all of them are there.
     labelling
         What is known of forces and friction.
+    on, retry_failed
+        As `import_recordings` takes them.
 
     Raises
     ------
@@ -341,36 +387,54 @@ def label_dataset(
         If a trial has no forces, or its labels did not come from them and would be overwritten.
     RecordingError
         If nothing touches, or a trial never slips and no friction is given.
+    ShardError
+        If that is so of some of several trials, when all others are labelled; the data set is as it was.
     """
     data = data if isinstance(data, Dataset) else load_dataset(data)
     labelling, out = labelling or LabelSettings(), Path(out)
-    captures, edits = read_stored(data.folder), read_edits(data.folder)
-    jobs = [_relabelling(data, capture, labelling, edits) for capture in captures]
+    work = _Labelling(data=data, labelling=labelling, edits=read_edits(data.folder))
     in_place = out.resolve() == data.folder.resolve()
-    if set(read_edits(out)) - set(edits):
+    if set(read_edits(out)) - set(work.edits):
         raise InputError(
             f"{out} has edits by hand that {data.folder} has not; label {out} itself, or name a new folder"
         )
-    for capture in captures:
-        kept = capture.labels.labelling if capture.labels else None
+    edits = []
+    for number, info in enumerate(data.trials):  # a mistake is told before anything slow
+        edits.append(work.open(number).edits)
+        kept = read_header(trial_path(data.folder, info.trial)).labelling
         if in_place and (kept is None or kept.basis is None):
             raise InputError(
-                f"the labels of {capture.trial} did not come from its forces and would be lost; "
+                f"the labels of {info.trial} did not come from its forces and would be lost; "
                 "name a new folder with --output"
             )
-    config = {"labelling": labelling, "data_hash": data.hash, "edits": [job.edits for job in jobs]}
+    config = {"labelling": labelling, "data_hash": data.hash, "edits": edits}
     with output_folder(out, stage="label", config=config, overwrite=overwrite or in_place) as output:
         if not output.complete:
-            table, _ = write_trials(output.folder, jobs, on_progress, title="Labelling frames")
-            named = [replace(row, split=info.split) for row, info in zip(table, data.trials, strict=True)]
-            simulated = all(capture.simulated for capture in captures)
-            write_dataset_table(output.folder, named, simulated=simulated, left_out=data.left_out)
-            _keep_words(data.folder, output.folder)
-    if count := sum(len(job.edits) for job in jobs):
-        note(on_progress, f"{count} edits by hand were applied, to {sum(bool(job.edits) for job in jobs)} trials")
-    if gone := sorted({edit.trial for edit in edits} - {info.trial for info in data.trials}):
+            given = [(number, info.trial, info.frames) for number, info in enumerate(data.trials)]
+            how = {"on": on, "retry_failed": retry_failed, "on_progress": on_progress}
+            with write_trials(work, given, output.folder, title="Labelling frames", **how) as (rows, _):
+                named = [replace(row, split=info.split) for row, info in zip(rows, data.trials, strict=True)]
+                write_dataset_table(output.folder, named, simulated=data.simulated, left_out=data.left_out)
+                _keep_words(data.folder, output.folder)
+    if count := sum(map(len, edits)):
+        note(on_progress, f"{count} edits by hand were applied, to {sum(map(bool, edits))} trials")
+    if gone := sorted({edit.trial for edit in work.edits} - {info.trial for info in data.trials}):
         note(on_progress, f"{data.folder / EDITS_FILE} edits {gone[0]}, which is no trial of the data set; it is kept")
     return _tell(load_dataset(out), on_progress, kept=output.complete)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Labelling(TrialWork):
+    """Work on the stored trials of a data set, by their numbers there."""
+
+    data: Dataset
+    labelling: LabelSettings
+    edits: tuple[Edit, ...]
+    """Those by hand, of all trials."""
+
+    def open(self, item: int) -> TrialJob:
+        capture = read_stored_trial(self.data, self.data.trials[item])
+        return _relabelling(self.data, capture, self.labelling, self.edits)
 
 
 def relabel_trial(
@@ -402,11 +466,11 @@ def relabel_trial(
     info = data.find(trial)
     edits = read_edits(data.folder) if edits is None else edits
     job = _relabelling(data, read_stored_trial(data, info), labelling or LabelSettings(), edits)
-    rng = np.random.default_rng((job.settings.seed, data.trials.index(info)))
     path = trial_path(data.folder, trial)
     motion = measure_motion(map(soften, stream_frames(path))) if image_motion is None else image_motion
     footage = Footage(motion=motion, read=lambda places: stream_frames(path, set(places)))
-    with threadpool_limits(1, user_api="blas"):  # see write_trials
+    with leave_cores():  # as it is where trials are written
+        rng = trial_rng(job.settings, trial)
         return label_footage(job.capture, footage, settings=job.settings, edits=job.edits, rng=rng)[1]
 
 
@@ -450,10 +514,22 @@ def _require_names(captures: Sequence[Capture], left_out: Sequence[LeftOut] = ()
             raise InputError(f"{capture.source} does not tell its sensor, and a network is of one; add --sensor")
 
 
-def _deal(captures: Sequence[Capture], validation_trials: int | None, test_trials: int | None) -> list[str]:
-    count = len(captures)
+def _deal(
+    old: Sequence[TrialInfo],
+    captures: Sequence[Capture],
+    *,
+    plan: SplitPlan | None,
+    validation_trials: int | None,
+    test_trials: int | None,
+) -> tuple[list[str], SplitResult | None]:
+    """Splits of all trials, the old ones first, and how a plan dealt them."""
+    if plan is not None:
+        dealt = assign_splits(plan, [*old, *captures])
+        return list(dealt.splits), dealt
+    kept = [info.split for info in old]
     if validation_trials is None and test_trials is None:
-        return [capture.split or "train" for capture in captures]
+        return [*kept, *(capture.split or "train" for capture in captures)], None
+    count = len(captures)
     validation, test = validation_trials or 0, test_trials or 0
     if validation < 0 or test < 0:
         raise InputError("numbers of trials are not negative; give 0 or more")
@@ -462,7 +538,7 @@ def _deal(captures: Sequence[Capture], validation_trials: int | None, test_trial
         raise InputError(
             f"{validation} trials to validate and {test} to test are more than the {count} there are; give fewer"
         )
-    return ["train"] * training + ["validation"] * validation + ["test"] * test
+    return [*kept, *["train"] * training, *["validation"] * validation, *["test"] * test], None
 
 
 def _fingerprint(path: Path) -> list[object]:

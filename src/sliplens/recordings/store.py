@@ -61,9 +61,10 @@ def encode_frames(frames: Iterable[Pixels]) -> Iterator[list[bytes]]:
 def in_turn(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
     """Do a work in threads while the next items are made, and give what comes of each in their order.
 
-    Two items a processor are held, however many there are.
+    Two items a thread are held, however many there are.
     """
-    workers = os.cpu_count() or 1
+    share = os.environ.get("OMP_NUM_THREADS", "")  # of the processor, where several processes work
+    workers = int(share) if share.isdigit() and int(share) else os.cpu_count() or 1
     waiting: deque[Future[_Result]] = deque()
     with ThreadPoolExecutor(workers) as pool:
         for item in items:

@@ -1,17 +1,19 @@
-"""Labelled trials written from recordings, each whole or not at all, several side by side."""
+"""Labelled trials written from recordings, each whole or not at all, wherever that is done."""
 
-import os
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Event, Lock
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
+from sliplens.codec import RESULT_FILE, load_record, save_record
 from sliplens.errors import RecordingError, SliplensError
+from sliplens.files import remove
 from sliplens.progress import OnProgress, stage
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import LeftOut, TrialInfo, trial_info, trial_path
@@ -31,6 +33,7 @@ from sliplens.recordings.store import (
     write_trial,
 )
 from sliplens.recordings.trial import Labels
+from sliplens.shards import MakePart, Shard, Work, make_parts, shard
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,54 +52,101 @@ class TrialJob:
     """Whether it is left out where it cannot be imported, rather than stopping the others."""
 
 
-def write_trials(
-    folder: Path, jobs: Sequence[TrialJob], on_progress: OnProgress | None, *, title: str, first: int = 0
-) -> tuple[list[TrialInfo], list[LeftOut]]:
-    """Write the trials of a data set that are not there yet; gives their rows, and what was left out of many."""
-    total, done, lock = sum(len(job.capture) for job in jobs), [0] * len(jobs), Lock()
+@dataclass(frozen=True, kw_only=True)
+class WrittenTrial:
+    """What came of a trial: its row of the data set's table, or why it was left out."""
 
-    def write(number: int, count: OnProgress) -> TrialInfo | LeftOut:
-        job = jobs[number]
-        capture, path = job.capture, trial_path(folder, job.capture.trial)
-        samples = forces_path(folder, capture.trial)
+    info: TrialInfo | None = None
+    left_out: LeftOut | None = None
 
-        def tell(written: int, _: int) -> None:
-            if stopped.is_set():
-                raise KeyboardInterrupt
-            with lock:
-                done[number] = written
-                count(sum(done), total)
 
-        # a trial is there whole or not at all, and the folder is of this very command
-        if not path.is_file():
-            rng = np.random.default_rng((job.settings.seed, first + number))
+class TrialWork(Work):
+    """Work on whole trials, each of which becomes a data set of its own, to be taken into that of all."""
+
+    in_threads = True  # decoding, arrays and compression let go of the interpreter's lock
+
+    @abstractmethod
+    def open(self, item: Any) -> TrialJob:
+        """Open the trial of a shard."""
+
+    def begin(self) -> MakePart:
+        """Make data sets of one trial."""
+        leave_cores()
+
+        def make(item: Any, path: Path, on_progress: OnProgress) -> None:
+            job = self.open(item)
+            capture = job.capture
+            trial, samples = trial_path(path, capture.trial), forces_path(path, capture.trial)
             try:
-                own = {"settings": job.settings, "edits": job.edits, "rng": rng}
-                import_trial(capture, path, **own, forces_file=samples, on_progress=tell)
+                own = {"settings": job.settings, "edits": job.edits, "rng": trial_rng(job.settings, capture.trial)}
+                import_trial(capture, trial, **own, forces_file=samples, on_progress=on_progress)
             except SliplensError as error:
-                samples.unlink(missing_ok=True)
                 if job.undo:
                     raise RecordingError(f"{error}; {job.undo}") from None
                 if not job.one_of_many:
                     raise
-                return LeftOut(trial=capture.trial, source=capture.source, why=str(error))
-        tell(len(capture), total)
-        return trial_info(path, split="")
+                samples.unlink(missing_ok=True)
+                left_out = LeftOut(trial=capture.trial, source=capture.source, why=str(error))
+                written = WrittenTrial(left_out=left_out)
+            else:
+                written = WrittenTrial(info=trial_info(trial, split=""))
+            save_record(written, path / RESULT_FILE)
 
-    stopped = Event()
-    # decoding, arrays and compression run beside one another in threads; each holds one frame of its trial
-    workers = min(os.cpu_count() or 1, len(jobs))
-    # and the threads of NumPy's matrices, which are small here, would only take the cores from these while they spin
-    blas = threadpool_limits(1, user_api="blas")
-    with blas, stage(on_progress, title) as count, ThreadPoolExecutor(max_workers=workers) as pool:
-        try:
-            rows = [future.result() for future in [pool.submit(write, number, count) for number in range(len(jobs))]]
-        except BaseException:
-            stopped.set()
-            pool.shutdown(cancel_futures=True)
-            raise
-    failed = [row for row in rows if isinstance(row, LeftOut)]
-    return [row for row in rows if isinstance(row, TrialInfo)], failed
+        return make
+
+
+def trial_rng(settings: LabelSettings, trial: str) -> np.random.Generator:
+    """Random numbers for the labels of a trial, whichever others there are."""
+    return np.random.default_rng((settings.seed, *trial.encode()))
+
+
+def leave_cores() -> AbstractContextManager:
+    """Keep the threads of NumPy's matrices, which are small here, from taking cores while they spin."""
+    return threadpool_limits(1, user_api="blas")
+
+
+@contextmanager
+def write_trials(
+    work: TrialWork,
+    trials: Sequence[tuple[Any, str, int]],
+    folder: Path,
+    *,
+    title: str,
+    on: str,
+    retry_failed: bool,
+    on_progress: OnProgress | None,
+) -> Iterator[tuple[list[TrialInfo], list[LeftOut]]]:
+    """Write trials into the folder of a data set; gives their rows, and what was left out of many.
+
+    Of each trial the item of its shard, its name and its number of frames are given. What was done is kept for another
+    try until all within this ends well.
+    """
+    parts = folder / "parts"
+
+    def shards() -> Iterator[Shard]:
+        # the folder is of these recordings and settings alone (`files.output_folder`)
+        return (shard(item, trial=name, frames=frames, recipe="trial", shown=name) for item, name, frames in trials)
+
+    with leave_cores(), stage(on_progress, title) as count:
+        make_parts(work, shards, parts, title=title, on=on, retry_failed=retry_failed, on_progress=count)
+    rows, left_out = [], []
+    for one in shards():
+        part = parts / one.part
+        written = load_record(part / RESULT_FILE, WrittenTrial, command="the interrupted command")
+        if written.left_out is not None:
+            left_out.append(written.left_out)
+        if written.info is not None:
+            rows.append(written.info)
+            for path in (trial_path(part, written.info.trial), forces_path(part, written.info.trial)):
+                if path.exists():  # else there are none, or they were taken before an interruption
+                    target = folder / path.relative_to(part)
+                    target.parent.mkdir(exist_ok=True)
+                    path.replace(target)
+    if left_out and not rows:
+        remove(parts)
+        raise RecordingError(f"no trial could be imported; the first: {left_out[0].why}")
+    yield rows, left_out
+    remove(parts)
 
 
 def import_trial(

@@ -32,7 +32,7 @@ from sliplens.results.study import (
     Study,
     UntrainedMaps,
 )
-from sliplens.shards import EXECUTORS, Crew, MakePart
+from sliplens.shards import EXECUTORS, Crew, MakePart, Work, WorkError
 from sliplens.simulation.intervention import rebuild_trial
 from sliplens.study.checks import CASCADE, Measuring, Randomising, Untrained, time_explainers
 from sliplens.study.choice import (
@@ -229,7 +229,7 @@ _NEEDED_BY = {"score": {"score", "remedies"}, "control": {"faithfulness", "truth
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Judging:
+class _Judging(Work):
     """Work on all stages that judge explanations, on shards of ((network, stage), shard of that); paths travel."""
 
     folder: Path
@@ -259,7 +259,10 @@ class _Judging:
             (network, stage), own = item
             if opened is None or opened[0] != item[0]:  # one at a time: each holds images and maps
                 opened = None
-                opened = item[0], self.open(network).stage(stage).begin()
+                try:
+                    opened = item[0], self.open(network).stage(stage).begin()
+                except Exception as error:
+                    raise WorkError(error) from None
             opened[1](own, path, on_progress)
 
         return make

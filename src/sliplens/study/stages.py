@@ -1,6 +1,6 @@
 """Stages of a study: work on shards whose parts are records, and the result that these make together."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
@@ -14,25 +14,20 @@ from sliplens.files import scratch_folder
 from sliplens.models.engines import counting_passes
 from sliplens.progress import OnProgress
 from sliplens.results.explanation import Explained
-from sliplens.shards import Crew, MakePart, Shard, make_parts, shard
+from sliplens.shards import Crew, MakePart, Shard, Work, make_parts, shard
 
 Result = TypeVar("Result")
 Find: TypeAlias = Callable[[Any, OnProgress], Any]
 """From what a shard is of to its record."""
 
 
-class Stage(ABC, Generic[Result]):
+class Stage(Work, Generic[Result]):
     """Work on the shards of a stage; it travels, so that it holds no more than its shards need."""
 
     piece: ClassVar[type]
     """Record of a shard."""
     title: ClassVar[str]
     """What is done, for `read_status`."""
-
-    @property
-    @abstractmethod
-    def on_gpu(self) -> bool:
-        """Whether the network of the stage runs on a graphics card."""
 
     @abstractmethod
     def shards(self) -> Iterator[Shard]:
