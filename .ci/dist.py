@@ -107,8 +107,11 @@ def faults(wheel: Path, archive: Path) -> list[str]:
     ):
         if not told[field]:
             found.append(f"the metadata has no {field}")
-    if render(str(told.get_payload())) is None:
+    page = render(str(told.get_payload()))
+    if page is None:
         found.append("the README cannot be rendered as a package index does it")
+    elif broken := re.findall(r'(?:src|href)="(?!https?:|#)([^"]*)"', page):
+        found.append(f"a package index cannot show {', '.join(broken)}; see hatch_build.py")
     return found
 
 

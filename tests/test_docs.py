@@ -3,6 +3,7 @@
 import ast
 import importlib
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,11 @@ import pytest
 import sliplens
 
 ROOT = Path(__file__).parents[1]
-PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    *sorted(ROOT.glob("*.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs" / "sensors").glob("*.md")),
+]
 PAGE = pytest.mark.parametrize(
     "page", [page for page in PAGES if page.name != "CHANGELOG.md"], ids=lambda page: page.stem
 )
@@ -90,3 +95,49 @@ def test_what_a_page_names_in_its_text_is_there(page: Path):
 def test_where_a_page_links_to_there_is_a_file(page: Path):
     links = re.findall(r"\]\((?!https?:)([^)#\s]+)", text_of(page))
     assert not [link for link in links if not (page.parent / link).exists()]
+
+
+def anchors_of(page: Path) -> set[str]:
+    """Anchors of a page: its headings as GitHub and MyST name them, and its own labels."""
+    text = text_of(page)
+    headings = (
+        re.sub(r"[^\w\s-]", "", heading).strip().lower() for heading in re.findall(r"^#+ (.*)", text, re.MULTILINE)
+    )
+    return {re.sub(r"\s", "-", heading) for heading in headings} | set(
+        re.findall(r"^\(([\w-]+)\)=", text, re.MULTILINE)
+    )
+
+
+@PAGE
+def test_where_a_page_links_into_another_there_is_a_heading(page: Path):
+    links = re.findall(r"\]\((?!https?:)([^)#\s]*)#([^)\s]+)\)", text_of(page))
+    assert not [
+        f"{path}#{anchor}" for path, anchor in links if anchor not in anchors_of(page.parent / path if path else page)
+    ]
+
+
+def rows_of(page: str) -> list[list[str]]:
+    """Cells of every row of a page's tables, heads and rules left out."""
+    lines = (ROOT / "docs" / page).read_text(encoding="utf-8").splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines if line.startswith("| ")]
+    return [row for number, row in enumerate(rows) if number]
+
+
+def test_the_table_of_extras_is_that_of_the_package():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    needed = {
+        name: ", ".join(re.findall(r"^[\w-]+", "\n".join(packages), flags=re.MULTILINE))
+        for name, packages in project["optional-dependencies"].items()
+        if name not in {"dev", "docs"}
+    }
+    assert {row[0].strip("`"): row[2] for row in rows_of("install.md")} == needed
+
+
+def test_sentences_that_the_troubleshooting_quotes_are_said_somewhere():
+    source = "".join(path.read_text(encoding="utf-8") for path in sorted((ROOT / "src").rglob("*.py")))
+    # sentences are broken over lines, and what stands in braces is told at run time
+    said = re.sub(r"\{[^{}\"\n]*\}", "…", re.sub(r'"\s*f?"', "", source))
+    quoted = [text for row in rows_of("troubleshooting.md") for text in re.findall(r"^`([^`]*)`", row[0])]
+    assert len(quoted) > 30
+    parts = {part.strip() for text in quoted for part in text.split("…") if len(part.strip()) > 3}
+    assert not sorted(part for part in parts - {".NAME.partial"} if part not in said)

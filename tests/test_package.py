@@ -4,7 +4,10 @@ import re
 import subprocess
 import sys
 import tomllib
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+
+from readme_renderer.markdown import render
 
 ROOT = Path(__file__).parents[1]
 
@@ -55,3 +58,20 @@ def test_contributing_names_files_that_there_are():
     folders = [ROOT, ROOT / "src" / "sliplens", ROOT / "src" / "sliplens" / "faithfulness"]
     assert len(named) > 10
     assert not [name for name in named if not any((folder / name).exists() for folder in folders)]
+
+
+def test_a_package_index_shows_the_readme_whole():
+    spec = spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
+    assert spec is not None
+    assert spec.loader is not None
+    build = module_from_spec(spec)
+    spec.loader.exec_module(build)
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    page = render(build.describe(readme))
+    assert page is not None
+    # nothing there is relative to the repository
+    assert "<img" not in page
+    assert not re.findall(r'href="(?!https?:|#)', page)
+    for heading in re.findall(r"^## (.*)", readme, flags=re.MULTILINE):
+        assert f">{heading}<" in page
+    assert "*" not in re.sub(r"<pre.*?</pre>", "", page, flags=re.DOTALL)
