@@ -474,6 +474,27 @@ def _lerobot(folder: Path) -> None:
     export_lerobot(load_dataset(folder / "data"), folder / "robot")
 
 
+def _robot(folder: Path) -> None:
+    """A data set of LeRobot as others write it: frames in videos, and none of what sliplens keeps beside."""
+    _lerobot(folder)
+    robot = folder / "robot"
+    shutil.rmtree(robot / "meta" / "sliplens")
+    info = json.loads((robot / "meta" / "info.json").read_text())
+    info["features"]["observation.images.tactile"]["dtype"] = "video"
+    info["video_path"] = "{video_key}-{file_index}.mkv"
+    (robot / "meta" / "info.json").write_text(json.dumps(info))
+    (path,) = robot.glob("meta/episodes/*/*.parquet")
+    table = pq.read_table(path).select(["episode_index", "length", "data/chunk_index", "data/file_index"])
+    for name, values in (("chunk_index", [0, 0]), ("file_index", [0, 1]), ("from_timestamp", [0.0, 0.0])):
+        table = table.append_column(f"videos/observation.images.tactile/{name}", pa.array(values))
+    pq.write_table(table, path)
+    (path,) = robot.glob("data/*/*.parquet")
+    pq.write_table(pq.read_table(path, columns=["timestamp", "episode_index", "observation.force"]), path)
+    for index in range(2):
+        trial = make_recording(f"trial-{index}", seed=index)
+        write_video(trial, robot / f"observation.images.tactile-{index}.mkv")
+
+
 def _workspace(folder: Path) -> None:
     write_workspace(folder / "work", trials=2)
 
@@ -617,6 +638,7 @@ FORMATS = {
     "lerobot": Format(_lerobot, ("robot/meta/info.json",), {**ANY, **JSON}, _frames_of("robot")),
     "lerobot tables": Format(_lerobot, _ROBOT, TABLES, _frames_of("robot")),
     "toml": Format(_toml, ("*.toml",), TOML, _read_toml),
+    "robot": Format(_robot, _ROBOT, TABLES, _frames_of("robot")),
 }
 """Every kind of input."""
 

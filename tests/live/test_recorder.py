@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -131,6 +132,7 @@ def test_what_is_cut_off_is_whole_up_to_the_cut(recording: Recording, tmp_path: 
 _CHILD = """
 import sys, time
 from pathlib import Path
+from typing import Any
 import numpy as np
 from sliplens.recordings.dataset import begin_recording
 from sliplens.recordings.journal import Journal, JournalHeader
@@ -261,7 +263,7 @@ def test_nothing_recorded_leaves_nothing_behind(tmp_path: Path):
 
 
 def test_nothing_recorded_by_a_profile_leaves_its_folder_free_whenever_it_was_killed(tmp_path: Path, monkeypatch):
-    def killed(folder: Path, **options: object) -> None:
+    def killed(folder: Path, **options: Any) -> None:
         if folder.name == SENSORS_FOLDER:
             raise KeyboardInterrupt
         remove(folder, **options)

@@ -380,8 +380,14 @@ def test_tables_that_contradict_the_metadata_are_refused(dataset):
     write_episodes(dataset, starts, **{f"videos/{CAMERA}/from_timestamp": [0.0, None, 0.0]})
     with pytest.raises(RecordingError, match=r"has gaps in the column 'videos/.*/from_timestamp'; copy the data set"):
         read_lerobot(dataset)
+    write_episodes(dataset, starts, **{f"videos/{CAMERA}/from_timestamp": [0.0, np.inf, 0.0]})
+    with pytest.raises(RecordingError, match="begins episode 1 at inf s of a video"):
+        read_lerobot(dataset)
+    write_episodes(dataset, starts, episode_index=["0", "1", "2"])
+    with pytest.raises(RecordingError, match=r"holds string as .episode_index. where whole numbers belong"):
+        read_lerobot(dataset)
     write_episodes(dataset, starts, **{"data/file_index": ["0", "0", "1"]})
-    with pytest.raises(RecordingError, match="has no whole numbers in data/file_index"):
+    with pytest.raises(RecordingError, match=r"holds string as .data/file_index. where whole numbers belong"):
         read_lerobot(dataset)
     write_episodes(dataset, starts)
     write_info(dataset, lambda info: info["features"][FORCE].update(shape=[3]))

@@ -31,6 +31,7 @@ from sliplens.recordings.store import load_forces
 
 _COPY = "copy the data set again"
 _NO_VIDEO = "copy the data set again, with its videos"
+_LATEST_S = 1e7  # of a stamp in a video: four months
 _VERSION = re.compile(r"v3\.\d+")
 _FIELD = re.compile(r"\{(video_key|chunk_index|file_index)(?::0?([1-9])d)?\}")
 
@@ -95,16 +96,14 @@ def read_layout(folder: Path) -> Layout:
 def read_episodes(layout: Layout, *, camera_key: str) -> list[Episode]:
     """Episodes of a data set and where their frames from a camera lie, in their order."""
     in_video = layout.features[camera_key].dtype == "video"
-    columns = ["episode_index", "length", "data/chunk_index", "data/file_index"]
+    columns = dict.fromkeys(("episode_index", "length", "data/chunk_index", "data/file_index"), "whole numbers")
     if in_video:
-        columns += [f"videos/{camera_key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
+        columns |= {f"videos/{camera_key}/{name}": "whole numbers" for name in ("chunk_index", "file_index")}
+        columns[f"videos/{camera_key}/from_timestamp"] = "numbers"
     folder = layout.folder / "meta" / "episodes"
     rows = []
     for path in sorted(folder.glob("*/*.parquet")):
-        table = read_columns(path, columns)
-        for name in columns[:6]:
-            if not pa.types.is_integer(table.schema.field(name).type):
-                raise RecordingError(f"{path} has no whole numbers in {name}; copy the data set again")
+        table = read_parquet(path, columns, cure=_COPY, error=RecordingError)
         rows += zip(*(table.column(name).to_pylist() for name in columns), strict=True)
     if not rows:
         raise RecordingError(f"{folder} lists no episode; record one, or copy it again")
@@ -112,6 +111,10 @@ def read_episodes(layout: Layout, *, camera_key: str) -> list[Episode]:
     for index, length, chunk, file, *video in sorted(rows):
         if episodes and episodes[-1].index == index:
             raise RecordingError(f"{folder} lists episode {index} twice; copy the data set again")
+        if in_video and not 0 <= video[2] <= _LATEST_S:
+            raise RecordingError(
+                f"{folder} begins episode {index} at {video[2]:g} s of a video; copy the data set again"
+            )
         data = {"chunk_index": chunk, "file_index": file}
         where = {"video_key": camera_key, **dict(zip(data, video, strict=False))}
         episodes.append(
@@ -124,11 +127,6 @@ def read_episodes(layout: Layout, *, camera_key: str) -> list[Episode]:
             )
         )
     return episodes
-
-
-def read_columns(path: Path, columns: list[str]) -> pa.Table:
-    """Columns of a Parquet file, with no value missing."""
-    return read_parquet(path, dict.fromkeys(columns, "values"), cure=_COPY, error=RecordingError)
 
 
 def _expand(layout: Layout, template: str, values: dict[str, Any]) -> Path:
@@ -192,9 +190,10 @@ class Rows:
         return tuple(words[code] for code in codes)
 
 
-def read_rows(layout: Layout, episodes: list[Episode], columns: list[str]) -> Iterator[Rows]:
-    """Rows of episodes one after another; those of one file share what was read of it."""
-    read = lru_cache(maxsize=1)(partial(read_columns, columns=["episode_index", *columns]))
+def read_rows(layout: Layout, episodes: list[Episode], columns: dict[str, str]) -> Iterator[Rows]:
+    """Rows of episodes one after another, with columns of some kinds; those of one file share what was read of it."""
+    wanted = {"episode_index": "whole numbers", **columns}
+    read = lru_cache(maxsize=1)(partial(read_parquet, columns=wanted, cure=_COPY, error=RecordingError))
     for episode in episodes:
         path = episode.data_file
         rows = read(path).filter(pc.field("episode_index") == episode.index)
@@ -339,7 +338,7 @@ def kept_captures(layout: Layout, trials: tuple[ExportedTrial, ...]) -> list[Cap
             f"the episodes of {layout.folder} are no longer those that {path} tells of; export the trials again, or "
             "remove that file to read the data set without labels"
         )
-    rows = read_rows(layout, episodes, _COLUMNS)
+    rows = read_rows(layout, episodes, dict.fromkeys(_COLUMNS, "values"))
     return [_capture(one, trials[one.episode.index]) for one in rows]
 
 
@@ -397,7 +396,8 @@ def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
     video_header = cache(read_video_header)  # episodes share files
     captures = []
     episodes = read_episodes(layout, camera_key=camera)
-    for rows in read_rows(layout, episodes, ["timestamp", *([force] if force else [])]):
+    columns = {"timestamp": "numbers", **({force: "values"} if force else {})}
+    for rows in read_rows(layout, episodes, columns):
         one, own_notes, forces = rows.episode, (), None
         time = rows.table.column("timestamp").to_numpy().astype(np.float64)
         source = f"episode {one.index} of {layout.folder}"
