@@ -6,6 +6,7 @@ as they are read; as a script, `python docs/benchmark_tables.py`, it draws those
 
 import re
 import tomllib
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +22,16 @@ MACHINES = {
 
 def load_sections() -> dict[str, dict[str, Any]]:
     """Load the figures, by the name of the script that measures them."""
-    sections = tomllib.loads((FOLDER / "results.toml").read_text(encoding="utf-8"))["section"]
+    sections = tomllib.loads((FOLDER / "results.toml").read_text(encoding="utf-8"), parse_float=Decimal)["section"]
     return {section["script"]: section for section in sections}
 
 
-def meets(value: float, goal: str) -> bool:
+def meets(value: Decimal | int, goal: str) -> bool:
     """Whether a value reaches a goal such as "<= 8"."""
     direction, bound = goal.split()
     if direction == "=":
         return str(value).lower() == bound
-    return value <= float(bound) if direction == "<=" else value >= float(bound)
+    return value <= Decimal(bound) if direction == "<=" else value >= Decimal(bound)
 
 
 def judge(row: dict[str, Any]) -> str:
@@ -42,8 +43,10 @@ def judge(row: dict[str, Any]) -> str:
     return "reached" if all(meets(row[end], row["goal"]) for end in ("low", "high") if end in row) else "not for sure"
 
 
-def _say(value: float | str) -> str:
-    return str(value).lower() if isinstance(value, bool) else f"{value:,}" if isinstance(value, int) else str(value)
+def _say(value: Decimal | int | str) -> str:
+    if isinstance(value, Decimal):
+        return f"{value:.1e}" if 0 < abs(value) < Decimal("0.001") else str(value)
+    return str(value).lower() if isinstance(value, bool | str) else f"{value:,}"
 
 
 def _say_goal(goal: str) -> str:
