@@ -26,7 +26,6 @@ def load_tables() -> ModuleType:
 
 TABLES = load_tables()
 SECTIONS: dict[str, dict[str, Any]] = TABLES.load_sections()
-ROWS = [(section, row) for section in SECTIONS.values() for row in section["rows"]]
 
 
 def test_every_script_has_its_figures():
@@ -34,8 +33,14 @@ def test_every_script_has_its_figures():
     assert set(SECTIONS) == scripts
 
 
-@pytest.mark.parametrize(("section", "row"), ROWS, ids=[f"{own['script']}-{row['figure'][:30]}" for own, row in ROWS])
-def test_a_row_is_whole(section: dict[str, Any], row: dict[str, Any]):
+@pytest.mark.parametrize("script", SECTIONS)
+def test_rows_are_whole(script: str):
+    section = SECTIONS[script]
+    for row in section["rows"]:
+        check_row(section, row)
+
+
+def check_row(section: dict[str, Any], row: dict[str, Any]) -> None:
     facts = section | row
     assert set(facts) <= {"script", "title", "rows", "command", "date", "machine"} | {
         "figure", "value", "unit", "low", "high", "spread", "goal"
