@@ -271,6 +271,19 @@ def test_the_driver_holds_a_few_shards_however_many_come(log: Path, out: Path):
     assert most <= 2
 
 
+def test_the_driver_keeps_nothing_of_ten_thousand_shards(log: Path, out: Path, monkeypatch: pytest.MonkeyPatch):
+    def many() -> Iterator[Shard]:
+        for number in range(10_000):
+            yield shard(number, trial=f"t{number}", frames=1, recipe=0, shown="", suffix=".parquet")
+
+    blocks: list[int] = []  # of memory, as each shard is done
+    monkeypatch.setattr("sliplens.shards._are_made", lambda _, given: [True] * len(given))
+    out.mkdir()
+    make(Count(log=log), out, given=many, on_part=lambda _: blocks.append(sys.getallocatedblocks()))
+    assert len(blocks) == 10_000
+    assert blocks[-1] - blocks[99] < 15_000  # of which the list itself holds one a shard
+
+
 def test_parts_join_into_a_file_or_stay_a_data_set(log: Path, tmp_path: Path):
     def table(out: Path | None, **more: object):
         return make_table(Count(log=log), shards, out, title=TITLE, recipe={}, **more)  # pyright: ignore
