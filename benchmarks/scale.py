@@ -8,9 +8,9 @@ Kills are `SIGKILL` at random moments, of the command or of a process that works
 Ray, of one or, as `cluster`, of two of them. The same command must then end with the bytes of a serial run, no part
 twice and none missing.
 
-With `--keep FOLDER` each piece is kept as soon as it is measured, by the hash of its data, and the next call goes on
-from there, so that hours can be had in minutes: `--stages predict --kills 0`, then `--stages --kills 10`, then
-`--kills 30`. With `--json` the last line is one object.
+With `--keep FOLDER` each piece is kept as soon as it is measured, by the hashes of code and data, and the next call of
+the same code goes on from there, so that hours can be had in minutes: `--stages predict --kills 0`, then `--stages
+--kills 10`, then `--kills 30`. With `--json` the last line is one object.
 """
 
 import argparse
@@ -35,6 +35,7 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command line does; before torch is imported
 
+import sliplens
 from sliplens import load_dataset, predict, simulate
 from sliplens.extras import missing_packages
 from sliplens.files import hash_file, hash_json, machine, partial_folder, versions, write_json
@@ -127,7 +128,8 @@ def plan(
     for (stage, own), frames, (machines, cores) in product(rates.items(), PLANNED, MACHINES.items()):
         rate_per_s, trials = own["frames_per_s"] * cores / workers, frames / TRIAL
         shards = frames if stage == "explain" else trials
-        held = driver["bytes_a_trial"] * trials + own["held_per_frame"] * frames
+        held = driver["bytes_a_trial"] * trials + driver["grew_mb"] * 1e6 / EMPTY * shards
+        held += own["held_per_frame"] * frames
         rows.append({
             "stage": stage,
             "frames": frames,
@@ -276,7 +278,7 @@ def survive(data: Path, on: str, *, wanted: str, within_s: float, rng: random.Ra
                 kill_words(data, out, place), check=False, capture_output=True, text=True, timeout=_PATIENCE_S
             )
             same = again.returncode == 0 and content(out) == wanted
-            told = "" if same else again.stderr[-2000:]
+            told = "" if same else f"exit code {again.returncode}: {again.stderr[-2000:]}"
             return {"killed": killed, "on": on, "parts": there, "survived": same, "told": told}
         return {"killed": killed, "on": on, "parts": there, "survived": False, "told": "the second command hung"}
 
@@ -300,11 +302,14 @@ class Kept:
     """What is measured, a file a piece."""
 
     folder: Path
+    code: str
+    """Hash of what is measured; what another one took or made is not compared."""
 
     def once(self, name: str, make: Callable[[], Any]) -> Any:
         """Measure a piece unless it is there."""
-        path = self.folder / f"{name}.json"
+        path = self.folder / self.code / f"{name}.json"
         if not path.is_file():
+            path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, make())
         return json.loads(path.read_text())
 
@@ -378,7 +383,9 @@ def main() -> None:
     if with_ray := not options.without_ray and missing_packages("ray", extra="ray") is None:
         places.append("ray")
     with tempfile.TemporaryDirectory() as folder:
-        kept = Kept(folder=options.keep or Path(folder))
+        sources = Path(sliplens.__file__).parent
+        code = hash_json({str(one.relative_to(sources)): hash_file(one) for one in sources.rglob("*.py")})
+        kept = Kept(folder=options.keep or Path(folder), code=code)
         driver = kept.driver()  # first: whatever else is done would hide by how much its memory peaks
         found = load_dataset(options.data or kept.data("data", trials=12, frames=40))
         rates = kept.rates(found, options.stages, places)

@@ -328,7 +328,8 @@ def _ray(work: Work, address: str, most: int) -> Iterator[Seats]:
 
     connected = ray.is_initialized()
     if not connected:
-        where: dict[str, Any] = {"address": address} if address else {"include_dashboard": False}
+        # without a word Ray looks for a cluster that was here before, which a kill may have left the address of
+        where: dict[str, Any] = {"address": address} if address else {"address": "local", "include_dashboard": False}
         try:
             ray.init(**where, log_to_driver=False, logging_level=logging.ERROR)
         except Exception as error:  # it raises just that of a node that takes more than 30 s to start
