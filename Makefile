@@ -47,8 +47,8 @@ format: $(INSTALLED) ## format the code and sort its imports
 bench: $(INSTALLED) ## run every benchmark
 	@set -e; for script in $(BENCHMARKS); do echo "== $$script"; $(BIN)/python $$script --json; done
 
-docs: $(INSTALLED) ## build the documentation: docs/_build/index.html
-	$(BIN)/sphinx-build -W -q -b html docs docs/_build
+docs: $(INSTALLED) ## build the documentation, run its gallery and try every page: docs/_build/index.html
+	$(BIN)/python .ci/docs.py
 
 weights: $(INSTALLED) ## train the networks that come with the package: some five hours on two cores
 	$(BIN)/sliplens simulate runs/weights/varied --preset varied

@@ -1,7 +1,6 @@
 """How large the house is and how much of it a newcomer meets: lines, modules, public names, examples, loose dicts.
 
-Counted in the source text, without importing the package. `--json` prints one line of JSON, `--examples` the table of
-docstrings with an example that docs/api.md holds.
+Counted in the source text, without importing the package. `--json` prints one line of JSON.
 """
 
 import argparse
@@ -92,17 +91,6 @@ def docstrings(tree: ast.Module) -> Iterator[str]:
             yield text
 
 
-def examples_table(package: Path) -> str:
-    """Rows of Markdown: each package, and what has an example in its docstring."""
-    rows: dict[str, set[str]] = {}
-    for path in package.rglob("*.py"):
-        place = ".".join((package.name, *path.relative_to(package).with_suffix("").parts[:1]))
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ClassDef | Function) and ">>> " in (ast.get_docstring(node) or ""):
-                rows.setdefault(place, set()).add(f"`{node.name}`")
-    return "\n".join(f"| `{place}` | {', '.join(sorted(names))} |" for place, names in sorted(rows.items()))
-
-
 def loose_dicts(tree: ast.Module) -> Iterator[str]:
     """Public functions, methods and annotated fields that give or take a dict of anything."""
 
@@ -149,11 +137,7 @@ def main() -> None:
     """Print the size of the package."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", action="store_true", help="print one line of JSON")
-    parser.add_argument("--examples", action="store_true", help="print the table of examples")
     options = parser.parse_args()
-    if options.examples:
-        print(examples_table(_PACKAGE))
-        return
     house = measure(_PACKAGE)
     if options.json:
         facts = asdict(house) | {"dicts_across_modules": len(house.dicts_across_modules)}

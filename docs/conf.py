@@ -1,29 +1,34 @@
 """Sphinx configuration."""
 
+import inspect
 import os
 import sys
 from pathlib import Path
+from types import ModuleType
 
 from docutils import nodes
 from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
 from sphinx.util import logging
 from sphinx.util.math import get_node_equation_number
 from sphinx.writers.html5 import HTML5Translator
 
-from sliplens import __version__
+import sliplens
 
 project = "sliplens"
 author = "The sliplens developers"
 copyright = "2026, the sliplens developers"
-release = version = __version__
+release = version = sliplens.__version__
 
 sys.path.insert(0, str(Path(__file__).parent))
 extensions = [
     "benchmark_tables",
     "myst_parser",
     "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
     "sphinx.ext.intersphinx",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
@@ -33,6 +38,9 @@ extensions = [
     "sphinxcontrib.bibtex",
     "notfound.extension",
 ]
+autosummary_generate = False
+# names in backticks are names of the interface wherever they are known
+default_role = "py:obj"
 # a field may be named as a builtin is (`object`): which one is meant nobody need say
 suppress_warnings = ["ref.python"]
 exclude_patterns = ["_build"]
@@ -99,7 +107,9 @@ sphinx_gallery_conf = {
     "doc_module": ("sliplens",),
     "download_all_examples": False,
     "min_reported_time": 1e9,
-    "plot_gallery": "True",
+    "junit": "gallery.xml",
+    "write_computation_times": False,
+    "thumbnail_size": (400, 280),
 }
 
 
@@ -123,12 +133,52 @@ def write_math(translator: HTML5Translator, node: nodes.math | nodes.math_block)
     raise nodes.SkipNode
 
 
-def escape_bars(_app: Sphinx, _what: str, _name: str, _object: object, _options: object, lines: list[str]) -> None:
-    """Read bars in docstrings as absolute values, |T_n - T_0|, not as substitutions of reStructuredText."""
+def complete_docstring(_app: Sphinx, what: str, name: str, thing: object, _options: object, lines: list[str]) -> None:
+    """Add what no docstring need say: what a package exports, and the pages of the gallery that use a name."""
+    # bars are absolute values, |T_n - T_0|, not substitutions of reStructuredText
     lines[:] = [line.replace("|", r"\|") for line in lines]
+    if what == "module" and isinstance(thing, ModuleType):
+        names = [
+            one
+            for one in sorted(thing.__all__)
+            if inspect.isroutine(getattr(thing, one)) or inspect.isclass(getattr(thing, one))
+        ]
+        lines += [".. autosummary::", "   :nosignatures:", "", *(f"   {one}" for one in names), ""]
+    # examples name a class by the shortest path that leads to it, whether or not it is exported there
+    for used in dict.fromkeys((name, f"sliplens.{getattr(thing, '__name__', '')}")):
+        pages = Path(__file__).parent / "gallery" / "backreferences" / f"{used}.examples"
+        if what in ("function", "class", "exception") and pages.is_file() and pages.stat().st_size:
+            lines += ["", ".. rubric:: Used in the gallery", "", f".. minigallery:: {used}", ""]
+
+
+def skip_calls(_app: Sphinx, what: str, name: str, thing: object, _skip: bool, _options: object) -> bool | None:
+    """Describe what is a name of `sliplens` itself once, among the calls, and not again where it lives."""
+    return True if what == "module" and name in sliplens.__all__ and getattr(sliplens, name) is thing else None
+
+
+def find_where_exported(
+    app: Sphinx, env: BuildEnvironment, node: pending_xref, inner: nodes.Element
+) -> nodes.Node | None:
+    """Lead from where a name is defined, as types name it, to the package that exports and describes it."""
+    *modules, name = str(node.get("reftarget", "")).split(".")
+    if node.get("refdomain") != "py" or not name:
+        return None
+    # a type that is imported for the type checker alone, or a name in words, stands without its module
+    modules = modules or str(node.get("py:module", "sliplens")).split(".")
+    described = env.domains.python_domain.objects
+    places = [".".join((*modules[:depth], name)) for depth in range(len(modules), 0, -1)]
+    classes = [place for place, one in described.items() if place.endswith(f".{name}") and one.objtype == "class"]
+    for place in places + classes * (len(classes) == 1):
+        if place in described:
+            found = described[place]
+            uri = app.builder.get_relative_uri(node.get("refdoc", ""), found.docname)
+            return nodes.reference("", "", inner, internal=True, refuri=f"{uri}#{found.node_id}", reftitle=place)
+    return None
 
 
 def setup(app: Sphinx) -> None:
-    """Add formulas without a script, and bars in docstrings."""
+    """Add formulas without a script, and links that autodoc alone does not find."""
     app.add_html_math_renderer("mathml", (write_math, None), (write_math, None))
-    app.connect("autodoc-process-docstring", escape_bars)
+    app.connect("autodoc-process-docstring", complete_docstring)
+    app.connect("autodoc-skip-member", skip_calls)
+    app.connect("missing-reference", find_where_exported)

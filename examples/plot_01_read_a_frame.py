@@ -29,7 +29,7 @@ table.column_names
 margin, low, high = (100 * table[name].to_numpy() for name in ("prediction", "low_90", "high_90"))
 frame = 3 * len(margin) // 5
 
-figure, (picture, chart) = plt.subplots(ncols=2, figsize=(9, 3.6), width_ratios=(1, 1.8), layout="constrained")
+figure, (picture, chart) = plt.subplots(ncols=2, figsize=(9, 3.6), width_ratios=(1, 1.8), layout="compressed")
 picture.imshow(trial.frames[frame])
 picture.set(title=f"{trial.time_s[frame]:.1f} s: read {margin[frame]:.0f} %", xticks=[], yticks=[])
 chart.fill_between(trial.time_s, low, high, color="#0072B2", alpha=0.2, label="90 % interval")

@@ -33,7 +33,7 @@ maps = {
 }
 
 # %%
-figure, axes = plt.subplots(2, 4, figsize=(11, 6.4), layout="constrained")
+figure, axes = plt.subplots(2, 4, figsize=(11, 6.4), layout="compressed")
 for ax, (method, explanation) in zip(axes.flat, maps.items(), strict=True):
     sl.plot(explanation, ax)
     ax.set_title(method, loc="left", fontsize=10)

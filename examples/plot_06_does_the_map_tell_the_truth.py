@@ -57,7 +57,7 @@ for method, options in methods.items():
     said[method] = np.array([relevance[disc].mean() for disc in near])
 
 # %%
-figure, axes = plt.subplots(ncols=4, figsize=(13, 3.6), layout="constrained")
+figure, axes = plt.subplots(ncols=4, figsize=(13, 3.8), layout="compressed")
 axes[0].imshow(frame)
 top = np.abs(effects).max()
 dots = axes[0].scatter(
@@ -66,13 +66,12 @@ dots = axes[0].scatter(
 axes[0].set(title="what each marker does", xticks=[], yticks=[])
 figure.colorbar(dots, ax=axes[0], label="margin units", location="bottom")
 for ax, (method, values) in zip(axes[1:], said.items(), strict=True):
-    ax.scatter(effects, values, color="#0072B2", s=18)
+    ax.scatter(effects, 1e3 * values, color="#0072B2", s=18)
     ax.axhline(0, color="grey", linewidth=0.8)
     ax.axvline(0, color="grey", linewidth=0.8)
     rank = spearmanr(effects, values).statistic
     ax.set(title=f"{method}\nrank correlation {rank:.2f}", xlabel="Effect of the marker (margin units)")
-    ax.ticklabel_format(axis="y", style="sci", scilimits=(0, 0))
-axes[1].set_ylabel("Map (margin units a pixel)")
+axes[1].set_ylabel("Map (thousandths a pixel)")
 plt.show()
 
 # %%

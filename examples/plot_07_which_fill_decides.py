@@ -36,6 +36,7 @@ for ax, (fill, found) in zip(axes, scores.items(), strict=True):
 for ax in axes[1:]:
     ax.set_ylabel("")
     ax.get_legend().remove()
+axes[0].legend(loc="lower right", fontsize=8)
 plt.show()
 
 # %%

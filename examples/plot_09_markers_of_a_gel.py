@@ -34,7 +34,7 @@ rest, moved = (
 known = np.isfinite(moved).all(axis=1) & np.isfinite(rest).all(axis=1)
 field = interpolate_field(rest[known], moved[known], size=trial.reference.shape[:2])
 
-figure, (left, right) = plt.subplots(ncols=2, figsize=(10, 4.6), layout="constrained")
+figure, (left, right) = plt.subplots(ncols=2, figsize=(10, 4.6), layout="compressed")
 plot_arrows(trial.frames[number], rest, moved, ax=left)
 left.set_title("each dot, from where it rests")
 scale = plot_field(field, size=trial.reference.shape[:2], ax=right)

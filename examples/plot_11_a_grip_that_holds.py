@@ -31,6 +31,7 @@ chart.set(
     xlabel="Force above the least (1 = twice as much)",
     ylabel="Dropped (% of 200 episodes)",
     ylim=(-0.1, 2.5),
+    xlim=(2.5, 4.8),
 )
 sl.plot(grips["margin"], course)
 course.set_title("the first episode under margin", loc="left")

@@ -43,9 +43,10 @@ frame = trial.frames[24:25]
 own = sl.explain("chromatouch-difference", frame, reference=trial.reference, method=Midpoint())
 known = sl.explain("chromatouch-difference", frame, reference=trial.reference, method="integrated-gradients", steps=20)
 
-figure, axes = plt.subplots(ncols=2, figsize=(8, 4.4), layout="constrained")
+figure, axes = plt.subplots(ncols=2, figsize=(8, 4.4), layout="compressed")
 for ax, explanation in zip(axes, (own, known), strict=True):
     sl.plot(explanation, ax)
+    ax.set_title(explanation.method, loc="left")
 plt.show()
 
 

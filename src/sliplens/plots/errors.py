@@ -181,10 +181,11 @@ def plot_answers(predictions: Predictions, conditions: list[str], *, ax: Axes) -
         rows = np.flatnonzero(predictions.condition == name)
         rows = rows[:: max(1, len(rows) // _MOST_DOTS)]
         label, read = 100 * predictions.safety_margin[rows], 100 * predictions.prediction[rows]
-        ax.scatter(label, read, s=5, alpha=0.35, color=CONDITION_COLOURS.get(name, GREEN), label=name, **_DOTS)
+        size = np.clip(3000 / max(len(rows), 1), 5, 30)  # few dots are seen as well as many
+        ax.scatter(label, read, s=size, alpha=0.5, color=CONDITION_COLOURS.get(name, GREEN), label=name, **_DOTS)
     ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="perfect")
     ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103), title="Answers")
-    ax.legend(markerscale=2.5, fontsize=8, loc="upper left")
+    ax.legend(fontsize=8, loc="upper left")
 
 
 def _plot_trials(predictions: Predictions, conditions: list[str], *, ax: Axes) -> None:
