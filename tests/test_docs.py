@@ -1,17 +1,22 @@
-"""What the documentation names is there: imports, calls, files."""
+"""What the documentation and its gallery name is there: imports, calls and their arguments, files."""
 
 import ast
 import importlib
+import inspect
 import re
+import runpy
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import pytest
 
 import sliplens
 
 ROOT = Path(__file__).parents[1]
-PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+EXAMPLES = sorted((ROOT / "examples").glob("plot_*.py"))
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")), *EXAMPLES]
 PAGE = pytest.mark.parametrize(
     "page", [page for page in PAGES if page.name != "CHANGELOG.md"], ids=lambda page: page.stem
 )
@@ -33,7 +38,12 @@ _CODE = re.compile(r"^```(\w*)\n(.*?)^```", flags=re.MULTILINE | re.DOTALL)
 
 
 def code_of(page: Path) -> list[ast.Module]:
-    return [ast.parse(code) for kind, code in _CODE.findall(page.read_text(encoding="utf-8")) if kind == "python"]
+    text = page.read_text(encoding="utf-8")
+    return (
+        [ast.parse(code) for kind, code in _CODE.findall(text) if kind == "python"]
+        if page.suffix == ".md"
+        else [ast.parse(text)]
+    )
 
 
 def text_of(page: Path) -> str:
@@ -79,6 +89,36 @@ def test_what_a_page_calls_is_public(page: Path):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in {"sl", "sliplens"}
     }
     assert calls <= set(sliplens.__all__)
+
+
+def calls_of(code: ast.Module) -> Iterator[tuple[ast.Call, object]]:
+    """Calls of names of `sliplens`, and what each name stands for."""
+    imported = {
+        alias.asname or alias.name: find(f"{node.module}.{alias.name}")
+        for node in ast.walk(code)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("sliplens")
+        for alias in node.names
+    }
+    for node in ast.walk(code):
+        if isinstance(node, ast.Call):
+            match node.func:
+                case ast.Attribute(value=ast.Name(id="sl" | "sliplens"), attr=name):
+                    yield node, getattr(sliplens, name)
+                case ast.Name(id=name) if name in imported:
+                    yield node, imported[name]
+
+
+@PAGE
+def test_what_a_page_calls_takes_what_it_is_given(page: Path):
+    """What would break an example is told without running it; `make docs` runs them all."""
+    for code in code_of(page):
+        for call, thing in calls_of(code):
+            assert callable(thing)
+            given = [argument for argument in call.args if not isinstance(argument, ast.Starred)]
+            named = {keyword.arg: keyword.value for keyword in call.keywords if keyword.arg}
+            spread = len(given) < len(call.args) or len(named) < len(call.keywords)
+            signature = inspect.signature(thing)
+            (signature.bind_partial if spread else signature.bind)(*given, **named)
 
 
 @PAGE
@@ -137,3 +177,25 @@ def test_sentences_that_the_troubleshooting_quotes_are_said_somewhere():
     assert len(quoted) > 30
     parts = {part.strip() for text in quoted for part in text.split("…") if len(part.strip()) > 3}
     assert not sorted(part for part in parts - {".NAME.partial"} if part not in said)
+
+
+@pytest.mark.parametrize("name", ["plot_08_table_2", "plot_09_markers_of_a_gel", "plot_11_a_grip_that_holds"])
+def test_the_quickest_pages_of_the_gallery_run(name: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(plt, "show", lambda: None)
+    plt.switch_backend("agg")
+    try:
+        runpy.run_path(str(ROOT / "examples" / f"{name}.py"))
+        [figure] = map(plt.figure, plt.get_fignums())
+        assert all(ax.has_data() for ax in figure.axes)
+    finally:
+        plt.close("all")
+
+
+def test_every_page_of_the_gallery_shows_a_picture_and_says_what_it_is_about():
+    assert len(EXAMPLES) == 12
+    for page in EXAMPLES:
+        title, line, blank, *_ = (ast.get_docstring(ast.parse(page.read_text(encoding="utf-8"))) or "").splitlines()
+        assert set(line) == {"="}
+        assert len(line) == len(title)
+        assert not blank
+        assert "plt.show()" in page.read_text(encoding="utf-8")

@@ -185,7 +185,7 @@ def plot_answers(predictions: Predictions, conditions: list[str], *, ax: Axes) -
         ax.scatter(label, read, s=size, alpha=0.5, color=CONDITION_COLOURS.get(name, GREEN), label=name, **_DOTS)
     ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="perfect")
     ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103), title="Answers")
-    ax.legend(fontsize=8, loc="upper left")
+    ax.legend(markerscale=2, fontsize=8, loc="upper left")
 
 
 def _plot_trials(predictions: Predictions, conditions: list[str], *, ax: Axes) -> None:
@@ -210,7 +210,7 @@ def _plot_coverage(reliability: Mapping[str, Reliability], conditions: list[str]
     ax.set(xlabel="Promised (% of the frames)", ylabel="Held (%)", xlim=(40, 100), ylim=(0, 102), title="Intervals")
     if not known:
         write_over(ax, "this network was never calibrated")
-    ax.legend(fontsize=8, loc="upper left")
+    ax.legend(markerscale=2, fontsize=8, loc="upper left")
 
 
 def _plot_risk(risk: RiskCoverage | None, *, ax: Axes) -> None:
