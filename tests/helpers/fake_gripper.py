@@ -25,7 +25,8 @@ class FakeGripper:
                 with suppress(ConnectionError), self._connection, self._connection.makefile("rwb") as stream:
                     for line in stream:
                         self.heard.append(line.decode().strip())
-                        answer = self.answer(self.heard[-1]) if callable(self.answer) else self.answer
+                        told = self.answer
+                        answer = told(self.heard[-1]) if callable(told) else told
                         if answer is not None:
                             stream.write(answer)
                             stream.flush()
