@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 import sliplens as sl
-from sliplens.errors import InputError, RecordingError
+from sliplens.errors import InputError, RecordingError, SliplensError
 from sliplens.live import ForceStream, LiveFrame, Recorder, SimulatedSource, SourceOptions, open_live
 from sliplens.recordings import Dataset, Recording, TrialFacts, load_dataset
 from sliplens.recordings.capture import Forces
@@ -178,6 +179,35 @@ def test_a_recording_that_was_killed_before_it_wrote_its_table_is_begun_anew(tmp
     (tmp_path / "recording" / "mine.png").touch()
     with pytest.raises(RecordingError, match="is no data set of sliplens"):
         begin_recording(tmp_path, simulated=False)
+
+
+def test_a_damaged_journal_is_whole_frames_or_a_sentence(
+    recording: Recording, tmp_path: Path, rng: np.random.Generator
+):
+    lock, _ = begin_recording(tmp_path / "data", simulated=False)
+    header = JournalHeader(facts=FACTS, source="a camera", simulated=False, size=(48, 48))
+    journal = Journal(lock.folder, header, reference=recording.reference)
+    for frame in frames_of(recording)[:3]:
+        journal.append(frame.image, time_s=frame.time_s, safety_margin=frame.safety_margin, forces=frame.forces)
+    journal.close()
+    lock.release()
+    whole, outcomes = journal.path.read_bytes(), set()
+    for number in range(60):
+        damaged = bytearray(whole)
+        for at in rng.integers(0, len(whole), 8):
+            damaged[at] ^= int(rng.integers(1, 256))
+        shutil.copytree(tmp_path / "data", data := tmp_path / str(number))
+        (data / JOURNAL_FOLDER / journal.path.name).write_bytes(damaged)
+        try:
+            load_dataset(data)
+            outcomes.add("read")
+        except SliplensError:
+            outcomes.add("told")
+    assert "told" in outcomes
+    with pa.ipc.new_stream(str(journal.path), schema := pa.schema({"time_s": pa.float64()})) as stream:
+        stream.write_batch(pa.record_batch([[0.0]], schema=schema))
+    with pytest.raises(RecordingError, match=r"is damaged \(it has other columns than a recording\); move it away"):
+        load_dataset(tmp_path / "data")
 
 
 @contextmanager

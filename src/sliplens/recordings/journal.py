@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from sliplens.codec import from_builtins, one_line, to_builtins
 from sliplens.errors import RecordingError
-from sliplens.files import make_and_hold, parse_json
+from sliplens.files import make_and_hold, parse_json, require_file
 from sliplens.images import decode_png, encode_png
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling, ReferenceChoice
@@ -139,6 +139,7 @@ def finish_journal(journal: Path, trial: Path) -> JournalHeader | None:
 
     Labels are the margins that the source knew. Without any, `label_dataset` finds them from the forces.
     """
+    require_file(journal, missing="move it away")
     try:
         with pa.memory_map(str(journal)) as file:
             head = _read_head(file)
@@ -177,11 +178,15 @@ def finish_journal(journal: Path, trial: Path) -> JournalHeader | None:
 def _read_head(file: pa.NativeFile) -> tuple[JournalHeader, bytes | None] | None:
     """What is known of the trial, and the picture of the untouched sensor; None where it was cut off before that."""
     try:
-        metadata = pa.ipc.open_stream(file).schema.metadata or {}
+        schema = pa.ipc.open_stream(file).schema
     except pa.ArrowInvalid:
         return None
+    except OSError as error:  # of no disk: the file is mapped
+        raise pa.ArrowInvalid(str(error)) from None
     file.seek(0)
-    where = "the header of a journal"
+    if not schema.equals(_SCHEMA):
+        raise pa.ArrowInvalid("it has other columns than a recording")
+    where, metadata = "the header of a journal", schema.metadata or {}
     values = parse_json(metadata.get(_HEADER, b""), where=where, cure="move it away")
     header = from_builtins(values, JournalHeader, where=where, command="sliplens live")
     return header, metadata.get(_REFERENCE)
@@ -192,9 +197,14 @@ def _rows(file: pa.NativeFile) -> Iterator[pa.RecordBatch]:
     reader = pa.ipc.open_stream(file)
     while True:
         try:
-            yield reader.read_next_batch()
+            row = reader.read_next_batch()
         except (StopIteration, pa.ArrowInvalid, OSError):
             return
+        row.validate(full=True)
+        known = not any(row.column(name).null_count for name in _SCHEMA.names if name != "safety_margin")
+        if len(row) != 1 or not known or len(row["force_n"][0]) != 3 * len(row["force_time_s"][0]):
+            raise pa.ArrowInvalid("a row is no frame")
+        yield row
 
 
 def _save_forces(numbers: pa.Table, header: JournalHeader, path: Path) -> None:
