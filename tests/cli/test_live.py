@@ -32,6 +32,13 @@ def test_a_line_for_people(small_dataset: Dataset, capsys: pytest.CaptureFixture
     assert re.search("no network|no margin: .*; ", capsys.readouterr().out)
 
 
+def test_the_network_is_that_of_the_profile(small_dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    profile = tmp_path / "tip.toml"
+    profile.write_text('name = "tip"\nnetwork = "trained-elsewhere"\n', encoding="utf-8")
+    assert main(["live", str(small_dataset.folder), "--sensor", str(profile), "--no-page"]) == 2
+    assert "the run trained-elsewhere does not exist" in " ".join(capsys.readouterr().err.split())
+
+
 def told_by_a_process(*words: str) -> str:
     """What `sliplens live` says: a process serves one page, and this one has other things to do."""
     ended = subprocess.run(

@@ -30,7 +30,8 @@ class Live:
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[SOURCE]", help=_SOURCE)] = "simulated"
     network: str | None = None
-    """Folder or name of a trained network. If not given, chromatouch-difference for what is simulated, else none."""
+    """Folder or name of a trained network. If not given, that of the profile; chromatouch-difference for what is
+    simulated, else none."""
     reference: Path | None = None
     """Image of the untouched sensor; taken when the picture is still at first if not given."""
     friction: Friction = None
@@ -81,7 +82,7 @@ class Live:
         from sliplens.live import LiveReader
         from sliplens.live.contract import SourceOptions, parse_size
         from sliplens.recordings import TrialFacts
-        from sliplens.recordings.sensor import is_profile
+        from sliplens.recordings.sensor import is_profile, load_profile
 
         if self.list:
             self._list()
@@ -92,12 +93,13 @@ class Live:
         options = SourceOptions(rate_hz=self.rate, size=parse_size(self.size), **wishes)
         names = ("reference", "engine", "device", "seconds", "forces", "friction")
         named = {name: getattr(self, name) for name in names} | {"smoothing_s": self.smoothing, "options": options}
-        named["sensor"] = self.sensor if is_profile(self.sensor) else None
+        profile = named["sensor"] = load_profile(self.sensor) if is_profile(self.sensor) else None
         named |= {"source": open_grip(self.source, options), "options": None} if grips else {"source": self.source}
         told = {name: getattr(self, name) for name in ("sensor", "object", "condition", "day")}
         facts = TrialFacts(trial="live", **told)
         with ExitStack() as stack:
-            reader = stack.enter_context(closing(LiveReader(network=self.network or shipped, **named)))
+            network = self.network or (profile.network if profile else shipped)
+            reader = stack.enter_context(closing(LiveReader(network=network, **named)))
             if reader.doubt is not None:
                 say(reader.doubt, aside=True)
             reader.send_to(*self.sink)
