@@ -112,11 +112,11 @@ class Live:
     @contextmanager
     def _shown(self, reader: "LiveReader", facts: "TrialFacts") -> Iterator[None]:
         """Page of it, if it is wanted; alone it stays when the source has ended."""
-        from sliplens.app import LivePage
-
         if not self.page:
             yield
             return
+        from sliplens.app import LivePage
+
         shown = {"host": self.host, "port": self.port, "record_into": self.record or Path("recorded")}
         with LivePage(reader, facts=facts, **shown) as page:
             say(f"open {page.address}", aside=True)
