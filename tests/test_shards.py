@@ -150,7 +150,7 @@ def test_threads_make_the_same_bytes_and_an_interruption_ends_them(log: Path, ou
 
     with pytest.raises(KeyboardInterrupt):
         make(work, tmp_path / "other", on_progress=interrupt)
-    assert work.tries().keys() < set("abcde")
+    assert len(list((tmp_path / "other").glob("trial=*/*.parquet"))) < 4
     with pytest.raises(ShardError, match="1 of 5"):
         make(work, tmp_path / "other", on_progress=lambda done, _: seen.append(done))
     assert seen[-1] == 12
