@@ -33,10 +33,10 @@ figure, axes = plt.subplots(ncols=3, figsize=(12, 3.8), sharey=True, layout="con
 for ax, (fill, found) in zip(axes, scores.items(), strict=True):
     sl.plot(found, ax)
     ax.set_title(f"{fill}: gain {found.symmetric_gain.mean():.2f}", loc="left")
+    ax.get_legend().remove()
 for ax in axes[1:]:
     ax.set_ylabel("")
-    ax.get_legend().remove()
-axes[0].legend(loc="lower right", fontsize=8)
+figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
 plt.show()
 
 # %%
