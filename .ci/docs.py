@@ -80,11 +80,12 @@ class Page(HTMLParser):
 
 
 def read_pages(site: Path) -> dict[Path, Page]:
-    """Every page of a built site."""
+    """Every page of a built site; below `_static` there are templates of the theme's."""
     pages = {}
     for path in sorted(site.rglob("*.html")):
-        pages[path] = page = Page()
-        page.feed(path.read_text(encoding="utf-8"))
+        if "_static" not in path.relative_to(site).parts:
+            pages[path] = page = Page()
+            page.feed(path.read_text(encoding="utf-8"))
     return pages
 
 
@@ -158,7 +159,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kept", action="store_true", help="try what was built before")
     seconds, warnings = (0.0, 0) if parser.parse_args().kept else build()
-    pages = [path for path in sorted(SITE.rglob("*.html")) if "_modules" not in path.parts]
+    pages = [path for path in sorted(SITE.rglob("*.html")) if not {"_modules", "_static"} & set(path.parts)]
     gallery = [path for path in pages if path.parent.name == "gallery" and path.name.startswith("plot_")]
     ran = {case.attrib["classname"]: case for case in ET.parse(SITE / "gallery.xml").iter("testcase")}
     times = {name: float(case.attrib["time"]) for name, case in ran.items()}
