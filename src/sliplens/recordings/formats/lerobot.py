@@ -96,7 +96,9 @@ def read_layout(folder: Path) -> Layout:
 def read_episodes(layout: Layout, *, camera_key: str) -> list[Episode]:
     """Episodes of a data set and where their frames from a camera lie, in their order."""
     in_video = layout.features[camera_key].dtype == "video"
-    columns = dict.fromkeys(("episode_index", "length", "data/chunk_index", "data/file_index"), "whole numbers")
+    columns: dict[str, str] = dict.fromkeys(
+        ("episode_index", "length", "data/chunk_index", "data/file_index"), "whole numbers"
+    )
     if in_video:
         columns |= {f"videos/{camera_key}/{name}": "whole numbers" for name in ("chunk_index", "file_index")}
         columns[f"videos/{camera_key}/from_timestamp"] = "numbers"
