@@ -54,11 +54,8 @@ TASKS = {
     "live": ("Read a running camera, and hold what it feels", ("live", "grip", "hold")),
 }
 """What users come for, and the commands that do it, in their order."""
-_SEVERAL = {
-    "allow_large": "LIMIT ...",
-    "force_columns": "NAME ...",
-    "bad_frames": "FIRST LAST ...",
-}  # their help
+# options of several words, as they are shown
+_SEVERAL = {"allow_large": "LIMIT ...", "force_columns": "NAME ...", "bad_frames": "FIRST LAST ..."}
 
 
 @dataclass(frozen=True, kw_only=True)
