@@ -15,7 +15,7 @@ from sliplens.models import Run, load_checkpoint
 from sliplens.recordings import Dataset
 from sliplens.results import Explained, load_explained
 from sliplens.results.faithfulness import DeletionScores
-from sliplens.study import explain_frames, frames_from_dataset, score_explanations
+from sliplens.study import explain_frames, frames_from_dataset, score_explained
 from sliplens.study.explaining import network_inputs
 
 METHODS = ("grad-cam", "integrated-gradients")
@@ -158,7 +158,7 @@ def test_a_folder_of_another_stage_is_refused(tmp_path: Path):
 
 def test_scores_follow_from_the_stored_curves(trained: Run, explanations: Path, tmp_path: Path):
     explained = load_explained(explanations)
-    save_result(score_explanations(trained, explained, steps=8), tmp_path)
+    save_result(score_explained(trained, explained, steps=8), tmp_path)
     scored = load_result(tmp_path, DeletionScores, command="sliplens score")
     assert set(scored.methods) == {*METHODS, "random"}
     for method, score in scored.methods.items():
@@ -173,7 +173,7 @@ def test_scores_follow_from_the_stored_curves(trained: Run, explanations: Path, 
 
 def test_explanations_of_another_network_are_refused(raw_run: Path, explanations: Path):
     with pytest.raises(CheckpointError, match="made with another network; explain the frames again with this run"):
-        score_explanations(load_checkpoint(raw_run), load_explained(explanations))
+        score_explained(load_checkpoint(raw_run), load_explained(explanations))
 
 
 def test_alarms_say_when_the_fill_decides_and_when_no_method_beats_chance(trained: Run, explanations: Path):
@@ -181,6 +181,6 @@ def test_alarms_say_when_the_fill_decides_and_when_no_method_beats_chance(traine
         def forward(self, images: torch.Tensor) -> torch.Tensor:
             return torch.full((len(images), 1), 0.7)
 
-    result = score_explanations(replace(trained, model=Stubborn()), load_explained(explanations), steps=4)
+    result = score_explained(replace(trained, model=Stubborn()), load_explained(explanations), steps=4)
     assert "the fill decides in 2 of 2 frames" in result.alarms[0]
     assert "grad-cam does not beat a random order (1.000 against 1.000)" in result.alarms

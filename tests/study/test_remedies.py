@@ -5,15 +5,16 @@ import torch
 from sliplens.codec import load_result, save_result
 from sliplens.faithfulness import deletion_order
 from sliplens.results.faithfulness import Remedies
+from sliplens.study import score_explained
 from sliplens.study.choice import Material
-from sliplens.study.scoring import RemedialDeletion, score_explanations
+from sliplens.study.scoring import RemedialDeletion
 
 STEPS = 8
 
 
 @pytest.fixture(scope="module")
 def remedies(material: Material) -> Remedies:
-    grey = score_explanations(material.trained, material.explained, steps=STEPS)
+    grey = score_explained(material.trained, material.explained, steps=STEPS)
     return RemedialDeletion(material=material, grey=grey, steps=STEPS).make()
 
 

@@ -13,7 +13,6 @@ from sliplens.plots.style import (
     BLACK,
     BLUE,
     CONDITION_COLOURS,
-    CONTROL,
     GREEN,
     GREY,
     INPUT_COLOURS,
@@ -105,7 +104,7 @@ def plot_faithfulness(curves: Mapping[str, DeletionCurve], *, pixels: int, ax: A
         share = 100 * curve.pixels_removed / pixels
         low, high = np.quantile(curve.scores, [0.25, 0.75], axis=0)
         ax.fill_between(share, low, high, color=colour, alpha=0.12, linewidth=0)
-        line = {"linestyle": METHOD_LINES.get(name, "-"), "linewidth": 2.2 if name != CONTROL else 2.4}
+        line = {"linestyle": METHOD_LINES.get(name, "-"), "linewidth": 2.2 if name != CHANCE else 2.4}
         ax.plot(share, curve.scores.mean(axis=0), color=colour, label=method_name(name), **line)
     ax.set(xlabel="Pixels removed (%)", ylabel="Deletion score D (no unit)", xlim=(0, 100), ylim=(0, 1.03))
     ax.legend()

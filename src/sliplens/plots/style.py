@@ -35,7 +35,6 @@ INPUT_COLOURS = {"raw": ORANGE, "difference": BLUE}
 CONDITION_COLOURS = {"dry": ORANGE, "wet": BLUE}
 SOURCE_NAMES = {"simulated": "simulated touch", "real": "real touch"}
 
-CONTROL = CHANCE
 METHOD_NAMES = {
     "grad-cam": "Grad-CAM",
     "integrated-gradients": "Integrated Gradients",
@@ -57,7 +56,7 @@ METHOD_NAMES = {
     "local-change": "Local change (control)",
     "weights-1": "All channels alike (control)",
     "centre": "Centred blob (control)",
-    CONTROL: "Random order (control)",
+    CHANCE: "Random order (control)",
     "oracle": "The truth itself",
     "degraded-oracle": "The truth, damaged",
 }
@@ -73,7 +72,7 @@ METHOD_COLOURS = {
     "grad-cam-thesis": "#F2A37E",
     "integrated-gradients-thesis": "#A9A9A9",
     "lrp": GREY,
-    CONTROL: BLACK,
+    CHANCE: BLACK,
 }
 METHOD_LINES: dict[str, Any] = {
     "grad-cam": "-",
@@ -87,7 +86,7 @@ METHOD_LINES: dict[str, Any] = {
     "grad-cam-thesis": (0, (5, 1)),
     "integrated-gradients-thesis": (0, (5, 3)),
     "lrp": (0, (1, 1)),
-    CONTROL: ":",
+    CHANCE: ":",
 }
 FILL_NAMES = {
     "reference": "untouched frame",

@@ -18,7 +18,7 @@ from jaxtyping import Float64
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.plots import style
 from sliplens.results.evaluation import Predictions
-from sliplens.results.faithfulness import Comparison, DeletionCurve, DeletionScores, RemovalCurve, RemovalScores
+from sliplens.results.faithfulness import CHANCE, Comparison, DeletionCurve, DeletionScores, RemovalCurve, RemovalScores
 from sliplens.results.study import Choice, MarkerEffects, Roughness
 
 CITATION = (
@@ -84,9 +84,9 @@ def compare_deletion(first: DeletionCurve, second: DeletionCurve, *, rng: np.ran
 
 def against_control(scored: DeletionScores, method: str, *, rng: np.random.Generator) -> Difference | None:
     """Difference of a method's D_AUC from the random control's; None for the control itself or without one."""
-    if method == style.CONTROL or not {method, style.CONTROL} <= set(scored.curves):
+    if method == CHANCE or not {method, CHANCE} <= set(scored.curves):
         return None
-    return compare_deletion(scored.curves[method], scored.curves[style.CONTROL], rng=rng)
+    return compare_deletion(scored.curves[method], scored.curves[CHANCE], rng=rng)
 
 
 def compare_gain(*pairs: tuple[RemovalCurve, RemovalCurve], rng: np.random.Generator) -> Difference | None:

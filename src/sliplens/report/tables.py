@@ -8,7 +8,6 @@ import numpy as np
 
 from sliplens.intervals import Difference
 from sliplens.plots.style import (
-    CONTROL,
     FILL_NAMES,
     UNIT_NAMES,
     UNKNOWN,
@@ -42,6 +41,7 @@ from sliplens.report.comparisons import (
 from sliplens.report.results import Results
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import (
+    CHANCE,
     DeletionScores,
     Lead,
     MethodScore,
@@ -151,7 +151,7 @@ def table_deletion(scores: Mapping[str, DeletionScores], *, rng: np.random.Gener
     rows, gaps = [], []
     for name, method, score in _each_method(scores):
         scored = scores[name]
-        lowest = min((own.mean for other, own in scored.methods.items() if other != CONTROL), default=None)
+        lowest = min((own.mean for other, own in scored.methods.items() if other != CHANCE), default=None)
         gaps.append(against_control(scored, method, rng=rng))
         against = _interval(gaps[-1], digits=3)
         last, thesis = decimals(score.last_step_mean, 3), _thesis_score(name, method, scored.methods)
@@ -442,7 +442,7 @@ def table_localisation(truth: Truth) -> Table:
         found, lead = truth.methods[name], truth.methods[name].lead_over_controls
         gaps = (found.shapley, lead and lead.gap, found.network, found.margin)
         shares = [percent(own[region]) for own in (found.mass, found.rank) for region in REGIONS]
-        title = "Random map (control)" if name == CONTROL else method_name(name)  # here it is a map, not an order
+        title = "Random map (control)" if name == CHANCE else method_name(name)  # here it is a map, not an order
         rows.append((title, *shares, *map(_interval, gaps)))
     nothing = ("A map that knows nothing", *(percent(truth.areas[region]) for region in REGIONS * 2), *4 * ["0"])
     return make_table(

@@ -12,7 +12,6 @@ from scipy.stats import binomtest
 
 from sliplens.intervals import FEWEST_UNITS, Difference
 from sliplens.plots.style import (
-    CONTROL,
     FILL_NAMES,
     conditions_in_order,
     decimals,
@@ -40,7 +39,7 @@ from sliplens.report.comparisons import (
 )
 from sliplens.report.results import Results
 from sliplens.results.explanation import Explained
-from sliplens.results.faithfulness import DeletionScores, Lead, RemovalScores
+from sliplens.results.faithfulness import CHANCE, DeletionScores, Lead, RemovalScores
 from sliplens.results.grip import Grip
 from sliplens.results.study import Localisation, Truth
 
@@ -329,12 +328,12 @@ def _faithfulness(scored: DeletionScores, *, rng: np.random.Generator) -> Statem
     topic = f"Faithfulness, {input_name(scored.input).lower()}"
     if scored.source != "simulated":
         topic += f", {source_name(scored.source)}"
-    methods = {name: score for name, score in scored.methods.items() if name != CONTROL}
+    methods = {name: score for name, score in scored.methods.items() if name != CHANCE}
     if not methods:
         return Statement(topic=topic, text="No method was scored.", tone="caution")
     best = min(methods, key=lambda name: methods[name].mean)
     text = f"{method_name(best)} has the lowest deletion score, {methods[best].mean:.3f} ± {methods[best].sd:.3f}"
-    control = scored.methods.get(CONTROL)
+    control = scored.methods.get(CHANCE)
     if control is None:
         text += "; no random control was scored, so whether that is better than chance is not known."
         return Statement(topic=topic, text=text, tone="caution")

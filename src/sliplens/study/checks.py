@@ -229,7 +229,7 @@ class Randomising(MaterialStage[Randomisation]):
     """Maps of a few frames while weights are drawn anew from the output on: how far they change, a method a shard."""
 
     piece = RandomisedMethod
-    title = "Drawing weights anew"
+    title = "Drawing weights anew, layer by layer"
 
     seed: int = 0
 

@@ -337,9 +337,9 @@ class MaterialStage(Stage[Result]):
     material: Material
 
     @property
-    def on_gpu(self) -> bool:
-        """Whether the network runs on a graphics card."""
-        return self.material.trained.device.type != "cpu"
+    def trained(self) -> Run:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Network that was explained."""
+        return self.material.trained
 
 
 _TRIALS = 1000

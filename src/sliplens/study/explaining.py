@@ -233,11 +233,6 @@ class Explaining(Stage[Explained]):
     chosen: ChosenFrames
     explainers: Mapping[str, Explainer]
 
-    @property
-    def on_gpu(self) -> bool:
-        """Whether the network runs on a graphics card."""
-        return self.trained.device.type != "cpu"
-
     def prepare(self) -> Find:
         """Explain one frame with one method."""
         run, references = self.trained, self.chosen.references

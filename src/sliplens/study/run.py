@@ -214,16 +214,6 @@ def load_network(network: Network, name: str, *, device: str = "cpu") -> Run:
     return run
 
 
-_TITLES = {
-    "explain": "Explaining frames",
-    "score": "Deleting pixels, as the thesis did",
-    "remedies": "Trying the thesis's remedies",
-    "control": "Explaining networks with new weights",
-    "faithfulness": "Removing parts under every fill",
-    "randomisation": "Drawing weights anew, layer by layer",
-    "map-quality": "Measuring how maps look",
-    "truth": "Putting markers back",
-}
 _NEEDED_BY = {"score": {"score", "remedies"}, "control": {"faithfulness", "truth"}}
 """Tests that need a stage, where it is not that test alone."""
 
@@ -307,7 +297,7 @@ class _Network:
     def stage(self, name: str) -> Stage:
         """A stage, ready to be made anywhere; of one at a time."""
         if name not in self._ready:
-            self._ready = {name: _WORKS[name](self)}
+            self._ready = {name: _WORKS[name][1](self)}
         return self._ready[name]
 
     def explaining(self) -> Explaining:
@@ -317,6 +307,11 @@ class _Network:
         images, find = run.encoding.normalise(frames.images), lambda: seen_places(run, chosen, markers)
         markers = self.result("states").markers
         return Explaining(trained=run, chosen=frames, explainers=with_markers(study.explainers, images, find))
+
+    def deletion(self) -> Deletion:
+        """Deletion as the thesis did it."""
+        study = self.study
+        return Deletion(trained=self.run, explained=self.material.explained, steps=study.steps, seed=study.seed)
 
     def removal(self) -> Removal:
         """Removal under every setting, and in simulation of markers that are put back."""
@@ -347,18 +342,23 @@ class _Network:
         )
 
 
-_WORKS: dict[str, Callable[[_Network], Stage]] = {
-    "explain": _Network.explaining,
-    "score": lambda of: Deletion(
-        trained=of.run, explained=of.material.explained, steps=of.study.steps, seed=of.study.seed
+_WORKS: dict[str, tuple[type[Stage], Callable[[_Network], Stage]]] = {
+    "explain": (Explaining, _Network.explaining),
+    "score": (Deletion, _Network.deletion),
+    "remedies": (
+        RemedialDeletion,
+        lambda of: RemedialDeletion(material=of.material, grey=of.result("score"), seed=of.study.seed),
     ),
-    "remedies": lambda of: RemedialDeletion(material=of.material, grey=of.result("score"), seed=of.study.seed),
-    "control": lambda of: Untrained(material=of.material, seed=of.study.seed),
-    "faithfulness": _Network.removal,
-    "randomisation": lambda of: Randomising(material=of.material, seed=of.study.seed),
-    "map-quality": lambda of: Measuring(material=of.material, data=of.study.data, seed=of.study.seed),
-    "truth": _Network.by_truth,
+    "control": (Untrained, lambda of: Untrained(material=of.material, seed=of.study.seed)),
+    "faithfulness": (Removal, _Network.removal),
+    "randomisation": (Randomising, lambda of: Randomising(material=of.material, seed=of.study.seed)),
+    "map-quality": (
+        Measuring,
+        lambda of: Measuring(material=of.material, data=of.study.data, seed=of.study.seed),
+    ),
+    "truth": (JudgingByTruth, _Network.by_truth),
 }
+"""Stages of a network in their order, and what makes each ready."""
 
 
 @dataclass(kw_only=True)
@@ -405,7 +405,7 @@ class _Stages:
             "randomisation": {"stages": CASCADE, "statistics": "images"},
             "truth": {"pairs": TRUTH_PAIRS, **_CONTROLS},
         }
-        for test in _WORKS:
+        for test, (kind, _) in _WORKS.items():
             asked = test == "explain" or not _NEEDED_BY.get(test, {test}).isdisjoint(tests)
             if not asked or (test == "truth" and not judging.redrawn):
                 continue
@@ -414,7 +414,7 @@ class _Stages:
                 stage, own = judging.open(name).stage(test), {"crew": crew, "name": (name, test)}
                 return stage.make(parts, **own, retry_failed=retry_failed, on_progress=count)
 
-            config, title = self._about(name) | depends.get(test, {}), f"{_TITLES[test]} ({name})"
+            config, title = self._about(name) | depends.get(test, {}), f"{kind.title} ({name})"
             self.found[name][test] = self._run(test, name, config, title, work)
 
     def time(self, name: str, judging: _Judging) -> None:

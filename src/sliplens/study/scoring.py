@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,6 +32,7 @@ from sliplens.models import Run
 from sliplens.progress import OnProgress, continued
 from sliplens.results.explanation import Explained, ExplainedFrame
 from sliplens.results.faithfulness import (
+    CHANCE,
     Agreement,
     Comparison,
     DeletionScores,
@@ -51,7 +51,6 @@ from sliplens.study.choice import Material, MaterialStage, trial_seed
 from sliplens.study.explaining import network_inputs
 from sliplens.study.stages import Find, Stage, join_trials, trial_shards
 
-CONTROL = "random"
 STEPS = 28
 """An eighth of the thesis's 224: the mean over the steps differs from that over all of them by less than a step."""
 BACKGROUND = {"difference": "black", "raw": "white"}
@@ -71,36 +70,6 @@ def require_same_network(trained: Run, explained: Explained) -> None:
         )
 
 
-def score_explanations(
-    trained: Run,
-    explained: Explained,
-    *,
-    fill: str = "grey",
-    steps: int | None = None,
-    seed: int = 0,
-    parts: Path | None = None,
-    on: str = "serial",
-    retry_failed: bool = False,
-    on_progress: OnProgress | None = None,
-) -> DeletionScores:
-    """Delete the most salient pixels for every method and a random order, in so many steps or the image's height.
-
-    `parts` is a folder, of this network, these explanations and options alone, that keeps the answers of each trial as
-    soon as they are there; `on` says where they are made, a row of `shards.EXECUTORS`, and `retry_failed` tries those
-    again that failed before.
-
-    Raises
-    ------
-    CheckpointError
-        If the explanations are of another network.
-    ShardError
-        If some of several trials failed again and again, when all others are there.
-    """
-    require_same_network(trained, explained)
-    work = Deletion(trained=trained, explained=explained, fill=fill, steps=steps, seed=seed)
-    return work.make(parts, on=on, retry_failed=retry_failed, on_progress=on_progress)
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Answers:
     """Answers on the frames of a trial while pixels go, by the order in which they go; the first with all of them."""
@@ -113,7 +82,7 @@ class Deletion(Stage[DeletionScores]):
     """Deletion of the most salient pixels by every method and in a random order, a trial a shard."""
 
     piece = _Answers
-    title = "Deleting pixels"
+    title = "Deleting pixels, as the thesis did"
 
     trained: Run
     explained: Explained
@@ -121,11 +90,6 @@ class Deletion(Stage[DeletionScores]):
     steps: int | None = None
     """The image's height if None."""
     seed: int = 0
-
-    @property
-    def on_gpu(self) -> bool:
-        """Whether the network runs on a graphics card."""
-        return self.trained.device.type != "cpu"
 
     def shards(self) -> Iterator[Shard]:
         """Trials, whose maps are counted with a random one."""
@@ -153,7 +117,7 @@ class Deletion(Stage[DeletionScores]):
         explained, removed = self.explained, self._removed
         answers = join_trials(explained, [one.answers for one in pieces])
         curves = {name: _split(name, removed, own, explained) for name, own in answers.items()}
-        control = answers[CONTROL]
+        control = answers[CHANCE]
         return DeletionScores(
             input=explained.input,
             source=explained.source,
@@ -302,7 +266,7 @@ def _orders(explained: Explained, *, seed: int) -> dict[str, Int[np.ndarray, "fr
     """Pixels of each frame by method, most salient first, and a random order."""
     rng, shape = np.random.default_rng(seed), (explained.image_size, explained.image_size)
     orders = {name: saliency_orders(maps, shape) for name, maps in explained.saliency.items()}
-    return orders | {CONTROL: np.stack([random_order(shape, rng=rng) for _ in explained.frames])}
+    return orders | {CHANCE: np.stack([random_order(shape, rng=rng) for _ in explained.frames])}
 
 
 def _curve(method: str, frame: ExplainedFrame, removed: np.ndarray, answers: np.ndarray, base: float) -> DeletionTable:
@@ -355,9 +319,9 @@ def _inserted(curves: Sequence[DeletionTable], explained: Explained) -> list[Del
 
 def _method_alarms(curves: _Curves) -> Iterator[str]:
     """Say where the score does not measure the map: one that does not beat a random order has shown nothing."""
-    chance = float(np.mean([curve.score.mean() for curve in curves[CONTROL]]))
+    chance = float(np.mean([curve.score.mean() for curve in curves[CHANCE]]))
     for name, own in curves.items():
-        if name == CONTROL:
+        if name == CHANCE:
             continue
         means, last = (np.array(values) for values in zip(*((c.score.mean(), c.score[-1]) for c in own), strict=True))
         if len({len(curve) for curve in own}) == 1:  # where curves stop early, the last step is the map's doing
@@ -423,7 +387,7 @@ class Removal(MaterialStage[RemovalScores]):
     """
 
     piece = _SettingCurves
-    title = "Removing parts"
+    title = "Removing parts under every fill"
 
     maps: Influence
     settings: Sequence[Setting] = SETTINGS

@@ -11,6 +11,7 @@ import numpy as np
 
 from sliplens.codec import load_result, save_result
 from sliplens.files import scratch_folder
+from sliplens.models import Run
 from sliplens.models.engines import counting_passes
 from sliplens.progress import OnProgress
 from sliplens.results.explanation import Explained
@@ -27,7 +28,15 @@ class Stage(Work, Generic[Result]):
     piece: ClassVar[type]
     """Record of a shard."""
     title: ClassVar[str]
-    """What is done, for `read_status`."""
+    """What is done, as a person is told."""
+
+    trained: Run
+    """Network that the stage asks."""
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether the network runs on a graphics card."""
+        return self.trained.device.type != "cpu"
 
     @abstractmethod
     def shards(self) -> Iterator[Shard]:

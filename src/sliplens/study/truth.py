@@ -37,7 +37,7 @@ from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset
 from sliplens.recordings.trial import SLIPS
 from sliplens.results.explanation import Explained
-from sliplens.results.faithfulness import is_control
+from sliplens.results.faithfulness import CHANCE, is_control
 from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTest, OracleTest, Truth
 from sliplens.shards import Shard, shard
 from sliplens.simulation.intervention import (
@@ -181,8 +181,6 @@ def find_places(frame: StagedFrame, *, image_size: int) -> Places:
 
 TRUE_FILL = "true"
 ORACLE, DEGRADED = "oracle", "degraded-oracle"
-RANDOM = "random"
-"""A map of even noise."""
 TRUTH_FILLS = ("reference", "grey", "background", "blur")
 """Fills that the oracle is tried under; the true one always is. The noisy-linear one takes longer than all of them."""
 TRUTH_PAIRS = 400
@@ -356,11 +354,6 @@ class JudgingByTruth(Stage[Truth]):
         for fill in self.fills:
             get_fill(fill)
 
-    @property
-    def on_gpu(self) -> bool:
-        """Whether the network runs on a graphics card."""
-        return self.trained.device.type != "cpu"
-
     def shards(self) -> Iterator[Shard]:
         """All frames."""
         for index, frame in enumerate(self.explained.frames):
@@ -437,7 +430,7 @@ class JudgingByTruth(Stage[Truth]):
             for sign, own in zip(explained.towards, effects, strict=True)
         ]
         judged = dict(self.maps) | {
-            RANDOM: np.random.default_rng(seed).random((len(frames), size, size)),
+            CHANCE: np.random.default_rng(seed).random((len(frames), size, size)),
             ORACLE: _paint(places, [own["shapley"] for own in along]),
             DEGRADED: _paint(places, [own["shuffled"] for own in along]),
         }
@@ -485,7 +478,7 @@ def _judge(
     }
     # a map that tells no marker from another ranks them as chance does
     ranks = {name: np.nan_to_num(own["shapley"]) for name, own in alike.items()}
-    controls = {name: own for name, own in ranks.items() if is_control(name) and name != RANDOM}
+    controls = {name: own for name, own in ranks.items() if is_control(name) and name != CHANCE}
     rng, found = np.random.default_rng(seed), {}
     interval = partial(mean_of_defined, clusters=clusters, seed=seed, limits=(-1.0, 1.0))
     methods = [name for name in maps if not is_control(name) and name not in (ORACLE, DEGRADED)]

@@ -44,7 +44,7 @@ from sliplens.study.explaining import (
     nearest_frame,
     require_methods,
 )
-from sliplens.study.scoring import require_same_network, score_explanations
+from sliplens.study.scoring import Deletion, require_same_network
 
 RECOMMENDED_METHODS = ("shapley-marker", "poly-cam")
 """Methods that explain where none is named, the quickest first."""
@@ -196,8 +196,8 @@ def score_explained(
     explained = explanations if isinstance(explanations, Explained) else load_explained(explanations)
     require_same_network(trained, explained)
     title = f"Deleting pixels ({explained.input}, {explained.source})"
-    own: dict[str, Any] = {"fill": fill, "steps": steps, "seed": seed, "on": on, "retry_failed": retry_failed}
-    score = partial(score_explanations, trained, explained, **own)
+    work = Deletion(trained=trained, explained=explained, fill=fill, steps=steps, seed=seed)
+    score = partial(work.make, on=on, retry_failed=retry_failed)
     if out is None:
         with stage(on_progress, title) as count:
             return score(on_progress=count)
