@@ -24,16 +24,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from adapt import SENSORS
-from networks import r2, require_disjoint
+from networks import draw_in_contact, film_frames, fresh_days, r2, require_disjoint
 from sliplens.errors import SliplensError
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
-from sliplens.simulation import PRESETS, SimulationRecipe
+from sliplens.simulation import SimulationRecipe
 from sliplens.simulation.plan import plan_trials
 from sliplens.simulation.trials import prepare_trial
 
-DAYS, TRIALS, FRAMES, DRAWN = 20, 3, 40, 10
-"""Days; trials of a day and condition; frames of a trial, and how many of them with contact are drawn."""
+DAYS = 20
 RESAMPLES = 2000
 
 
@@ -49,17 +48,7 @@ class Read:
 
 def recipes() -> dict[str, SimulationRecipe]:
     """The sets: days, sensors and trials of a series of their own."""
-    days = DAYS + 1  # the first trains, as a recipe wants it, and is not used
-    varied = replace(
-        PRESETS["varied"],
-        series="inputs, test",
-        frames_per_trial=FRAMES,
-        days=days,
-        test_days=DAYS,
-        dry_trials=TRIALS * days,
-        wet_trials=TRIALS * DAYS,
-        nuisances=PRESETS["thesis"].nuisances,
-    )
+    varied = fresh_days("inputs, test", DAYS)
     return {"chromatouch": varied} | {name: replace(varied, sensor=sensor) for name, sensor in SENSORS.items()}
 
 
@@ -73,10 +62,8 @@ def read(runs: dict[str, Run], recipe: SimulationRecipe, *, trials: int | None) 
     answers: dict[str, list[np.ndarray]] = {name: [] for name in runs}
     for plan in plans:
         loading, film = prepare_trial(plan)
-        contact = np.flatnonzero(np.isfinite(loading.safety_margin))
-        at = np.sort(rng.choice(contact, min(DRAWN, len(contact)), replace=False))
-        frames = np.concatenate([film.draw(slice(one, one + 1)).numpy() for one in at.tolist()])
-        reference = film.draw_reference().numpy()
+        at = draw_in_contact(loading, rng=rng)
+        frames, reference = film_frames(film, at)
         for name, run in runs.items():
             answers[name].append(run.estimate(run.encode(frames, reference)).margin)
         margin.append(loading.safety_margin[at])

@@ -21,13 +21,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int, UInt8
 
 from sliplens.errors import SliplensError
 from sliplens.friction import Friction
 from sliplens.models import Estimate, Run
 from sliplens.models.checkpoint import load
 from sliplens.simulation import PRESETS, SimulationRecipe
+from sliplens.simulation.filming import Film
+from sliplens.simulation.loading import Loading
 from sliplens.simulation.plan import TrialPlan, plan_trials
 from sliplens.simulation.trials import prepare_trial
 
@@ -49,19 +51,23 @@ class Seen:
     """Whether the contact was pulled: frames before are read at once, by anyone."""
 
 
-def test_recipe(*, selection: bool) -> SimulationRecipe:
-    """Fresh days; a series of its own for the selection and for the test, which share no day, sensor or trial."""
-    days = DAYS + 1  # the first trains, as a recipe wants it, and is not used
+def fresh_days(series: str, days: int) -> SimulationRecipe:
+    """Days to test on, in a series of their own: series share no day, sensor or trial."""
     return replace(
         PRESETS["varied"],
-        series="networks, selection" if selection else "networks, test",
+        series=series,
         frames_per_trial=FRAMES,
-        days=days,
-        test_days=DAYS,
-        dry_trials=TRIALS * days,
-        wet_trials=TRIALS * DAYS,
+        days=days + 1,  # the first trains, as a recipe wants it, and is not used
+        test_days=days,
+        dry_trials=TRIALS * (days + 1),
+        wet_trials=TRIALS * days,
         nuisances=PRESETS["thesis"].nuisances,
     )
+
+
+def test_recipe(*, selection: bool) -> SimulationRecipe:
+    """Days of the selection, or of the test."""
+    return fresh_days("networks, selection" if selection else "networks, test", DAYS)
 
 
 def require_disjoint(plans: list[TrialPlan]) -> None:
@@ -86,6 +92,20 @@ def require_disjoint(plans: list[TrialPlan]) -> None:
             )
 
 
+def draw_in_contact(loading: Loading, *, rng: np.random.Generator) -> Int[np.ndarray, " frames"]:
+    """A few of the frames with contact, in their order."""
+    contact = np.flatnonzero(np.isfinite(loading.safety_margin))
+    return np.sort(rng.choice(contact, min(DRAWN, len(contact)), replace=False))
+
+
+def film_frames(
+    film: Film, at: Int[np.ndarray, " frames"]
+) -> tuple[UInt8[np.ndarray, "frames height width 3"], UInt8[np.ndarray, "height width 3"]]:
+    """Frames of a trial by their numbers, and the sensor untouched."""
+    frames = np.concatenate([film.draw(slice(one, one + 1)).numpy() for one in at.tolist()])
+    return frames, film.draw_reference().numpy()
+
+
 def draw(run: Run, plan: TrialPlan, *, rng: np.random.Generator, before_slip: int = 0) -> Seen:
     """Draw and encode a few frames of a trial: at random among those with contact, or the last before it slips."""
     loading, film = prepare_trial(plan)
@@ -93,11 +113,10 @@ def draw(run: Run, plan: TrialPlan, *, rng: np.random.Generator, before_slip: in
         slip = int(np.argmax(loading.safety_margin == 0))
         at = np.arange(slip - before_slip, slip)
     else:
-        contact = np.flatnonzero(np.isfinite(loading.safety_margin))
-        at = np.sort(rng.choice(contact, min(DRAWN, len(contact)), replace=False))
-    frames = np.concatenate([film.draw(slice(one, one + 1)).numpy() for one in at.tolist()])
+        at = draw_in_contact(loading, rng=rng)
+    frames, reference = film_frames(film, at)
     return Seen(
-        inputs=run.encode(frames, film.draw_reference().numpy()),
+        inputs=run.encode(frames, reference),
         margin=loading.safety_margin[at],
         ratio=loading.tangential_force_n[at] / loading.normal_force_n[at],
         pulled=loading.safety_margin[at] < 1,

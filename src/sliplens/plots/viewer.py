@@ -51,7 +51,7 @@ from sliplens.recordings.trial import OUTSIDE, SLIPS, STICKS, Labels, labels_of_
 from sliplens.results.explanation import Explained
 
 if TYPE_CHECKING:
-    from rerun import RecordingStream, TimeColumn
+    from rerun import RecordingStream
     from rerun.blueprint import Blueprint, TimeSeriesView
 
 
@@ -213,18 +213,19 @@ SAMPLE_LINES = {"x (N), as recorded": VERMILLION, "y (N), as recorded": GREEN, "
 
 
 def lay_out(
+    viewed: Viewed,
     *,
-    size: tuple[int, int],
     factor: float,
-    highest_ratio: float,
+    friction: Float[np.ndarray, " frames"] | None,
     truth: bool,
-    sensor: bool,
-    forced: bool,
     methods: Sequence[str] = (),
 ) -> "Blueprint":
-    """Lay out a trial: what is seen at first sight, before anything is moved."""
-    rrb = require_rerun().blueprint
-    height, width = size
+    """Lay out a trial: what is seen at first sight, before anything is moved.
+
+    `factor`: of the brightness of its differences; `friction`: the static one of each frame, where that is known.
+    """
+    rrb, trial = require_rerun().blueprint, viewed.trial
+    height, width = trial.reference.shape[:2]
     bounds = rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height))
     pictures = (
         ("camera", f"camera T_n{': contact, stick zone, markers' if truth else ''}"),
@@ -235,16 +236,15 @@ def lay_out(
         rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds) for origin, name in pictures
     )
     states = rrb.StateTimelineView(origin="state", name="contact state")
-    charts = [
-        _chart("margin", "safety margin Γ and stick ratio (%)", "LeftBottom", (-5.0, 105.0)),
-        *([_chart("force", "forces (N)", "RightBottom")] if forced else []),
-        *(
-            [_chart("ratio", "F_t / F_n in contact, beside friction", "RightBottom", (0.0, highest_ratio))]
-            if forced
-            else []
-        ),
-        *([_chart("sensor", "force sensor, as recorded (N)", "RightBottom")] if sensor else []),
-    ]
+    charts = [_chart("margin", "safety margin Γ and stick ratio (%)", "LeftBottom", (-5.0, 105.0))]
+    if np.isfinite(trial.normal_force_n).any():
+        frictions = trial.friction_coefficient if friction is None else friction
+        highest = float(np.max(frictions, where=np.isfinite(frictions), initial=0))
+        span = 0.0, end_of_ratio(force_ratio(trial), highest)
+        charts.append(_chart("force", "forces (N)", "RightBottom"))
+        charts.append(_chart("ratio", "F_t / F_n in contact, beside friction", "RightBottom", span))
+    if viewed.forces is not None:
+        charts.append(_chart("sensor", "force sensor, as recorded (N)", "RightBottom"))
     # a map is as large as the network's image, whatever the camera's
     maps = [
         rrb.Spatial2DView(origin=f"map/{method}", name=f"map by {method_name(method)}, at its frame")
@@ -316,12 +316,14 @@ def _plain(words: str) -> str:
 _STATE_COLOURS = {str(state): colour for state, colour in STATE_COLOURS.items()}
 _LABEL_COLOURS = {"valid": GREEN, "not valid": GREY}
 _SAMPLES_TOGETHER = 2**16
-
-
-def clock(time_s: Float[np.ndarray, " _"], frames: Int[np.ndarray, " _"]) -> "list[TimeColumn]":
-    """Both timelines of some frames: `time`, on the clock of the camera, and `frame`."""
-    rerun = require_rerun()
-    return [rerun.TimeColumn("time", duration=_nanoseconds(time_s)), rerun.TimeColumn("frame", sequence=frames)]
+_PNG = "image/png"
+_TOGETHER = 8  # frames that are sent together: a megabyte or so, as much as Rerun itself sends at once
+_OPACITY = 0.35
+_HALF_PX = 0.5  # Rerun's pixels reach from one whole number to the next, ours have their centres there
+_PREDICTED = {
+    "trial": "texts", "frame": "whole numbers", "prediction": "numbers", "low_90": "numbers", "high_90": "numbers"
+}  # fmt: skip
+_TRACKED = {"trial": "texts", "frame": "whole numbers", "x_px": "numbers", "y_px": "numbers", "marker": "whole numbers"}
 
 
 def rgba(colour: str) -> list[int]:
@@ -329,40 +331,168 @@ def rgba(colour: str) -> list[int]:
     return [round(255 * part) for part in to_rgba(colour)]
 
 
-def log_numbers(stream: "RecordingStream", trial: Recording, static_friction: Float[np.ndarray, " _"] | None) -> None:
-    """Log forces, their ratio where something touches, and labels: a line each."""
-    normal = trial.normal_force_n
-    margin, sigma = 100 * trial.safety_margin, trial.safety_margin_sigma
-    lines = {
-        "force/normal": normal,
-        "force/tangential": trial.tangential_force_n,
-        "force/limit": trial.friction_coefficient * normal,
-        "ratio/tangential_to_normal": force_ratio(trial),
-        "margin/gamma": margin,
-        "margin/stick_ratio": 100 * trial.stick_ratio,
-    }
-    if static_friction is None:
-        lines["ratio/friction"] = trial.friction_coefficient
-    else:
-        lines["ratio/static_friction"] = static_friction
-    if sigma is not None:
-        lines |= {"margin/band/high": margin + 100 * sigma, "margin/band/low": margin - 100 * sigma}
-    _log_lines(stream, lines, clock(trial.time_s, np.arange(len(trial))))
+@dataclass(frozen=True, kw_only=True)
+class _Log:
+    """Stream of a trial, on both timelines: `time`, on the clock of the camera, and `frame`.
 
+    What is not known is NaN: there a line breaks.
+    """
 
-def _log_lines(stream: "RecordingStream", lines: dict[str, Float[np.ndarray, " _"]], times: "list[TimeColumn]") -> None:
-    rerun = require_rerun()
-    for entity, values in lines.items():
-        name, colour = LINES[entity]
-        width = 1.0 if entity.endswith(("high", "low")) else 2.0
-        stream.log(entity, rerun.SeriesLines(names=name, colors=[rgba(colour)], widths=width), static=True)
-        stream.send_columns(entity, times, rerun.Scalars.columns(scalars=values))
+    stream: "RecordingStream"
+    rerun: ModuleType
+    trial: Recording
 
+    def fixed(self, entity: str, what: object) -> None:
+        """Log what no frame changes."""
+        self.stream.log(entity, what, static=True)
 
-_PREDICTED = {
-    "trial": "texts", "frame": "whole numbers", "prediction": "numbers", "low_90": "numbers", "high_90": "numbers"
-}  # fmt: skip
-_TRACKED = {"trial": "texts", "frame": "whole numbers", "x_px": "numbers", "y_px": "numbers", "marker": "whole numbers"}
+    def send(self, entity: str, frames: Int[np.ndarray, " _"], columns: object) -> None:
+        """Log something of some frames."""
+        time = self.rerun.TimeColumn("time", duration=_nanoseconds(self.trial.time_s[frames]))
+        self.stream.send_columns(entity, [time, self.rerun.TimeColumn("frame", sequence=frames)], columns)
+
+    def lines(self, lines: dict[str, Float[np.ndarray, " _"]], frames: Int[np.ndarray, " _"]) -> None:
+        """Log numbers of some frames, a line each."""
+        for entity, values in lines.items():
+            name, colour = LINES[entity]
+            width = 1.0 if entity.endswith(("high", "low")) else 2.0
+            self.fixed(entity, self.rerun.SeriesLines(names=name, colors=[rgba(colour)], widths=width))
+            self.send(entity, frames, self.rerun.Scalars.columns(scalars=values))
+
+    def numbers(self, static_friction: Float[np.ndarray, " _"] | None) -> None:
+        """Log forces, their ratio where something touches, and labels."""
+        trial, normal = self.trial, self.trial.normal_force_n
+        margin, sigma = 100 * trial.safety_margin, trial.safety_margin_sigma
+        lines = {
+            "force/normal": normal,
+            "force/tangential": trial.tangential_force_n,
+            "force/limit": trial.friction_coefficient * normal,
+            "ratio/tangential_to_normal": force_ratio(trial),
+            "margin/gamma": margin,
+            "margin/stick_ratio": 100 * trial.stick_ratio,
+        }
+        if static_friction is None:
+            lines["ratio/friction"] = trial.friction_coefficient
+        else:
+            lines["ratio/static_friction"] = static_friction
+        if sigma is not None:
+            lines |= {"margin/band/high": margin + 100 * sigma, "margin/band/low": margin - 100 * sigma}
+        self.lines(lines, np.arange(len(trial)))
+
+    def predictions(self, path: Path) -> None:
+        """Log the margins that a network read, with the ends of their 90 % intervals where it tells any."""
+        rows, frames = _rows_of(self.trial, path, _PREDICTED, command="sliplens predict")
+        columns = {"margin/read": "prediction", "margin/read/high": "high_90", "margin/read/low": "low_90"}
+        lines = {entity: 100 * rows[name].to_numpy().astype(np.float64) for entity, name in columns.items()}
+        self.lines({entity: values for entity, values in lines.items() if np.isfinite(values).any()}, frames)
+
+    def tracks(self, path: Path) -> None:
+        """Log where markers were followed to, over the camera frames."""
+        rows, frames = _rows_of(self.trial, path, _TRACKED, command="sliplens track")
+        places, starts = np.unique(frames, return_index=True)
+        points = np.stack([rows[name].to_numpy().astype(np.float32) for name in ("x_px", "y_px")], axis=-1) + _HALF_PX
+        seen = np.isfinite(points).all(axis=1)
+        counts = np.add.reduceat(seen.astype(np.int64), starts)
+        self.dots("camera/followed", GREEN, 2.5)
+        self.send("camera/followed", places, self.rerun.Points2D.columns(positions=points[seen]).partition(counts))
+
+    def dots(self, entity: str, colour: str, radius: float) -> None:
+        """Say how the points of an entity look, their radius in points of the screen."""
+        size = self.rerun.Radius.ui_points(radius)
+        self.fixed(entity, self.rerun.Points2D.from_fields(colors=[rgba(colour)], radii=[size]))
+
+    def maps(self, maps: Explained, files: Sequence[str]) -> None:
+        """Log the maps of the trial's frames, each until the next frame, on one scale."""
+        rerun, trial = self.rerun, self.trial
+        numbers = {f"{trial.trial}-f{at:04d}": at for at in range(len(trial))}
+        # given names go before made ones: of maps alone the files are the frames that were explained
+        numbers |= {Path(name).stem: at for at, name in enumerate(files)}
+        found = {numbers[frame.id]: row for row, frame in enumerate(maps.frames) if frame.id in numbers}
+        if not found:
+            raise InputError(f"the maps are of no frame of {trial.trial}; they are of {maps.frames[0].id} and others")
+        for method in maps.methods:
+            scale = full_colour(maps.relevance[method])
+            for at, row in sorted(found.items()):
+                picture = overlay_relevance(maps.pictures[row], maps.relevance[method][row] / scale)
+                self.pictures(f"map/{method}", np.array([at]), [encode_png(picture)])
+                if at + 1 < len(trial) and at + 1 not in found:  # a map says nothing of the frames after its own
+                    self.send(f"map/{method}", np.array([at + 1]), rerun.Clear.columns(is_recursive=[False]))
+
+    def pictures(self, entity: str, frames: Int[np.ndarray, " _"], blobs: Sequence[bytes]) -> None:
+        """Log a PNG of each of some frames."""
+        columns = self.rerun.EncodedImage.columns(blob=list(blobs), media_type=[_PNG] * len(blobs))
+        self.send(entity, frames, columns)
+
+    def states(self) -> None:
+        """Log when the contact changes its state, and when labels begin and cease to be valid."""
+        rerun, trial = self.rerun, self.trial
+        lanes = [("state/contact", [str(state) for state in trial.contact_state], _STATE_COLOURS)]
+        if trial.valid is not None:
+            lanes.append(("state/label", ["valid" if one else "not valid" for one in trial.labelled], _LABEL_COLOURS))
+        for entity, states, colours in lanes:
+            style = rerun.StateConfiguration(values=list(colours), colors=[rgba(colour) for colour in colours.values()])
+            self.fixed(entity, style)
+            begins = np.flatnonzero([at == 0 or state != states[at - 1] for at, state in enumerate(states)])
+            self.send(entity, begins, rerun.StateChange.columns(state=[states[at] for at in begins]))
+
+    def samples(self, forces: Forces, basis: LabelBasis | None) -> None:
+        """Log what the force sensor recorded, on the clock of the camera if its lag was applied to the labels."""
+        rerun = self.rerun
+        late_s = basis.lag.lag_s if basis and basis.lag and basis.lag_applied else 0.0
+        names, colours = list(SAMPLE_LINES), [rgba(colour) for colour in SAMPLE_LINES.values()]
+        self.fixed("sensor/force", rerun.SeriesLines(names=names, colors=colours, widths=[1.0] * len(names)))
+        for begin in range(0, len(forces.time_s), _SAMPLES_TOGETHER):
+            some = slice(begin, begin + _SAMPLES_TOGETHER)
+            time = rerun.TimeColumn("time", duration=_nanoseconds(forces.time_s[some] + late_s))
+            self.stream.send_columns("sensor/force", [time], rerun.Scalars.columns(scalars=forces.force_n[some]))
+
+    def frames(self, read: Iterator[Frame], factor: float, on_progress: OnProgress | None) -> None:
+        """Log camera frames and their bright differences from the reference, losslessly.
+
+        As PNG: two thirds the size of raw pixels, in the file and in the viewer's memory, for some 5 ms a picture.
+        """
+        reference, done = self.trial.reference, 0
+
+        def encode(frame: UInt8[np.ndarray, "_ _ 3"]) -> tuple[bytes, bytes]:
+            return encode_png(frame), encode_png(brighten(absolute_difference(frame, reference), factor))
+
+        self.fixed("reference", self.rerun.EncodedImage(contents=encode_png(reference), media_type=_PNG))
+        with ThreadPoolExecutor() as pool:
+            while some := list(islice(read, _TOGETHER)):
+                both = zip(*pool.map(encode, some), strict=True)
+                for entity, blobs in zip(("camera/frame", "difference"), both, strict=True):
+                    self.pictures(entity, np.arange(done, done + len(some)), blobs)
+                done += len(some)
+                if on_progress is not None:
+                    on_progress(done, len(self.trial))
+
+    def truth(self, path: Path, truth: TruthHeader) -> None:
+        """Log contact and stick zone, and markers with how far they went, over the frames of a simulated trial."""
+        rerun, done = self.rerun, 0
+        rest_px = np.array(truth.marker_rest_px, dtype=np.float32).reshape(-1, 2)
+        height, width = self.trial.reference.shape[:2]
+        zones = [(OUTSIDE, "no contact", [0, 0, 0, 0]), (SLIPS, "slips", rgba(ORANGE)), (STICKS, "sticks", rgba(SKY))]
+        self.fixed("camera/zones", rerun.AnnotationContext(zones))
+        form = rerun.components.ImageFormat(width=width, height=height, channel_datatype="U8")
+        self.fixed("camera/zones", rerun.SegmentationImage.from_fields(format=form, opacity=_OPACITY))
+        self.dots("camera/markers", YELLOW, 2.0)
+        arrows = rerun.Arrows2D.from_fields(colors=[rgba(YELLOW)], radii=[rerun.Radius.ui_points(1.0)])
+        self.fixed("camera/displacements", arrows)
+        for rows in _stored_rows(path):
+            places, lengths = np.arange(done, done + rows.num_rows), [len(rest_px)] * rows.num_rows
+            markers = rows.column("marker_px").flatten().to_numpy().reshape(rows.num_rows, len(rest_px), 2)
+            begin = np.tile(rest_px + _HALF_PX, (rows.num_rows, 1))
+            points = rerun.Points2D.columns(positions=markers.reshape(-1, 2) + _HALF_PX).partition(lengths)
+            self.send("camera/markers", places, points)
+            ways = rerun.Arrows2D.columns(vectors=(markers - rest_px).reshape(-1, 2), origins=begin)
+            self.send("camera/displacements", places, ways.partition(lengths))
+            stored, size = zip(places, rows.column("contact_map"), strict=True), (height, width)
+            maps = [
+                decode_pixels(one.as_buffer(), size=size, where=f"frame {at} (contact map) of {path}").tobytes()
+                for at, one in stored
+            ]
+            self.send("camera/zones", places, rerun.SegmentationImage.columns(buffer=maps))
+            done += rows.num_rows
 
 
 def _rows_of(trial: Recording, path: Path, kinds: dict[str, str], *, command: str) -> tuple[pa.Table, np.ndarray]:
@@ -379,147 +509,14 @@ def _rows_of(trial: Recording, path: Path, kinds: dict[str, str], *, command: st
     return rows, frames
 
 
-def log_predictions(stream: "RecordingStream", trial: Recording, path: Path) -> None:
-    """Log the margins that a network read, with the ends of their 90 % intervals where it tells any."""
-    rows, frames = _rows_of(trial, path, _PREDICTED, command="sliplens predict")
-    columns = {"margin/read": "prediction", "margin/read/high": "high_90", "margin/read/low": "low_90"}
-    lines = {entity: 100 * rows[name].to_numpy().astype(np.float64) for entity, name in columns.items()}
-    known = {entity: values for entity, values in lines.items() if np.isfinite(values).any()}
-    _log_lines(stream, known, clock(trial.time_s[frames], frames))
-
-
-def log_tracks(stream: "RecordingStream", trial: Recording, path: Path) -> None:
-    """Log where markers were followed to, over the camera frames."""
-    rerun = require_rerun()
-    rows, frames = _rows_of(trial, path, _TRACKED, command="sliplens track")
-    places, starts = np.unique(frames, return_index=True)
-    points = np.stack([rows[name].to_numpy().astype(np.float32) for name in ("x_px", "y_px")], axis=-1) + _HALF_PX
-    seen = np.isfinite(points).all(axis=1)
-    counts = np.add.reduceat(seen.astype(np.int64), starts)
-    dots = rerun.Points2D.from_fields(colors=[rgba(GREEN)], radii=[rerun.Radius.ui_points(2.5)])
-    stream.log("camera/followed", dots, static=True)
-    columns = rerun.Points2D.columns(positions=points[seen]).partition(counts)
-    stream.send_columns("camera/followed", clock(trial.time_s[places], places), columns)
-
-
-def log_maps(stream: "RecordingStream", viewed: Viewed, maps: Explained) -> tuple[str, ...]:
-    """Log the maps of a trial's frames, each until the next frame, on one scale; gives their methods."""
-    rerun, trial = require_rerun(), viewed.trial
-    numbers = {f"{trial.trial}-f{at:04d}": at for at in range(len(trial))}
-    # names that were given go before those that are made: of maps alone the files are the frames that were explained
-    numbers |= {Path(name).stem: at for at, name in enumerate(viewed.files)}
-    found = {numbers[frame.id]: row for row, frame in enumerate(maps.frames) if frame.id in numbers}
-    if not found:
-        raise InputError(f"the maps are of no frame of {trial.trial}; they are of {maps.frames[0].id} and others")
-    for method in maps.methods:
-        scale = full_colour(maps.relevance[method])
-        for at, row in sorted(found.items()):
-            picture = overlay_relevance(maps.pictures[row], maps.relevance[method][row] / scale)
-            image = rerun.EncodedImage.columns(blob=[encode_png(picture)], media_type=[_PNG])
-            stream.send_columns(f"map/{method}", clock(trial.time_s[[at]], np.array([at])), image)
-            if at + 1 < len(trial) and at + 1 not in found:  # a map says nothing of the frames after its own
-                after = clock(trial.time_s[[at + 1]], np.array([at + 1]))
-                stream.send_columns(f"map/{method}", after, rerun.Clear.columns(is_recursive=[False]))
-    return tuple(maps.methods)
-
-
-def log_states(stream: "RecordingStream", trial: Recording) -> None:
-    """Log when the contact changes its state, and when labels begin and cease to be valid."""
-    rerun = require_rerun()
-    lanes = [("state/contact", [str(state) for state in trial.contact_state], _STATE_COLOURS)]
-    if trial.valid is not None:
-        lanes.append(("state/label", ["valid" if one else "not valid" for one in trial.labelled], _LABEL_COLOURS))
-    for entity, states, colours in lanes:
-        style = rerun.StateConfiguration(values=list(colours), colors=[rgba(colour) for colour in colours.values()])
-        stream.log(entity, style, static=True)
-        begins = np.flatnonzero([at == 0 or state != states[at - 1] for at, state in enumerate(states)])
-        columns = rerun.StateChange.columns(state=[states[at] for at in begins])
-        stream.send_columns(entity, clock(trial.time_s[begins], begins), columns)
-
-
-def log_samples(stream: "RecordingStream", forces: Forces, basis: LabelBasis | None) -> None:
-    """Log what the force sensor recorded, on the clock of the camera if its lag was applied to the labels."""
-    rerun = require_rerun()
-    late_s = basis.lag.lag_s if basis and basis.lag and basis.lag_applied else 0.0
-    names, colours = list(SAMPLE_LINES), [rgba(colour) for colour in SAMPLE_LINES.values()]
-    stream.log("sensor/force", rerun.SeriesLines(names=names, colors=colours, widths=[1.0] * len(names)), static=True)
-    for begin in range(0, len(forces.time_s), _SAMPLES_TOGETHER):
-        some = slice(begin, begin + _SAMPLES_TOGETHER)
-        time = rerun.TimeColumn("time", duration=_nanoseconds(forces.time_s[some] + late_s))
-        stream.send_columns("sensor/force", [time], rerun.Scalars.columns(scalars=forces.force_n[some]))
-
-
 def _nanoseconds(time_s: Float[np.ndarray, " _"]) -> np.ndarray:
     # rounded here: Rerun cuts off, and a third of a second could come back a nanosecond short
     return np.round(1e9 * time_s).astype("timedelta64[ns]")
 
 
-_PNG = "image/png"
-_TOGETHER = 8  # frames that are sent together: a megabyte or so, as much as Rerun itself sends at once
-
-
-def log_frames(stream: "RecordingStream", viewed: Viewed, factor: float, on_progress: OnProgress | None) -> None:
-    """Log camera frames and their bright differences from the reference, losslessly.
-
-    As PNG: two thirds the size of raw pixels, in the file and in the viewer's memory, for some 5 ms a picture.
-    """
-    rerun, frames, trial, done = require_rerun(), viewed.read_frames(), viewed.trial, 0
-
-    def encode(frame: UInt8[np.ndarray, "_ _ 3"]) -> tuple[bytes, bytes]:
-        return encode_png(frame), encode_png(brighten(absolute_difference(frame, trial.reference), factor))
-
-    stream.log("reference", rerun.EncodedImage(contents=encode_png(trial.reference), media_type=_PNG), static=True)
-    with ThreadPoolExecutor() as pool:
-        while some := list(islice(frames, _TOGETHER)):
-            places = np.arange(done, done + len(some))
-            times, pictures = clock(trial.time_s[places], places), zip(*pool.map(encode, some), strict=True)
-            for entity, blobs in zip(("camera/frame", "difference"), pictures, strict=True):
-                columns = rerun.EncodedImage.columns(blob=list(blobs), media_type=[_PNG] * len(blobs))
-                stream.send_columns(entity, times, columns)
-            done += len(some)
-            if on_progress is not None:
-                on_progress(done, len(trial))
-
-
-_OUTLINES_TOGETHER = 8  # frames whose maps are held and sent together
-_OPACITY = 0.35
-_HALF_PX = 0.5  # Rerun's pixels reach from one whole number to the next, ours have their centres there
-
-
-def log_truth(stream: "RecordingStream", path: Path, trial: Recording, truth: TruthHeader) -> None:
-    """Log contact and stick zone, and markers with how far they went, over the camera frames of a simulated trial."""
-    rerun, done = require_rerun(), 0
-    rest_px = np.array(truth.marker_rest_px, dtype=np.float32).reshape(-1, 2)
-    height, width = trial.reference.shape[:2]
-    zones = [(OUTSIDE, "no contact", [0, 0, 0, 0]), (SLIPS, "slips", rgba(ORANGE)), (STICKS, "sticks", rgba(SKY))]
-    stream.log("camera/zones", rerun.AnnotationContext(zones), static=True)
-    form = rerun.components.ImageFormat(width=width, height=height, channel_datatype="U8")
-    stream.log("camera/zones", rerun.SegmentationImage.from_fields(format=form, opacity=_OPACITY), static=True)
-    dots = rerun.Points2D.from_fields(colors=[rgba(YELLOW)], radii=[rerun.Radius.ui_points(2.0)])
-    stream.log("camera/markers", dots, static=True)
-    arrows = rerun.Arrows2D.from_fields(colors=[rgba(YELLOW)], radii=[rerun.Radius.ui_points(1.0)])
-    stream.log("camera/displacements", arrows, static=True)
-    for rows in _stored_rows(path):
-        places = np.arange(done, done + rows.num_rows)
-        times, lengths = clock(trial.time_s[places], places), [len(rest_px)] * rows.num_rows
-        markers = rows.column("marker_px").flatten().to_numpy().reshape(rows.num_rows, len(rest_px), 2)
-        moved = (markers - rest_px).reshape(-1, 2)
-        begin = np.tile(rest_px + _HALF_PX, (rows.num_rows, 1))
-        points = rerun.Points2D.columns(positions=markers.reshape(-1, 2) + _HALF_PX).partition(lengths)
-        stream.send_columns("camera/markers", times, points)
-        columns = rerun.Arrows2D.columns(vectors=moved, origins=begin).partition(lengths)
-        stream.send_columns("camera/displacements", times, columns)
-        maps = [
-            decode_pixels(one.as_buffer(), size=(height, width), where=f"frame {at} (contact map) of {path}").tobytes()
-            for at, one in zip(places, rows.column("contact_map"), strict=True)
-        ]
-        stream.send_columns("camera/zones", times, rerun.SegmentationImage.columns(buffer=maps))
-        done += rows.num_rows
-
-
 def _stored_rows(path: Path) -> Iterator[pa.RecordBatch]:
     with reading(path), pq.ParquetFile(path) as file:
-        yield from file.iter_batches(_OUTLINES_TOGETHER, columns=["marker_px", "contact_map"])
+        yield from file.iter_batches(_TOGETHER, columns=["marker_px", "contact_map"])
 
 
 _APPLICATION = "sliplens"
@@ -548,46 +545,32 @@ def open_viewer(viewed: Viewed, *, beside: Beside = Beside(), on_progress: OnPro
 def log_trial(
     stream: "RecordingStream", viewed: Viewed, beside: Beside, *, on_progress: OnProgress | None = None
 ) -> None:
-    """Log a trial, what is beside it, and its layout to a Rerun stream, a few frames in memory at a time.
-
-    Timelines are `time`, on the clock of the camera, and `frame`. What is not known is NaN: there a line breaks.
-    """
-    rerun = require_rerun()
+    """Log a trial, what is beside it, and its layout to a Rerun stream, a few frames in memory at a time."""
     trial, path = viewed.trial, viewed.path
+    log = _Log(stream=stream, rerun=(rerun := require_rerun()), trial=trial)
     truth = None if path is None else read_header(path).truth
     basis = trial.labelling.basis if trial.labelling else None
     friction = _static_friction(path, trial, truth, basis)
-    methods = () if beside.maps is None else log_maps(stream, viewed, beside.maps)
+    if beside.maps is not None:
+        log.maps(beside.maps, viewed.files)
     if beside.predictions is not None:
-        log_predictions(stream, trial, beside.predictions)
+        log.predictions(beside.predictions)
     if beside.tracks is not None:
-        log_tracks(stream, trial, beside.tracks)
+        log.tracks(beside.tracks)
     some = np.stack(list(viewed.pick(range(0, len(trial), -(-len(trial) // _SAMPLED)))))
-    size, factor = trial.reference.shape[:2], brightening([absolute_difference(some, trial.reference)])
-    frictions = trial.friction_coefficient if friction is None else friction
-    highest = end_of_ratio(force_ratio(trial), float(np.max(frictions, where=np.isfinite(frictions), initial=0)))
-    sensor, forced = viewed.forces is not None, bool(np.isfinite(trial.normal_force_n).any())
+    factor = brightening([absolute_difference(some, trial.reference)])
     stream.send_recording_name(trial.trial)
-    stream.send_blueprint(
-        lay_out(
-            size=size,
-            factor=factor,
-            highest_ratio=highest,
-            truth=truth is not None,
-            sensor=sensor,
-            forced=forced,
-            methods=methods,
-        )
-    )
+    methods = () if beside.maps is None else tuple(beside.maps.methods)
+    stream.send_blueprint(lay_out(viewed, factor=factor, friction=friction, truth=truth is not None, methods=methods))
     about = describe_trial(trial, truth, split=viewed.split)
-    stream.log("about", rerun.TextDocument(about, media_type=rerun.MediaType.MARKDOWN), static=True)
-    log_numbers(stream, trial, friction)
-    log_states(stream, trial)
+    log.fixed("about", rerun.TextDocument(about, media_type=rerun.MediaType.MARKDOWN))
+    log.numbers(friction)
+    log.states()
     if viewed.forces is not None:
-        log_samples(stream, viewed.forces, basis)
+        log.samples(viewed.forces, basis)
     if path is not None and truth is not None:
-        log_truth(stream, path, trial, truth)
-    log_frames(stream, viewed, factor, on_progress)
+        log.truth(path, truth)
+    log.frames(viewed.read_frames(), factor, on_progress)
 
 
 def _log_whole(

@@ -1,6 +1,7 @@
 """Where the markers go under load: a calibrated model and the exact half-space."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -99,13 +100,9 @@ def move_markers(sensor: Sensor, touch: Touch, *, loading: Loading, displacement
     centre_m = np.asarray(grasp.contact_offset) * sphere_m
     from_centre = rest[:, :2] - centre_m
     distance = np.linalg.norm(from_centre, axis=-1)
-    outward, inward = hertz_displacement(
-        distance,
-        depth_m,
-        contact_radius_m=contact_m[:, None],
-        sphere_radius_m=sphere_m,
-        poisson_ratio=sensor.poisson_ratio,
-    )
+    contact: dict[str, Any] = {"contact_radius_m": contact_m[:, None], "sphere_radius_m": sphere_m}
+    contact["poisson_ratio"] = sensor.poisson_ratio
+    outward, inward = hertz_displacement(distance, depth_m, **contact)
     yielding = model.layer * clamp
     outward, inward = outward * yielding / np.where(distance > 0, distance, 1), inward * yielding
     pull = np.array([np.cos(grasp.shear_direction_rad), np.sin(grasp.shear_direction_rad)])
@@ -113,17 +110,15 @@ def move_markers(sensor: Sensor, touch: Touch, *, loading: Loading, displacement
     # a tilted object pushes a little sideways
     moved = rest + outward[..., None] * np.append(from_centre, np.zeros((len(rest), 1)), axis=1)
     moved += inward[..., None] * np.append(np.tan(grasp.tilt_rad), -1)
-    for sign, *contact in loading.tractions:
-        friction, margin = (values[:, None] for values in contact)
+    for sign, *held in loading.tractions:
+        friction, margin = (values[:, None] for values in held)
         along, across, sunk = partial_slip_displacement(
             from_centre @ pull,
             from_centre @ athwart,
             depth_m,
             friction_coefficient=friction * model.local_friction,
             safety_margin=margin,
-            contact_radius_m=contact_m[:, None],
-            sphere_radius_m=sphere_m,
-            poisson_ratio=sensor.poisson_ratio,
+            **contact,
         )
         skin = model.skin_shear * sphere_m * friction / _FITTED_FRICTION * sunken[:, None]
         along = (along + skin * (1 - margin**grasp.shear_exponent)) * (sign * clamp)

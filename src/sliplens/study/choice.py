@@ -1,6 +1,6 @@
 """What a study looks at: trials, frames, their markers, the methods, and the fastest way to ask a network."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from functools import cache
 from itertools import groupby
@@ -18,7 +18,7 @@ from sliplens.images import absolute_difference
 from sliplens.markers import track_markers
 from sliplens.models import Run
 from sliplens.progress import OnProgress, counted
-from sliplens.recordings import Dataset, Recording
+from sliplens.recordings import Dataset, Recording, TrialInfo
 from sliplens.results.explanation import Explained
 from sliplens.results.study import Choice, ChosenFrame, ChosenTrial, MarkedFrame, MarkerTable, ShownFrame, States
 from sliplens.study.explaining import DEFAULT_LEVELS as LEVELS
@@ -56,68 +56,77 @@ def choose_frames(
     if not 0 <= tolerance <= 1:
         raise InputError(f"the tolerance is {tolerance:g}; give a share of the margin between 0 and 1")
     infos = data.select(split=split, condition=condition)
-    candidates: list[tuple[ChosenTrial, list[tuple[int, float]]]] = []
-    errors: dict[str, dict[str, Float[np.ndarray, " levels"]]] = {}
-    scored = [level in SCORED_LEVELS for level in LEVELS]
-    for info in counted(infos, on_progress):
-        recording = data.load(info, truth=False)
-        margin = np.where(recording.labelled, recording.safety_margin, np.nan)
-        rows = [nearest_frame(margin, level) for level in LEVELS] if np.isfinite(margin).any() else []
-        near = bool(rows) and all(abs(margin[row] - level) <= _REACH for row, level in zip(rows, LEVELS, strict=True))
-        if near and len(set(rows)) == len(rows):
-            own = errors[info.trial] = {}
-            for name, trained in networks.items():
-                answers = trained.predict(trained.encode(recording.frames[rows], recording.reference)).numpy()
-                own[name] = np.abs(answers - margin[rows])
-            worst = {name: float(values.max()) for name, values in own.items()}
-            trial = ChosenTrial(trial=info.trial, qualified=max(worst.values()) <= tolerance, worst_error=worst)
-            candidates.append((trial, [(row, float(margin[row])) for row in rows]))
+    looked = (_look_at(info, networks, data, tolerance=tolerance) for info in counted(infos, on_progress))
+    candidates = [one for one in looked if one is not None]
     if not candidates:
         raise RecordingError(
             f"none of the {len(infos)} {condition} trials of split {split!r} has a labelled frame within {_REACH:.0%} "
             f"of each of {', '.join(f'{level:.0%}' for level in LEVELS)}; choose another split or condition, or trials "
             "with more frames from full stick to full slip"
         )
-    days = {info.trial: info.day for info in infos}
     # sorting is stable: those that qualify keep the data set's order, so that none is picked for its looks
-    taken = sorted(candidates, key=lambda item: 0.0 if item[0].qualified else item[0].worst)[:trials]
-    shown = min((trial for trial, _ in taken), key=lambda trial: trial.worst).trial
-    frames = tuple(
-        ChosenFrame(
-            id=f"{trial.trial}-f{row:04d}",
-            trial=trial.trial,
-            day=days[trial.trial],
-            frame=row,
-            level=level,
-            safety_margin=label,
-            scored=level in SCORED_LEVELS,
-            shown=trial.trial == shown,
-        )
-        for trial, rows in taken
-        for level, (row, label) in zip(LEVELS, rows, strict=True)
-        if level in SCORED_LEVELS or trial.trial == shown
-    )
+    taken = sorted(candidates, key=lambda one: 0.0 if one.trial.qualified else one.trial.worst)[:trials]
+    shown = min((one.trial for one in taken), key=lambda trial: trial.worst).trial
+    scored = [level in SCORED_LEVELS for level in LEVELS]
     choice = Choice(
         trials_wanted=trials,
         tolerance=tolerance,
         considered=len(candidates),
-        qualified=sum(trial.qualified for trial, _ in candidates),
+        qualified=sum(one.trial.qualified for one in candidates),
         qualified_alone={
-            name: sum(trial.worst_error[name] <= tolerance for trial, _ in candidates) for name in networks
+            name: sum(one.trial.worst_error[name] <= tolerance for one in candidates) for name in networks
         },
-        mean_error={
-            name: float(np.mean([errors[trial.trial][name][scored] for trial, _ in taken])) for name in networks
-        },
+        mean_error={name: float(np.mean([one.errors[name][scored] for one in taken])) for name in networks},
         summary="",
         source=data.source,
         condition=condition,
         inputs=tuple(networks),
         levels=LEVELS,
         scored_levels=SCORED_LEVELS,
-        trials=tuple(trial for trial, _ in taken),
-        frames=frames,
+        trials=tuple(one.trial for one in taken),
+        frames=tuple(frame for one in taken for frame in one.frames(shown=one.trial.trial == shown)),
     )
     return replace(choice, summary=_summarise(choice, len(infos)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Candidate:
+    """A trial with a frame near every level."""
+
+    trial: ChosenTrial
+    day: int
+    rows: list[int]
+    """Frames by level, and their labels."""
+    labels: Float[np.ndarray, " levels"]
+    errors: dict[str, Float[np.ndarray, " levels"]]
+    """Of each network's answers, in margin units."""
+
+    def frames(self, *, shown: bool) -> Iterator[ChosenFrame]:
+        """Frames to score, and where the panels show the trial all the others."""
+        name = self.trial.trial
+        for level, row, label in zip(LEVELS, self.rows, self.labels.tolist(), strict=True):
+            if shown or level in SCORED_LEVELS:
+                own = {"id": f"{name}-f{row:04d}", "trial": name, "day": self.day, "frame": row, "shown": shown}
+                scored = level in SCORED_LEVELS
+                yield ChosenFrame(**own, level=level, safety_margin=label, scored=scored)
+
+
+def _look_at(info: TrialInfo, networks: Mapping[str, Run], data: Dataset, *, tolerance: float) -> _Candidate | None:
+    recording = data.load(info, truth=False)
+    margin = np.where(recording.labelled, recording.safety_margin, np.nan)
+    if not np.isfinite(margin).any():
+        return None
+    rows = [nearest_frame(margin, level) for level in LEVELS]
+    near = all(abs(margin[row] - level) <= _REACH for row, level in zip(rows, LEVELS, strict=True))
+    if not near or len(set(rows)) < len(rows):
+        return None
+    errors = {}
+    for name, trained in networks.items():
+        answers = trained.predict(trained.encode(recording.frames[rows], recording.reference)).numpy()
+        errors[name] = np.abs(answers - margin[rows])
+    worst = {name: float(values.max()) for name, values in errors.items()}
+    trial = ChosenTrial(trial=info.trial, qualified=max(worst.values()) <= tolerance, worst_error=worst)
+    return _Candidate(trial=trial, day=info.day, rows=rows, labels=margin[rows], errors=errors)
 
 
 def _summarise(choice: Choice, trials: int) -> str:

@@ -125,6 +125,11 @@ class FrameSet(TorchDataset):
         rows = torch.as_tensor(indices)
         return self.encoding.normalise(self.images[rows]), self.safety_margin[rows], self.traction_ratio[rows]
 
+    def name(self, row: int) -> str:
+        """Words for a frame."""
+        frame = "the reference frame" if self.frame[row] == UNTOUCHED else f"frame {self.frame[row]}"
+        return f"{frame} of {self.trial[row]}"
+
     def batches(self, size: int, on_progress: OnProgress | None = None) -> Iterator[Tensor]:
         """Inputs of all frames, in their order."""
         for rows in torch.arange(len(self)).split(size):
@@ -287,6 +292,10 @@ class EpochShuffle(Sampler[int]):
     def __iter__(self) -> Iterator[int]:
         """Yield the indices of this process."""
         return iter(self.order(self.epoch)[self.rank :: self.processes][: len(self)])
+
+    def batch(self, epoch: int, number: int, *, size: int) -> list[int]:
+        """Indices of a batch of this process, of so many frames."""
+        return self.order(epoch)[self.rank :: self.processes][number * size : (number + 1) * size]
 
     def order(self, epoch: int) -> list[int]:
         """Indices in the order of an epoch: each once, or as many as are drawn, none again before all others."""

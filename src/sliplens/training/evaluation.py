@@ -1,7 +1,7 @@
 """How well a network reads the safety margin, and what markers alone tell."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from torch import Tensor
 
 from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError, RecordingError
@@ -19,7 +20,7 @@ from sliplens.markers import KINDS, MarkerStatus, track_markers
 from sliplens.markers.detect import get_kind
 from sliplens.markers.estimators import ESTIMATORS, FieldTrial, field_trial, get_estimator
 from sliplens.models import Run
-from sliplens.models.checkpoint import load, tell_each
+from sliplens.models.checkpoint import Estimate, load, tell_each
 from sliplens.progress import OnProgress, counted, note, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset, trial_path
@@ -313,22 +314,12 @@ def evaluate_frames(
     RecordingError
         If there is no frame, or one of a trial whose friction is not known and is to be told.
     """
-    count = len(frames)
-    if not count:
+    if not len(frames):
         raise RecordingError("there is no labelled frame to evaluate; check the split and the condition")
-    estimate = run.estimate_batches(
-        frames.batches(batch_size, on_progress), friction=None if friction == EACH else friction
-    )
-    if friction == EACH:
-        if not np.isfinite(frames.friction).all():
-            raise RecordingError("not every trial has a coefficient of friction to tell; name one, or leave it out")
-        traction = run.require_ratio()
-        estimate = tell_each(
-            estimate, frames.friction, trained_friction=np.array(traction.friction), calibration=traction.told
-        )
+    estimate = _estimate(run, frames.batches(batch_size, on_progress), frames.friction, told=friction)
     levels = estimate.calibration.offsets if estimate.calibration else ()
     intervals = {level: ends for level in levels if (ends := estimate.interval(float(level)))}
-    unknown, sigma = np.full(count, np.nan), estimate.sigma
+    unknown, sigma = np.full(len(frames), np.nan), estimate.sigma
     low_90, high_90 = intervals.get("0.9", (unknown, unknown))
     predictions = Predictions(
         trial=np.array(frames.trial),
@@ -351,26 +342,23 @@ def evaluate_frames(
     trials = {name: predictions.trial == name for name in dict.fromkeys(frames.trial)}
     wet, dry = conditions.get("wet"), conditions.get("dry")
 
-    def score(rows: Bool[np.ndarray, " frames"]) -> RegressionScores:
-        return score_predictions(predictions.where(rows))
+    def score(groups: dict[str, Bool[np.ndarray, " frames"]]) -> dict[str, RegressionScores]:
+        return {name: score_predictions(predictions.where(rows)) for name, rows in groups.items()}
+
+    def reliability(rows: Bool[np.ndarray, " frames"]) -> Reliability:
+        labels = predictions.safety_margin[rows]
+        held = {level: coverage(low[rows], high[rows], labels) for level, (low, high) in intervals.items()}
+        width = float((high_90 - low_90)[rows].mean()) if intervals else None
+        return Reliability(coverage=held, mean_width_90=width)
 
     return Evaluation(
         input=run.manifest.input,
         split=split,
         known_trials=0,
-        conditions={name: score(rows) for name, rows in conditions.items()},
-        days={name: score(rows) for name, rows in days.items()},
-        trials={name: score(rows) for name, rows in trials.items()},
-        reliability={
-            name: Reliability(
-                coverage={
-                    level: coverage(low[rows], high[rows], predictions.safety_margin[rows])
-                    for level, (low, high) in intervals.items()
-                },
-                mean_width_90=float((high_90 - low_90)[rows].mean()) if intervals else None,
-            )
-            for name, rows in conditions.items()
-        },
+        conditions=score(conditions),
+        days=score(days),
+        trials=score(trials),
+        reliability={name: reliability(rows) for name, rows in conditions.items()},
         wet_auroc=None if sigma is None or wet is None or dry is None else auroc(sigma[wet], sigma[dry]),
         lead_times={name: find_lead_times(predictions.where(rows)) for name, rows in conditions.items()},
         predictions=predictions,
@@ -381,6 +369,19 @@ def evaluate_frames(
         friction="that of each trial, told exactly" if friction == EACH else str(estimate.friction or ""),
         ratio_r2={} if estimate.ratio is None else _ratio_r2(estimate.ratio.mean, frames),
     )
+
+
+def _estimate(
+    run: Run, batches: Iterable[Tensor], friction: Float[np.ndarray, " frames"], *, told: FrictionLike | None
+) -> Estimate:
+    """Answers to frames with these frictions, of which as much is told as `evaluate` says."""
+    if told != EACH:
+        return run.estimate_batches(batches, friction=told)
+    estimate = run.estimate_batches(batches)
+    if not np.isfinite(friction).all():
+        raise RecordingError("not every trial has a coefficient of friction to tell; name one, or leave it out")
+    traction = run.require_ratio()
+    return tell_each(estimate, friction, trained_friction=np.array(traction.friction), calibration=traction.told)
 
 
 def _ratio_r2(ratio: Float[np.ndarray, " frames"], frames: FrameSet) -> dict[str, float | None]:

@@ -382,12 +382,19 @@ def fit(
         metrics_file=folder / "metrics.csv" if first else None,
         on_progress=on_progress if first else None,
     )
-
-    def batch_rows(epoch: int, batch: int) -> list[str]:
-        order = shuffle.order(epoch)[rank::processes]
-        rows = [(train.frame[row], train.trial[row]) for row in order[batch * share : (batch + 1) * share]]
-        return [f"{'the reference frame' if frame < 0 else f'frame {frame}'} of {trial}" for frame, trial in rows]
-
+    begun = Manifest(
+        backbone=config.backbone,
+        head=config.head,
+        recipe=config.recipe,
+        input=train.encoding.name,
+        image_size=config.image_size,
+        frame_size=frame_size,
+        sensor=sensor,
+        data_hash=data_hash,
+        trained_on=(*trained_on, *(start.manifest.trained_on if start else ())),
+        started_from=start.manifest.weights_sha256 if start else "",
+        versions=versions(),
+    )
     network: nn.Module = model
     if config.learns == "ratio":
         network, train, validation = _last_layer_alone(model, train, validation, config=config, report=on_progress)
@@ -396,84 +403,80 @@ def fit(
         config=config,
         augmentation=get_augmentation(config.augmentation, neutral=train.encoding.neutral),
         clock=clock,
-        batch_rows=batch_rows,
+        batch_rows=lambda epoch, batch: [train.name(row) for row in shuffle.batch(epoch, batch, size=share)],
     )
-    checkpoints = folder / "checkpoints"
-    best = ModelCheckpoint(dirpath=checkpoints, filename="best", monitor="validation_mse", save_last=True)
+    best = ModelCheckpoint(dirpath=folder / "checkpoints", filename="best", monitor="validation_mse", save_last=True)
     # in this order: a checkpoint holds what the stopping has counted of the same epoch
     early = EarlyStopping("validation_mse", patience=config.patience) if config.patience else None
     trainer.callbacks += [clock, *filter(None, [early]), best]  # pyright: ignore[reportAttributeAccessIssue]
     trainer.loggers = [logger] if logger is not None and first else []
     trainer.log_every_n_steps = min(50, per_epoch)  # pyright: ignore[reportAttributeAccessIssue]
     loaders = make_loaders(train, validation, shuffle=shuffle, batch_size=share)
-
-    def save_best() -> float:
-        # our own file of tensors and plain numbers, read back without unpickling anything else
-        kept = torch.load(best.best_model_path, map_location="cpu", weights_only=True)
-        module.load_state_dict(kept["state_dict"])
-        # as the file itself has it: after a crash between two files the callback may remember an older one
-        best_mse = float(kept["callbacks"][best.state_key]["current_score"])
-        calibration, traction = calibrate(
-            network,
-            validation,
-            batch_size=config.batch_size,
-            trained_friction=train.friction,
-            kept=start.manifest.calibration if start and config.learns == "ratio" else None,
-        )
-        _put_back(network, model)
-        manifest = Manifest(
-            backbone=config.backbone,
-            head=config.head,
-            recipe=config.recipe,
-            input=train.encoding.name,
-            image_size=config.image_size,
-            frame_size=frame_size,
-            sensor=sensor,
-            data_hash=data_hash,
-            trained_on=(*trained_on, *(start.manifest.trained_on if start else ())),
-            started_from=start.manifest.weights_sha256 if start else "",
-            metrics={"validation_mse": calibration.mse},
-            calibration=calibration,
-            traction=traction,
-            novelty=_find_novelty(model.eval(), config, train, validation, start=start),
-            versions=versions(),
-        )
-        save_checkpoint(folder, model, manifest)
-        return best_mse
-
-    def describe(best_mse: float) -> Training:
-        return Training(
-            input=train.encoding.name,
-            backbone=config.backbone,
-            image_size=config.image_size,
-            frame_size=frame_size,
-            train_frames=len(train),
-            validation_frames=len(validation),
-            seed=config.seed,
-            epochs=clock.rows[-1][0],
-            minutes=clock.seconds / 60,
-            stopped_by="no gain" if early is not None and early.stopped_epoch else clock.stopped_by,
-            best_validation_mse=best_mse,
-            parameters=sum(value.numel() for value in model.parameters()),
-            processes=processes,
-            curve=clock.curve(),
-        )
-
+    known: dict[str, Any] = {"begun": begun, "train": train, "validation": validation, "start": start}
+    save_best = partial(_save_best, folder, model, module, best, **known)
     try:
         title = f"Training ({train.encoding.name})"
         with torch.random.fork_rng(devices=[]), stage(on_progress if first else None, title) as clock.on_progress:
-            run_trainer(trainer, module, loaders, checkpoints / "last.ckpt")
+            run_trainer(trainer, module, loaders, folder / "checkpoints" / "last.ckpt")
     except DivergedError as error:
         if not first or not best.best_model_path:
             raise
         raise ModelError(
             f"{error} (the best network so far, of validation MSE {save_best():.4g}, is in {folder})"
         ) from None
-    if not first:
-        return describe(float(best.best_model_score or np.nan))
-    training = describe(save_best())
-    shutil.rmtree(checkpoints)
+    training = Training(
+        input=train.encoding.name,
+        backbone=config.backbone,
+        image_size=config.image_size,
+        frame_size=frame_size,
+        train_frames=len(train),
+        validation_frames=len(validation),
+        seed=config.seed,
+        best_validation_mse=save_best() if first else float(best.best_model_score or np.nan),
+        epochs=clock.rows[-1][0],
+        minutes=clock.seconds / 60,
+        stopped_by="no gain" if early is not None and early.stopped_epoch else clock.stopped_by,
+        parameters=sum(value.numel() for value in model.parameters()),
+        processes=processes,
+        curve=clock.curve(),
+    )
+    if first:
+        shutil.rmtree(folder / "checkpoints")
     return training
+
+
+def _save_best(
+    folder: Path,
+    model: nn.Module,
+    module: Regressor,
+    best: ModelCheckpoint,
+    *,
+    begun: Manifest,
+    train: FrameSet,
+    validation: FrameSet,
+    start: Run | None,
+) -> float:
+    """Calibrate and save the network of the best epoch; gives its validation error.
+
+    `begun`: what its manifest says before anything is learnt; `module` holds the part of `model` that learnt.
+    """
+    # our own file of tensors and plain numbers, read back without unpickling anything else
+    kept = torch.load(best.best_model_path, map_location="cpu", weights_only=True)
+    module.load_state_dict(kept["state_dict"])
+    config, network = module.config, module.model
+    calibration, traction = calibrate(
+        network,
+        validation,
+        batch_size=config.batch_size,
+        trained_friction=train.friction,
+        kept=start.manifest.calibration if start and config.learns == "ratio" else None,
+    )
+    _put_back(network, model)
+    novelty = _find_novelty(model.eval(), config, train, validation, start=start)
+    learnt = {"calibration": calibration, "traction": traction, "novelty": novelty}
+    save_checkpoint(folder, model, replace(begun, metrics={"validation_mse": calibration.mse}, **learnt))
+    # as the file itself has it: after a crash between two files the callback may remember an older one
+    return float(kept["callbacks"][best.state_key]["current_score"])
 
 
 def _begin(config: TrainConfig, encoding: Encoding, start: Run | None) -> nn.Module:
