@@ -78,6 +78,11 @@ class Outlet(Generic[Item]):
         """Items that were not handed on, it being too slow or ended."""
         return self._box.lost
 
+    @property
+    def reason(self) -> str:
+        """The error in the words of the system, where it has any."""
+        return str((self.error.strerror if isinstance(self.error, OSError) else None) or self.error)
+
     def put(self, item: Item, *, size_bytes: int) -> None:
         """Take an item, without waiting."""
         self._box.put(item, most=max(1, self._most_bytes // size_bytes))

@@ -98,12 +98,11 @@ class Recorder:
     @property
     def state(self) -> RecordingState:
         """How far it is now."""
-        outlet, error, trouble = self._outlet, self._outlet.error, None
-        if error is not None:
-            reason = (error.strerror if isinstance(error, OSError) else None) or error
+        outlet, trouble = self._outlet, None
+        if outlet.error is not None:
             trouble = (
-                f"recording into {self.folder} stopped after {outlet.sent} frames ({reason}); make room, and record "
-                "again: what is there stays"
+                f"recording into {self.folder} stopped after {outlet.sent} frames ({outlet.reason}); make room, and "
+                "record again: what is there stays"
             )
         return RecordingState(
             folder=self.folder, frames=outlet.sent, seconds=self._seconds, lost=outlet.lost, trouble=trouble

@@ -9,10 +9,10 @@ import secrets
 import socket
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -258,6 +258,16 @@ def _open_rerun(address: str) -> Sink:
     return RerunFile(_new_file(address, kind="rerun"))
 
 
+class RosMessage(Protocol):
+    """Message of ROS as `rosbags` has it, such as a header."""
+
+    __msgtype__: ClassVar[str]
+
+
+RosFields: TypeAlias = Mapping[str, float | str | np.ndarray | RosMessage]
+"""Fields of a message by name."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RosTopic:
     """What is sent to ROS on one topic."""
@@ -266,7 +276,7 @@ class RosTopic:
     """Below the key of the sink."""
     kind: str
     """Type of its messages."""
-    fields: Callable[[Reading, Frame | None, Any], dict[str, Any] | None]
+    fields: Callable[[Reading, Frame | None, RosMessage], RosFields | None]
     """Fields of the message of a reading, with a header at hand; None where there is none to send."""
 
 
@@ -354,12 +364,12 @@ class ZenohRos:
         if kind not in self._types.types:
             self._types.register(get_types_from_msg(definition, kind))
 
-    def header(self, at_ns: int) -> Any:
+    def header(self, at_ns: int) -> RosMessage:
         """Header of a message, at nanoseconds since 1970."""
         stamp = self._types.types["builtin_interfaces/msg/Time"](sec=at_ns // 10**9, nanosec=at_ns % 10**9)
         return self._types.types["std_msgs/msg/Header"](stamp=stamp, frame_id=_FRAME_ID)
 
-    def publisher(self, topic: str, kind: str) -> Callable[[dict[str, Any], int], None]:
+    def publisher(self, topic: str, kind: str) -> Callable[[RosFields, int], None]:
         """Declare a topic; gives what sends a message of these fields on it, at nanoseconds since 1970.
 
         Sending raises `OSError` where the way is closed.
@@ -367,7 +377,7 @@ class ZenohRos:
         publishers = [self._session.declare_publisher(name) for name in self._names(topic, kind)]
         ext, own_id, count = self._ext, secrets.token_bytes(16), itertools.count(1)
 
-        def send(fields: dict[str, Any], at_ns: int) -> None:
+        def send(fields: RosFields, at_ns: int) -> None:
             message = bytes(self._types.serialize_cdr(self._types.types[kind](**fields), kind))
             attachment = ext.z_serialize((ext.Int64(next(count)), ext.Int64(at_ns), own_id))
             by_name, by_type = publishers
@@ -509,10 +519,9 @@ class Sender:
     @property
     def state(self) -> SinkState:
         """How far it is now."""
-        outlet, error, trouble = self._outlet, self._outlet.error, None
-        if error is not None:
-            reason = (error.strerror if isinstance(error, OSError) else None) or error
-            trouble = f"--sink {self._name} broke off after {outlet.sent} readings ({reason}); begin it anew"
+        outlet, trouble = self._outlet, None
+        if outlet.error is not None:
+            trouble = f"--sink {self._name} broke off after {outlet.sent} readings ({outlet.reason}); begin it anew"
         return SinkState(name=self._name, sent=outlet.sent, lost=outlet.lost, trouble=trouble)
 
     @property

@@ -131,8 +131,7 @@ class SlipDetector:
         if np.isfinite(moved[:, 0]).sum() < _FEWEST:
             self._end_contact()
             return MarkerReading(state=SlipState.CANNOT_TELL)
-        reading = self._read(moved, time_s, self._usual)
-        return reading
+        return self._read(moved, time_s, self._usual)
 
     def _read(self, moved: Field, time_s: float, usual: _Usual) -> MarkerReading:
         spread = float(affine_parts(self._rest, moved[None])[0, 2])

@@ -18,10 +18,12 @@ from sliplens.plots.style import BLACK, GREY, drawing_style
 
 # light is far: read alike under every common colour blindness
 FIELD_COLOURS = "cividis"
-_SURE = 0.2  # confidence below which the field is not shown
+SURE = 0.2
+"""Confidence below which a field is a guess, and is not shown."""
 ARROWS = 5.0
 """Length of arrows over the displacement."""
-_STILL_PX = 0.3  # below which a direction is noise
+STILL_PX = 0.3
+"""Displacement below which a direction is noise."""
 _PANEL_IN = 2.2
 
 
@@ -64,15 +66,15 @@ def plot_field(
 
     The lightest colour stands for `longest_px`, or for the field's own longest displacement.
     """
-    sure = field.confidence > _SURE
+    sure = field.confidence > SURE
     length = np.linalg.norm(field.displacement_px, axis=-1)
-    top = longest_px or max(float(np.nanmax(np.where(sure, length, 0))), _STILL_PX)
+    top = longest_px or max(float(np.nanmax(np.where(sure, length, 0))), STILL_PX)
     (left, right), (top_edge, bottom) = _ends(field.x_px), _ends(field.y_px)
     extent = (left, right, bottom, top_edge)
     ax.set_facecolor("#D1D5DB")
     norm = Normalize(0, top)
     ax.imshow(np.where(sure, length, np.nan), cmap=FIELD_COLOURS, norm=norm, extent=extent, interpolation="nearest")
-    moves = sure & (length > _STILL_PX)
+    moves = sure & (length > STILL_PX)
     if moves.sum() > 3:
         x, y = (np.where(moves, field.displacement_px[..., axis], np.nan) for axis in (0, 1))
         lines = ax.streamplot(field.x_px, field.y_px, x, y, color="white", density=0.8, linewidth=1.0, arrowsize=0.9)
@@ -87,7 +89,7 @@ def draw_fields_beside_saliency(frames: Sequence[MarkedFrame]) -> Figure:
     if not frames:
         raise InputError("there is no frame to draw; name one or more")
     fields = [one.field for one in frames]
-    longest = max(float(np.linalg.norm(one.displacement_px, axis=-1)[one.confidence > _SURE].max()) for one in fields)
+    longest = max(float(np.linalg.norm(one.displacement_px, axis=-1)[one.confidence > SURE].max()) for one in fields)
     with drawing_style():
         figure = Figure(figsize=(3 * _PANEL_IN + 1.4, _PANEL_IN * len(frames) + 1.3), layout="constrained")
         heights = [*[1.0] * len(frames), 0.07]

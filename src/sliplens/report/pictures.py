@@ -13,7 +13,15 @@ from sliplens.markers import DisplacementField, interpolate_field
 from sliplens.plots.contact_sheet import TIMES, brighten, brightening
 from sliplens.plots.errors import MARGIN_LABEL
 from sliplens.plots.margins import draw_strip
-from sliplens.plots.markers import ARROWS, MarkedFrame, draw_fields_beside_saliency, plot_arrows, plot_field
+from sliplens.plots.markers import (
+    ARROWS,
+    STILL_PX,
+    SURE,
+    MarkedFrame,
+    draw_fields_beside_saliency,
+    plot_arrows,
+    plot_field,
+)
 from sliplens.plots.saliency import FULL_COLOUR_PERCENTILE, full_colour, overlay_relevance
 from sliplens.plots.style import (
     BLUE,
@@ -68,8 +76,6 @@ _SALIENCY_COLUMNS = (
     "input", "method", "frame_id", "level", "safety_margin", "prediction", "share_above_half", "centre_x_px",
     "centre_y_px",
 )  # fmt: skip
-_SURE = 0.2  # confidence of a field below which it is a guess, as `plot_field` draws it
-_FEWEST_STILL_PX = 0.3
 _TRUTH_FRAMES = _TRUTH_METHODS = 3
 _EFFECT_COLUMNS = {name: name for name in ("frame_id", "marker", "x_px", "y_px")}
 _EFFECT_COLUMNS |= {"shapley_value": "shapley", "shapley_error": "shapley_error", "network_effect": "network"}
@@ -401,7 +407,7 @@ def plate_contact_states(states: States) -> Plate | None:
     ]
     heads = [f"{frame.contact_state.capitalize()}\nΓ {percent(frame.safety_margin)}" for frame in chosen]
     grid = draw_grid(rows, heads=heads, below_in=0.55, cell_in=1.3 * CELL_IN)
-    top = max(*lengths, _FEWEST_STILL_PX)
+    top = max(*lengths, STILL_PX)
     mappable = None
     with drawing_style():
         for column, frame in enumerate(chosen):
@@ -474,12 +480,12 @@ def _field(frame: StateFrame) -> DisplacementField | None:
 
 
 def _longest(field: DisplacementField) -> float:
-    length = np.linalg.norm(field.displacement_px, axis=-1)[field.confidence > _SURE]
+    length = np.linalg.norm(field.displacement_px, axis=-1)[field.confidence > SURE]
     return float(length.max()) if len(length) else 0.0
 
 
 def _share_on_moving(saliency: np.ndarray, field: DisplacementField) -> float:
-    length = np.linalg.norm(field.displacement_px, axis=-1) * (field.confidence > _SURE)
+    length = np.linalg.norm(field.displacement_px, axis=-1) * (field.confidence > SURE)
     high, wide = saliency.shape
     rows = np.abs(np.arange(high)[:, None] - field.y_px).argmin(axis=1)
     columns = np.abs(np.arange(wide)[:, None] - field.x_px).argmin(axis=1)

@@ -96,8 +96,8 @@ class _Candidate:
     trial: ChosenTrial
     day: int
     rows: list[int]
-    """Frames by level, and their labels."""
     labels: Float[np.ndarray, " levels"]
+    """Frames by level, and their labels."""
     errors: dict[str, Float[np.ndarray, " levels"]]
     """Of each network's answers, in margin units."""
 
@@ -105,10 +105,18 @@ class _Candidate:
         """Frames to score, and where the panels show the trial all the others."""
         name = self.trial.trial
         for level, row, label in zip(LEVELS, self.rows, self.labels.tolist(), strict=True):
-            if shown or level in SCORED_LEVELS:
-                own = {"id": f"{name}-f{row:04d}", "trial": name, "day": self.day, "frame": row, "shown": shown}
-                scored = level in SCORED_LEVELS
-                yield ChosenFrame(**own, level=level, safety_margin=label, scored=scored)
+            scored = level in SCORED_LEVELS
+            if shown or scored:
+                yield ChosenFrame(
+                    id=f"{name}-f{row:04d}",
+                    trial=name,
+                    day=self.day,
+                    frame=row,
+                    level=level,
+                    safety_margin=label,
+                    scored=scored,
+                    shown=shown,
+                )
 
 
 def _look_at(info: TrialInfo, networks: Mapping[str, Run], data: Dataset, *, tolerance: float) -> _Candidate | None:

@@ -377,10 +377,10 @@ def _estimate(
     """Answers to frames with these frictions, of which as much is told as `evaluate` says."""
     if told != EACH:
         return run.estimate_batches(batches, friction=told)
-    estimate = run.estimate_batches(batches)
+    traction = run.require_ratio()
     if not np.isfinite(friction).all():
         raise RecordingError("not every trial has a coefficient of friction to tell; name one, or leave it out")
-    traction = run.require_ratio()
+    estimate = run.estimate_batches(batches)
     return tell_each(estimate, friction, trained_friction=np.array(traction.friction), calibration=traction.told)
 
 
