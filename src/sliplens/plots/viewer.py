@@ -51,7 +51,7 @@ from sliplens.recordings.trial import OUTSIDE, SLIPS, STICKS, Labels, labels_of_
 from sliplens.results.explanation import Explained
 
 if TYPE_CHECKING:
-    from rerun import RecordingStream
+    from rerun import AsComponents, ComponentColumn, RecordingStream
     from rerun.blueprint import Blueprint, TimeSeriesView
 
 
@@ -342,11 +342,11 @@ class _Log:
     rerun: ModuleType
     trial: Recording
 
-    def fixed(self, entity: str, what: object) -> None:
+    def fixed(self, entity: str, what: "AsComponents") -> None:
         """Log what no frame changes."""
         self.stream.log(entity, what, static=True)
 
-    def send(self, entity: str, frames: Int[np.ndarray, " _"], columns: object) -> None:
+    def send(self, entity: str, frames: Int[np.ndarray, " _"], columns: "Iterable[ComponentColumn]") -> None:
         """Log something of some frames."""
         time = self.rerun.TimeColumn("time", duration=_nanoseconds(self.trial.time_s[frames]))
         self.stream.send_columns(entity, [time, self.rerun.TimeColumn("frame", sequence=frames)], columns)
