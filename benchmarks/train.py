@@ -21,7 +21,7 @@ import torch
 from sliplens.files import machine, versions
 from sliplens.models import build_model
 from sliplens.models.backbones import margin_loss
-from sliplens.models.encodings import get_encoding
+from sliplens.models.encodings import ENCODINGS
 from sliplens.training import TrainConfig, fit, get_recipe
 from sliplens.training.data import FrameSet, get_augmentation
 
@@ -29,7 +29,7 @@ from sliplens.training.data import FrameSet, get_augmentation
 def make_frames(count: int, *, size: int, trial: str, generator: torch.Generator) -> FrameSet:
     """Frames of noise: how long a step takes does not depend on what they show."""
     return FrameSet(
-        encoding=get_encoding("difference"),
+        encoding=ENCODINGS.pick("difference"),
         images=torch.randint(0, 256, (count, 3, size, size), dtype=torch.uint8, generator=generator),
         safety_margin=torch.rand(count, generator=generator),
         traction_ratio=torch.rand(count, generator=generator),

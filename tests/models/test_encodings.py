@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from sliplens.errors import ImageError, InputError
-from sliplens.models.encodings import ENCODINGS, get_encoding
+from sliplens.models.encodings import ENCODINGS
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def test_frames_of_another_size_than_the_reference_are_refused(frames: np.ndarra
 
 def test_an_unknown_input_lists_those_there_are():
     with pytest.raises(InputError, match="no input named 'depth'; choose one of difference, raw"):
-        get_encoding("depth")
+        ENCODINGS.pick("depth")
 
 
 def test_a_signed_difference_tells_up_from_down_and_leaves_equal_pixels_alone(rng: np.random.Generator):

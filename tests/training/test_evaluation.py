@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from sliplens.errors import RecordingError
 from sliplens.models import load_checkpoint
-from sliplens.models.encodings import get_encoding
+from sliplens.models.encodings import ENCODINGS
 from sliplens.recordings import Dataset
 from sliplens.training import evaluate_frames, regression_scores
 from sliplens.training.data import load_frames
@@ -59,7 +59,7 @@ def test_no_frame_is_refused():
 def test_every_condition_is_scored_on_its_own_frames(small_dataset: Dataset, difference_run: Path):
     trained = load_checkpoint(difference_run)
     frames = load_frames(
-        small_dataset, small_dataset.select(split="test"), encoding=get_encoding("difference"), image_size=32
+        small_dataset, small_dataset.select(split="test"), encoding=ENCODINGS.pick("difference"), image_size=32
     )
     evaluation = evaluate_frames(trained, frames, batch_size=5)
     table = evaluation.frame().to_pydict()

@@ -7,7 +7,7 @@ import torch
 
 from sliplens.errors import InputError, ModelError
 from sliplens.models import load_checkpoint
-from sliplens.models.encodings import get_encoding
+from sliplens.models.encodings import ENCODINGS
 from sliplens.recordings import Dataset
 from sliplens.results.evaluation import Training
 from sliplens.training import TrainConfig, evaluate_frames, fit, get_recipe
@@ -19,7 +19,7 @@ CONFIG = TrainConfig(image_size=32, epochs=3, batch_size=11, seed=3)
 
 @pytest.fixture(scope="module")
 def frames(small_dataset: Dataset) -> tuple[FrameSet, FrameSet]:
-    encoding = get_encoding("difference")
+    encoding = ENCODINGS.pick("difference")
     train, validation = (
         load_frames(small_dataset, small_dataset.select(split=split), encoding=encoding, image_size=32)
         for split in ("train", "validation")

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from sliplens.models.encodings import get_encoding
+from sliplens.models.encodings import ENCODINGS
 from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
@@ -13,14 +13,14 @@ from sliplens.training.data import UNTOUCHED, load_frames
 
 def test_frames_without_a_label_are_left_out(small_dataset: Dataset):
     trials = small_dataset.select(split="train")
-    frames = load_frames(small_dataset, trials, encoding=get_encoding("difference"), image_size=32)
+    frames = load_frames(small_dataset, trials, encoding=ENCODINGS.pick("difference"), image_size=32)
     assert len(frames) == sum(trial.frames - 1 for trial in trials)
     assert torch.isfinite(frames.safety_margin).all()
 
 
 def test_a_batch_is_what_encoding_the_frames_one_by_one_gives(small_dataset: Dataset):
     trials = small_dataset.select(split="test")
-    encoding = get_encoding("difference")
+    encoding = ENCODINGS.pick("difference")
     frames = load_frames(small_dataset, trials, encoding=encoding, image_size=24)
     recording = small_dataset.load(trials[1])
     images, labels, _ = frames.__getitems__([11, 15])
@@ -37,7 +37,7 @@ def test_progress_counts_trials(small_dataset: Dataset):
     load_frames(
         small_dataset,
         trials,
-        encoding=get_encoding("raw"),
+        encoding=ENCODINGS.pick("raw"),
         image_size=32,
         on_progress=lambda done, total: seen.append((done, total)),
     )
@@ -47,7 +47,7 @@ def test_progress_counts_trials(small_dataset: Dataset):
 def test_the_untouched_sensor_is_added_as_full_stick_only_when_asked_for(small_dataset: Dataset):
     trials = small_dataset.select(split="train")
     plain, more = (
-        load_frames(small_dataset, trials, encoding=get_encoding("difference"), image_size=32, untouched_share=share)
+        load_frames(small_dataset, trials, encoding=ENCODINGS.pick("difference"), image_size=32, untouched_share=share)
         for share in (0.0, 0.2)
     )
     added = [row for row, frame in enumerate(more.frame) if frame == UNTOUCHED]
@@ -64,6 +64,6 @@ def test_frames_whose_label_cannot_be_trusted_are_left_out(tmp_path: Path, recor
     save_recording(doubted, path)
     write_dataset_table(tmp_path, [trial_info(path, split="train")])
     data = load_dataset(tmp_path)
-    frames = load_frames(data, data.trials, encoding=get_encoding("difference"), image_size=32)
+    frames = load_frames(data, data.trials, encoding=ENCODINGS.pick("difference"), image_size=32)
     # frame 0 has no contact, frames 7 to 11 are not trusted
     assert frames.frame == (1, 2, 3, 4, 5, 6)

@@ -13,7 +13,7 @@ from safetensors.torch import load_file
 from torch import distributed
 
 from sliplens.models import load_checkpoint
-from sliplens.models.encodings import get_encoding
+from sliplens.models.encodings import ENCODINGS
 from sliplens.recordings import Dataset
 from sliplens.training import evaluate_frames
 from sliplens.training.data import EpochShuffle, load_frames
@@ -61,7 +61,7 @@ def test_a_run_of_two_processes_is_whole_and_tells_its_own_error(tmp_path: Path,
     frames = load_frames(
         small_dataset,
         small_dataset.select(split="validation"),
-        encoding=get_encoding("difference"),
+        encoding=ENCODINGS.pick("difference"),
         image_size=32,
     )
     alone = evaluate_frames(trained, frames).conditions["dry"].mse

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from sliplens.errors import ModelError
-from sliplens.models.encodings import get_encoding
+from sliplens.models.encodings import ENCODINGS
 from sliplens.recordings import load_dataset
 from sliplens.results.evaluation import Training
 from sliplens.training import TrainConfig, fit, make_trainer
@@ -37,7 +37,7 @@ class Plain(nn.Module):
 
 def load(folder: Path) -> tuple[FrameSet, FrameSet]:
     """44 frames to train on, and 21 to validate on, which two processes cannot share evenly."""
-    data, encoding = load_dataset(folder), get_encoding("difference")
+    data, encoding = load_dataset(folder), ENCODINGS.pick("difference")
     train, validation = (
         load_frames(data, data.select(split=split), encoding=encoding, image_size=32)
         for split in ("train", "validation")

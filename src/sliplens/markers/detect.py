@@ -61,11 +61,6 @@ KINDS = Table("kind of markers", "sliplens.markers", _KINDS)
 `auto` looks for whatever is round and stands out alike in many places."""
 
 
-def get_kind(name: str) -> MarkerKind:
-    """Look up a kind of markers by name."""
-    return KINDS.pick(name)
-
-
 FEWEST = 4
 """Markers without which a pattern cannot be told from dirt."""
 _BRIGHT, _DARK, _EXPOSED = 250, 5, 0.5
@@ -320,7 +315,7 @@ def detect_markers(
     """
     if appearance is not None:
         return _detect(frame, appearance)
-    first = find_appearance(frame, get_kind(kind) if isinstance(kind, str) else kind)
+    first = find_appearance(frame, KINDS.pick(kind) if isinstance(kind, str) else kind)
     # the first impression errs in size by the threshold's place on the edge: measure, correct, measure again
     for _ in range(2):
         found = _detect(frame, first)

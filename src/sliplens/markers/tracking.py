@@ -15,7 +15,7 @@ from sliplens.codec import read_written, regrouped, write_tables
 from sliplens.errors import InputError
 from sliplens.extras import import_cv2
 from sliplens.files import as_path, require_new_file
-from sliplens.markers.detect import get_kind
+from sliplens.markers.detect import KINDS
 from sliplens.markers.tracker import Tracker
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame
 from sliplens.progress import OnProgress, note
@@ -141,7 +141,7 @@ def track(
     path = None if out is None else as_path(out)
     if path is not None and path.suffix:
         require_new_file(path, suffix=".parquet", overwrite=overwrite)
-    get_kind(markers)
+    KINDS.pick(markers)
     import_cv2()
     trials = open_trials(
         source,

@@ -21,7 +21,7 @@ from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.images import MOST_PIXELS
 from sliplens.models.backbones import Answers, bin_edges, build_model, ratio_edges
 from sliplens.models.calibration import Calibration, Traction, raw_interval, spread, told_probabilities
-from sliplens.models.encodings import Encoding, get_encoding
+from sliplens.models.encodings import ENCODINGS, Encoding
 from sliplens.models.novelty import Novelty, watch_features
 from sliplens.results.evaluation import Training
 
@@ -105,7 +105,7 @@ class Run:
     @property
     def encoding(self) -> Encoding:
         """The input the network was trained on."""
-        return get_encoding(self.manifest.input)
+        return ENCODINGS.pick(self.manifest.input)
 
     def encode(
         self, frames: Shaped[np.ndarray, "batch height width 3"], reference: Shaped[np.ndarray, "_ _ 3"] | None
@@ -409,7 +409,7 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> Run:
         raise CheckpointError(f"{weights} is missing; train the network again or copy the whole folder")
     if hash_file(weights) != manifest.weights_sha256:
         raise CheckpointError(f"{weights} is not the file its manifest describes; copy the whole folder again")
-    model = build_model(manifest.backbone, head=manifest.head, colours=get_encoding(manifest.input).colours)
+    model = build_model(manifest.backbone, head=manifest.head, colours=ENCODINGS.pick(manifest.input).colours)
     try:
         values, own = load_file(weights, device="cpu"), model.state_dict()
         model.load_state_dict(values)

@@ -92,8 +92,3 @@ _ROWS = {
 }
 ENCODINGS = Table("input", "sliplens.encodings", _ROWS)
 """Encodings by name; an installed package adds its own by the entry point `sliplens.encodings`."""
-
-
-def get_encoding(name: str) -> Encoding:
-    """Look up an encoding by name."""
-    return ENCODINGS.pick(name)

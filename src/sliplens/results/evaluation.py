@@ -38,6 +38,16 @@ PIXEL = Meta(ge=-1e5, le=1e5)
 
 
 @dataclass(frozen=True, kw_only=True)
+class OfNetwork:
+    """What was found of one network on some frames."""
+
+    input: str
+    """Name of the encoding that the network sees."""
+    source: str
+    """Where the frames come from: "simulated" or "real"."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SplitCount:
     """Trials and frames of one part of the data."""
 
@@ -369,11 +379,9 @@ class FrictionSlope:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Diagnosis:
+class Diagnosis(OfNetwork):
     """Where a network fails and why: slices of its errors, its markers, other frictions, kinds of explanations."""
 
-    input: str
-    source: str
     sentences: tuple[str, ...]
     """What was found, with figures."""
     left_out: str

@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32, Float64, Shaped, UInt8
 from sliplens.codec import UNKNOWN, Columns, load_record, load_result
 from sliplens.errors import InputError, SaliencyError
 from sliplens.files import RUN_FILE, Provenance, require_folder
-from sliplens.results.evaluation import ANSWER, MARGIN, SHARE, TIME
+from sliplens.results.evaluation import ANSWER, MARGIN, SHARE, TIME, OfNetwork
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,11 +36,9 @@ class MethodNotes:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explained:
+class Explained(OfNetwork):
     """Explanations of some frames by several methods."""
 
-    input: str
-    source: str
     weights_sha256: str
     """Hash of the network that was explained."""
     frames: tuple[ExplainedFrame, ...]

@@ -10,7 +10,7 @@ from jaxtyping import Float64, Int, Int64, Shaped
 
 from sliplens.codec import UNKNOWN, Columns
 from sliplens.intervals import Difference
-from sliplens.results.evaluation import AMOUNT, ANSWER, CORRELATION, MARGIN, SHARE
+from sliplens.results.evaluation import AMOUNT, ANSWER, CORRELATION, MARGIN, SHARE, OfNetwork
 
 _Rows = TypeVar("_Rows", "DeletionTable", "RemovalTable")
 Key = tuple[str, str, str]
@@ -77,11 +77,9 @@ class DeletionCurve:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DeletionScores:
+class DeletionScores(OfNetwork):
     """Deletion score of the thesis of one network's explanations, a random order among the methods."""
 
-    input: str
-    source: str
     fill: str
     steps: int
     pixels_per_step: int
@@ -119,11 +117,9 @@ class VariantTable(DeletionTable):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Remedies:
+class Remedies(OfNetwork):
     """The thesis's own remedies for its score, and insertion."""
 
-    input: str
-    source: str
     steps: int
     variants: dict[str, Variant]
     alarms: tuple[str, ...]
@@ -220,11 +216,9 @@ class RemovalTable(Columns):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RemovalScores:
+class RemovalScores(OfNetwork):
     """Sound scores of one network's explanations: what is lost by removal, against controls."""
 
-    input: str
-    source: str
     frames: int
     trials: int
     random_orders: int

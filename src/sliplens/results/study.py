@@ -12,7 +12,7 @@ from jaxtyping import Float32, Float64, Int64, Shaped, UInt8
 
 from sliplens.codec import UNKNOWN, Columns
 from sliplens.intervals import Difference
-from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, PIXEL, Evaluation
+from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, PIXEL, Evaluation, OfNetwork
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionScores, Lead, Remedies, RemovalScores
 
@@ -165,11 +165,9 @@ class States:
 
 
 @dataclass(frozen=True, kw_only=True)
-class UntrainedMaps:
+class UntrainedMaps(OfNetwork):
     """Maps of networks whose weights were drawn anew: controls that every map has to beat."""
 
-    input: str
-    source: str
     maps: dict[str, Annotated[Float32[np.ndarray, "frames size size"], ANSWER]]
     """Part of the relevance that works towards those networks' own targets, by method with `NEW_WEIGHTS`."""
 
@@ -190,11 +188,9 @@ class RandomisedMethod:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Randomisation:
+class Randomisation(OfNetwork):
     """Whether explanations notice that the network's weights were drawn anew."""
 
-    input: str
-    source: str
     frames: int
     methods: dict[str, RandomisedMethod]
     alarms: tuple[str, ...]
@@ -221,11 +217,9 @@ class Roughness:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MapQuality:
+class MapQuality(OfNetwork):
     """What the eye judges of maps, by method."""
 
-    input: str
-    source: str
     frames: int
     repeated_frames: int
     """Frames that were explained again for the stability."""
@@ -248,11 +242,9 @@ class MethodTime:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Timing:
+class Timing(OfNetwork):
     """Cost of explanations on one machine."""
 
-    input: str
-    source: str
     device: str
     threads: int
     frames: int
@@ -332,11 +324,9 @@ class MarkerEffects(Columns):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Truth:
+class Truth(OfNetwork):
     """What a network should have looked at, which only a simulation tells."""
 
-    input: str
-    source: str
     frames: int
     areas: dict[str, float | None]
     """Share of the image that each of `REGIONS` covers, None where no frame has it."""

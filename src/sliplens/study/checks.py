@@ -42,9 +42,9 @@ from sliplens.results.study import (
     UntrainedMaps,
 )
 from sliplens.shards import Shard
-from sliplens.study.choice import Material, MaterialStage, as_the_thesis_ran, trial_seed
+from sliplens.study.choice import Material, MaterialStage, MethodStage, as_the_thesis_ran, trial_seed
 from sliplens.study.explaining import mean_of_known
-from sliplens.study.stages import Find, join_trials, method_shards, trial_shards
+from sliplens.study.stages import Find, join_trials, trial_shards
 
 _NORMAL_QUARTILE = 0.6745
 """Median size of a standard normal number."""
@@ -65,7 +65,7 @@ class _Measured:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Measuring(MaterialStage[MapQuality]):
+class Measuring(MethodStage[MapQuality]):
     """Resolution, smoothness, sparsity and stability of the maps, a method a shard.
 
     Stability is the correlation with the map of the same frame under other camera noise, as large as what differs
@@ -78,10 +78,6 @@ class Measuring(MaterialStage[MapQuality]):
 
     data: Dataset
     seed: int = 0
-
-    def shards(self) -> Iterator[Shard]:
-        """All methods."""
-        return method_shards(list(self.material.explainers))
 
     def prepare(self) -> Find:
         """Measure the maps of a method."""
@@ -225,17 +221,13 @@ Maps = Float[np.ndarray, "frames height width"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Randomising(MaterialStage[Randomisation]):
+class Randomising(MethodStage[Randomisation]):
     """Maps of a few frames while weights are drawn anew from the output on: how far they change, a method a shard."""
 
     piece = RandomisedMethod
     title = "Drawing weights anew, layer by layer"
 
     seed: int = 0
-
-    def shards(self) -> Iterator[Shard]:
-        """All methods."""
-        return method_shards(list(self.material.explainers))
 
     def prepare(self) -> Find:
         """Explain the networks with new weights with a method."""

@@ -21,6 +21,7 @@ from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset, Recording, TrialInfo
 from sliplens.results.explanation import Explained
 from sliplens.results.study import Choice, ChosenFrame, ChosenTrial, MarkedFrame, MarkerTable, ShownFrame, States
+from sliplens.shards import Shard, shard
 from sliplens.study.explaining import DEFAULT_LEVELS as LEVELS
 from sliplens.study.explaining import frames_at, nearest_frame, network_inputs, require_methods
 from sliplens.study.stages import Result, Stage
@@ -357,6 +358,15 @@ class MaterialStage(Stage[Result]):
     def trained(self) -> Run:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Network that was explained."""
         return self.material.trained
+
+
+class MethodStage(MaterialStage[Result]):
+    """The same, a method a shard."""
+
+    def shards(self) -> Iterator[Shard]:
+        """All methods."""
+        for method in self.material.explainers:
+            yield shard(method, trial=method, frames=1, recipe="method", shown="")
 
 
 _TRIALS = 1000

@@ -104,12 +104,6 @@ def trial_shards(explained: Explained, *about: str, maps: int = 1) -> Iterator[S
         yield shard((*about, trial), trial=trial, name=" ".join((*about, trial)), **known)
 
 
-def method_shards(methods: Sequence[str]) -> Iterator[Shard]:
-    """A shard for each method."""
-    for method in methods:
-        yield shard(method, trial=method, frames=1, recipe="method", shown="")
-
-
 def join_trials(
     explained: Explained, pieces: Sequence[Mapping[str, np.ndarray]], *, axis: int = 0
 ) -> dict[str, np.ndarray]:

@@ -17,7 +17,6 @@ from sliplens.extras import import_cv2
 from sliplens.files import output_folder, scratch_folder
 from sliplens.friction import FrictionLike, as_friction
 from sliplens.markers import KINDS, MarkerStatus, track_markers
-from sliplens.markers.detect import get_kind
 from sliplens.markers.estimators import ESTIMATORS, FieldTrial, field_trial, get_estimator
 from sliplens.models import Run
 from sliplens.models.checkpoint import Estimate, load, tell_each
@@ -285,7 +284,7 @@ def _plan_baselines(
             "trials with sliplens split"
         )
     training = choose_training(offered, count)
-    kind = marker_kind((*training, *trials)) if markers is None else get_kind(markers).name
+    kind = marker_kind((*training, *trials)) if markers is None else KINDS.pick(markers).name
     return BaselinePlan(estimators=names, training=training, offered_trials=len(offered), markers=kind)
 
 

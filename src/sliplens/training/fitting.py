@@ -32,7 +32,7 @@ from sliplens.models.backbones import (
 )
 from sliplens.models.calibration import LEVELS, Calibration, Traction, conformal_offset, fit_temperature, raw_interval
 from sliplens.models.checkpoint import Estimate, Ratio, load, tell_each
-from sliplens.models.encodings import Encoding, get_encoding
+from sliplens.models.encodings import ENCODINGS, Encoding
 from sliplens.models.novelty import Novelty, fit_novelty
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
@@ -115,7 +115,7 @@ def train(
     if start is not None:
         require_same_kind(start, config, input)
     data = data if isinstance(data, Dataset) else load_dataset(data)
-    encoding, trials = get_encoding(input), _choose_trials(data, condition)
+    encoding, trials = ENCODINGS.pick(input), _choose_trials(data, condition)
     _require_varied_labels(data, trials[0])
     for sentence in _advise(config, *trials, start=start) if trainer.is_global_zero else ():  # one process speaks
         note(on_progress, sentence)
