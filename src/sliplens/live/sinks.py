@@ -9,10 +9,10 @@ import secrets
 import socket
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -258,16 +258,6 @@ def _open_rerun(address: str) -> Sink:
     return RerunFile(_new_file(address, kind="rerun"))
 
 
-class RosMessage(Protocol):
-    """Message of ROS as `rosbags` has it, such as a header."""
-
-    __msgtype__: ClassVar[str]
-
-
-RosFields: TypeAlias = Mapping[str, float | str | np.ndarray | RosMessage]
-"""Fields of a message by name."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class RosTopic:
     """What is sent to ROS on one topic."""
@@ -276,7 +266,7 @@ class RosTopic:
     """Below the key of the sink."""
     kind: str
     """Type of its messages."""
-    fields: Callable[[Reading, Frame | None, RosMessage], RosFields | None]
+    fields: Callable[[Reading, Frame | None, Any], dict[str, Any] | None]
     """Fields of the message of a reading, with a header at hand; None where there is none to send."""
 
 
@@ -364,12 +354,12 @@ class ZenohRos:
         if kind not in self._types.types:
             self._types.register(get_types_from_msg(definition, kind))
 
-    def header(self, at_ns: int) -> RosMessage:
+    def header(self, at_ns: int) -> Any:
         """Header of a message, at nanoseconds since 1970."""
         stamp = self._types.types["builtin_interfaces/msg/Time"](sec=at_ns // 10**9, nanosec=at_ns % 10**9)
         return self._types.types["std_msgs/msg/Header"](stamp=stamp, frame_id=_FRAME_ID)
 
-    def publisher(self, topic: str, kind: str) -> Callable[[RosFields, int], None]:
+    def publisher(self, topic: str, kind: str) -> Callable[[dict[str, Any], int], None]:
         """Declare a topic; gives what sends a message of these fields on it, at nanoseconds since 1970.
 
         Sending raises `OSError` where the way is closed.
@@ -377,7 +367,7 @@ class ZenohRos:
         publishers = [self._session.declare_publisher(name) for name in self._names(topic, kind)]
         ext, own_id, count = self._ext, secrets.token_bytes(16), itertools.count(1)
 
-        def send(fields: RosFields, at_ns: int) -> None:
+        def send(fields: dict[str, Any], at_ns: int) -> None:
             message = bytes(self._types.serialize_cdr(self._types.types[kind](**fields), kind))
             attachment = ext.z_serialize((ext.Int64(next(count)), ext.Int64(at_ns), own_id))
             by_name, by_type = publishers
