@@ -42,7 +42,7 @@ from sliplens.results.evaluation import (
     RiskCoverage,
     Training,
 )
-from sliplens.results.faithfulness import DeletionCurve
+from sliplens.results.faithfulness import CHANCE, DeletionCurve
 
 MARGIN_LABEL = "Safety margin Γ (%)"
 _MSE_LABEL, _EPOCH_LABEL = "MSE (Γ as a fraction, squared)", "Epoch (passes over the training frames)"
