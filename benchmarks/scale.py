@@ -1,8 +1,9 @@
 """Many trials serially, by processes and by Ray: how fast, with which bytes, in what memory, and what a kill costs.
 
-Rates are of steady work: of the later half of the parts. The start is what the whole took beyond its frames at that
+Rates are of steady work: of its later half. The start is what the whole took beyond its frames at that
 rate. `serial` is what users get, its batches in as many threads as there are cores; `one core` is the same on one of
-them. From the rates of processes the plan is drawn, of what a million and a hundred million frames take.
+them: its time of the processor, which other work on the machine hardly changes, is the cost from which the plan is
+drawn, of what a million and a hundred million frames take.
 
 Kills are `SIGKILL` at random moments, of the command or of a process that works for it: a worker, an actor, a node of
 Ray, of one or, as `cluster`, of two of them. The same command must then end with the bytes of a serial run, no part
@@ -75,6 +76,8 @@ class Rate:
     """Of what was made."""
     held_per_frame: float = 0.0
     """Bytes in the driver's memory."""
+    cpu_s_per_frame: float = 0.0
+    """Time of the processor in the driver's process, which is all where it works alone."""
 
 
 def parts(folder: Path) -> dict[str, Path]:
@@ -87,19 +90,29 @@ def content(folder: Path) -> str:
     return hash_json({name: hash_file(path) for name, path in parts(folder).items() if path.is_file()})
 
 
-def rate(made: list[tuple[float, int]], began_s: float, out: Path, sha256: str) -> Rate:
-    """Speed from when parts were made, and of how many frames: of the later half, when all workers are long there."""
-    made = sorted(made)
-    half, last_s, frames = len(made) // 2, made[-1][0], sum(frames for _, frames in made)
-    steady = sum(frames for _, frames in made[half:]) / (last_s - made[half - 1][0])
-    start_s = last_s - began_s - frames / steady
-    return Rate(start_s=start_s, frames_per_s=steady, sha256=sha256, bytes_per_frame=size_of(out) / frames)
+class Ticks:
+    """Whole and processor's seconds as work goes on."""
 
+    def __init__(self) -> None:
+        self._ticks = [(time.time(), time.process_time(), 0)]
 
-def rate_of_parts(out: Path, began_s: float) -> Rate:
-    """Speed of what left a file a part."""
-    made = [(path.stat().st_mtime, int(path.name.split("-")[1])) for path in parts(out).values()]
-    return rate(made, began_s, out, content(out))
+    def __call__(self, done: int, _: int) -> None:
+        """Note how many frames are done."""
+        self._ticks.append((time.time(), time.process_time(), done))
+
+    def rate(self, out: Path, sha256: str) -> Rate:
+        """Speed and cost of the later half."""
+        ticks, frames = self._ticks, self._ticks[-1][2]
+        half = next(one for one in ticks if one[2] >= frames / 2)
+        last_s, cpu_s, steady = (last - then for last, then in zip(ticks[-1], half, strict=True))
+        frames_per_s = steady / last_s
+        return Rate(
+            start_s=ticks[-1][0] - ticks[0][0] - frames / frames_per_s,
+            frames_per_s=frames_per_s,
+            sha256=sha256,
+            bytes_per_frame=size_of(out) / frames,
+            cpu_s_per_frame=cpu_s / steady,
+        )
 
 
 def size_of(folder: Path) -> int:
@@ -119,26 +132,22 @@ def one_core() -> Iterator[None]:
         os.sched_setaffinity(0, every)
 
 
-def plan(
-    rates: dict[str, dict[str, Any]], *, workers: int, driver: dict[str, float], data: Dataset
-) -> list[dict[str, str | int | float]]:
-    """What each stage would take of many frames, from its cost a core while all cores work."""
-    stored = size_of(data.folder) / data.frames
-    rows: list[dict[str, str | int | float]] = []
+def plan(rates: dict[str, dict[str, Any]], *, driver: dict[str, float], data: Dataset) -> list[dict[str, Any]]:
+    """What each stage would take of many frames, if every core did as much as one does alone."""
+    stored, rows = size_of(data.folder) / data.frames, []
     for (stage, own), frames, (machines, cores) in product(rates.items(), PLANNED, MACHINES.items()):
-        rate_per_s, trials = own["frames_per_s"] * cores / workers, frames / TRIAL
+        rate_per_s, trials = cores / own["cpu_s_per_frame"], frames / TRIAL
         shards = frames if stage == "explain" else trials
         held = driver["bytes_a_trial"] * trials + driver["grew_mb"] * 1e6 / EMPTY * shards
-        held += own["held_per_frame"] * frames
         rows.append({
             "stage": stage,
             "frames": frames,
             "on": machines,
-            "hours": max(own["start_s"] + frames / rate_per_s, driver["s_a_shard"] * shards) / 3600,
+            "hours": max(frames / rate_per_s, driver["s_a_shard"] * shards) / 3600,
             "read_tb": stored * frames / 1e12,
             "read_gb_per_s": stored * rate_per_s / 1e9,
             "written_gb": own["bytes_per_frame"] * frames / 1e9,
-            "driver_gb": held / 1e9,
+            "driver_gb": (held + own["held_per_frame"] * frames) / 1e9,
         })  # fmt: skip
     return rows
 
@@ -157,27 +166,26 @@ class Empty(Work):
 
 def time_predict(data: Dataset, out: Path, on: str) -> Rate:
     """Margins of all frames."""
-    began_s = time.time()
-    predict(NETWORK, data, engine="folded", on=on, out=out)
-    return rate_of_parts(out, began_s)
+    ticks = Ticks()
+    predict(NETWORK, data, engine="folded", on=on, out=out, on_progress=ticks)
+    return ticks.rate(out, content(out))
 
 
 def time_track(data: Dataset, out: Path, on: str) -> Rate:
     """Markers of all frames."""
-    began_s = time.time()
-    track(data, markers="chromatouch", on=on, out=out)
-    return rate_of_parts(out, began_s)
+    ticks = Ticks()
+    track(data, markers="chromatouch", on=on, out=out, on_progress=ticks)
+    return ticks.rate(out, content(out))
 
 
 def time_explain(data: Dataset, out: Path, on: str) -> Rate:
     """Maps of Poly-CAM on its budget."""
-    made: list[tuple[float, int]] = []
-    began_s, levels = time.time(), tuple(1 - number / (MAPS - 1) for number in range(MAPS))
+    ticks, levels = Ticks(), tuple(1 - number / (MAPS - 1) for number in range(MAPS))
     options = {"methods": ("poly-cam",), "levels": levels, "split": data.trials[-1].split, "out": out}
-    maps = explain_source(NETWORK, data, on=on, on_progress=lambda *_: made.append((time.time(), 1)), **options)
+    maps = explain_source(NETWORK, data, on=on, on_progress=ticks, **options)
     kept = (maps.images, maps.pictures, *maps.relevance.values(), *maps.saliency.values())
     held = sum(array.nbytes for array in kept) + 4 * maps.images.nbytes  # the references, in 32 bits
-    found = rate(made, began_s, out, hashlib.sha256(maps.relevance["poly-cam"].tobytes()).hexdigest())
+    found = ticks.rate(out, hashlib.sha256(maps.relevance["poly-cam"].tobytes()).hexdigest())
     return replace(found, held_per_frame=held / MAPS)
 
 
@@ -401,8 +409,7 @@ def main() -> None:
     def each(name: str) -> dict[str, dict[str, Any]]:
         return {stage: {on: one[name] for on, one in own.items()} for stage, own in rates.items()}
 
-    costs = {stage: own[by_processes] for stage, own in rates.items()}
-    planned = plan(costs, workers=options.workers, driver=driver, data=found)
+    planned = plan({stage: own[ONE_CORE] for stage, own in rates.items()}, driver=driver, data=found)
     result = {
         "speedup_processes": over(by_processes, "serial"),
         "speedup_processes_one_core": over(by_processes, ONE_CORE),
@@ -413,7 +420,7 @@ def main() -> None:
         "kills_survived": survived,
         "killed": dict(killed),
         "parts_there_when_killed": sorted(one["parts"] for one in kills),
-        **{name: each(name) for name in ("frames_per_s", "start_s", "load_average")},
+        **{name: each(name) for name in ("frames_per_s", "start_s", "cpu_s_per_frame", "load_average")},
         "plan": planned,
         "frames": found.frames,
         "workers": options.workers,
