@@ -50,7 +50,7 @@ from sliplens.study.workspace import explain_source
 NETWORK = "chromatouch-difference"
 EMPTY = 10_000
 """Shards whose driver is weighed."""
-MAPS = 12
+MAPS = 8
 """Frames that are explained."""
 PLANNED = (1_000_000, 100_000_000)
 """Frames of the plan, in trials of so many, 20 s of a usual camera, on so many cores."""
