@@ -2,6 +2,7 @@
 
 import inspect
 import os
+import re
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -156,6 +157,15 @@ def skip_calls(_app: Sphinx, what: str, name: str, thing: object, _skip: bool, _
     return True if what == "module" and name in sliplens.__all__ and getattr(sliplens, name) is thing else None
 
 
+def find_described(app: Sphinx, page: str, modules: list[str], name: str) -> tuple[str, str] | None:
+    """Name by which a package describes what one of its modules defines, and the link from a page to there."""
+    described = app.env.domains.python_domain.objects
+    for depth in range(len(modules), 0, -1):
+        if (found := described.get(place := ".".join((*modules[:depth], name)))) is not None:
+            return place, f"{app.builder.get_relative_uri(page, found.docname)}#{found.node_id}"
+    return None
+
+
 def find_where_exported(
     app: Sphinx, env: BuildEnvironment, node: pending_xref, inner: nodes.Element
 ) -> nodes.Node | None:
@@ -166,14 +176,24 @@ def find_where_exported(
     # a type that is imported for the type checker alone, or a name in words, stands without its module
     modules = modules or str(node.get("py:module", "sliplens")).split(".")
     described = env.domains.python_domain.objects
-    places = [".".join((*modules[:depth], name)) for depth in range(len(modules), 0, -1)]
     classes = [place for place, one in described.items() if place.endswith(f".{name}") and one.objtype == "class"]
-    for place in places + classes * (len(classes) == 1):
-        if place in described:
-            found = described[place]
-            uri = app.builder.get_relative_uri(node.get("refdoc", ""), found.docname)
-            return nodes.reference("", "", inner, internal=True, refuri=f"{uri}#{found.node_id}", reftitle=place)
-    return None
+    found = find_described(app, node.get("refdoc", ""), modules, name)
+    if found is None and len(classes) == 1:
+        found = find_described(app, node.get("refdoc", ""), classes[0].split(".")[:-1], name)
+    return found and nodes.reference("", "", inner, internal=True, refuri=found[1], reftitle=found[0])
+
+
+def lead_back(app: Sphinx, page: str, _template: str, context: dict[str, str], _tree: nodes.document | None) -> None:
+    """Lead from the source to where a name is described; viewcode takes one package for all names of a module."""
+
+    def link(match: re.Match[str]) -> str:
+        *_, owner, name = match[1].split(".")
+        modules = page.split("/")[1:]
+        found = find_described(app, page, modules, f"{owner}.{name}") or find_described(app, page, modules, name)
+        return f'href="{found[1]}"' if found else match[0]
+
+    if page.startswith("_modules/sliplens/"):
+        context["body"] = re.sub(r'href="[^"#]*#(sliplens\.[\w.]+)"', link, context["body"])
 
 
 def setup(app: Sphinx) -> None:
@@ -182,3 +202,4 @@ def setup(app: Sphinx) -> None:
     app.connect("autodoc-process-docstring", complete_docstring)
     app.connect("autodoc-skip-member", skip_calls)
     app.connect("missing-reference", find_where_exported)
+    app.connect("html-page-context", lead_back)
