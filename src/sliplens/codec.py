@@ -4,6 +4,7 @@ A record is a frozen dataclass. What it declares is what its file must hold: a f
 not finite is told in one sentence with its place and its cure, by msgspec for JSON and by jaxtyping for arrays.
 """
 
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -450,6 +451,12 @@ def _require_claimed(archive: zipfile.ZipFile, info: zipfile.ZipInfo, room: int)
     return info.file_size
 
 
+_NO_ARRAYS = (
+    OSError, ValueError, LookupError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error, tokenize.TokenError,
+)  # fmt: skip
+"""What NumPy raises of a damaged archive; its headers are read as text of Python where they are old."""
+
+
 def _load_arrays(path: Path, declared: Mapping[str, Any], cure: str) -> dict[str, Any]:
     """Arrays of the fields of a record, each alone or a mapping of several."""
     room = max(_MOST_ARRAYS, MOST_TIMES * require_file(path, missing=cure))
@@ -458,7 +465,7 @@ def _load_arrays(path: Path, declared: Mapping[str, Any], cure: str) -> dict[str
             for info in archive.zip.infolist():
                 room -= _require_claimed(archive.zip, info, room)
             arrays = {name: archive[name] for name in archive}
-    except (OSError, ValueError, LookupError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
+    except _NO_ARRAYS as error:
         raise InputError(f"{path} cannot be read as arrays ({one_line(error)}); {cure}") from None
     given = {}
     with jaxtyped("context"):  # "frames" of one array are as many as "frames" of another

@@ -57,6 +57,11 @@ def test_a_number_that_no_stage_measures_is_told_wherever_it_stands_in_a_result(
         assert "-1e+09" in said
 
 
+def test_an_array_whose_header_is_no_text_is_told(originals: Path, tmp_path: Path):
+    kind, said = outcome(Input(format="arrays", change="zeros inside", seed=2430), originals, tmp_path / "input")
+    assert (kind, "cannot be read as arrays" in said) == ("refused", True)
+
+
 def test_every_change_of_every_format_comes_before_any_comes_again():
     pairs = sum(len(kind.changes) for kind in FORMATS.values())
     drawn = list(inputs(pairs + 1, seed=5))
