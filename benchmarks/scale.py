@@ -42,9 +42,10 @@ from sliplens.extras import missing_packages
 from sliplens.files import hash_file, hash_json, machine, partial_folder, versions, write_json
 from sliplens.markers.tracking import track
 from sliplens.models.engines import one_thread
+from sliplens.parts import Shard, shard
 from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset, TrialInfo
-from sliplens.shards import MakePart, Shard, Work, make_parts, shard
+from sliplens.shards import MakePart, Work, make_parts
 from sliplens.study.workspace import explain_source
 
 NETWORK = "chromatouch-difference"

@@ -17,7 +17,8 @@ from shard_work import Count, CountInThreads, shards
 from sliplens.cli import main
 from sliplens.errors import InputError, ShardError, SliplensError
 from sliplens.files import hash_file
-from sliplens.shards import TRIES, Crew, Doing, Shard, make_parts, make_table, read_status, shard
+from sliplens.parts import TRIES, Doing, Shard, read_status, shard
+from sliplens.shards import Crew, make_parts, make_table
 
 TITLE = "Counting"
 Make = Callable[..., None]
@@ -277,7 +278,7 @@ def test_the_driver_keeps_nothing_of_ten_thousand_shards(log: Path, out: Path, m
             yield shard(number, trial=f"t{number}", frames=1, recipe=0, shown="", suffix=".parquet")
 
     blocks: list[int] = []  # of memory, as each shard is done
-    monkeypatch.setattr("sliplens.shards._are_made", lambda _, given: [True] * len(given))
+    monkeypatch.setattr("sliplens.shards.look_for", lambda _, given: ((one, True) for one in given))
     out.mkdir()
     make(Count(log=log), out, given=many, on_part=lambda _: blocks.append(sys.getallocatedblocks()))
     assert len(blocks) == 10_000
@@ -303,6 +304,6 @@ def test_parts_join_into_a_file_or_stay_a_data_set(log: Path, tmp_path: Path):
 
 
 def _writing(out: Path):
-    from sliplens.shards import parts_folder  # noqa: PLC0415
+    from sliplens.parts import parts_folder  # noqa: PLC0415
 
     return parts_folder(out)

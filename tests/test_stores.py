@@ -13,9 +13,10 @@ from sliplens import load_dataset, predict
 from sliplens.cli import main
 from sliplens.errors import InputError, ShardError
 from sliplens.files import StoredPath, as_path, output_folder, remove
+from sliplens.parts import TRIES, read_status
 from sliplens.recordings import Dataset
 from sliplens.results.explanation import load_explained
-from sliplens.shards import TRIES, make_parts, make_table, read_status
+from sliplens.shards import make_parts, make_table
 from sliplens.study.workspace import explain_source
 
 SETTINGS = {

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from sliplens.models.checkpoint import load
     from sliplens.models.onnx import export_onnx
     from sliplens.models.predictions import predict
+    from sliplens.parts import read_status
     from sliplens.plots.figure import plot
     from sliplens.recordings.check import check_dataset
     from sliplens.recordings.dataset import load_dataset
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from sliplens.recordings.importing import import_recordings, label_dataset
     from sliplens.recordings.splits import split_dataset
     from sliplens.report.page import write_report
-    from sliplens.shards import read_status
     from sliplens.simulation.sharing import compare_datasets
     from sliplens.simulation.trials import simulate
     from sliplens.study.diagnose import diagnose
@@ -55,7 +55,7 @@ _MODULES = {
     "plot": "sliplens.plots.figure",
     "predict": "sliplens.models.predictions",
     "read_live": "sliplens.live.loop",
-    "read_status": "sliplens.shards",
+    "read_status": "sliplens.parts",
     "run_episodes": "sliplens.grip.episodes",
     "run_study": "sliplens.study.run",
     "score": "sliplens.faithfulness.scoring",

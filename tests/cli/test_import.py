@@ -11,10 +11,10 @@ from command_line import refused, run
 from own_recording import TARE, write_forces, write_video
 
 from sliplens.images import write_png
+from sliplens.parts import read_status
 from sliplens.recordings import Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import read_header, save_recording, write_trial
-from sliplens.shards import read_status
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 

@@ -10,6 +10,7 @@ import pytest
 from command_line import refused, run
 
 from sliplens.images import write_png
+from sliplens.parts import read_status
 from sliplens.recordings import ContactState, LabelSettings, Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.edits import EDITS_FILE, edits_in_force, keep_edit, make_edit, read_edits
@@ -22,7 +23,6 @@ from sliplens.recordings.store import (
     save_forces,
     save_recording,
 )
-from sliplens.shards import read_status
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 

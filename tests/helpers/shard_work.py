@@ -11,8 +11,9 @@ import pyarrow as pa
 
 from sliplens.codec import write_tables
 from sliplens.errors import InputError, RecordingError
+from sliplens.parts import Shard, shard
 from sliplens.progress import OnProgress
-from sliplens.shards import MakePart, Shard, Work, WorkError, shard
+from sliplens.shards import MakePart, Work, WorkError
 
 SCHEMA = pa.schema({"trial": pa.string(), "value": pa.int64()})
 

@@ -19,13 +19,13 @@ from sliplens.images import absolute_difference, write_png
 from sliplens.models import Run, load_checkpoint
 from sliplens.models.predictions import Predictions
 from sliplens.models.predictions import predict as predict_source
+from sliplens.parts import read_status
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import trial_path
 from sliplens.recordings.formats.lerobot_export import write_lerobot
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.trial import ContactState
-from sliplens.shards import read_status
 
 TRIAL = "test-wet-7"
 

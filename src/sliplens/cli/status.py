@@ -10,7 +10,7 @@ from sliplens.cli.console import say
 from sliplens.files import RUN_FILE
 
 if TYPE_CHECKING:
-    from sliplens.shards import Status as Progress
+    from sliplens.parts import Status as Progress
 
 _SHOWN = 20
 """Shards of which each has a line."""
@@ -28,7 +28,7 @@ class Status:
 
     def run(self) -> None:
         """Read the parts and show them."""
-        from sliplens.shards import read_status
+        from sliplens.parts import read_status
 
         works = read_status(self.output)
         if not works:

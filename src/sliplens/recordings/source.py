@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.files import as_path, hash_file, hash_json, hash_tree
 from sliplens.images import list_images, read_image
+from sliplens.parts import Shard, shard
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import DATASET_FILE, Dataset, load_dataset
 from sliplens.recordings.formats import open_captures, recognise
@@ -21,7 +22,7 @@ from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
 from sliplens.recordings.options import LIMITS, Budget, ReadOptions, spoken
 from sliplens.recordings.sensor import SensorProfile, load_profile
-from sliplens.shards import LONGEST, Shard, shard
+from sliplens.shards import LONGEST
 
 Frames: TypeAlias = UInt8[np.ndarray, "frames height width 3"]
 """RGB images of the camera, one after another."""

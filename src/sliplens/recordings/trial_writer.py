@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 from sliplens.codec import RESULT_FILE, load_record, save_record
 from sliplens.errors import RecordingError, SliplensError
 from sliplens.files import remove
+from sliplens.parts import Shard, shard
 from sliplens.progress import OnProgress, stage
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import LeftOut, TrialInfo, trial_info, trial_path
@@ -33,7 +34,7 @@ from sliplens.recordings.store import (
     write_trial,
 )
 from sliplens.recordings.trial import Labels
-from sliplens.shards import MakePart, Shard, Work, make_parts, shard
+from sliplens.shards import MakePart, Work, make_parts
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,6 +27,7 @@ from sliplens.faithfulness.controls import (
 )
 from sliplens.intervals import paired_difference
 from sliplens.models import Run
+from sliplens.parts import Shard
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
 from sliplens.results.faithfulness import NEW_WEIGHTS
@@ -41,7 +42,6 @@ from sliplens.results.study import (
     Timing,
     UntrainedMaps,
 )
-from sliplens.shards import Shard
 from sliplens.study.choice import Material, MaterialStage, MethodStage, as_the_thesis_ran, trial_seed
 from sliplens.study.explaining import mean_of_known
 from sliplens.study.stages import Find, join_trials, trial_shards

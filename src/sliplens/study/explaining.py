@@ -18,6 +18,7 @@ from sliplens.explainers import EXPLAINERS, Explainer
 from sliplens.explainers.table import network_images
 from sliplens.models import Run
 from sliplens.models.engines import expecting
+from sliplens.parts import Shard, shard
 from sliplens.plots.saliency import NOMINAL_MARGINS
 from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset
@@ -26,7 +27,6 @@ from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import open_source
 from sliplens.results.evaluation import ANSWER, SHARE
 from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes, require_saliency
-from sliplens.shards import Shard, shard
 from sliplens.study.stages import Find, Stage
 
 DEFAULT_LEVELS = NOMINAL_MARGINS

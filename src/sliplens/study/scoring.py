@@ -29,6 +29,7 @@ from sliplens.faithfulness.scoring import (
 )
 from sliplens.intervals import mean_interval, paired_difference
 from sliplens.models import Run
+from sliplens.parts import Shard
 from sliplens.progress import OnProgress, continued
 from sliplens.results.explanation import Explained, ExplainedFrame
 from sliplens.results.faithfulness import (
@@ -46,7 +47,6 @@ from sliplens.results.faithfulness import (
     VariantTable,
     is_control,
 )
-from sliplens.shards import Shard
 from sliplens.study.choice import Material, MaterialStage, trial_seed
 from sliplens.study.explaining import network_inputs
 from sliplens.study.stages import Find, Stage, join_trials, trial_shards

@@ -13,9 +13,10 @@ from sliplens.codec import load_result, save_result
 from sliplens.files import scratch_folder
 from sliplens.models import Run
 from sliplens.models.engines import counting_passes
+from sliplens.parts import Shard, shard
 from sliplens.progress import OnProgress
 from sliplens.results.explanation import Explained
-from sliplens.shards import Crew, MakePart, Shard, Work, make_parts, shard
+from sliplens.shards import Crew, MakePart, Work, make_parts
 
 Result = TypeVar("Result")
 Find: TypeAlias = Callable[[Any, OnProgress], Any]

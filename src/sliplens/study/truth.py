@@ -32,6 +32,7 @@ from sliplens.faithfulness.removal import (
 from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.models import Run
+from sliplens.parts import Shard, shard
 from sliplens.plots.style import tell_ends
 from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset
@@ -39,7 +40,6 @@ from sliplens.recordings.trial import SLIPS
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import CHANCE, is_control
 from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTest, OracleTest, Truth
-from sliplens.shards import Shard, shard
 from sliplens.simulation.intervention import (
     FilmedTrial,
     draw_with_markers_back,
