@@ -165,3 +165,9 @@ def write_proposal(proposal: SensorProposal, path: Path) -> None:
     """Write the picture as PNG, whole or not at all."""
     with written_whole(path) as part:
         draw_proposal(proposal).savefig(part, dpi=120, format="png")
+
+
+__all__ = [
+    "ARROWS", "FIELD_COLOURS", "MarkedFrame", "draw_fields_beside_saliency", "draw_proposal", "plot_arrows", "plot_field",
+    "write_proposal",
+]  # fmt: skip
