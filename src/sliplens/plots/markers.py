@@ -168,6 +168,6 @@ def write_proposal(proposal: SensorProposal, path: Path) -> None:
 
 
 __all__ = [
-    "ARROWS", "FIELD_COLOURS", "MarkedFrame", "draw_fields_beside_saliency", "draw_proposal", "plot_arrows", "plot_field",
-    "write_proposal",
+    "ARROWS", "FIELD_COLOURS", "MarkedFrame", "draw_fields_beside_saliency", "draw_proposal", "plot_arrows",
+    "plot_field", "write_proposal",
 ]  # fmt: skip
