@@ -17,11 +17,11 @@ from sliplens.faithfulness.removal import Units, marker_units, tile_units
 from sliplens.images import absolute_difference
 from sliplens.markers import track_markers
 from sliplens.models import Run
+from sliplens.parts import Shard, shard
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset, Recording, TrialInfo
 from sliplens.results.explanation import Explained
 from sliplens.results.study import Choice, ChosenFrame, ChosenTrial, MarkedFrame, MarkerTable, ShownFrame, States
-from sliplens.shards import Shard, shard
 from sliplens.study.explaining import DEFAULT_LEVELS as LEVELS
 from sliplens.study.explaining import frames_at, nearest_frame, network_inputs, require_methods
 from sliplens.study.stages import Result, Stage
